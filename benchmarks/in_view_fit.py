@@ -26,12 +26,12 @@ from scipy.optimize import minimize
 
 from benchmarks.independent_filter import filter_independently
 from benchmarks.joint_view import JointView
-from benchmarks.trajectories import Trajectories
 from saga_fg.errors import InputError
 from saga_fg.learning.interaction_fit import Rule, RuleParameters
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.labelled_objects import LabelledObjects
 
 NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 EXPLAINED_BOUNDS = (0.0, 3.0)  # s
@@ -48,7 +48,7 @@ class FittedInView:
 
 
 def fit_interactions_in_view(
-    recordings: Sequence[Trajectories],
+    recordings: Sequence[LabelledObjects],
     position_noise: float,
     acceleration_noise: Mapping[str, float],
     template: Sequence[Rule],
@@ -86,7 +86,7 @@ class _Views:
     """Likelihood of recordings given parameters x: those of rules, log noise of each class, explained noise."""
 
     def __init__(
-        self, recordings: Sequence[Trajectories], position_noise: float, acceleration_noise: Mapping[str, float]
+        self, recordings: Sequence[LabelledObjects], position_noise: float, acceleration_noise: Mapping[str, float]
     ) -> None:
         self._position_noise, self._noise = position_noise, dict(acceleration_noise)
         self._recordings = []

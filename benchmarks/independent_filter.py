@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.trajectories import Trajectories
 from saga_fg.model.motion import ConstantVelocity
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.tracking.box_filter import MOVING
+from saga_fg.types.labelled_objects import LabelledObjects
 
 INITIAL_SPEED_DEVIATION = 10.0  # standard deviation of a velocity component before the second measurement, m/s
 
@@ -32,7 +32,7 @@ class FilteredTrajectories(NamedTuple):
 
 
 def filter_independently(
-    trajectories: Trajectories, acceleration_noise: FloatArray, position_noise: float
+    trajectories: LabelledObjects, acceleration_noise: FloatArray, position_noise: float
 ) -> FilteredTrajectories:
     """All objects of a recording; acceleration_noise (N,) m^2/s^3, position_noise standard deviation, m."""
     K, N = trajectories.position.shape[:2]

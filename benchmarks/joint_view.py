@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.independent_filter import INITIAL_SPEED_DEVIATION, FilteredTrajectories
-from benchmarks.trajectories import Trajectories
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import EdgeRule
@@ -16,6 +15,7 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.numerics.arrays import IntArray
 from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.labelled_objects import LabelledObjects
 
 _H = np.eye(2, 4)
 
@@ -29,7 +29,7 @@ class JointView:
 
     def __init__(
         self,
-        trajectories: Trajectories,
+        trajectories: LabelledObjects,
         filtered: FilteredTrajectories,
         noise: Mapping[str, float],
         position_noise: float,

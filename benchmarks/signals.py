@@ -3,11 +3,15 @@
 Lights count from the first moment at which a vehicle is first before one of their lines, at every frame. The prior is
 the belief without traffic. From an even prior, the time is measured until a light is believed closed that is, since its
 first vehicle stands or brakes.
+
+With --left-out the settings of the inference are not those of the configuration: for each window they are the ones
+among `CANDIDATES` with the least log-loss on all others that do not overlap with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Annotated
@@ -16,6 +20,7 @@ import numpy as np
 import typer
 
 from data_tools.datasets.ngsim.windows import NgsimWindows
+from data_tools.datasets.overlapping import overlapping
 from data_tools.datasets.recorded_traffic import PERIOD, RecordedTraffic
 from data_tools.datasets.source import names
 from data_tools.figures import FigureTable, cell
@@ -30,6 +35,7 @@ SINCE = (0.0, 0.5, 1.0, 2.0, 4.0, np.inf)  # s since the first vehicle was there
 BELIEFS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 SURE = 0.8  # belief that counts as believed
 EVEN = 30.0  # s that all phases last in the even prior
+CANDIDATES = ((0.1, 2.0), (0.05, 2.0), (0.2, 2.0), (0.1, 1.0), (0.1, 4.0))  # non_compliance and driver_noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +73,29 @@ def believed_lights(traffic: RecordedTraffic, config: TrackConfig) -> list[Belie
                 row = time - start, nodes.belief(light)["green"], shown == "green", light in held
                 found.setdefault(light, []).append(row)
     return [BelievedLight(traffic.name, *map(np.array, zip(*rows, strict=True))) for rows in found.values()]
+
+
+def left_out(found: Sequence[Sequence[BelievedLight]], unit: Mapping[str, str]) -> list[int]:
+    """For each unit of windows, in order, the candidate of the least log-loss on the windows of all others.
+
+    found  by candidate, the lights of all windows; unit: of each window
+
+    Raises `InputError` for a single unit.
+    """
+    units = list(dict.fromkeys(unit.values()))
+    if len(units) < 2:
+        raise InputError("--left-out: expected windows that do not overlap, two at least")
+    best = []
+    for mine in units:
+        others = [[light for light in lights if unit[light.window] != mine] for lights in found]
+        losses = [
+            log_loss(*(np.concatenate([getattr(one, name) for one in lights]) for name in ("green", "truth")))
+            if lights
+            else np.nan
+            for lights in others
+        ]
+        best.append(int(np.nanargmin(losses)) if np.isfinite(losses).any() else 0)
+    return best
 
 
 def log_loss(belief: FloatArray, truth: BoolArray) -> float:
@@ -121,6 +150,9 @@ def signals(
     scenes: Annotated[
         str | None, typer.Option("--scenes", help="Windows, with commas; all with lights if left out.")
     ] = None,
+    chosen: Annotated[
+        bool, typer.Option("--left-out", help="Choose the settings for each window on the other ones.")
+    ] = False,
     config: Config = None,
     json_file: JsonFile = None,
     verbose: Verbose = False,
@@ -129,15 +161,28 @@ def signals(
     windows = NgsimWindows(dataroot, "signals")
     settings = load_config("traffic", config)
     own = settings.tracker.signals
-    same = replace(own, red_duration=EVEN, amber_duration=0.1, green_duration=EVEN)
-    priors = settings, replace(settings, tracker=replace(settings.tracker, signals=same))
-    found: tuple[list[BelievedLight], list[BelievedLight]] = ([], [])
-    for name in names("--scenes", scenes) if scenes else windows.names:
-        traffic = windows.recording(name)
-        if scenes or traffic.colours:
-            for lights, each in zip(found, priors, strict=True):
-                lights += believed_lights(traffic, each)
-    if not found[0]:
+    named = names("--scenes", scenes) if scenes else windows.names
+    traffic = [one for one in map(windows.recording, named) if scenes or one.colours]
+    unit = overlapping(traffic)
+    found: list[tuple[list[BelievedLight], list[BelievedLight]]] = []  # by candidate, from the prior and an even one
+    for share, noise in CANDIDATES if chosen else ((own.non_compliance, own.driver_noise),):
+        signal = replace(own, non_compliance=share, driver_noise=noise)
+        even = replace(signal, red_duration=EVEN, amber_duration=0.1, green_duration=EVEN)
+        priors = (replace(settings, tracker=replace(settings.tracker, signals=each)) for each in (signal, even))
+        of_prior, of_even = ([light for one in traffic for light in believed_lights(one, each)] for each in priors)
+        found.append((of_prior, of_even))
+    if not found[0][0]:
         raise InputError(f"{dataroot}: expected windows with vehicles before stop lines, there are none")
-    shown = tables(*found, prior=float(own.stationary[2:].sum()))
+    best = dict.fromkeys(unit.values(), 0)
+    if chosen:
+        best = dict(zip(best, left_out([lights for lights, _ in found], unit), strict=True))
+    judged = [
+        [light for k, lights in enumerate(found) for light in lights[prior] if best[unit[light.window]] == k]
+        for prior in range(2)
+    ]
+    shown = tables(judged[0], judged[1], prior=float(own.stationary[2:].sum()))
     report(shown, {table.title: table.rows for table in shown}, json_file)
+    if chosen:
+        counts = Counter(best.values())
+        said = (f"{CANDIDATES[k][0]:g} and {CANDIDATES[k][1]:g} for {n}" for k, n in counts.most_common())
+        typer.echo(f"non_compliance and driver_noise chosen for {len(best)} windows: {', '.join(said)}")

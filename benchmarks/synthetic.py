@@ -22,7 +22,6 @@ import typer
 
 from benchmarks.in_view_fit import fit_interactions_in_view
 from benchmarks.sampled_scenes import LABEL, SceneSettings, sample_scene, sampled_config
-from benchmarks.trajectories import Trajectories
 from data_tools.datasets.source import names
 from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, SceneMetrics, difference, paired_bootstrap, ratio_of_sums, scene_metrics
@@ -38,6 +37,7 @@ from saga_fg.model.motion import ConstantVelocity
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Scene
+from saga_fg.types.labelled_objects import LabelledObjects
 
 BASE = SceneSettings()
 OCCLUDED = replace(BASE, spacing=2.5, hidden=0.4, hidden_for=3.0)
@@ -80,7 +80,9 @@ def _independent(settings: SceneSettings, scenes: Sequence[Scene]) -> TrackConfi
 
 def _learned(settings: SceneSettings, scenes: Sequence[Scene]) -> TrackConfig:
     """Interactions and process noise fitted to the truth of some scenes of the cell; as kf where nothing is shared."""
-    recordings = [Trajectories.of_truth(scene).until(LEARNED_SECONDS) for scene in scenes[:LEARNED_SCENES]]
+    recordings = [
+        LabelledObjects.of(scene).about_their_mean().until(LEARNED_SECONDS) for scene in scenes[:LEARNED_SCENES]
+    ]
     fitted = fit_interactions_in_view(recordings, LABEL_NOISE, {DEFAULT: 1.0}, (TEMPLATE,), DEGREES)
     if not fitted.rules:
         return _independent(settings, scenes)

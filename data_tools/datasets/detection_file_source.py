@@ -4,40 +4,99 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
+from data_tools.datasets.detection_files import TableImport, TruthFile
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files.table_import import pairs
 from data_tools.datasets.parts import OpenedPart, Parts, file_digest
-from data_tools.datasets.results import SceneResult, read_table_results
-from data_tools.datasets.source import TRACKING, ChosenScenes, DatasetSource, names, option
+from data_tools.datasets.results import SceneResult, read_judged_results, read_table_results
+from data_tools.datasets.source import TRACKING, ChosenScenes, DatasetSource, Verb, names, option
 from data_tools.files.remote_files import expanded, is_url, local_copy, name_of
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
+
+if TYPE_CHECKING:
+    from data_tools.evaluation import Evaluation
+    from saga_fg.numerics.arrays import FloatArray
+
+JUDGED: tuple[Verb, ...] = ("evaluate", "report", "view")
+"""Verbs that compare with true objects."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionFileSource(DatasetSource):
     """Your own detections: a table with a row for each.
 
-    The columns timestamp (s), x and y (m) are needed; label, score, sensor, size, heading and more are used where they
-    are there (see `saga-fg docs formats`).
+    Time, x and y (m) are needed; label, score, sensor, size, heading and more are used where they are there. Columns,
+    classes and units may be your own: `saga-fg inspect TABLE` shows how it is understood (see `saga-fg docs formats`).
     """
 
     name = "file"
     has_truth = False
+    summarised = True
     example = "detections.csv"
     detections: list[str] | None = option(
-        "Table of detections: .csv, .ndjson, .jsonl or .npz. In parallel: several of them, patterns, URLs, or lists of "
-        "such in a .txt file.",
+        "Table of detections: .csv, .ndjson, .jsonl, .npz, .parquet or .feather (extra [parquet]). In parallel: "
+        "several of them, patterns, URLs, or lists of such in a .txt file.",
         None,
         metavar="TABLE",
         required=(*TRACKING, "learn interactions"),
         argument=True,
     )
+    truth: str | None = option(
+        "Table of true objects, a row for each and moment: time, id, x, y, and what else is known.",
+        None,
+        metavar="TABLE",
+        verbs=JUDGED,
+    )
+    columns: str | None = option(
+        "Names of columns in the file, where they are not found: time=ts_ns,x=pos_x,yaw=hdg. `length=` leaves one out.",
+        None,
+        metavar="OURS=THEIRS,...",
+    )
+    classes: str | None = option(
+        "Names of classes: REGULAR_VEHICLE=car,PERSON=pedestrian. `SIGN=` leaves a class out.",
+        None,
+        metavar="THEIRS=OURS,...",
+    )
+    units: str | None = option(
+        "Units: time=ns (s, ms, us, ns, iso8601, 10Hz), length=ft (m, cm, mm, km, ft), speed=km/h (m/s, km/h, mph, "
+        "ft/s), angle=deg (rad, deg), score=percent (share, percent).",
+        None,
+        metavar="KIND=UNIT,...",
+    )
+    coordinates: Literal["world", "ego", "sensor"] | None = option(
+        "Coordinates of rows that say none; ego and sensor need the pose of the vehicle.  [default: world]", None
+    )
+    sort: bool = option("Sort the rows by time, in memory.", False)
+    table_import: TableImport | None = option(
+        "YAML file with the same: columns, classes, units, coordinates, sort.", None, flag="--import", metavar="FILE"
+    )
+    truth_import: TableImport | None = option(
+        "YAML file with the same, for --truth alone.", None, flag="--truth-import", metavar="FILE", verbs=JUDGED
+    )
     scenes: str | None = option("Scene names with commas between them; all if left out.", None)
     table: Literal["csv", "ndjson"] = option("Format of the tables, in parallel.", "csv", verbs=("track",))
+
+    def __post_init__(self) -> None:
+        vars(self)["has_truth"] = self.truth is not None
+        _ = self.how  # what is wrong in it is said before anything is read
+
+    @property
+    def how(self) -> TableImport:
+        """How the table of detections is read."""
+        own = TableImport(
+            pairs("--columns", self.columns),
+            pairs("--classes", self.classes),
+            pairs("--units", self.units),
+            self.coordinates or "",
+            self.sort,
+        )
+        return own.over(self.table_import or TableImport())
 
     @property
     def title(self) -> str:
@@ -49,21 +108,26 @@ class DetectionFileSource(DatasetSource):
 
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[Dataset]:
+        if truth and self.truth is not None:
+            with self._true_scenes() as dataset:
+                yield dataset
+            return
         with local_copy(self._table()) as path:
-            dataset = read_detections(path)
+            dataset = read_detections(path, self.how)
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{path}: --scenes")
 
     def restricted(self, scenes: Collection[str]) -> Self:
         return replace(self, scenes=None)
 
     def input_files(self) -> tuple[Path, ...]:
-        return tuple(Path(place) for place in self.detections or () if not is_url(place))
+        places = (*(self.detections or ()), *([self.truth] if self.truth is not None else []))
+        return tuple(Path(place) for place in places if not is_url(place))
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:
         if self.scenes is not None:
             raise InputError("--scenes: all scenes of a file are done with --workers or --ray")
-        parts = [DetectionFilePart(url) for url in expanded(self.detections or ())]
+        parts = [DetectionFilePart(url, self.how) for url in expanded(self.detections or ())]
         yield Parts([part.name for part in parts], parts)
 
     def stream(self) -> AbstractContextManager[Iterator[Scene]]:
@@ -73,13 +137,54 @@ class DetectionFileSource(DatasetSource):
     def _stream(self) -> Iterator[Iterator[Scene]]:
         chosen = None if self.scenes is None else names("--scenes", self.scenes)
         with local_copy(self._table()) as path:
-            yield read_scenes_in_parts(path, scenes=chosen)
+            yield read_scenes_in_parts(path, scenes=chosen, how=self.how)
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
+        if self.truth is not None:
+            with self._true_scenes() as truth:
+                return read_judged_results(result, truth, self.how, self.scenes is not None)
         if self.detections is None:
-            return read_table_results(result, None)
+            return read_table_results(result, None, how=self.how)
         with self.open() as dataset:
-            return read_table_results(result, dataset, every_scene=True)
+            return read_table_results(result, dataset, every_scene=True, how=self.how)
+
+    def evaluate(
+        self,
+        results: Mapping[str, SceneResult],
+        hota: bool = False,
+        innovations: Mapping[str, FloatArray] | None = None,
+    ) -> Evaluation:
+        from data_tools.evaluation import evaluate_tracks
+
+        hota = hota or find_spec("trackeval") is not None
+        return evaluate_tracks([(each.scene, each.found) for each in results.values()], hota, innovations, sweep=True)
+
+    def kept(self) -> Mapping[str, Any]:
+        return self.how.values()
+
+    def with_kept(self, kept: Mapping[str, Any]) -> Self:
+        given = (self.columns, self.classes, self.units, self.coordinates, self.table_import, self.sort or None)
+        if any(each is not None for each in given) or not kept:
+            return self
+        known = {field.name for field in fields(TableImport)}
+        try:
+            how = TableImport(**{name: kept[name] for name in kept if name in known})
+        except (AttributeError, TypeError) as error:
+            raise InputError(f"the record of the run: recordings: expected how they were read: {error}") from error
+        return replace(self, table_import=how)
+
+    @contextmanager
+    def _true_scenes(self) -> Iterator[Dataset]:
+        """The scenes of --truth, with the frames of the detections where these are there."""
+        assert self.truth is not None
+        how = self.how if self.truth_import is None else self.truth_import
+        with local_copy(self.truth) as path:
+            truth = TruthFile(path, how)
+        dataset: Dataset = truth
+        if self.detections is not None:
+            with local_copy(self._table()) as path:
+                dataset = DetectedTruth(truth, read_detections(path, self.how))
+        yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{self.truth}: --scenes")
 
     def _table(self) -> str:
         if len(self.detections or ()) != 1:
@@ -89,11 +194,30 @@ class DetectionFileSource(DatasetSource):
         return (self.detections or [""])[0]
 
 
+class DetectedTruth:
+    """The scenes of a table of true objects, with the frames of a table of detections.
+
+    Where one of them does not name its only scene, it is that of the other.
+    """
+
+    def __init__(self, truth: TruthFile, detections: Dataset) -> None:
+        self._truth, self._detections = truth, detections
+        same = len(truth.scenes) == 1 and len(detections.scenes) == 1
+        self._true_name = {detections.scenes[0]: truth.scenes[0]} if same else {}
+        self.scenes: tuple[str, ...] = detections.scenes if same else truth.scenes
+
+    def scene(self, name: str) -> Scene:
+        """Read one of the scenes; raises `InputError` where a table does not have it."""
+        true, detected = self._truth.scene(self._true_name.get(name, name)), self._detections.scene(name)
+        return replace(true, name=name, frames=detected.frames)
+
+
 @dataclass(frozen=True)
 class DetectionFilePart:
     """A table of detections, a local file or one that fsspec can open by its URL, read at the worker."""
 
     url: str
+    how: TableImport = field(default_factory=TableImport)
 
     @property
     def name(self) -> str:
@@ -104,4 +228,4 @@ class DetectionFilePart:
     def opened(self) -> Iterator[OpenedPart]:
         """Open with the digest of the file."""
         with local_copy(self.url) as path:
-            yield OpenedPart({name_of(self.url): file_digest(path)}, lambda: read_detections(path))
+            yield OpenedPart({name_of(self.url): file_digest(path)}, lambda: read_detections(path, self.how))

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.recorded_traffic import PERIOD, RecordedTraffic, StateRows
+from data_tools.files.arrow_tables import all_of, read_arrow_table
 from data_tools.files.error_messages import error_context, unknown_name
-from data_tools.files.input_files import open_bytes
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
 
@@ -148,23 +148,11 @@ def _courses(vehicle: IntArray, position: FloatArray) -> FloatArray:
 
 def _columns(path: Path) -> dict[str, Any]:
     """The columns of the file as arrays; numbers may be NaN where the file has nothing."""
-    arrow = _pyarrow()
-    try:
-        with open_bytes(path) as file:
-            table = arrow.parquet.read_table(file)
-            missing = [name for name in (*_COLUMNS, _GAP) if name not in table.column_names]
-            if missing:
-                there = ", ".join(table.column_names)
-                raise InputError(f"{path}: {missing[0]}: expected this column, the file has {there[:200]}")
-            table = table.select([*_COLUMNS, _GAP])
-            table.validate(full=True)  # its C++ trusts what it has read
-            empty = [name for name in ("setting", "run", "t", "veh") if table[name].null_count]
-            if empty:
-                raise InputError(f"{path}: {empty[0]}: expected a value in every row")
-            columns = {name: table[name].to_numpy() for name in table.column_names}
-    except (OSError, UnicodeDecodeError, arrow.ArrowException) as error:
-        first = (str(error).splitlines() or ["empty"])[0]
-        raise InputError(f"{path}: expected a readable Parquet file: {first}") from error
+    table = read_arrow_table(path, all_of(path, (*_COLUMNS, _GAP)))
+    empty = [name for name in ("setting", "run", "t", "veh") if table[name].null_count]
+    if empty:
+        raise InputError(f"{path}: {empty[0]}: expected a value in every row")
+    columns = {name: table[name].to_numpy() for name in table.column_names}
     for name, column in columns.items():
         kinds = _COLUMNS.get(name, "iuf")
         if column.dtype.kind not in kinds:
@@ -172,11 +160,3 @@ def _columns(path: Path) -> dict[str, Any]:
             raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
         columns[name] = column.astype(np.str_ if kinds == "OUT" else np.int64 if kinds == "iu" else np.float64)
     return columns
-
-
-def _pyarrow() -> Any:
-    try:
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingExtraError("OpenACC platoons: Parquet needs pyarrow: pip install 'saga-fg[parquet]'") from error
-    return pyarrow

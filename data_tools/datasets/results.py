@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.detection_files import TrackRows, read_tracks
+from data_tools.datasets.detection_files import TableImport, TrackRows, read_tracks
 from data_tools.files.error_messages import unknown_name
 from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError
@@ -19,6 +20,8 @@ from saga_fg.types.track import known_velocities
 log = logging.getLogger(__name__)
 
 _SAME_TIME = 1e-4  # s
+_FEW = 0.1  # of the moments, which a tracker may need to begin
+_NEAR_TIME = 0.02  # s between a moment of the truth and the tracks of another clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,19 +36,24 @@ class SceneResult:
     coasting: FloatArray | None = field(default=None, kw_only=True)
 
 
-def read_table_results(path: Path, dataset: Dataset | None, every_scene: bool = False) -> dict[str, SceneResult]:
+def read_table_results(
+    path: Path, dataset: Dataset | None, every_scene: bool = False, how: TableImport | None = None
+) -> dict[str, SceneResult]:
     """A table of tracks in those scenes of a dataset that it has; rows of other scenes are left out.
 
     every_scene  include scenes without a row, in which nothing was found; an empty table always has all scenes
+    how          what it takes to understand the table, if saga-fg did not write it
 
     Without a dataset, the scenes are those of the table: their moments are the times of its rows, and the vehicle
     stands amid all tracks. Logs a warning where scenes are left out. Raises `InputError` for a broken table, for one
     that has none of the scenes, and for times that are no moments of their scene.
     """
-    rows = read_tracks(path)
+    rows = read_tracks(path, how, lenient=True)
     there = tuple(dict.fromkeys(rows.scene.tolist()))
     if dataset is None:
         return {name: scene_result(_scene(rows, name), rows, path) for name in there}
+    if dataset.scenes != there and len(there) == len(dataset.scenes) == 1 and not rows.named:
+        rows, there = replace(rows, scene=np.full(len(rows.scene), dataset.scenes[0])), tuple(dataset.scenes)
     if there and not set(there) & set(dataset.scenes):
         raise InputError(f"{path}: {unknown_name('scene', there[0], dataset.scenes)}")
     chosen = [name for name in dataset.scenes if every_scene or not there or name in there]
@@ -57,6 +65,75 @@ def read_table_results(path: Path, dataset: Dataset | None, every_scene: bool = 
             len(dataset.scenes),
         )
     return {name: scene_result(dataset.scene(name), rows, path) for name in chosen}
+
+
+def read_judged_results(
+    path: Path, truth: Dataset, how: TableImport | None = None, every_scene: bool = False
+) -> dict[str, SceneResult]:
+    """A table of anybody's tracks at the moments of a dataset with ground truth; rows at other times are left out.
+
+    The only scene of the one is that of the other. Raises `InputError` for a broken table, and where hardly a moment
+    has tracks near its time.
+    """
+    rows = read_tracks(path, how, lenient=True)
+    there = tuple(dict.fromkeys(rows.scene.tolist()))
+    if len(there) == len(truth.scenes) == 1:
+        rows, there = replace(rows, scene=np.full(len(rows.scene), truth.scenes[0])), tuple(truth.scenes)
+    if there and not set(there) & set(truth.scenes):
+        raise InputError(f"{path}: {unknown_name('scene', there[0], truth.scenes)} (scenes of the ground truth)")
+    chosen = [name for name in truth.scenes if every_scene or not there or name in there]
+    if len(chosen) < len(truth.scenes):
+        log.warning("%s: has tracks in %d of the %d scenes with ground truth", path, len(chosen), len(truth.scenes))
+    results = {}
+    for name in chosen:
+        scene = truth.scene(name)
+        results[name] = scene_result(scene, _at_moments(rows, scene, path), path)
+    _warn_of_classes(results, path)
+    return results
+
+
+def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> TrackRows:
+    """The rows at the times that are nearest to the moments of a scene, if near enough, with these as their times."""
+    mine = np.flatnonzero(rows.scene == scene.name)
+    times = np.unique(rows.timestamp[mine])
+    if not len(times) or not len(scene):
+        return rows.select(mine)
+    step = float(np.median(np.diff(scene.timestamps))) if len(scene) > 1 else 1.0
+    nearest = _nearest(times, scene.timestamps)
+    near = np.abs(nearest - scene.timestamps) <= min(_NEAR_TIME, step / 4)
+    within = (scene.timestamps >= times[0] - step) & (scene.timestamps <= times[-1] + step)
+    if not near.any() or near[within].mean() < 0.5:
+        raise InputError(
+            f"{path}: scene {scene.name}: expected tracks at the times of the ground truth, {scene.timestamps[0]:.3f} "
+            f"to {scene.timestamps[-1]:.3f} s every {step:.3g} s; they are at {times[0]:.3f} to {times[-1]:.3f} s, and "
+            f"{near.sum()} of {len(scene)} moments have one within {min(_NEAR_TIME, step / 4):.3g} s"
+        )
+    moment_of = dict(zip(nearest[near].tolist(), scene.timestamps[near].tolist(), strict=True))
+    moved = np.array([moment_of.get(time, np.nan) for time in rows.timestamp[mine].tolist()])
+    kept = np.isfinite(moved)
+    missing = int((~near).sum())
+    if missing > _FEW * len(scene):
+        log.warning("%s: scene %s: no tracks at %d of %d moments of the truth", path, scene.name, missing, len(scene))
+    return replace(rows.select(mine[kept]), timestamp=moved[kept])
+
+
+def _nearest(times: FloatArray, moments: FloatArray) -> FloatArray:
+    """The nearest of ascending times to each moment."""
+    after = np.minimum(np.searchsorted(times, moments), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(moments - times[before]) <= np.abs(times[after] - moments), times[before], times[after])
+
+
+def _warn_of_classes(results: Mapping[str, SceneResult], path: Path) -> None:
+    """Warn where tracks and true objects have no class in common: nothing can match."""
+    found = {label for each in results.values() for label in each.found.boxes.label.tolist()}
+    true = {
+        label for each in results.values() for t in each.scene.ground_truth or () for label in t.boxes.label.tolist()
+    }
+    if found and true and not found & true:
+        pair = f"{min(found)}={min(true)}"
+        text = "%s: tracks are of %s, true objects of %s: nothing can match; name them alike: --classes %s"
+        log.warning(text, path, ", ".join(sorted(found)), ", ".join(sorted(true)), pair)
 
 
 def _scene(rows: TrackRows, name: str) -> Scene:

@@ -127,6 +127,7 @@ class DatasetSource(ABC):
     example         options of the examples in the help
     tracks          what `track` writes, for the help; tracks_example: such a name
     merged          result of all parts in parallel, "" for none: of tracks, of labels
+    summarised      whether figures have a narrow summary
     """
 
     name: ClassVar[str]
@@ -136,6 +137,7 @@ class DatasetSource(ABC):
     tracks: ClassVar[str] = "Table of tracks to write: .csv, .ndjson or .jsonl."
     tracks_example: ClassVar[str] = "tracks.csv"
     merged: ClassVar[tuple[str, str]] = ("", "")
+    summarised: ClassVar[bool] = False
 
     @property
     def title(self) -> str:
@@ -162,6 +164,14 @@ class DatasetSource(ABC):
     def input_files(self) -> tuple[Path, ...]:
         """Files that the options name, which no result may overwrite."""
         return ()
+
+    def kept(self) -> Mapping[str, Any]:
+        """What a result has to say on how its recordings were read: values of JSON."""
+        return {}
+
+    def with_kept(self, kept: Mapping[str, Any]) -> Self:
+        """The recordings, read as a result says (`kept`) where no option says otherwise."""
+        return self
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:

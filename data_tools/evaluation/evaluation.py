@@ -12,10 +12,13 @@ from typing import Any
 from data_tools.evaluation.errors import error_json, error_pictures, error_tables
 from data_tools.evaluation.hota import HotaRow, hota, hota_json, hota_table
 from data_tools.evaluation.innovations import innovation_json, innovation_table
+from data_tools.evaluation.score_sweep import TITLE, best_thresholds, score_sweep, sweep_table
+from data_tools.evaluation.summary import summary_table
 from data_tools.evaluation.track_quality import track_table
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics import (
     LabelErrors,
+    NuScenesTrackingMetrics,
     SceneBoxes,
     SceneMetrics,
     WholeTracks,
@@ -24,6 +27,7 @@ from data_tools.metrics import (
     track_summaries,
     whole_tracks,
 )
+from data_tools.plots import recall_sweep
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Scene
@@ -46,6 +50,7 @@ class Evaluation:
     hota         empty where it was not asked for
     innovations  squared distances in sigmas by class; empty where they are not known
     draw         makes pictures of the tracking metrics by name
+    sweep        over scores; None where it was not asked for
     """
 
     tracking: FigureTable
@@ -55,12 +60,18 @@ class Evaluation:
     hota: Sequence[HotaRow] = ()
     innovations: Mapping[str, FloatArray] = field(default_factory=dict)
     draw: Callable[[], Mapping[str, Any]] = dict
+    sweep: NuScenesTrackingMetrics | None = None
+
+    def summary(self) -> FigureTable | None:
+        """One narrow table of what matters most, None without the sweep over scores."""
+        return None if self.sweep is None else summary_table(self.sweep, self.errors, self.hota)
 
     def tables(self) -> list[FigureTable]:
         """Tables for people."""
         innovations = [innovation_table(self.innovations)] if self.innovations else []
         return [
             self.tracking,
+            *([] if self.sweep is None else [sweep_table(TITLE, self.sweep)]),
             *error_tables(self.errors),
             track_table(self.tracks),
             *innovations,
@@ -69,8 +80,10 @@ class Evaluation:
 
     def figures(self) -> dict[str, Any]:
         """Figures for programs."""
+        swept = {} if self.sweep is None else {"sweep": {"overall": self.sweep.overall, **self.sweep.per_class}}
         return {
             **self.programs,
+            **swept,
             **error_json(self.errors),
             "tracks": track_summaries(self.tracks),
             "innovations": innovation_json(self.innovations),
@@ -86,9 +99,11 @@ def evaluate_tracks(
     results: Sequence[tuple[Scene, SceneBoxes]],
     with_hota: bool = False,
     innovations: Mapping[str, FloatArray] | None = None,
+    sweep: bool = False,
 ) -> Evaluation:
-    """Score the tracks found in some scenes, class by class, pooled over the scenes; all tracks count for HOTA.
+    """Score the tracks found in some scenes, class by class, pooled over the scenes.
 
+    sweep        over scores, too (AMOTA); HOTA is then of the tracks from the score of the best MOTA on, else of all
     innovations  squared distances of the run by class, to be among the figures
 
     Raises `InputError` for a scene without ground truth, `MissingExtraError` for HOTA without trackeval.
@@ -105,6 +120,8 @@ def evaluate_tracks(
         pairs.append((SceneBoxes.of_annotations(scene.ground_truth), found))
         tracks.append(whole_tracks(*pairs[-1]))
     pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
+    swept = score_sweep(results) if sweep else None
+    thresholds = dict.fromkeys(pooled, 0.0) if swept is None else best_thresholds(swept)
     whole = {"overall": SceneMetrics.pool(pooled.values()), **pooled}
     return Evaluation(
         FigureTable(_TITLE, _COLUMNS, tuple((name, *_cells(metrics)) for name, metrics in whole.items())),
@@ -114,8 +131,10 @@ def evaluate_tracks(
         },
         LabelErrors.pool(errors),
         WholeTracks.concatenate(tracks),
-        hota(pairs, dict.fromkeys(pooled, 0.0)) if with_hota else (),
+        hota(pairs, thresholds) if with_hota else (),
         innovations or {},
+        dict if swept is None else lambda: {"recall": recall_sweep(swept.curves)},
+        swept,
     )
 
 

@@ -37,11 +37,23 @@ class HotaRow:
 def hota(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], thresholds: Mapping[str, float]) -> list[HotaRow]:
     """Judge (truth, found) of all scenes for the classes of `thresholds`. Raises `MissingExtraError` w/o trackeval."""
     rows = []
+    similarities = _similarities(scenes)
     for label, threshold in thresholds.items():
         scored = [(truth, _surer(found, label, threshold)) for truth, found in scenes]
-        for overlap, similarity in SIMILARITIES.items():
+        for overlap, similarity in similarities.items():
             rows.append(HotaRow(label, overlap, threshold, hota_metrics(scored, label, similarity)))
     return rows
+
+
+def _similarities(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]]) -> dict[str, Similarity]:
+    """The overlaps that boxes have; where truth or tracks are points, the nearness of centres, 0 from 4 m on."""
+    for one in zip(*scenes, strict=True):
+        size = np.concatenate([table.boxes.size for table in one])
+        if len(size) and not np.isfinite(size[:, :2]).all(axis=1).any():
+            return {"centre": "centre"}
+        if len(size) and not np.isfinite(size[:, 2]).any():
+            return {"2D": "bev_iou"}
+    return SIMILARITIES
 
 
 def hota_table(rows: Sequence[HotaRow]) -> FigureTable:

@@ -22,8 +22,9 @@ from data_tools.metrics.bootstrap import ratio_of_sums
 from data_tools.metrics.consistency import coverages, nees, negative_log_density
 from data_tools.metrics.matching import match_scene
 from saga_fg import PredictedTracks, Scene, Tracker, Tracks
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.columns import Columns
+from saga_fg.types.labelled_objects import LabelledObjects
 
 HORIZONS = (1.0, 2.0, 3.0, 5.0)  # s
 EVERY = 1.0  # s between predictions
@@ -31,7 +32,6 @@ GATE = 2.0  # m, between an object and its track
 MOVING = 0.5  # m/s
 DETECTED = 0.15  # s since its latest detection: a track counts as visible
 FEWEST_UNITS = 3  # of scenes that do not overlap, for an interval
-LABEL_GAP = 1.1  # s between labels that are joined by a straight line
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,35 +68,19 @@ class _Truth:
 
     def __init__(self, scene: Scene) -> None:
         assert scene.ground_truth is not None
-        self._scene, self._moments = scene, scene.ground_truth
-        self._names = np.unique(np.concatenate([moment.id for moment in self._moments]))
-        self._position = np.full((len(self._moments), len(self._names), 2), np.nan)
-        for k, moment in enumerate(self._moments):
-            self._position[k, np.searchsorted(self._names, moment.id)] = moment.boxes.position[:, :2]
-
-    def at(self, time: float, objects: IntArray) -> FloatArray:
-        """(n, 2) places of `objects` (n,) at a time, s, on the line between their labels; NaN where there are none."""
-        times = self._scene.timestamps
-        after = int(np.searchsorted(times, time - 1e-6))
-        if after == len(times):
-            return np.full((len(objects), 2), np.nan)
-        if times[after] - time < 1e-6 or after == 0:
-            return np.where(times[after] - time < 1e-6, self._position[after, objects], np.nan)
-        apart = times[after] - times[after - 1]
-        share = (time - times[after - 1]) / apart if apart <= LABEL_GAP else math.nan
-        return np.asarray((1 - share) * self._position[after - 1, objects] + share * self._position[after, objects])
+        self._moments, self._objects = scene.ground_truth, LabelledObjects.of(scene)
 
     def errors(self, tracks: Tracks, predicted: PredictedTracks) -> PredictionErrors:
         """Errors of the predictions made at one moment."""
-        moment = self._moments[int(np.argmin(np.abs(self._scene.timestamps - tracks.timestamp)))]
+        moment = self._moments[int(np.argmin(np.abs(self._objects.time - tracks.timestamp)))]
         visible = tracks.select((tracks.coasting <= DETECTED) & np.isin(tracks.id, predicted.id))
         pairs = match_scene([moment], [visible], GATE)[0]
         rows = np.searchsorted(predicted.id, visible.id[pairs.track_row])
-        objects = np.searchsorted(self._names, moment.id[pairs.object_row])
-        now = self.at(tracks.timestamp, objects)
+        objects = np.searchsorted(self._objects.id, moment.id[pairs.object_row])
+        now = self._objects.at(tracks.timestamp)[objects]
         parts = [_nothing()]
         for k, horizon in enumerate(predicted.horizons.tolist()):
-            then = self.at(tracks.timestamp + horizon, objects)
+            then = self._objects.at(tracks.timestamp + horizon)[objects]
             known = np.isfinite(then[:, 0]) & np.isfinite(now[:, 0])
             error, P = (predicted.position[k, rows] - then)[known], predicted.position_covariance[k, rows[known]]
             distance = nees(error, P)

@@ -13,6 +13,7 @@ from pipelines.cli.demo import demo
 from pipelines.cli.docs import docs
 from pipelines.cli.evaluate import evaluate_app
 from pipelines.cli.explain import explain
+from pipelines.cli.inspect import inspect_table
 from pipelines.cli.learn import learn_app
 from pipelines.cli.report import report_app
 from pipelines.cli.serve import serve, status
@@ -24,6 +25,7 @@ from pipelines.cli.view import view_app
 from saga_fg import __version__
 
 app = new_command()
+app.command("inspect")(inspect_table)
 app.add_typer(track_app, name="track")
 app.add_typer(smooth_app, name="smooth")
 app.add_typer(evaluate_app, name="evaluate")

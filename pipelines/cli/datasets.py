@@ -84,12 +84,16 @@ def _command(
 
     def command(**values: Any) -> None:
         from pipelines.configuration import load_settings
+        from pipelines.report.run_record import as_recorded
 
         chosen = {each.name: values.pop(each.name) for each in of_dataset}
         for name, kind in settings.items():
             if chosen.get(name) is not None:
                 chosen[name] = load_settings(kind, chosen[name])
-        run(source(**chosen), **values)
+        chosen_source = source(**chosen)
+        if values.get("result") is not None:
+            chosen_source = as_recorded(chosen_source, values["result"])
+        run(chosen_source, **values)
 
     ordered = sorted([*of_dataset, *parameters], key=lambda each: each.name != "result")
     keyword = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in ordered]

@@ -12,8 +12,8 @@ import typer
 from pipelines.cli import options
 from pipelines.cli import tracking_options as how
 from pipelines.cli.console import progress_bar, working
-from pipelines.cli.datasets import dataset_commands
-from pipelines.cli.tables import JsonFile, report
+from pipelines.cli.datasets import Source, dataset_commands
+from pipelines.cli.tables import JsonFile, MarkdownFile, report, show_summary
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,7 +40,9 @@ def _evaluate(
         bool,
         typer.Option("--innovations", help="How well innovations fit (NIS), from the journal beside the result."),
     ] = False,
+    full: Annotated[bool, typer.Option("--full", help="Print all tables, not the summary alone.")] = False,
     json_file: JsonFile = None,
+    markdown: MarkdownFile = None,
     plots: Annotated[
         Path | None,
         typer.Option("--plots", help="Folder to draw recall sweeps, calibration and errors to.", metavar="DIR"),
@@ -52,12 +54,14 @@ def _evaluate(
     The scenes scored are those of the result, or those that are named.
     Where detections are given and the metrics are official, errors are those at the labels that detections match.
     """
-    from data_tools.files.atomic_files import atomic_directory
+    from data_tools.evaluation.summary import LEGEND
+    from data_tools.files.atomic_files import atomic_directory, write_text
     from data_tools.plots import png
     from pipelines.explaining import journal_innovations, journal_of
 
     if not source.has_truth:
-        raise InputError(f"evaluate {source.name}: expected ground truth, there is none; see evaluate labels")
+        mend = "name it: --truth TABLE" if hasattr(source, "truth") else "see evaluate labels"
+        raise InputError(f"evaluate {source.name}: expected ground truth, there is none; {mend}")
     if result is None:
         settings = how.configured(source.family, config, method or "saga", estimator, lag, association)
         found, nis = _tracked(source, settings, method or "saga")
@@ -70,7 +74,13 @@ def _evaluate(
             found, nis = source.read_results(result), journal_innovations(journal_of(result)) if innovations else {}
     with working("scoring"):
         evaluation = source.evaluate(found, hota, nis)
-    report(evaluation.tables(), evaluation.figures(), json_file)
+    summary = evaluation.summary()
+    if summary is not None:
+        show_summary(summary, LEGEND)
+    tables = evaluation.tables()
+    report(tables if full or summary is None else (), evaluation.figures(), json_file)
+    if markdown is not None:
+        write_text(markdown, "\n".join(table.markdown() for table in (*([summary] if summary else ()), *tables)))
     if plots is not None:
         with atomic_directory(plots) as folder:
             for name, picture in evaluation.pictures().items():
@@ -81,12 +91,16 @@ def _tracked(
     source: DatasetSource, settings: TrackConfig, method: Method
 ) -> tuple[Mapping[str, SceneResult], Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
+    from pipelines.doubts import Doubted, Doubts
     from pipelines.observers import InnovationRecorder
     from pipelines.tracking import track_dataset
 
+    doubts = Doubts(settings.of_method(method), options=source.summarised)
     recorder = InnovationRecorder()
     with TemporaryDirectory() as folder, source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
-        runs = track_dataset(dataset, lambda: settings.new_tracker(method, recorder), progress=progress)
+        runs = track_dataset(
+            Doubted(dataset, doubts), lambda: settings.new_tracker(method, recorder), progress=progress
+        )
         result = Path(folder) / source.tracks_example
         source.write_tracks(result, dataset, ((run.scene, run.tracks) for run in runs))
         return source.restricted(dataset.scenes).read_results(result), recorder.by_class
@@ -123,6 +137,11 @@ def _evaluate_labels(
     report(evaluation.tables(), evaluation.figures(), json_file)
 
 
+def _texts(source: Source) -> dict[str, str | None]:
+    """Options of datasets whose figures have a summary."""
+    return {} if source.summarised else {"full": None}
+
+
 _commands = dataset_commands(
     "evaluate",
     _evaluate,
@@ -131,6 +150,7 @@ _commands = dataset_commands(
         "evaluate {result} --hota --json figures.json --plots plots",
         "evaluate {recordings} --method kf",
     ),
+    _texts,
 )
 evaluate_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
 _label_commands = dataset_commands("evaluate labels", _evaluate_labels, ("evaluate labels {result}",))

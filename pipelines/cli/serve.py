@@ -82,7 +82,9 @@ def serve(
       saga-fg serve --listen ./saga.sock --snapshot state.saga --every 2
       saga-fg status
     """
+    from pipelines.config import load_config
     from pipelines.configuration import load_settings
+    from pipelines.doubts import Doubts
     from pipelines.process import one_thread, return_large_blocks
     from pipelines.serving import StopRequest, StreamSettings, StreamTracker
     from pipelines.serving.log_limit import LogLimitFilter
@@ -94,9 +96,9 @@ def serve(
     bounds = StreamSettings() if limits is None else load_settings(StreamSettings, limits)
     if reorder is not None:
         bounds = replace(bounds, reorder=reorder)
-    rules = settings.of_method(method).tracker.edges
+    doubts = Doubts(settings.of_method(method), load_config("file"))
     horizons = how.horizons(predict, method)
-    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, rules, horizons)
+    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, doubts, horizons)
     return_large_blocks()
     keeper = None if snapshot is None else _restored(stream, snapshot, every, settings, method)
     last_acts = () if keeper is None else (keeper.save, keeper.clear_leftovers)

@@ -39,6 +39,7 @@ def _smooth(
 
     Tables of detections are smoothed as they are read: memory does not grow with their length.
     """
+    from pipelines.doubts import Doubted, Doubts
     from pipelines.scale_out import SmoothTask
     from pipelines.smoothing import (
         load_smooth_config,
@@ -52,7 +53,10 @@ def _smooth(
     settings = load_smooth_config(source.family, config)
     tracking = how.with_interactions(settings.tracking, method, interactions)
     settings = replace(settings, tracking=tracking.with_association(association))
+    usual = load_smooth_config(source.family).tracking
+    doubts = Doubts(settings.tracking.of_method(method), usual, source.summarised)
     if at_scale(workers, ray):
+        doubts.see_first(source)
         task = SmoothTask(settings, method, source, f".{table}")
         report = run_at_scale(source, task, output, workers, ray, source.merged[1], source.merge_labels)
         exit_on_failures(report)
@@ -61,12 +65,14 @@ def _smooth(
     if stream is not None:
         with stream as parts, progress_bar() as progress:
             streamed = write_streamed_labels(
-                output, lambda folder: smooth_stream(parts, settings, folder, method, progress=progress), f".{table}"
+                output,
+                lambda folder: smooth_stream(doubts.over(parts), settings, folder, method, progress=progress),
+                f".{table}",
             )
         _show(output, streamed)
         return
     with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
-        runs = smooth_dataset(dataset, settings, method, progress=progress)
+        runs = smooth_dataset(Doubted(dataset, doubts), settings, method, progress=progress)
         done = write_labels(
             output, runs, f".{table}", lambda folder, labels: source.write_labels(folder, dataset, labels)
         )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -42,13 +42,14 @@ class Summary:
                     self.best_score[track] = max(score, self.best_score.get(track, score))
             yield run
 
-    def write_record(self, method: str, settings: TrackConfig) -> None:
-        """Write the record of the run beside its result, for reports."""
+    def write_record(self, method: str, settings: TrackConfig, recordings: Mapping[str, Any]) -> None:
+        """Write the record of the run beside its result, for reports; recordings: `DatasetSource.kept`."""
         from pipelines.configuration import write_settings
         from pipelines.report.run_record import RunRecord, write_run_record
 
         rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
-        write_run_record(self.output, RunRecord(method, write_settings(settings, comments=False), rounded))
+        configuration = write_settings(settings, comments=False)
+        write_run_record(self.output, RunRecord(method, configuration, rounded, recordings=recordings))
 
     def show(self) -> None:
         """Print the line on stdout."""

@@ -50,6 +50,17 @@ def report(tables: Iterable[FigureTable], figures: Any, json_file: Path | None, 
         write_text(markdown, "\n".join(table.markdown() for table in tables))
 
 
+def show_summary(table: FigureTable, legend: str) -> None:
+    """Print one table without lines, which is narrow, and what its columns mean."""
+    shown = Table(title=table.title, title_justify="left", box=None, padding=(0, 1), collapse_padding=True)
+    for n, column in enumerate(table.columns):
+        shown.add_column(column, justify="right" if n else "left", no_wrap=True)
+    for row in table.rows:
+        shown.add_row(*row)
+    Console(width=max(Console().width, 80)).print(shown)
+    typer.echo(legend)
+
+
 def show_tables(tables: Iterable[FigureTable]) -> None:
     """Print the tables on stdout, each as wide as it needs to be: broken lines are no table any more."""
     for table in tables:

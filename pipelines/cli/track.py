@@ -34,32 +34,35 @@ def _track(
     verbose: options.Verbose = False,
 ) -> None:
     """Track the detections of recordings."""
+    from pipelines.config import load_config
+    from pipelines.doubts import Doubted, Doubts
     from pipelines.explaining import trackers
-    from pipelines.idle_edges import IdleEdges
     from pipelines.scale_out import TrackTask
     from pipelines.tracking import keep_predictions, track_dataset
 
     settings = how.configured(source.family, config, method, estimator, lag, association, interactions)
     options.apart(output, *source.input_files())
     kept, horizons = how.journal(explain, output, at_scale(workers, ray)), how.horizons(predict, method)
-    idle = IdleEdges(settings.of_method(method).tracker.edges)
+    doubts = Doubts(settings.of_method(method), load_config(source.family), source.summarised)
     if at_scale(workers, ray):
+        doubts.see_first(source)
         task = TrackTask(settings, method, source, horizons)
         report = run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)
-        idle.add(task.classes(report.counts))
-        idle.warn()
+        doubts.add(task.classes(report.counts))
+        doubts.finish()
         exit_on_failures(report)
         return
     summary = Summary(output)
     with source.open() as dataset:
         scenes = dataset.scenes
         with progress_bar(len(scenes)) as progress, trackers(settings, method, scenes, kept) as new_tracker:
-            runs = summary.of(track_dataset(dataset, new_tracker, progress=progress, horizons=horizons))
+            looked_at = Doubted(dataset, doubts)
+            runs = summary.of(track_dataset(looked_at, new_tracker, progress=progress, horizons=horizons))
             with keep_predictions(runs, output, horizons is not None) as kept_runs:
                 source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in kept_runs))
-    summary.write_record(method, settings)
-    idle.add(summary.classes)
-    idle.warn()
+    summary.write_record(method, settings, source.kept())
+    doubts.add(summary.classes)
+    doubts.finish()
     summary.show()
 
 

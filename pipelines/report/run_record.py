@@ -1,16 +1,19 @@
 """The record of a run, written beside its result for reports: method, version, configuration and times.
 
-{"method": "saga", "version": "0.1.0", "configuration": YAML, "milliseconds": {scene: [of each frame]}}
+{"method": "saga", "version": "0.1.0", "configuration": YAML, "milliseconds": {scene: [of each frame]},
+ "recordings": how they were read}
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
+from data_tools.datasets.source import DatasetSource
 from data_tools.files.atomic_files import write_text
 from data_tools.files.input_files import read_bytes
 from data_tools.files.json_stream import parsed_json
@@ -19,12 +22,16 @@ from saga_fg.errors import InputError
 
 @dataclass(frozen=True)
 class RunRecord:
-    """method; version of saga-fg; configuration, YAML; milliseconds in the tracker for every frame, by scene."""
+    """method; version of saga-fg; configuration, YAML; milliseconds in the tracker for every frame, by scene.
+
+    recordings  how the dataset was read, `DatasetSource.kept`
+    """
 
     method: str
     configuration: str
     milliseconds: Mapping[str, Sequence[float]]
     version: str = version("saga-fg")
+    recordings: Mapping[str, Any] = field(default_factory=dict)
 
 
 def record_path(result: Path) -> Path:
@@ -45,6 +52,13 @@ def read_run_record(result: Path) -> RunRecord | None:
     raw = parsed_json(read_bytes(path), str(path))
     try:
         milliseconds = {str(name): [float(ms) for ms in times] for name, times in raw["milliseconds"].items()}
-        return RunRecord(str(raw["method"]), str(raw["configuration"]), milliseconds, str(raw["version"]))
+        kept = dict(raw.get("recordings", {}))
+        return RunRecord(str(raw["method"]), str(raw["configuration"]), milliseconds, str(raw["version"]), kept)
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: expected the record of a run: {error}") from error
+
+
+def as_recorded(source: DatasetSource, result: Path) -> DatasetSource:
+    """A dataset, read as it was for a result, where its options do not say otherwise."""
+    record = read_run_record(result)
+    return source if record is None else source.with_kept(record.recordings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -37,6 +38,7 @@ class TrackTask:
         """The method, the form of the results, and the settings."""
         ahead = "" if self.horizons is None else f", predicted by {self.horizons.tolist()} s"
         head = f"# track, method {self.method}, results of {self.source.name} as {self.source.tracks_suffix}{ahead}\n"
+        head += _reading(self.source)
         return head + write_settings(self.settings, comments=False)
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
@@ -68,6 +70,7 @@ class SmoothTask:
     def configuration(self) -> str:
         """The method, the form of the results, and the settings."""
         head = f"# smooth, method {self.method}, results of {self.source.name}, table as {self.suffix}\n"
+        head += _reading(self.source)
         return head + write_settings(self.settings, comments=False)
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
@@ -80,6 +83,12 @@ class SmoothTask:
         write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
         self.source.write_label_part(folder, file_name(name), dataset, labels)
         return asdict(LabelCounts.sum(run.counts for run in runs))
+
+
+def _reading(source: DatasetSource) -> str:
+    """How recordings are read, as a comment; empty where they say it themselves."""
+    kept = source.kept()
+    return f"# recordings read with {json.dumps(kept, sort_keys=True)}\n" if kept else ""
 
 
 def _counted(runs: Iterable[TrackedScene], counts: dict[str, int]) -> Iterator[TrackedScene]:

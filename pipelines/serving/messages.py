@@ -50,10 +50,11 @@ LONGEST_NAME = 64  # characters of a label or a sensor: names are kept
 
 @dataclass(frozen=True, eq=False)
 class FrameMessage:
-    """A frame, and its number among the messages of its sensor (None: not numbered)."""
+    """A frame, its number among the messages of its sensor (None: not numbered), and its headings (n,) as they came."""
 
     frame: Frame
     seq: int | None = None
+    yaw: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,19 +213,21 @@ def _frame_message(message: Mapping[str, Any], settings: StreamSettings) -> Fram
         raise InputError(f"detections: expected at most {settings.max_detections}, got {len(rows)}")
     coordinates = message.get("coordinates", "world")
     try:
+        detections, yaw = _detections(rows)
         frame = Frame(
             timestamp=_number("", message, "timestamp"),
             sensor=_name("", message, "sensor", "sensor"),
-            detections=_detections(rows),
+            detections=detections,
             world_T_ego=_pose(message["ego"]) if message.get("ego") is not None else None,
             coordinates=cast(Coordinates, coordinates if isinstance(coordinates, str) else repr(coordinates)),
         )
     except InputError as error:  # names the field as a frame has it
         raise InputError(re.sub("^world_T_ego:", "ego:", str(error))) from error
-    return FrameMessage(frame, seq)
+    return FrameMessage(frame, seq, yaw)
 
 
-def _detections(rows: Sequence[Any]) -> Detections:
+def _detections(rows: Sequence[Any]) -> tuple[Detections, FloatArray]:
+    """The detections, and their headings before they are wrapped."""
     labels, numbers = _plain_rows(rows) or _checked_rows(rows)
     columns = dict(zip(MEASURED, numbers.T, strict=True))
 
@@ -232,7 +235,7 @@ def _detections(rows: Sequence[Any]) -> Detections:
         return np.stack([columns[name] for name in names], axis=-1)
 
     boxes = Boxes.of(labels, stacked(POSITION), stacked(SIZE), columns["yaw"], stacked(VELOCITY))
-    return Detections(boxes, columns["score"], columns["range_rate"])
+    return Detections(boxes, columns["score"], columns["range_rate"]), columns["yaw"]
 
 
 def _plain_rows(rows: Sequence[Any]) -> tuple[list[str], FloatArray] | None:

@@ -7,13 +7,13 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from pipelines.idle_edges import IdleEdges
+from pipelines.doubts import Doubts
 from pipelines.process import resident_memory
 from pipelines.serving.log_limit import LogLimit
 from pipelines.serving.messages import (
@@ -30,7 +30,6 @@ from pipelines.serving.reordering import Reordering
 from pipelines.serving.settings import StreamSettings
 from pipelines.tracking import OnlineTracker, PredictingTracker
 from saga_fg.errors import InputError
-from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import TimeVerdict
 
@@ -92,7 +91,7 @@ class StreamTracker(Generic[Client]):
 
     new_tracker  makes a tracker; called at the start, on a reset, and after repeated internal errors
     settings     limits of the stream
-    rules        edge rules of the tracker, to warn where none acts on a class of the tracks
+    doubts       warns of what is doubtful in the first frames, None: nothing is said
     horizons     (H,) s, to which every answer to a frame has predictions; None for none
     keeper       keeps the state in a file, None: nothing is kept
 
@@ -105,7 +104,7 @@ class StreamTracker(Generic[Client]):
         self,
         new_tracker: Callable[[], StreamedTracker],
         settings: StreamSettings | None = None,
-        rules: Sequence[EdgeRule] = (),
+        doubts: Doubts | None = None,
         horizons: FloatArray | None = None,
     ) -> None:
         self.settings = settings or StreamSettings()
@@ -122,7 +121,7 @@ class StreamTracker(Generic[Client]):
         self._durable: dict[str, int] = {}
         self._failed_in_a_row = 0
         self._log_limit = LogLimit()
-        self._idle_edges = IdleEdges(rules)
+        self._doubts = doubts
         self._horizons = horizons
         self._started = time.monotonic()
         self._lock = threading.Lock()
@@ -257,7 +256,8 @@ class StreamTracker(Generic[Client]):
         """Take in one frame. Raises the errors of the tracker."""
         frame, number = message.frame, message.seq
         tracks = self._tracker.step(frame)
-        self._idle_edges.watch(tracks)
+        if self._doubts is not None:
+            self._doubts.watch(frame, message.yaw, tracks)
         verdict = self._tracker.time_verdict
         if verdict == "unconfirmed":
             self.counts["unconfirmed"] += 1

@@ -42,6 +42,7 @@ STEP = 0.5  # s, of predictions through a gap
 TAILS = 30.0  # degrees of freedom
 MOST, FEWEST = 300, 20  # objects used of a class, evenly spread; and those that a fit needs
 INDEPENDENT = 10  # objects
+MAJORITY = 0.8  # share of all objects; the motion of all together is that of such a class
 EVALUATIONS = 80
 INITIAL_SPEED_DEVIATION = 8.0  # m/s
 _NEAR = 0.06  # s between a detection and the end of a gap
@@ -159,7 +160,8 @@ def fit_curvilinear_by_class(
     """The motions that were learned: of a class of its own, and of all classes together as `default`.
 
     configured: the motion of a class, from which learning starts; classes that move otherwise are left alone. A class
-    has a motion of its own if that is more likely than that of all together, on objects not learned from.
+    has a motion of its own if that is more likely than that of all together, on objects not learned from; one of most
+    objects has that of all.
     """
     mine = {label: same for label, same in sorted(objects.items()) if isinstance(configured(label), Curvilinear)}
     start, learned = configured(DEFAULT), {}
@@ -167,10 +169,13 @@ def fit_curvilinear_by_class(
         together = fit_curvilinear([one for same in mine.values() for one in same], start)
         if together != start:
             learned[DEFAULT] = together
+    number = sum(map(len, mine.values()))
     for label, same in mine.items():
         own = configured(label)
         assert isinstance(own, Curvilinear)
         first = learned.get(DEFAULT, own) if own == start else own
+        if own == start and len(same) >= MAJORITY * number:
+            continue
         found = fit_curvilinear(same, first) if len(mine) > 1 or own != start else first
         if found != first:
             learned[label] = found

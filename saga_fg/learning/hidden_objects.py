@@ -19,7 +19,7 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.learning.marginals import Marginals
-from saga_fg.learning.recorded_tracks import LabelledPlaces, RecordedTracks, recorded_tracks
+from saga_fg.learning.recorded_tracks import RecordedTracks, recorded_tracks
 from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import Interaction, NodeTable
 from saga_fg.model.modes import Mixture
@@ -33,6 +33,7 @@ from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.prediction import predict
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.dataset import Scene
+from saga_fg.types.labelled_objects import LabelledObjects
 
 APART = 5000.0  # m between gaps: no edge reaches as far
 
@@ -202,7 +203,7 @@ def hidden_objects(
     Raises `InputError` for a scene without ground truth.
     """
     settings = settings or GapSettings()
-    labels = LabelledPlaces.of(scene)
+    labels = LabelledObjects.of(scene)
     parts, moments, held = recorded_tracks(scene, tracker, sensors, labels)
     if not parts:
         return None

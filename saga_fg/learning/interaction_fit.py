@@ -45,6 +45,7 @@ PLACE_DEVIATION = 0.1  # m, of labels
 FEWEST = 30  # places of a class; classes with fewer share a scale
 MOVED = 0.01  # m; edges that move a prediction by less do not reach it
 MOST_GAPS = 300  # a random sample to learn from; more only take longer
+LEAST_GAIN = 1e-3  # nats a place, of an iteration; what is left below it, the differences hardly resolve
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
 _LED = replace(traffic_rules()[0], classes=ROAD_USERS, information_gain=None)
@@ -136,7 +137,7 @@ def fit_interactions(
         prediction = sample.predict(settings, parameters.valued(x))
         return negative_log_likelihood(sample, prediction) + prior * float(((x - start) ** 2).sum())
 
-    options = {"maxiter": iterations, "eps": 1e-3}
+    options = {"maxiter": iterations, "eps": 1e-3, "ftol": LEAST_GAIN}
     found = minimize(loss, start, method="L-BFGS-B", bounds=parameters.bounds, options=options)
     return FittedInteractions(parameters.valued(found.x), float(found.fun))
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
 
 import numpy as np
 
-from saga_fg.errors import InputError
 from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import assign
 from saga_fg.numerics.columns import Columns
 from saga_fg.tracking import Tracker, TrackerSettings
@@ -18,6 +16,7 @@ from saga_fg.tracking.sensor_evidence import SensorEvidence
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.dataset import Scene
+from saga_fg.types.labelled_objects import LabelledObjects
 
 GATE = 2.0  # m, from a track to its object
 
@@ -35,37 +34,8 @@ class RecordedTracks(Columns):
     P: FloatArray
 
 
-class LabelledPlaces(NamedTuple):
-    """K labelled moments of N objects: time (K,), label (N,), position (K, N, 2), m, world, NaN where not labelled."""
-
-    time: FloatArray
-    label: StrArray
-    position: FloatArray
-
-    @classmethod
-    def of(cls, scene: Scene) -> Self:
-        if scene.ground_truth is None:
-            raise InputError(f"scene {scene.name}: expected ground truth, there is none")
-        names = np.unique(np.concatenate([moment.id for moment in scene.ground_truth]))
-        position, label = np.full((len(scene), len(names), 2), np.nan), np.full(len(names), "", dtype="U64")
-        for k, moment in enumerate(scene.ground_truth):
-            rows = np.searchsorted(names, moment.id)
-            position[k, rows], label[rows] = moment.boxes.position[:, :2], moment.boxes.label
-        return cls(scene.timestamps, label, position)
-
-    def at(self, time: float) -> FloatArray:
-        """(N, 2) interpolated between the moments before and after; NaN beyond the recording."""
-        k = int(np.searchsorted(self.time, time - 1e-6))
-        if k == len(self.time) or (k == 0 and time < self.time[0] - 1e-6):
-            return np.full(self.position.shape[1:], np.nan)
-        if k == 0 or abs(self.time[k] - time) < 1e-6:
-            return np.asarray(self.position[k])
-        share = (self.time[k] - time) / (self.time[k] - self.time[k - 1])
-        return np.asarray(share * self.position[k - 1] + (1 - share) * self.position[k])
-
-
 def recorded_tracks(
-    scene: Scene, settings: TrackerSettings, sensors: Mapping[str, Sensor], labels: LabelledPlaces
+    scene: Scene, settings: TrackerSettings, sensors: Mapping[str, Sensor], labels: LabelledObjects
 ) -> tuple[list[RecordedTracks], FloatArray, list[IntArray]]:
     """The tracks after each frame, in world coordinates; the times of the frames; the object of each track, -1: none.
 

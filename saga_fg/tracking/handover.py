@@ -138,6 +138,7 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
     table.hits, table.opportunities = table.sensors.best_hits()
     for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected, table.last_in_view):
         column[old] = column[new]
+    table.best_score[old] = np.maximum(table.best_score[old], table.best_score[new])
     table.confirmed[old] |= table.confirmed[new]
     table.has_moved[old] |= table.has_moved[new]
     table.existence[old] = np.maximum(table.existence[old], table.existence[new])

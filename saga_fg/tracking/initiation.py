@@ -41,6 +41,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         existence=p.copy(),
         last_existence=p.copy(),
         score=p.copy(),
+        best_score=p.copy(),
         covariance_scale=measurements.covariance_scale[rows],
         position_bias=measurements.position_bias[rows],
         initiated=np.full(k, time),

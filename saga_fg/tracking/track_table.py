@@ -28,6 +28,7 @@ class TrackTable(Columns):
     existence         (n,) probability that the track is a real object
     last_existence    (n,) its existence at its latest detection
     score             (n,) probability of its latest detection
+    best_score        (n,) the highest of its detections
     covariance_scale  (n,) factor on the reported standard deviation of the position, see `saga_fg.tracking.reporting`
     position_bias     (n,) standard deviation of the position error that all its detections share, m
     initiated         (n,) time of its first detection
@@ -51,6 +52,7 @@ class TrackTable(Columns):
     existence: FloatArray
     last_existence: FloatArray
     score: FloatArray
+    best_score: FloatArray
     covariance_scale: FloatArray
     position_bias: FloatArray
     initiated: FloatArray
@@ -75,7 +77,7 @@ class TrackTable(Columns):
         return cls(
             np.empty(0, dtype=np.int64),
             np.empty(0, dtype="<U1"),
-            *(number,) * 8,
+            *(number,) * 9,
             *(truth,) * 2,
             *(number,) * 4,
             np.empty((0, classes)),

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from benchmarks.in_view_fit import fit_interactions_in_view
-from benchmarks.trajectories import Trajectories
 from saga_fg import InputError
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
+from saga_fg.types.labelled_objects import LabelledObjects
 from tests.saga_fg.following_pairs import RATE, following_pairs
 
 FOLLOW = Following(CarFollowing(time_constant=math.inf), rate=0.3)
 
 
 def test_the_rate_of_objects_in_view_is_found_again():
-    trajectories = Trajectories.of_truth(following_pairs(pairs=4, moments=30, seed=4))
+    trajectories = LabelledObjects.of(following_pairs(pairs=4, moments=30, seed=4)).about_their_mean()
     labels = np.where(np.arange(8) >= 4, "car", "bus")
     trajectories = dataclasses.replace(trajectories, label=labels)
     template = dataclasses.replace(FOLLOW, gap_scale=math.inf, lateral_scale=math.inf, heading_scale=math.inf)
@@ -43,7 +43,9 @@ def drifting(rng, groups, members, noise, moments=25, rate=0.0):
         v = v + h * rate * (total - members * v) + np.sqrt(h * noise) * rng.normal(size=v.shape)
     ids, label = np.array([f"{k:02d}" for k in range(len(group))]), np.full(len(group), "car")
     time, heading = 0.2 * np.arange(moments), np.zeros((moments, len(group)))
-    return Trajectories(time, ids, label, np.full(len(group), 4.5), np.array(places), heading)
+    return LabelledObjects(
+        time, ids, label, np.full(len(group), 4.5), np.array(places), heading, np.full((*heading.shape, 2), np.nan)
+    )
 
 
 SHARING = Neighbours(

@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.app import app
-from benchmarks.signals import BelievedLight, log_loss, time_to_red
+from benchmarks.signals import BelievedLight, left_out, log_loss, time_to_red
+from saga_fg import InputError
 from tests.data_tools.ngsim_example import crossing, rows, write_ngsim
 
 
@@ -25,6 +26,18 @@ def test_red_counts_from_the_first_vehicle_that_is_held() -> None:
     never = BelievedLight("B", since, np.full(5, 0.5), np.zeros(5, dtype=bool), held)
     open_light = BelievedLight("C", since, green, np.ones(5, dtype=bool), held)
     assert time_to_red([red, never, open_light]) == pytest.approx([0.2, np.inf])
+
+
+def test_what_is_chosen_for_a_window_is_best_on_the_others() -> None:
+    def light(window: str, green: float) -> BelievedLight:
+        ones = np.ones(3, dtype=bool)
+        return BelievedLight(window, np.arange(3.0), np.full(3, green), ones, ones)
+
+    first = [light("A", 0.9), light("B", 0.2), light("C", 0.6)]
+    second = [light("A", 0.2), light("B", 0.9), light("C", 0.7)]
+    assert left_out([first, second], {"A": "A", "B": "B", "C": "B"}) == [1, 0]
+    with pytest.raises(InputError, match="--left-out: expected windows that do not overlap"):
+        left_out([first, second], {"A": "A", "B": "A", "C": "A"})
 
 
 def test_the_command(tmp_path: Path) -> None:

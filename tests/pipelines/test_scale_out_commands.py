@@ -221,7 +221,8 @@ def test_edge_rules_that_meet_no_class_are_told_once_however_it_runs(
             result = saga_fg(*command)
             assert result.exit_code == 0, result.output
             warnings.append([record.getMessage() for record in caplog.records])
-    told = ["no edges: tracker.edges act on truck, and the tracks are of car; objects are tracked one by one"]
+    what = "no edges: tracker.edges act on truck, and the tracks are of car; objects are tracked one by one"
+    told = [f"{what}; add --classes car=truck"]
     assert warnings == [told, told, [], [], [], []]  # also where the results are there already
 
 

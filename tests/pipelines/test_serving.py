@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import os
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.config import load_config
+from pipelines.doubts import Doubts
 from pipelines.serving import StreamSettings, StreamTracker, parse_address, serve_pipe
 from pipelines.serving.messages import FrameMessage, encode, parse_message
 from pipelines.serving.reordering import Reordering
@@ -36,8 +39,9 @@ def frame(timestamp: float, seq: int | None = None, sensor: str = "lidar", x: fl
 
 def test_edge_rules_that_meet_no_class_are_told_once(caplog: pytest.LogCaptureFixture):
     for label, told in (("truck", 1), ("car", 0)):
-        rules = (Following(classes=(label,)),)
-        service: StreamTracker[str] = StreamTracker(lambda: load_config("file").new_tracker("saga"), SETTINGS, rules)
+        config = load_config("file")
+        config = replace(config, tracker=replace(config.tracker, edges=(Following(classes=(label,)),)))
+        service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, Doubts(config))
         caplog.clear()
         answers(service, *(frame(0.1 * k) for k in range(300)))
         assert [record.levelname for record in caplog.records] == ["WARNING"] * told

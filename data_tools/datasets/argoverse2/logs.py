@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
+from data_tools.files.arrow_tables import all_of, read_arrow_table
 from data_tools.files.error_messages import error_context, unknown_name
-from data_tools.files.input_files import open_bytes
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
 from saga_fg.types.boxes import Boxes
@@ -64,7 +64,7 @@ class ArgoverseScene(Scene):
 class ArgoverseLogs:
     """The logs below `root`: folders with city_SE3_egovehicle.feather and, but for the test split, annotations.feather.
 
-    Files are read when asked for. Raises `InputError` for a root without any, `MissingExtraError` without pyarrow.
+    Files are read when asked for. Raises `InputError` for a root without any.
     """
 
     def __init__(self, root: str | Path) -> None:
@@ -73,7 +73,6 @@ class ArgoverseLogs:
         self._scenes = tuple(sorted({path.parent.name for path in files}))
         if not self._scenes:
             raise InputError(f"{self._root}: expected LOG/annotations.feather, there is none")
-        _pyarrow()
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -145,34 +144,18 @@ def transforms(rows: dict[str, Any]) -> FloatArray:
 
 def columns_of(path: Path, names: tuple[str, ...], may_lack: tuple[str, ...] = ()) -> dict[str, Any]:
     """The named columns of a Feather file as arrays, and those of `may_lack` that it has."""
-    arrow = _pyarrow()
-    try:
-        with open_bytes(path) as file:
-            table = arrow.feather.read_table(file)
-            missing = [name for name in names if name not in table.column_names]
-            if missing:
-                there = ", ".join(table.column_names)
-                raise InputError(f"{path}: {missing[0]}: expected this column, the file has {there}")
-            names = (*names, *(name for name in may_lack if name in table.column_names))
-            table = table.select(list(names))
-            table.validate(full=True)  # its C++ trusts what it has read
-            empty = [name for name in names if table[name].null_count and name not in may_lack]
-            if empty:
-                raise InputError(f"{path}: {empty[0]}: expected a value in every row")
-            columns = {name: table[name].to_numpy() for name in names}
-    except (OSError, UnicodeDecodeError, arrow.ArrowException) as error:  # names of columns are decoded on demand
-        raise InputError(f"{path}: expected a readable Feather file: {str(error).splitlines()[0]}") from error
+
+    def choose(there: list[str]) -> list[str]:
+        return [*all_of(path, names)(there), *(name for name in may_lack if name in there)]
+
+    table = read_arrow_table(path, choose)
+    empty = [name for name in names if table[name].null_count]
+    if empty:
+        raise InputError(f"{path}: {empty[0]}: expected a value in every row")
+    columns = {name: table[name].to_numpy() for name in table.column_names}
     for name, column in columns.items():
         kinds = KINDS.get(name, "iuf")
         if column.dtype.kind not in kinds:
             expected = "text" if kinds == "OU" else "whole numbers" if kinds == "iu" else "numbers"
             raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
     return columns
-
-
-def _pyarrow() -> Any:
-    try:
-        import pyarrow.feather
-    except ImportError as error:
-        raise MissingExtraError("Argoverse logs: Feather needs pyarrow: pip install 'saga-fg[parquet]'") from error
-    return pyarrow

@@ -20,6 +20,11 @@ One row per detection. The same columns in every format; only the first three ar
     odometry_x, odometry_y, odometry_yaw, odometry_dt                default unknown
                           how the vehicle has moved over the last odometry_dt s, in its frame of then, m and rad
     gps_x, gps_y, gps_z   its place as measured, m                   default unknown
+    qw, qx, qy, qz        rotation as a unit quaternion, instead of yaw
+    ego_qw, ego_qx, ego_qy, ego_qz                                   instead of ego_yaw
+
+Columns by other names (`pos_x`, `timestamp_ns`, `confidence`, ...), in other units or with other classes are understood
+too, by `data_tools.datasets.detection_files.column_names` or by what a `TableImport` says.
 
 Rows with the same scene, timestamp and sensor are one frame. A row whose x and y are both left out says that the sensor
 looked and saw nothing (in NumPy arrays, which cannot leave anything out: a boolean array `empty`).
@@ -40,6 +45,10 @@ NumPy archives (.npz, without pickled objects) have an array for each column, al
 
     np.savez("detections.npz", timestamp=[0.0, 0.1], x=[10.2, 0.0], y=[3.1, 0.0], empty=[False, True])
 
+Tables of true objects have the columns of tracks, and `visible`: 0 for objects that no sensor can see.
+
+Parquet, Feather and Arrow files have the same columns (extra [parquet]).
+
 Tracks are written with the same columns and, besides, id, cov_xx, cov_xy, cov_yy (covariance of the horizontal
 position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2) and coasting (s since the last detection).
 """
@@ -52,15 +61,19 @@ from data_tools.datasets.detection_files.predictions import (
     predictions_path,
     read_predictions,
 )
+from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.track_rows import TrackRows, read_tracks
 from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS, track_rows, write_rows, write_tracks
+from data_tools.datasets.detection_files.truth import TruthFile
 
 __all__ = [
     "PREDICTION_COLUMNS",
     "TRACK_COLUMNS",
     "DetectionFile",
     "PredictionRows",
+    "TableImport",
     "TrackRows",
+    "TruthFile",
     "prediction_writer",
     "predictions_path",
     "read_detections",

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.detection_files.column_names import Columns
+from data_tools.datasets.detection_files.table_import import TableImport
+from data_tools.datasets.detection_files.units import ISO, Clock, factor, is_date, seconds_of_dates
+from data_tools.plausibility import headings_in_degrees
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+
+log = logging.getLogger(__name__)
 
 REQUIRED = ("timestamp", "x", "y")
 BOX = ("z", "length", "width", "height", "yaw", "vx", "vy", "range_rate", "score")
@@ -18,7 +26,9 @@ POSE = ("ego_x", "ego_y", "ego_z", "ego_yaw")
 TEXT = ("label", "sensor", "scene", "coordinates")
 ODOMETRY = ("odometry_x", "odometry_y", "odometry_yaw", "odometry_dt")
 GPS = ("gps_x", "gps_y", "gps_z")
-COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, *ODOMETRY, *GPS, "empty")
+QUATERNION = ("qw", "qx", "qy", "qz")
+ROTATIONS = {"yaw": QUATERNION, "ego_yaw": tuple(f"ego_{name}" for name in QUATERNION)}
+COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, *ODOMETRY, *GPS, *QUATERNION, *ROTATIONS["ego_yaw"], "empty")
 LONGEST_NAME = 256  # characters; NumPy stores all texts of an array as wide as the widest
 
 Values = Sequence[Any] | np.ndarray[Any, Any]
@@ -26,9 +36,10 @@ Values = Sequence[Any] | np.ndarray[Any, Any]
 
 @dataclass(frozen=True, eq=False)
 class RawTable:
-    """Columns of N values each as a format gives them; `where(row)` says where in the file a row is.
+    """Columns of N values each, by our names; `where(row)` says where in the file a row is.
 
-    A value is text, a number, or None for one that was left out; with `numerals`, numbers come as text.
+    A value is text, a number, or None for one that was left out; with `numerals`, numbers come as text. `found` has the
+    file's names and units, `how` what was asked for, `clock` the unit of times. Numbers come out in s, m, m/s and rad.
     """
 
     path: Path
@@ -36,50 +47,105 @@ class RawTable:
     length: int
     where: Callable[[int], str]
     numerals: bool = False
+    found: Columns = field(default_factory=Columns)
+    how: TableImport = field(default_factory=TableImport)
+    clock: Clock = field(default_factory=Clock)
+    _read: dict[str, FloatArray] = field(default_factory=dict)
 
     def fault(self, row: int, what: str) -> InputError:
         """An error about one row."""
         return InputError(f"{self.path}: {self.where(row)}: {what}")
 
+    def title(self, name: str) -> str:
+        """The name of a column for people: ours, and that of the file where it is another."""
+        theirs = self.found.names.get(name, name)
+        return name if theirs == name else f"{name} (column {theirs[:40]!r})"
+
     def present(self, name: str) -> BoolArray:
         """Rows (N,) that have a value in a column, as a mask."""
         if name not in self.columns:
-            return np.zeros(self.length, dtype=bool)
+            parts = ROTATIONS.get(name, ())
+            return self.present(parts[0]) if parts else np.zeros(self.length, dtype=bool)
         values = self.columns[name]
         if isinstance(values, np.ndarray):
             return np.ones(self.length, dtype=bool)
         return np.fromiter((value is not None for value in values), dtype=bool, count=self.length)
 
     def numbers(self, name: str, default: float = np.nan) -> FloatArray:
-        """A column (N,) of finite numbers or NaN; `default` where left out. Raises `InputError` for anything else."""
+        """A column (N,) of finite numbers or NaN, in our units; `default` where left out.
+
+        A yaw may come from the columns of a quaternion. Raises `InputError` for anything else.
+        """
         if name not in self.columns:
+            if any(part in self.columns for part in ROTATIONS.get(name, ())):
+                return self._yaw_of_quaternions(name)
             return np.full(self.length, default)
-        values = self.columns[name]
-        if isinstance(values, np.ndarray):
-            if values.dtype.kind not in "fiu":
-                raise InputError(f"{self.path}: {name}: expected an array of numbers, got {values.dtype}")
-            numbers = values.astype(np.float64)
-        else:
-            numbers = self._converted(name, values, default)
-        if np.isinf(numbers).any():
-            raise self.fault(int(np.argmax(np.isinf(numbers))), f"{name}: expected a finite number, got inf")
-        return numbers
+        if name not in self._read:
+            self._read[name] = self._in_our_unit(name)
+        numbers = self._read[name]
+        if default == default and not self.present(name).all():
+            return np.where(self.present(name), numbers, default)
+        return numbers.copy()
+
+    def check_numbers(self, names: Sequence[str]) -> None:
+        """Raise one `InputError` for all of these columns that hold anything but finite numbers."""
+        faults = []
+        for name in names:
+            try:
+                self.numbers(name)
+            except InputError as error:
+                faults.append(str(error).removeprefix(f"{self.path}: "))
+        if faults:
+            raise InputError(f"{self.path}: {'; '.join(faults)}")
+
+    def warn_of_headings(self) -> None:
+        """Warn where headings look like degrees; they are wrapped later on, and cannot be told then."""
+        doubt = headings_in_degrees(self.numbers("yaw"))
+        if doubt is not None:
+            log.warning("%s: %s", self.path, doubt.text(options=True))
 
     def texts(self, name: str, default: str) -> StrArray:
-        """A column (N,) of names; `default` where left out. Raises `InputError` for anything else."""
+        """A column (N,) of names; `default` where left out. A whole number is a name too, but in NumPy archives.
+
+        Raises `InputError` for anything else.
+        """
         if name not in self.columns:
             return np.full(self.length, default)
         values = self.columns[name]
         if isinstance(values, np.ndarray):
             if values.dtype.kind != "U":
-                raise InputError(f"{self.path}: {name}: expected an array of strings, got {values.dtype}")
+                raise InputError(f"{self.path}: {self.title(name)}: expected an array of strings, got {values.dtype}")
             return np.where(values == "", default, values)
         for row, value in enumerate(values):
             if value is not None and not isinstance(value, str):
-                raise self.fault(row, f"{name}: expected a name, got {repr(value)[:40]}")
+                raise self.fault(row, f"{self.title(name)}: expected a name, got {repr(value)[:40]}")
             if value is not None and len(value) > LONGEST_NAME:
-                raise self.fault(row, f"{name}: expected a name of at most {LONGEST_NAME} characters, got {len(value)}")
+                expected = f"expected a name of at most {LONGEST_NAME} characters"
+                raise self.fault(row, f"{self.title(name)}: {expected}, got {len(value)}")
         return np.array([value or default for value in values], dtype=np.str_)
+
+    def labels(self) -> tuple[StrArray, BoolArray]:
+        """The class (N,) of each row by our names, and the rows whose class is to be left out, as a mask."""
+        theirs, of_row = np.unique(self.texts("label", "object"), return_inverse=True)
+        ours = [self.how.classes.get(name, name) for name in theirs.tolist()]
+        out = np.array([name == "" for name in ours], dtype=np.bool_)
+        return np.array([name or "object" for name in ours], dtype=np.str_)[of_row], out[of_row]
+
+    def identities(self, name: str) -> StrArray:
+        """A column (N,) of names or whole numbers of objects, as names. Raises `InputError` for anything else."""
+        values = self.columns[name]
+        names = []
+        for row, value in enumerate(values.tolist() if isinstance(values, np.ndarray) else values):
+            if isinstance(value, str) and self.numerals and value.endswith(".0"):
+                value = value[:-2]
+            if type(value) is float and value.is_integer():
+                value = int(value)
+            text = str(value) if type(value) in (int, str) else ""
+            if not 0 < len(text) <= LONGEST_NAME:
+                got = "it is left out" if value is None else f"got {str(value)[:40]!r}"
+                raise self.fault(row, f"{self.title(name)}: expected a name or a whole number, {got}")
+            names.append(text)
+        return np.array(names, dtype=np.str_)
 
     def flags(self, name: str) -> BoolArray:
         """A column (N,) of booleans, False where left out. Raises `InputError` for anything else."""
@@ -90,15 +156,85 @@ class RawTable:
             raise InputError(f"{self.path}: {name}: expected an array of booleans, in NumPy archives only")
         return np.asarray(values, dtype=bool)
 
-    def _converted(self, name: str, values: Sequence[Any], default: float) -> FloatArray:
+    def _in_our_unit(self, name: str) -> FloatArray:
+        numbers = self.plain_numbers(name)
+        if np.isinf(numbers).any():
+            where = self.where(int(np.argmax(np.isinf(numbers))))
+            raise InputError(f"{self.path}: {where}: {self.title(name)}: expected a finite number, got inf")
+        if name == "timestamp":
+            return self.clock.seconds(numbers)
+        if name.startswith("cov_"):
+            of = "vx" if name.startswith("cov_v") else "x"
+            unit = self.how.unit(of, self.found.units.get(of))
+            return numbers if unit is None else numbers * factor(of, unit) ** 2
+        unit = self.how.unit(name, self.found.units.get(name))
+        return numbers if unit is None else numbers * factor(name, unit)
+
+    def plain_numbers(self, name: str) -> FloatArray:
+        """A column (N,) in the unit of the file, NaN where left out; dates as s. Raises as `numbers`."""
+        values = self.columns[name]
+        if isinstance(values, np.ndarray):
+            if values.dtype.kind not in "fiu":
+                kind = "list" if values.dtype.kind == "O" else values.dtype
+                raise InputError(f"{self.path}: {self.title(name)}: expected an array of numbers, got {kind}")
+            return values.astype(np.float64)
+        if name == "timestamp" and self.clock.unit == ISO:
+            try:
+                return seconds_of_dates(values)
+            except ValueError as error:
+                row = int(error.args[0])
+                got = f"got {str(values[row])[:40]!r}"
+                raise self.fault(row, f"{self.title(name)}: expected a date and time of ISO 8601, {got}") from error
+        return self._converted(name, values)
+
+    def _converted(self, name: str, values: Sequence[Any]) -> FloatArray:
         kinds = (str,) if self.numerals else (int, float)
         if set(map(type, values)) <= {*kinds, type(None)}:
             try:
-                return np.array([default if value is None else value for value in values], dtype=np.float64)
+                return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
             except (ValueError, OverflowError):
                 pass
         row = next(row for row, value in enumerate(values) if value is not None and not _is_number(value, kinds))
-        raise self.fault(row, f"{name}: expected a number, got {str(values[row])[:40]!r}")
+        raise self.fault(row, f"{self.title(name)}: expected a number, got {str(values[row])[:40]!r}")
+
+    def _yaw_of_quaternions(self, name: str) -> FloatArray:
+        """Heading (N,) of rotations w, x, y, z, of which x and y may be missing; NaN where one is left out."""
+        names = ROTATIONS[name]
+        w, _, _, z = (part in self.columns for part in names)
+        if not (w and z):
+            there = next(part for part in names if part in self.columns)
+            theirs = self.found.names.get(there, there)
+            mend = f"if it is the heading: --columns {name}={theirs}"
+            raise InputError(f"{self.path}: {self.title(there)}: expected {' '.join(names)} with it; {mend}")
+        parts = np.stack([self.numbers(part, np.nan if part in self.columns else 0.0) for part in names], axis=-1)
+        known = np.flatnonzero(np.isfinite(parts).all(axis=1))
+        yaw = np.full(self.length, np.nan)
+        norm = np.linalg.norm(parts[known], axis=1)
+        odd = np.abs(norm - 1) > 0.01
+        if odd.any():
+            at = int(np.argmax(odd))
+            text = f"{' '.join(names)}: expected a quaternion of length 1, got {norm[at]:g}"
+            raise self.fault(int(known[at]), text)
+        unit = checked_quaternions(" ".join(names), parts[known] / norm[:, None])
+        yaw[known] = yaw_of(quaternion_rotation(unit))
+        return yaw
+
+
+def clock_of(table: RawTable) -> Clock:
+    """The clock of a table: that which is given, that of the column's name, or that which fits the times."""
+    values = table.columns.get("timestamp", ())
+    given = table.how.unit("timestamp", None)
+    first = next((value for value in values if value is not None), None) if not isinstance(values, np.ndarray) else None
+    if given is not None:
+        return Clock(given)
+    if is_date(first):
+        return Clock(ISO)
+    if "timestamp" in table.found.units:
+        return Clock(table.found.units["timestamp"])
+    try:
+        return Clock.of(table.plain_numbers("timestamp"))
+    except (InputError, KeyError):  # named with its row, when the column is read
+        return Clock()
 
 
 def _is_number(value: Any, kinds: tuple[type, ...]) -> bool:

@@ -9,9 +9,10 @@ from typing import cast
 
 import numpy as np
 
-from data_tools.datasets.detection_files.columns import POSE, RawTable
+from data_tools.datasets.detection_files.columns import BOX, GPS, ODOMETRY, POSE, RawTable
 from data_tools.datasets.detection_files.ego_columns import EgoColumns
 from data_tools.datasets.detection_files.formats import read_raw_parts, read_raw_table
+from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
@@ -111,13 +112,21 @@ class DetectionFile:
         return frames
 
 
-def read_detections(path: str | Path) -> DetectionFile:
-    """Read a table of detections, .csv, .ndjson, .jsonl or .npz. Raises `InputError` naming file, row and column."""
-    return DetectionFile(read_raw_table(Path(path)))
+def read_detections(path: str | Path, how: TableImport | None = None) -> DetectionFile:
+    """Read a table of detections: .csv, .ndjson, .jsonl, .npz, .parquet, .feather or .arrow.
+
+    how  what it takes to understand it; what is left out is found by the names of the columns
+
+    Raises `InputError` naming file, row and column.
+    """
+    raw = read_raw_table(Path(path), how=how)
+    table = DetectionFile(raw)
+    raw.warn_of_headings()
+    return table
 
 
 def read_scenes_in_parts(
-    path: str | Path, rows: int = 50_000, scenes: Collection[str] | None = None
+    path: str | Path, rows: int = 50_000, scenes: Collection[str] | None = None, how: TableImport | None = None
 ) -> Iterator[Scene]:
     """The scenes of a table as they come, each as successive `Scene`s of about `rows` rows: without holding them all.
 
@@ -128,8 +137,10 @@ def read_scenes_in_parts(
     """
     done: set[str] = set()
     name, latest, with_poses = "", -np.inf, None
-    for table in read_raw_parts(Path(path), rows=rows):
+    for table in read_raw_parts(Path(path), how=how, rows=rows):
         part = DetectionFile(table)
+        if with_poses is None:
+            table.warn_of_headings()
         if with_poses not in (None, part.with_poses):
             raise InputError(f"{path}: {table.where(0)}: ego_x, ego_y, ego_yaw: expected in all rows or in none")
         with_poses = part.with_poses
@@ -155,12 +166,13 @@ def read_scenes_in_parts(
 def _checked(raw: RawTable) -> _Rows:
     if raw.length == 0:
         raise InputError(f"{raw.path}: expected at least one row, the table is empty")
+    raw.check_numbers(("timestamp", "x", "y", *BOX, *POSE, *ODOMETRY, *GPS))
     timestamp = raw.numbers("timestamp")
     _require(raw, np.isfinite(timestamp), "timestamp", timestamp, "a finite number of seconds")
     scene = raw.texts("scene", raw.path.stem)
     _check_order(raw, scene, timestamp)
-    empty = raw.flags("empty") | (~raw.present("x") & ~raw.present("y"))
-    coordinates = raw.texts("coordinates", "world")
+    empty = raw.flags("empty") | (~raw.present("x") & ~raw.present("y")) | raw.labels()[1]
+    coordinates = raw.texts("coordinates", raw.how.coordinates or "world")
     strange = ~np.isin(coordinates, _COORDINATES)
     if strange.any():
         row = int(np.argmax(strange))
@@ -176,7 +188,9 @@ def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
     late = (np.diff(timestamp[order]) < 0) & (scene[order][1:] == scene[order][:-1])
     if late.any():
         row = int(order[1:][np.argmax(late)])
-        raise raw.fault(row, f"timestamp: expected rows in order of time, time runs backwards at {timestamp[row]} s")
+        title = raw.title("timestamp")
+        text = f"{title}: expected rows in order of time, time runs backwards at {timestamp[row]} s; --sort sorts them"
+        raise raw.fault(row, text)
 
 
 def box_columns(raw: RawTable, empty: BoolArray) -> Detections:
@@ -194,7 +208,7 @@ def box_columns(raw: RawTable, empty: BoolArray) -> Detections:
     score = np.where(empty, 0.0, raw.numbers("score", 1.0))
     _require(raw, np.isfinite(score), "score", score, "a finite number")
     velocity = np.stack([raw.numbers("vx"), raw.numbers("vy")], axis=-1)
-    boxes = Boxes(raw.texts("label", "object"), position, size, raw.numbers("yaw"), velocity)
+    boxes = Boxes(raw.labels()[0], position, size, raw.numbers("yaw"), velocity)
     return Detections(boxes, score, np.where(empty, np.nan, raw.numbers("range_rate")))
 
 
@@ -216,4 +230,4 @@ def _require(raw: RawTable, good: BoolArray, name: str, column: FloatArray, expe
     if not good.all():
         row = int(np.argmin(good))
         got = f"got {column[row]:g}" if raw.present(name)[row] else "it is left out"
-        raise raw.fault(row, f"{name}: expected {expected}, {got}")
+        raise raw.fault(row, f"{raw.title(name)}: expected {expected}, {got}")

@@ -1,20 +1,23 @@
-"""The three formats of tables of boxes: CSV, newline-delimited JSON, NumPy archives."""
+"""The formats of tables of boxes: CSV, newline-delimited JSON, NumPy archives, Parquet and Feather."""
 
 from __future__ import annotations
 
 import csv
 import logging
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from difflib import get_close_matches
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from data_tools.datasets.detection_files.columns import COLUMNS, REQUIRED, RawTable, Values
+from data_tools.datasets.detection_files.column_names import Columns, meaning, understood
+from data_tools.datasets.detection_files.columns import COLUMNS, POSE, REQUIRED, RawTable, Values, clock_of
+from data_tools.datasets.detection_files.table_import import TableImport
+from data_tools.datasets.detection_files.units import Clock
+from data_tools.files.arrow_tables import SUFFIXES, read_arrow_table
 from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes, open_text
 from data_tools.files.json_stream import parsed_json
@@ -24,66 +27,134 @@ from saga_fg.errors import InputError
 log = logging.getLogger(__name__)
 
 Row = TypeVar("Row")
+NAMED = ("label", "sensor", "scene", "coordinates", "id", "source", "quality")
+TRACK_MEANINGS = ("id",)  # of tracks, which need no word where detections are read
 _OPEN_QUOTE = "a quote is opened and not closed on this line"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The columns a table may have, and those it must."""
+    """The columns a table may have, and those it must; `lenient`: a column that --columns names need not be there."""
 
     columns: tuple[str, ...] = COLUMNS
     required: tuple[str, ...] = REQUIRED
+    lenient: bool = False
 
 
-def read_raw_table(path: Path, layout: Layout | None = None) -> RawTable:
+@dataclass(frozen=True)
+class _Reading:
+    """What is to be read: a file, of which columns, how, in parts of so many rows."""
+
+    path: Path
+    layout: Layout
+    how: TableImport
+    rows: int
+    own: Collection[str] | None
+
+    def way(self, names: Collection[str]) -> TableImport:
+        """How to read a file with these columns."""
+        return TableImport() if self.own is not None and set(self.own) <= set(names) else self.how
+
+    def understood(self, names: Collection[str]) -> Columns:
+        """The columns of the file by their meaning. Raises `InputError` for all that is wrong with their names."""
+        wanted, layout = self.way(names).columns, self.layout
+        return understood(self.path, names, layout.columns, layout.required, wanted, layout.lenient)
+
+
+def read_raw_table(
+    path: Path, layout: Layout | None = None, how: TableImport | None = None, own: Collection[str] | None = None
+) -> RawTable:
     """Read a table, of detections unless another layout is given, by its suffix.
+
+    own  columns by which a table is known as one of ours, on which `how` has no effect
 
     Raises `InputError` for another suffix and for files that are not what it says.
     """
-    (table,) = read_raw_parts(path, layout, sys.maxsize)
+    (table,) = read_raw_parts(path, layout, how, sys.maxsize, own)
     return table
 
 
-def read_raw_parts(path: Path, layout: Layout | None = None, rows: int = 50_000) -> Iterator[RawTable]:
+def read_raw_parts(
+    path: Path,
+    layout: Layout | None = None,
+    how: TableImport | None = None,
+    rows: int = 50_000,
+    own: Collection[str] | None = None,
+) -> Iterator[RawTable]:
     """Read a table in parts of about `rows` rows, in their order; rows of one scene and time stay together.
 
-    A file without rows is one empty part, a NumPy archive is one part. Columns that nobody gives in a part are missing
-    from it.
+    A file without rows is one empty part; a table that is no text, or is to be sorted, is one part. Columns
+    that nobody gives in a part are missing from it. Warns of columns that are not read, and of a clock that is guessed.
     """
-    readers: dict[str, Callable[[Path, Layout, int], Iterator[RawTable]]] = {
+    readers: dict[str, Callable[[_Reading], Iterator[RawTable]]] = {
         ".csv": _read_csv,
         ".ndjson": _read_ndjson,
         ".jsonl": _read_ndjson,
         ".npz": _read_npz,
+        **dict.fromkeys(SUFFIXES, _read_arrow),
     }
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected a file name that ends in {', '.join(readers)}")
+    how = how or TableImport()
+    clock: Clock | None = None
+    told: set[str] = set()
+    reading = _Reading(path, layout or Layout(), how, sys.maxsize if how.sort else rows, own)
     try:
-        yield from readers[path.suffix.lower()](path, layout or Layout(), rows)
+        for table in readers[path.suffix.lower()](reading):
+            if clock is None and table.length:
+                clock = clock_of(table)
+                _tell(table, clock)
+            unread = set(table.found.unread) - told - set(TRACK_MEANINGS)
+            if unread:
+                names = [name[:40] for name in sorted(unread)]
+                more = f", ... ({len(names)} in all)" if len(names) > 12 else ""
+                log.warning("%s: columns without a meaning here, not read: %s", path, ", ".join(names[:12]) + more)
+            told |= unread
+            table = replace(table, clock=clock or Clock())
+            yield sorted_by_time(table) if how.sort else table
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected text in UTF-8: {error}") from error
 
 
-def _read_csv(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
+def sorted_by_time(table: RawTable) -> RawTable:
+    """The rows of a table in order of time within each scene; scenes, and rows of one time, stay in their order."""
+    _, first, scene = np.unique(table.texts("scene", ""), return_index=True, return_inverse=True)
+    order = np.lexsort((table.numbers("timestamp"), first[scene]))
+    columns: dict[str, Values] = {
+        name: values[order] if isinstance(values, np.ndarray) else [values[row] for row in order.tolist()]
+        for name, values in table.columns.items()
+    }
+    return replace(table, columns=columns, where=lambda row: table.where(int(order[row])), _read={})
+
+
+def _tell(table: RawTable, clock: Clock) -> None:
+    for ours, theirs in table.found.names.items():
+        if ours != theirs or ours in table.found.units:
+            log.info("%s: %s is read from %r, in %s", table.path, ours, theirs, table.found.units.get(ours, "our unit"))
+    if clock.guessed:
+        long = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}[clock.unit]
+        text = "%s: times are read as %s, by their size; --units time=%s says so"
+        log.warning(text, table.path, long, clock.unit)
+
+
+def _read_csv(reading: _Reading) -> Iterator[RawTable]:
+    path = reading.path
     with open_text(path, encoding="utf-8-sig", newline="") as file:
         numbered = _csv_rows(path, file)
         header = [name.strip() for name in next(numbered, (1, []))[1]]
         if len(set(header)) != len(header):
             got = ", ".join(name[:40] for name in header)
             raise InputError(f"{path}: line 1: expected every column once, got {got}")
-        _check_names(path, set(header), layout)
-        moment = [header.index(name) for name in ("scene", "timestamp") if name in header]
+        found = reading.understood(header)
+        at = {ours: header.index(theirs) for ours, theirs in found.names.items()}
+        moment = [at[name] for name in ("scene", "timestamp") if name in at]
         for lines, rows in _parts(
-            _full_rows(path, numbered, len(header)), most, lambda row: [row[i].strip() for i in moment]
+            _full_rows(path, numbered, len(header)), reading.rows, lambda row: [row[i].strip() for i in moment]
         ):
-            columns: dict[str, Values] = {
-                name: [value.strip() or None for value in column]
-                for name, column in zip(header, zip(*rows, strict=True) if rows else [()] * len(header), strict=True)
-                if name in layout.columns
-            }
-            yield RawTable(path, columns, len(rows), partial(_line, lines), numerals=True)
+            columns: dict[str, Values] = {name: [row[i].strip() or None for row in rows] for name, i in at.items()}
+            yield RawTable(path, columns, len(rows), partial(_line, lines), True, found, reading.way(header))
 
 
 def _csv_rows(path: Path, file: TextIO) -> Iterator[tuple[int, list[str]]]:
@@ -112,21 +183,20 @@ def _full_rows(path: Path, numbered: Iterator[tuple[int, list[str]]], columns: i
         yield number, row
 
 
-def _read_ndjson(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
+def _read_ndjson(reading: _Reading) -> Iterator[RawTable]:
+    path, layout = reading.path, reading.layout
     with open_text(path, encoding="utf-8-sig", newline="") as file:
-        for lines, rows in _parts(
-            _json_rows(path, file), most, lambda row: [row.get(name) for name in ("scene", "timestamp")]
-        ):
+        for lines, rows in _parts(_json_rows(path, file), reading.rows, _moment(reading.how)):
             names = set().union(*rows)
-            columns: dict[str, Values] = {
-                name: [row.get(name) for row in rows] for name in layout.columns if name in names
-            }
             if not rows:
-                columns = {name: [] for name in layout.columns}
-            elif "x" not in columns and "y" not in columns:  # every frame is empty
-                columns |= {"x": [None] * len(rows), "y": [None] * len(rows)}
-            _check_names(path, names | columns.keys(), layout)
-            yield RawTable(path, columns, len(rows), partial(_line, lines))
+                names = set(layout.columns)
+            if not rows or not names - {"scene", "timestamp", "sensor", "coordinates", *POSE}:  # every frame is empty
+                names |= {"x", "y"}
+            found = reading.understood(names)
+            columns: dict[str, Values] = {
+                ours: [row.get(theirs) for row in rows] for ours, theirs in found.names.items()
+            }
+            yield RawTable(path, columns, len(rows), partial(_line, lines), False, found, reading.way(names))
 
 
 def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -158,28 +228,63 @@ def _line(lines: list[int], row: int) -> str:
     return f"line {lines[row]}"
 
 
-def _read_npz(path: Path, layout: Layout, most: int) -> Iterator[RawTable]:
-    with open_bytes(path) as file, error_context(str(path)):
-        names, arrays = load_archive(file, layout.columns)
-    columns: dict[str, Values] = dict(arrays)
-    _check_names(path, names, layout)
-    length = len(columns["timestamp"]) if np.ndim(columns.get("timestamp", 0.0)) == 1 else 0
+def _read_npz(reading: _Reading) -> Iterator[RawTable]:
+    path = reading.path
+    with open_bytes(path) as file:
+        with error_context(str(path)):
+            names, _ = load_archive(file, ())
+        found = reading.understood(names)
+        file.seek(0)
+        with error_context(str(path)):
+            _, arrays = load_archive(file, found.names.values())
+    columns: dict[str, Values] = {ours: arrays[theirs] for ours, theirs in found.names.items()}
+    length = len(columns["timestamp"]) if np.ndim(columns["timestamp"]) == 1 else 0
     for name, column in columns.items():
         if np.shape(column) != (length,):
             raise InputError(f"{path}: {name}: expected shape ({length},) as timestamp has, got {np.shape(column)}")
-    yield RawTable(path, columns, length, lambda row: f"row {row}")
+    yield RawTable(path, columns, length, _row, False, found, reading.way(names))
 
 
-def _check_names(path: Path, names: set[str], layout: Layout) -> None:
-    """Columns that are missing, or look misspelt, are errors; others that have no meaning here get a warning."""
-    unknown = sorted(names - set(layout.columns))
-    for name in unknown:
-        nearest = get_close_matches(name, set(layout.columns) - names, n=1, cutoff=0.75)
-        if nearest:
-            raise InputError(f"{path}: unknown column {name[:40]!r}; did you mean {nearest[0]!r}?")
-    for name in layout.required:
-        if name not in names:
-            there = ", ".join(name[:40] for name in sorted(names)[:12]) or "none"
-            raise InputError(f"{path}: expected a column {name!r}, the columns there are {there}")
-    if unknown:
-        log.warning("%s: columns without a meaning here, not read: %s", path, ", ".join(name[:40] for name in unknown))
+def _read_arrow(reading: _Reading) -> Iterator[RawTable]:
+    found = Columns()
+
+    def choose(names: list[str]) -> list[str]:
+        nonlocal found
+        found = reading.understood(names)
+        return list(found.names.values())
+
+    table = read_arrow_table(reading.path, choose)
+    columns = {ours: _arrow_values(table[theirs], ours) for ours, theirs in found.names.items()}
+    yield RawTable(reading.path, columns, len(table), _row, False, found, reading.way(list(found.names)))
+
+
+def _arrow_values(column: Any, ours: str) -> Values:
+    """The values of a column of Arrow: dates as text in ISO 8601, whole numbers as text where names are expected."""
+    kind = str(column.type)
+    if kind.startswith(("timestamp", "date")):
+        return [None if value is None else value.isoformat() for value in column.cast("timestamp[us]").to_pylist()]
+    values: list[Any] = column.to_pylist()
+    if ours in NAMED:
+        return [str(value) if type(value) is int else value for value in values]
+    if column.null_count or kind in ("string", "large_string", "null") or kind.startswith("dictionary"):
+        return values
+    array: Values = column.to_numpy()
+    return array
+
+
+def _row(row: int) -> str:
+    return f"row {row}"
+
+
+def _moment(how: TableImport) -> Callable[[dict[str, Any]], list[Any]]:
+    """Return what gives the scene and the time of a row, by any names of theirs."""
+    given = [how.columns[name] for name in ("scene", "timestamp") if name in how.columns]
+    known: dict[str, bool] = dict.fromkeys(given, True)
+
+    def moment(row: dict[str, Any]) -> list[Any]:
+        for name in row:
+            if name not in known:
+                known[name] = (meaning(name) or ("",))[0] in ("scene", "timestamp")
+        return [value for name, value in row.items() if known[name]]
+
+    return moment

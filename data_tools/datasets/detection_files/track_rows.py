@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.detection_files.columns import RawTable
+from data_tools.datasets.detection_files.columns import QUATERNION, RawTable
 from data_tools.datasets.detection_files.dataset import box_columns
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
+from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS
-from saga_fg.numerics.arrays import FloatArray, StrArray, from_upper_triangle
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, from_upper_triangle
 from saga_fg.types.boxes import Boxes
 
 REQUIRED = ("timestamp", "id", "x", "y")
-LARGEST_ID = 2**53  # beyond, doubles leave integers out
+OWN = frozenset({"timestamp", "id", "x", "y", "cov_xx", "coasting"})  # columns of a table that saga-fg wrote
+NUMBERS = tuple(name for name in TRACK_COLUMNS if name not in ("scene", "id", "label"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +25,7 @@ class TrackRows:
     """N rows of a table of tracks, in the order of the file; NaN in covariances and coasting for what is left out.
 
     scene (N,), timestamp (N,) in s, id (N,), boxes in world coordinates, score (N,), position_covariance (N, 2, 2) in
-    m^2, velocity_covariance (N, 2, 2) in (m/s)^2, coasting (N,) in s
+    m^2, velocity_covariance (N, 2, 2) in (m/s)^2, coasting (N,) in s; named: whether the table names its scenes
     """
 
     scene: StrArray
@@ -34,33 +36,48 @@ class TrackRows:
     position_covariance: FloatArray
     velocity_covariance: FloatArray
     coasting: FloatArray
+    named: bool = True
+
+    def select(self, rows: IntArray) -> TrackRows:
+        """Some of the rows."""
+        return replace(
+            self,
+            **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("boxes", "named")},
+            boxes=self.boxes.select(rows),
+        )
 
 
-def read_tracks(path: str | Path) -> TrackRows:
-    """Read a table of tracks, .csv, .ndjson or .jsonl. Raises `InputError` naming file, row and column."""
-    return track_rows_of(read_raw_table(Path(path), Layout(TRACK_COLUMNS, REQUIRED)))
+def read_tracks(path: str | Path, how: TableImport | None = None, lenient: bool = False) -> TrackRows:
+    """Read a table of tracks in any of the formats of detections. Raises `InputError` naming file, row and column.
+
+    how      what it takes to understand it, without effect on a table that saga-fg wrote
+    lenient  columns that `how` names need not be there
+    """
+    layout = Layout((*TRACK_COLUMNS, *QUATERNION), REQUIRED, lenient)
+    return track_rows_of(read_raw_table(Path(path), layout, how, own=OWN))
 
 
 def track_rows_of(raw: RawTable) -> TrackRows:
-    """The tracks in a table that may have further columns."""
-    found = box_columns(raw, np.zeros(raw.length, dtype=np.bool_))
+    """The tracks in a table that may have further columns; without those of classes that are to be left out."""
+    raw.check_numbers(NUMBERS)
+    _, left_out = raw.labels()
+    kept = np.flatnonzero(~left_out)
+    found = box_columns(raw, left_out)
+    raw.warn_of_headings()
     timestamp = raw.numbers("timestamp")
-    for name, column in (("timestamp", timestamp), ("id", id_ := raw.numbers("id"))):
-        if np.isnan(column).any():
-            raise raw.fault(int(np.argmax(np.isnan(column))), f"{name}: expected a number, got none")
-    strange = (np.abs(id_) > LARGEST_ID) | (id_ != np.floor(id_))
-    if strange.any():
-        row = int(np.argmax(strange))
-        raise raw.fault(row, f"id: expected an integer of at most {LARGEST_ID}, got {id_[row]:g}")
+    if np.isnan(timestamp).any():
+        row = int(np.argmax(np.isnan(timestamp)))
+        raise raw.fault(row, f"{raw.title('timestamp')}: expected a number, got none")
     return TrackRows(
-        raw.texts("scene", raw.path.stem),
-        timestamp,
-        id_.astype(np.int64).astype(np.str_),
-        found.boxes,
-        found.score,
-        _covariance(raw, ("cov_xx", "cov_xy", "cov_yy")),
-        _covariance(raw, ("cov_vxvx", "cov_vxvy", "cov_vyvy")),
-        raw.numbers("coasting"),
+        raw.texts("scene", raw.path.stem)[kept],
+        timestamp[kept],
+        raw.identities("id")[kept],
+        found.boxes.select(kept),
+        found.score[kept],
+        _covariance(raw, ("cov_xx", "cov_xy", "cov_yy"))[kept],
+        _covariance(raw, ("cov_vxvx", "cov_vxvy", "cov_vyvy"))[kept],
+        raw.numbers("coasting")[kept],
+        "scene" in raw.columns,
     )
 
 

@@ -10,10 +10,9 @@ from data_tools.datasets.nuscenes.scored_scenes import ScoredScene
 from data_tools.evaluation import Evaluation
 from data_tools.evaluation.hota import HotaRow, hota
 from data_tools.evaluation.placed_detections import PlacedBoxes, placed_detections
-from data_tools.figures import FigureTable, cell, count
+from data_tools.evaluation.score_sweep import best_thresholds, sweep_table
 from data_tools.metrics import (
     LabelErrors,
-    NuScenesClassMetrics,
     NuScenesTrackingMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
@@ -28,10 +27,6 @@ from data_tools.plots import recall_sweep
 from saga_fg.numerics.arrays import FloatArray
 
 REACH = 1  # keyframes to either side for a label's velocity, 0.5 s
-_COLUMNS = (
-    *("class", "AMOTA", "AMOTP", "MOTA", "MOTP", "recall", "IDS", "FRAG", "TP", "FP", "FN", "GT", "MT", "ML"),
-    *("FAF", "TID", "LGD"),
-)
 
 
 def evaluate_nuscenes(
@@ -45,7 +40,7 @@ def evaluate_nuscenes(
     """
     tracking = nuscenes_tracking_metrics([each.tracking for each in scored.values()])
     return Evaluation(
-        nuscenes_table("nuScenes tracking metrics; AMOTP, MOTP in m, TID, LGD in s", tracking),
+        sweep_table("nuScenes tracking metrics; AMOTP, MOTP in m, TID, LGD in s", tracking),
         {
             "scenes": tuple(scored),
             "overall": tracking.overall,
@@ -65,19 +60,13 @@ def evaluate_nuscenes(
 
 def nuscenes_hota(scenes: Sequence[NuScenesTrackingScene], tracking: NuScenesTrackingMetrics) -> list[HotaRow]:
     """HOTA, at the scores of the best MOTA. Raises `MissingExtraError` without trackeval."""
-    return hota([_in_range(scene) for scene in scenes], _best_thresholds(tracking))
+    return hota([_in_range(scene) for scene in scenes], best_thresholds(tracking))
 
 
 def nuscenes_label_errors(scene: NuScenesTrackingScene, detections: PlacedBoxes | None = None) -> LabelErrors:
     """The errors at the labels of one scene, those without a LiDAR or radar point left out."""
     velocity = label_velocities(scene.truth, scene.timestamps, REACH)
     return label_errors(scene.truth, scene.found, velocity, detections)
-
-
-def nuscenes_table(title: str, metrics: NuScenesTrackingMetrics) -> FigureTable:
-    """The official figures, a row for all classes and one for each."""
-    rows = [("overall", metrics.overall), *metrics.per_class.items()]
-    return FigureTable(title, _COLUMNS, tuple((name, *_cells(figures)) for name, figures in rows))
 
 
 def _in_range(scene: NuScenesTrackingScene) -> tuple[SceneBoxes, SceneBoxes]:
@@ -90,18 +79,3 @@ def _in_range(scene: NuScenesTrackingScene) -> tuple[SceneBoxes, SceneBoxes]:
         return table.select(np.flatnonzero(np.hypot(offset[:, 0], offset[:, 1]) < reach))
 
     return near(scene.truth), near(scene.found)
-
-
-def _best_thresholds(metrics: NuScenesTrackingMetrics) -> dict[str, float]:
-    """The score threshold of best MOTA of each class that occurs; infinite for one that is never matched."""
-    best = {}
-    for label, curves in metrics.curves.items():
-        reached = np.where(np.isfinite(curves.score), curves.mota, -np.inf)
-        best[label] = float(curves.score[np.argmax(reached)]) if np.isfinite(curves.score).any() else np.inf
-    return best
-
-
-def _cells(f: NuScenesClassMetrics) -> tuple[str, ...]:
-    shares = (cell(value) for value in (f.amota, f.amotp, f.mota, f.motp, f.recall))
-    counts = (count(value) for value in (f.ids, f.frag, f.tp, f.fp, f.fn, f.gt, f.mt, f.ml))
-    return (*shares, *counts, *(cell(value, 2) for value in (f.faf, f.tid, f.lgd)))

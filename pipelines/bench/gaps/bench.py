@@ -42,12 +42,16 @@ class SceneSource(Protocol):
 
 @dataclass(frozen=True)
 class GapBenchSettings:
-    """Passes over each recording with made gaps, the lives compared, lengths of made gaps, s, seed of their choice."""
+    """Passes over each recording with made gaps, the lives compared, lengths of made gaps, s, seed of their choice.
+
+    real  whether the gaps of the recordings themselves are judged too, and the links
+    """
 
     passes: int = 4
     lives: tuple[Life, ...] = LIVES
     lengths: tuple[float, ...] = LENGTHS
     seed: int = 0
+    real: bool = True
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class Contender:
 class Run:
     """A contender's outcomes in the gaps of one recording, and its links in the run without made gaps.
 
-    links       None of a contender that does not track
+    links       None of a contender that does not track, and without real gaps
     cluster     the first of the recordings that overlap with this one, or itself
     situations  of the object of each gap, by the length until which; none for real gaps
     """
@@ -136,7 +140,7 @@ class _Preparation:
 
 def _perform(job: _Job) -> list[Run]:
     labelled, gaps = prepared(job.source, job.recording, job.settings, job.contender.config.sensors)
-    return [run_of(labelled, gaps, job.contender, life) for life in job.settings.lives]
+    return [run_of(labelled, gaps, job.contender, life, job.settings.real) for life in job.settings.lives]
 
 
 def prepared(
@@ -149,14 +153,15 @@ def prepared(
 @lru_cache(maxsize=1)
 def _prepared(of: _Preparation) -> tuple[LabelledScene, list[Gap]]:
     labelled, settings = LabelledScene.of(of.source.scene(of.recording), of.sensors), of.settings
-    return labelled, [*real_gaps(labelled), *made_gaps(labelled, settings.passes, settings.seed, settings.lengths)]
+    real = real_gaps(labelled) if settings.real else []
+    return labelled, [*real, *made_gaps(labelled, settings.passes, settings.seed, settings.lengths)]
 
 
-def run_of(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> Run:
-    """Track with all detections, then without those of each pass, and judge."""
+def run_of(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life, real: bool = True) -> Run:
+    """Track without the detections of each pass, and before, for `real` gaps and links, with all; judge."""
     outcomes: dict[int, GapOutcome] = {}
-    links = Links()
-    for number in sorted({0, *(gap.run for gap in gaps)}):
+    links = Links() if real else None
+    for number in sorted({*([0] if real else []), *(gap.run for gap in gaps)}):
         mine = {k: gap for k, gap in enumerate(gaps) if gap.run == number}
         judged = judged_run(labelled, list(mine.values()), contender, life)
         outcomes |= {k: judged.outcome(gap) for k, gap in mine.items()}

@@ -17,6 +17,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Frame
+from saga_fg.types.labelled_objects import LabelledObjects
 
 REACH = 2.0  # m, from an object to its detections
 
@@ -48,15 +49,9 @@ class LabelledScene:
             missing = "detections" if scene.ground_truth is not None else "ground truth"
             raise InputError(f"scene {scene.name}: expected {missing} to find gaps in, there are none")
         truth = scene.ground_truth
-        names = np.unique(np.concatenate([moment.id for moment in truth]))
-        rows = [np.searchsorted(names, moment.id) for moment in truth]
-        position, velocity = np.full((2, len(truth), len(names), 2), np.nan)
-        yaw = np.full((len(truth), len(names)), np.nan)
-        label = np.full(len(names), "", dtype="U64")
-        detected = np.zeros((len(truth), len(names)), dtype=np.bool_)
-        for k, (moment, at) in enumerate(zip(truth, rows, strict=True)):
-            position[k, at], label[at] = moment.boxes.position[:, :2], moment.boxes.label
-            velocity[k, at], yaw[k, at] = moment.boxes.velocity, moment.boxes.yaw
+        objects = LabelledObjects.of(scene)
+        rows = [np.searchsorted(objects.id, moment.id) for moment in truth]
+        detected = np.zeros((len(truth), len(objects.id)), dtype=np.bool_)
         owners, found = [], []
         for frame in scene.frames:
             k = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
@@ -67,8 +62,10 @@ class LabelledScene:
             distance[boxes.label[:, None] != truth[k].boxes.label] = np.inf
             same = _nearest(distance, rows[k])
             detected[k, same[same >= 0]] = True
+        position, velocity = objects.position, objects.velocity
         velocity = np.where(np.isfinite(velocity), velocity, _differences(position, scene.timestamps))
-        return cls(scene, names, label, position, velocity, yaw, detected, tuple(owners), tuple(found))
+        about = objects.id, objects.label, position, velocity, objects.heading
+        return cls(scene, *about, detected, tuple(owners), tuple(found))
 
     def frames_without(self, row: IntArray, start: FloatArray, stop: FloatArray) -> list[Frame]:
         """The frames without the detections of objects `row` (W,) after `start` and before `stop` (W,), s."""

@@ -154,10 +154,15 @@ def learn_interactions(
 
     held_out = {name: combined(part.rules, origin) for part in parts for name in part.tested}
     runs = [run for form in (BASE, SHIPPED) for run in trials[form]]
-    for part in parts:
-        if part.tested:
-            learned = Contender(LEARNED, "saga", config.with_interactions(combined(part.rules, origin)))
-            runs += _judged(part.tested, [learned], settings, progress)
+    forms = {BASE if form == NOWHERE else form for form in chosen.values()}
+    tried = trials.get(forms.pop(), []) if len(forms) == 1 else []
+    if len(tried) == len(trials[BASE]):  # all groups have the form of these runs
+        runs += [replace(run, contender=LEARNED) for run in tried]
+    else:
+        for part in parts:
+            if part.tested:
+                learned = Contender(LEARNED, "saga", config.with_interactions(combined(part.rules, origin)))
+                runs += _judged(part.tested, [learned], settings, progress)
     everything = {
         group: fitted(tuple(scenes), {form: templates[form]}, group)
         for group, form in chosen.items()
@@ -226,7 +231,7 @@ def _judged(
     scenes: Mapping[str, Scene], contenders: Sequence[Contender], settings: LearningSettings, progress: Progress | None
 ) -> list[Run]:
     source = _HeldScenes("held out", scenes, {})
-    bench = GapBenchSettings(settings.passes, lives=("kept",), seed=settings.seed)
+    bench = GapBenchSettings(settings.passes, lives=("kept",), seed=settings.seed, real=False)
     return bench_gaps(source, tuple(scenes), contenders, bench, progress=progress)
 
 

@@ -4,23 +4,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
 from saga_fg.tracking.existence import after_hit, after_miss
-from saga_fg.tracking.reporting import reported_score
+from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import TrackTable
 from tests.saga_fg.traffic_frames import frame
 
 SETTINGS = ExistenceSettings(lifetime=np.inf)
 
 
-def score(probability, hits, opportunities, coasting=False, existence=0.9, settings=SETTINGS):
+def score(probability, hits, opportunities, coasting=False, existence=0.9, settings=SETTINGS, best=0.0):
     """Reported scores of tracks with these attributes."""
     probability = np.atleast_1d(np.asarray(probability, dtype=float))
     n = len(probability)
     counts = {"hits": np.full(n, hits * 1.0), "opportunities": np.full(n, opportunities * 1.0)}
-    table = replace(TrackTable.empty(), existence=np.full(n, existence), score=probability, **counts)
+    best = np.maximum(probability, best)
+    table = replace(TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, **counts)
     return reported_score(table, np.ones(n), np.full(n, coasting), settings)
 
 
@@ -66,8 +69,43 @@ def test_two_short_gaps_do_not_push_an_object_below_a_false_track(family):
 
 
 def test_a_steady_track_scores_higher_than_a_new_or_a_flickering_one():
-    settings = ExistenceSettings(prior_opportunities=1.0, hit_ratio_weight=0.5)
+    weighted = ExistenceSettings(prior_opportunities=1.0, hit_ratio_weight=0.5)
     counts = ((9, 9), (1, 1), (4, 9))
-    steady, new, flickering = (score(0.6, *count, settings=settings).item() for count in counts)
+    steady, new, flickering = (score(0.6, *count, settings=weighted).item() for count in counts)
     assert steady == pytest.approx(0.6 * np.sqrt(0.9))
     assert steady > new > flickering
+
+
+def test_one_weak_detection_leaves_a_share_of_the_best_one():
+    assert score(0.05, 5, 5, best=0.9) == pytest.approx(LASTING_SHARE * 0.9)
+    assert score(0.5, 5, 5, best=0.9) == pytest.approx(0.5), "detections that are not weak are believed"
+    assert score(0.05, 5, 5, best=0.9, coasting=True) == pytest.approx(0.9 * LASTING_SHARE * 0.9)
+
+
+@pytest.mark.parametrize("family", ["kitti", "nuscenes"])
+@given(data=st.data())
+@settings(max_examples=20, deadline=None)
+def test_a_score_is_monotone_in_all_evidence_of_the_track(family, data):
+    """A higher probability of any detection lowers no score, then or later."""
+    count = 8
+    p = data.draw(st.lists(st.floats(0.1, 0.9), min_size=count, max_size=count), "probabilities")
+    seen = [True, True, *data.draw(st.lists(st.booleans(), min_size=count - 2, max_size=count - 2), "detected")]
+    raised = data.draw(st.sampled_from([k for k in range(count) if seen[k]]), "raised")
+    higher = [*p]
+    higher[raised] += data.draw(st.floats(0.0, 0.95 - p[raised]), "by")
+    low, high = (_scores_of_one_object(family, values, seen) for values in (p, higher))
+    assert low.keys() <= high.keys()
+    assert all(high[k] >= value - 1e-9 for k, value in low.items())
+
+
+def _scores_of_one_object(family, probability, seen):
+    """Score by frame of a stationary object, detected in some frames with these probabilities."""
+    tracker, dt = load_config(family).new_tracker("saga"), 0.5 if family == "nuscenes" else 0.1
+    scores = {}
+    for k, (p, there) in enumerate(zip(probability, seen, strict=True)):
+        value = (np.log(p / (1 - p)) + 2.4) / 0.4 if family == "kitti" else p
+        tracks = tracker.step(frame(dt * k, [(0.0, 0.0)] * there, score=value))
+        assert len(tracks) <= 1
+        if len(tracks):
+            scores[k] = float(tracks.score[0])
+    return scores

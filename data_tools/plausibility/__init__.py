@@ -1,0 +1,32 @@
+"""Doubts about data: what is probably wrong in them although it can be read, each with what mends it."""
+
+from data_tools.plausibility.checks import (
+    ego_taken_for_world,
+    far_too_fast,
+    headings_in_degrees,
+    length_below_width,
+    scores_beyond_one,
+    strange_time_steps,
+    unlikely_sizes,
+    within_a_metre,
+)
+from data_tools.plausibility.class_names import idle_rules, settings_without_data, usual_classes
+from data_tools.plausibility.doubt import Doubt
+from data_tools.plausibility.sample import Sample, doubts_of
+
+__all__ = [
+    "Doubt",
+    "Sample",
+    "doubts_of",
+    "ego_taken_for_world",
+    "far_too_fast",
+    "headings_in_degrees",
+    "idle_rules",
+    "length_below_width",
+    "scores_beyond_one",
+    "settings_without_data",
+    "strange_time_steps",
+    "unlikely_sizes",
+    "usual_classes",
+    "within_a_metre",
+]

@@ -1,0 +1,160 @@
+"""Checks of detections, one function for each suspicion, over the arrays of a sample.
+
+Each returns a `Doubt` or None. Shares and numbers are such that none is raised by the recordings that come with tests.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from data_tools.plausibility.class_names import usual_class
+from data_tools.plausibility.doubt import Doubt
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import transform_points
+
+FEWEST = 20  # values that allow a judgement
+_FASTEST = {"pedestrian": 12.0, "bicycle": 25.0}  # m/s
+_FASTEST_VEHICLE, _FASTEST_OTHER = 75.0, 110.0  # m/s
+_TRAVELLED = 3.0  # m of the vehicle, from which it shows what moves with it
+_PAIRS = 20  # pairs of frames that are compared
+
+
+def headings_in_degrees(yaw: FloatArray) -> Doubt | None:
+    """Headings (n,), as they were given, of which many are beyond a full turn of 2 pi."""
+    known = np.abs(yaw[np.isfinite(yaw)])
+    share = _share(known > 2 * np.pi + 0.1)
+    if len(known) < FEWEST or share < 0.05:
+        return None
+    what = f"headings look like degrees: {share:.0%} of them are beyond 2 pi, the largest is {known.max():.4g}"
+    return Doubt("degrees", what, "expected rad", "--units angle=deg")
+
+
+def scores_beyond_one(score: FloatArray) -> Doubt | None:
+    """Scores (n,), which should be shares, beyond 0 to 1: percent where none is negative, else logits."""
+    share = _share((score < -1e-6) | (score > 1 + 1e-6))
+    if len(score) < FEWEST or share < 0.01:
+        return None
+    low, high = float(score.min()), float(score.max())
+    what = f"scores are no shares: {share:.0%} of them are outside 0 to 1, from {low:.3g} to {high:.3g}; "
+    if low >= 0 and 5 < high <= 100.5:
+        return Doubt("scores", what + "they look like percent", "expected 0 to 1", "--units score=percent")
+    setting = "put `sensors: {default: {score: logit}}` into a file for --config"
+    return Doubt("scores", what + "they look like logits", setting)
+
+
+def length_below_width(label: StrArray, size: FloatArray) -> Doubt | None:
+    """Large boxes, sizes (n, 3), that are mostly wider than long; barriers are."""
+    large = np.isfinite(size[:, :2]).all(axis=1) & (size[:, :2].max(axis=1) >= 2.5)
+    large &= ~np.isin(label, [name for name in np.unique(label).tolist() if usual_class(name) == "barrier"])
+    wide = size[large, 0] < 0.8 * size[large, 1]
+    if large.sum() < FEWEST or _share(wide) < 0.7:
+        return None
+    what = f"{_share(wide):.0%} of the large boxes are wider than long: length and width look exchanged"
+    return Doubt("sides", what, "expected the length along the heading", "--columns length=width,width=length")
+
+
+def unlikely_sizes(label: StrArray, size: FloatArray) -> Doubt | None:
+    """Lengths (of sizes (n, 3)) that no object has: other units than metres."""
+    length, width = size[:, 0], size[:, 1]
+    known = np.isfinite(length)
+    cars = known & np.isin(label, [name for name in np.unique(label).tolist() if usual_class(name) == "car"])
+    if known.sum() < FEWEST:
+        return None
+    middle = float(np.median(length[known]))
+    unit = "mm" if middle > 1000 else "cm" if middle > 80 else "km" if middle < 0.02 else ""
+    if not unit and cars.sum() >= FEWEST and np.isfinite(width[cars]).any():
+        feet = 11 < np.median(length[cars]) < 25 and 4 < np.nanmedian(width[cars]) < 10
+        middle, unit = (float(np.median(length[cars])), "ft") if feet else (middle, "")
+    if not unit:
+        return None
+    what = f"objects have a usual length of {middle:.3g}: this looks like {unit}"
+    return Doubt("lengths", what, "expected metres", f"--units length={unit}")
+
+
+def within_a_metre(frame: IntArray, position: FloatArray) -> Doubt | None:
+    """Positions (n, 3) of frames (n,) with several objects, all of them within a metre."""
+    several = np.flatnonzero(np.bincount(frame, minlength=1) >= 3)
+    mine = position[np.isin(frame, several), :2]
+    if len(mine) < FEWEST:
+        return None
+    spread = float(np.ptp(mine, axis=0).max())
+    if spread >= 1.0:
+        return None
+    what = f"all objects of all frames are within {spread:.2g} m: positions look like km, or degrees of latitude"
+    return Doubt("places", what, "expected metres", "--units length=km, or give metres in a plane (such as UTM)")
+
+
+def far_too_fast(label: StrArray, velocity: FloatArray) -> Doubt | None:
+    """Measured velocities (n, 2), of which many are beyond what the class can do."""
+    names, of_row = np.unique(label, return_inverse=True)
+    usual = [usual_class(name) for name in names.tolist()]
+    limits = [_FASTEST.get(name or "", _FASTEST_VEHICLE if name else _FASTEST_OTHER) for name in usual]
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    for k, name in enumerate(names.tolist()):
+        mine = speed[(of_row == k) & np.isfinite(speed)]
+        share = _share(mine > limits[k])
+        if len(mine) >= FEWEST and share > 0.05:
+            what = f"{share:.0%} of the velocities of {name} are above {limits[k]:g} m/s, up to {mine.max():.3g}"
+            return Doubt("speeds", f"{what}: they look like km/h", "expected m/s", "--units speed=km/h")
+    return None
+
+
+def strange_time_steps(time: FloatArray, sensor: StrArray) -> Doubt | None:
+    """Times (f,) of the frames of sensors (f,), s, which are mostly a thousand times too far apart, or too near."""
+    steps = [np.diff(np.unique(time[sensor == name])) for name in np.unique(sensor).tolist()]
+    step = np.concatenate([np.empty(0), *steps])
+    if len(step) < 3:
+        return None
+    middle = float(np.median(step))
+    if middle >= 20:
+        unit = "ms" if middle < 2e4 else "us" if middle < 2e7 else "ns"
+        what = f"frames are usually {middle:.4g} s apart: their times look like {unit}"
+        return Doubt("times", what, "expected seconds", f"--units time={unit}")
+    if middle <= 1e-4:
+        what = f"frames are usually {middle:.1g} s apart: their times look like a coarser unit than seconds"
+        return Doubt("times", what, "expected seconds", "--units time=s, or the unit that fits")
+    return None
+
+
+def ego_taken_for_world(
+    frame: IntArray, position: FloatArray, world_T_ego: FloatArray, in_world: BoolArray, sensor: StrArray
+) -> Doubt | None:
+    """Positions (n, 3) of frames (n,) that are said to be in the world, and move with the vehicle.
+
+    Either they lie about the origin and the vehicle is far from it; or objects stay nearer to where they were if they
+    are placed by the poses of the vehicle (f, 4, 4), NaN where unknown.
+    """
+    doubt = Doubt(
+        "frame",
+        "positions look like coordinates of the vehicle, but are taken for the world: they move with it",
+        "expected world coordinates, or coordinates: ego",
+        "--coordinates ego",
+    )
+    posed = in_world & np.isfinite(world_T_ego).all(axis=(1, 2))
+    rows = np.flatnonzero(posed[frame])
+    if len(rows) < FEWEST:
+        return None
+    ego = world_T_ego[:, :2, 3]
+    from_ego = np.hypot(*(position[rows, :2] - ego[frame[rows]]).T)
+    if np.median(from_ego) > 300 and np.median(np.hypot(*position[rows, :2].T)) < 150:
+        return doubt
+    as_given, as_placed = [], []
+    for name in np.unique(sensor[posed]).tolist():
+        mine = np.flatnonzero(posed & (sensor == name))
+        mine = mine[np.bincount(frame, minlength=len(sensor))[mine] > 0]
+        for k in mine[:: max(1, len(mine) // _PAIRS)].tolist():
+            later = mine[(mine > k) & (np.hypot(*(ego[mine] - ego[k]).T) >= _TRAVELLED)]
+            if len(later):
+                a, b = position[frame == k], position[frame == later[0]]
+                placed = transform_points(world_T_ego[k], a), transform_points(world_T_ego[later[0]], b)
+                as_given.append(cKDTree(b[:, :2]).query(a[:, :2])[0])
+                as_placed.append(cKDTree(placed[1][:, :2]).query(placed[0][:, :2])[0])
+    if sum(map(len, as_given)) < FEWEST:
+        return None
+    given, placed_apart = float(np.median(np.concatenate(as_given))), float(np.median(np.concatenate(as_placed)))
+    return doubt if given > 1.0 and placed_apart < 0.5 * given else None
+
+
+def _share(mask: BoolArray) -> float:
+    return float(np.mean(mask)) if len(mask) else 0.0

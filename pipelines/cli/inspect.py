@@ -1,0 +1,178 @@
+"""`saga-fg inspect`: how a table is understood, and the command to run next."""
+
+from __future__ import annotations
+
+import shlex
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from pipelines.cli import options
+from pipelines.cli.summary import counted
+
+if TYPE_CHECKING:
+    from data_tools.datasets.detection_files import TableImport
+    from data_tools.datasets.detection_files.survey import TableSurvey
+
+MOST = 12  # scenes and classes that are listed
+EPOCH = 1e8  # s, from which times count from 1970
+
+
+def inspect_table(
+    table: Annotated[
+        Path,
+        typer.Argument(help="Table of detections, tracks or true objects: .csv, .ndjson, .npz, .parquet, .feather."),
+    ],
+    columns: Annotated[
+        str | None,
+        typer.Option("--columns", help="Names of columns in the file: time=ts_ns,x=pos_x.", metavar="OURS=THEIRS,..."),
+    ] = None,
+    classes: Annotated[
+        str | None,
+        typer.Option("--classes", help="Names of classes: REGULAR_VEHICLE=car.", metavar="THEIRS=OURS,..."),
+    ] = None,
+    units: Annotated[
+        str | None,
+        typer.Option("--units", help="Units: time=ns,length=ft,angle=deg,score=percent.", metavar="KIND=UNIT,..."),
+    ] = None,
+    coordinates: Annotated[
+        Literal["world", "ego", "sensor"] | None,
+        typer.Option("--coordinates", help="Coordinates of rows that say none.  [default: world]"),
+    ] = None,
+    import_file: Annotated[
+        Path | None, typer.Option("--import", help="YAML file with the same.", metavar="FILE")
+    ] = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Look at a table: its columns, units, classes, times, what looks wrong, and the command to run next.
+
+    Nothing is written. The last lines are a command that can be run as it is; what looks wrong is mended in it.
+
+    \b
+    Examples:
+      saga-fg inspect detections.csv
+      saga-fg inspect detections.parquet --columns time=ts_ns,x=pos_x,y=pos_y --units angle=deg
+      saga-fg inspect truth.csv
+    """
+    from data_tools.datasets.detection_files import TableImport
+    from data_tools.datasets.detection_files.survey import survey_table
+    from data_tools.datasets.detection_files.table_import import pairs
+    from pipelines.configuration import load_settings
+
+    given = TableImport(
+        pairs("--columns", columns), pairs("--classes", classes), pairs("--units", units), coordinates or ""
+    )
+    base = TableImport() if import_file is None else load_settings(TableImport, import_file)
+    survey = survey_table(table, given.over(base))
+    _show_columns(survey)
+    _show_times(survey)
+    meant = _show_classes(survey)
+    typer.echo("\nWhat looks wrong:" if survey.doubts or not survey.sorted or meant else "\nNothing looks wrong.")
+    for doubt in survey.doubts:
+        typer.echo(f"  {doubt.text(options=True)}")
+    if not survey.sorted:
+        typer.echo("  rows are not in order of time; add --sort")
+    if meant:
+        typer.echo(f"  no edge rule acts on {', '.join(meant)}; {_named(meant)}")
+    _show_next(survey, table, meant, "" if import_file is None else f" --import {shlex.quote(str(import_file))}", given)
+
+
+def _show_columns(survey: TableSurvey) -> None:
+    raw = survey.raw
+    typer.echo(f"{raw.path}: {counted(raw.length, 'row')}\n\nColumns, and their least, median and largest value:")
+    names = raw.found.names
+    for ours, theirs in sorted(names.items(), key=lambda pair: list(raw.columns).index(pair[0])):
+        how = theirs if theirs != ours else ""
+        unit = raw.clock.unit if ours == "timestamp" else raw.how.unit(ours, raw.found.units.get(ours)) or ""
+        origin = " ".join(part for part in (f"from {how}" if how else "", f"in {unit}" if unit else "") if part)
+        numbers = ""
+        if ours in survey.ranges:
+            low, middle, high = survey.ranges[ours]
+            numbers = f"{low:>12.6g} {middle:>12.6g} {high:>12.6g}"
+            if ours == "timestamp" and low > EPOCH:
+                numbers = f"{_date(low):>38}"
+        typer.echo(f"  {ours:<12} {numbers:<39} {origin}".rstrip())
+    if "yaw" in survey.ranges and "yaw" not in names:
+        low, middle, high = survey.ranges["yaw"]
+        typer.echo(f"  {'yaw':<12} {low:>12.6g} {middle:>12.6g} {high:>12.6g} from the quaternion")
+    if raw.found.unread:
+        typer.echo(f"  not read: {', '.join(raw.found.unread)}")
+
+
+def _date(seconds: float) -> str:
+    return f"from {datetime.fromtimestamp(seconds, UTC).isoformat(timespec='milliseconds').replace('+00:00', 'Z')}"
+
+
+def _show_times(survey: TableSurvey) -> None:
+    typer.echo("\nFrames, by scene and sensor:")
+    for each in survey.times[:MOST]:
+        rate = f"{1 / each.step:.3g} Hz" if each.step > 0 else "one moment"
+        pause = f", {counted(each.pauses, 'pause')}, the longest of {each.longest:.3g} s" if each.pauses else ""
+        length = each.last - each.first
+        typer.echo(f"  {each.scene}, {each.sensor}: {counted(each.frames, 'frame')} in {length:.6g} s, {rate}{pause}")
+    if len(survey.times) > MOST:
+        typer.echo(f"  ... {len(survey.times)} in all")
+
+
+def _show_classes(survey: TableSurvey) -> dict[str, str]:
+    """List the classes; return those that no edge rule acts on, with what they seem to mean."""
+    from data_tools.plausibility import usual_classes
+    from pipelines.config import load_config
+
+    rules = load_config("file").tracker.edges
+    acting = {label for rule in rules for label in getattr(rule, "classes", getattr(rule, "attached", ()))}
+    mapped = {name: survey.how.classes.get(name, name) for name in survey.classes}
+    meant = usual_classes([name for name, ours in mapped.items() if ours == name], acting)
+    typer.echo("\nClasses, with rows and median length, width, height:")
+    for name in sorted(survey.classes, key=lambda name: -survey.classes[name])[:MOST]:
+        size = " x ".join("?" if x != x else f"{x:.2f}" for x in survey.sizes[name].tolist())
+        ours = mapped[name]
+        role = "left out" if not ours else "with interactions" if ours in acting else "without interactions"
+        renamed = f", read as {ours}" if ours not in ("", name) else ""
+        typer.echo(f"  {name}: {survey.classes[name]}, {size} m{renamed}, {role}")
+    if len(survey.classes) > MOST:
+        typer.echo(f"  ... {len(survey.classes)} in all")
+    return meant
+
+
+def _named(meant: dict[str, str]) -> str:
+    return f"add --classes {','.join(f'{name}={ours}' for name, ours in meant.items())}"
+
+
+def _mended(survey: TableSurvey, meant: dict[str, str], given: TableImport) -> TableImport:
+    """What was given, with the options that mend what looks wrong."""
+    from dataclasses import replace
+
+    from data_tools.datasets.detection_files import TableImport
+    from data_tools.datasets.detection_files.table_import import pairs
+
+    how = replace(given, sort=survey.how.sort)
+    if survey.raw.clock.guessed:
+        how = TableImport(units={"time": survey.raw.clock.unit}).over(how)
+    for doubt in survey.doubts:
+        option, _, value = doubt.option.partition(" ")
+        if option in ("--units", "--columns") and " " not in value:
+            values = pairs(option, value)
+            if option == "--columns":
+                values = {ours: survey.raw.found.names.get(theirs, theirs) for ours, theirs in values.items()}
+                how = TableImport(columns=values).over(how)
+            else:
+                how = TableImport(units=values).over(how)
+        elif option == "--coordinates":
+            how = TableImport(coordinates="ego").over(how)
+    return TableImport(classes=meant).over(how)
+
+
+def _show_next(survey: TableSurvey, table: Path, meant: dict[str, str], base: str, given: TableImport) -> None:
+    options = base + _mended(survey, meant, given).options()
+    name = shlex.quote(str(table))
+    typer.echo("\nNext:")
+    if survey.has_identities:
+        typer.echo("  these are tracks or true objects; as the truth beside tracks, or as tracks beside the truth:")
+        typer.echo(f"  saga-fg evaluate file tracks.csv --truth {name}{options}")
+        typer.echo(f"  saga-fg evaluate file {name} --truth truth.csv{options}")
+    else:
+        typer.echo(f"  saga-fg track file {name}{options} --output tracks.csv")
+        typer.echo(f"  saga-fg report file tracks.csv --detections {name} --output report.html")

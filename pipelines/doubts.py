@@ -1,0 +1,138 @@
+"""Warnings of what is probably wrong in data and settings, each once, by the checks of `data_tools.plausibility`."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+
+import numpy as np
+
+from data_tools.datasets.source import DatasetSource
+from data_tools.plausibility import (
+    Doubt,
+    Sample,
+    doubts_of,
+    headings_in_degrees,
+    idle_rules,
+    settings_without_data,
+)
+from pipelines.config import TrackConfig
+from saga_fg.errors import InputError
+from saga_fg.model.sensor import sensor_model
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.frame import Frame
+from saga_fg.types.track import Tracks
+
+log = logging.getLogger(__name__)
+
+FRAMES = 100  # with tracks, after which a live stream is judged
+SCENES = 3  # of a dataset, whose first frames are judged
+
+
+class Doubts:
+    """Warns of each suspicion once.
+
+    settings  of the run
+    usual     the shipped settings: what a file for --config adds to them should meet something in the data
+    options   whether the command has the options of tables, which warnings then name
+    """
+
+    def __init__(self, settings: TrackConfig, usual: TrackConfig | None = None, options: bool = False) -> None:
+        self._settings, self._options = settings, options
+        rules = settings.tracker.edges
+        self._acting = {label for rule in rules for label in getattr(rule, "classes", getattr(rule, "attached", ()))}
+        usual = usual or settings
+        self._own_classes = set(settings.tracker.classes) - set(usual.tracker.classes) - {DEFAULT}
+        self._own_sensors = set(settings.sensors) - set(usual.sensors) - {DEFAULT}
+        self._told: set[str] = set()
+        self._classes: set[str] = set()
+        self._detected: set[str] = set()
+        self._sensors: set[str] = set()
+        self._judged = 0
+        self._live: list[Frame] = []
+        self._yaw: list[FloatArray] = []
+        self._tracked_frames = 0
+
+    def over(self, scenes: Iterable[Scene]) -> Iterator[Scene]:
+        """Pass scenes on, and warn of what is doubtful in the first of them."""
+        for scene in scenes:
+            self.see(scene)
+            yield scene
+
+    def see(self, scene: Scene) -> None:
+        """Warn of what is doubtful in a scene, one of the first."""
+        sample = Sample.of(scene.frames)
+        self._note(sample)
+        if self._judged < SCENES:
+            self._judged += 1
+            self._tell(doubts_of(sample, self._logits))
+
+    def see_first(self, source: DatasetSource) -> None:
+        """Look at the first part of recordings that are done elsewhere; what cannot be read is said there."""
+        with suppress(InputError), source.parts() as there:
+            first = next(iter(there.parts))
+            with first.opened() as part:
+                dataset = part.read()
+                self._tell(doubts_of(Sample.of(dataset.scene(dataset.scenes[0]).frames), self._logits))
+
+    def add(self, classes: Iterable[str]) -> None:
+        """Note classes of tracks."""
+        self._classes.update(classes)
+
+    def finish(self) -> None:
+        """Warn of rules and settings that met nothing, when all is seen."""
+        classes, sensors = self._settings.tracker.classes, self._settings.sensors
+        found = [idle_rules(self._acting, self._classes)]
+        if self._detected and self._own_classes - self._detected:
+            found.append(settings_without_data("tracker.classes", set(classes) - {DEFAULT}, self._detected))
+        if self._sensors and self._own_sensors - self._sensors:
+            found.append(settings_without_data("sensors", set(sensors) - {DEFAULT}, self._sensors))
+        self._tell([doubt for doubt in found if doubt is not None])
+
+    def watch(self, frame: Frame, yaw: FloatArray, tracks: Tracks) -> None:
+        """Note a live frame, its headings (n,) as they were given and the tracks; judge after `FRAMES` with tracks."""
+        if self._tracked_frames >= FRAMES:
+            return
+        self._live.append(frame)
+        self._yaw.append(yaw)
+        self.add(tracks.boxes.label.tolist())
+        self._tracked_frames += bool(len(tracks))
+        if self._tracked_frames >= FRAMES or len(self._live) > 10 * FRAMES:
+            self._tracked_frames = FRAMES
+            doubt = headings_in_degrees(np.concatenate(self._yaw))
+            self._tell([doubt] if doubt is not None else [])
+            times = [frame.timestamp for frame in self._live]
+            ordered = [self._live[row] for row in np.argsort(times, kind="stable").tolist()]
+            self.see(Scene("live", np.empty(0), np.empty((0, 4, 4)), (), ordered))
+            self.finish()
+            self._live, self._yaw = [], []
+
+    def _note(self, sample: Sample) -> None:
+        self._detected.update(np.unique(sample.boxes.label).tolist())
+        self._sensors.update(np.unique(sample.sensor).tolist())
+
+    def _logits(self, sensor: str) -> bool:
+        return sensor_model(self._settings.sensors, sensor).score == "logit"
+
+    def _tell(self, doubts: Iterable[Doubt]) -> None:
+        for doubt in doubts:
+            if doubt.kind not in self._told:
+                self._told.add(doubt.kind)
+                log.warning("%s", doubt.text(self._options))
+
+
+class Doubted:
+    """A dataset whose scenes are looked at when they are read."""
+
+    def __init__(self, dataset: Dataset, doubts: Doubts) -> None:
+        self._dataset, self._doubts = dataset, doubts
+        self.scenes = dataset.scenes
+
+    def scene(self, name: str) -> Scene:
+        """Read a scene, and warn of what is doubtful in it."""
+        scene = self._dataset.scene(name)
+        self._doubts.see(scene)
+        return scene

@@ -1,0 +1,235 @@
+"""Each doubt: data that raise it, and data like it that must not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from data_tools.plausibility import (
+    Doubt,
+    Sample,
+    doubts_of,
+    ego_taken_for_world,
+    far_too_fast,
+    headings_in_degrees,
+    idle_rules,
+    length_below_width,
+    scores_beyond_one,
+    settings_without_data,
+    strange_time_steps,
+    unlikely_sizes,
+    usual_classes,
+    within_a_metre,
+)
+from data_tools.plausibility.class_names import usual_class
+from saga_fg import Boxes, Detections, Frame
+from saga_fg.numerics.geometry import yaw_transform
+
+RNG = np.random.default_rng(5)
+CARS = np.full(60, "car")
+
+
+def option(doubt: Doubt | None) -> str | None:
+    return None if doubt is None else doubt.option
+
+
+@pytest.mark.parametrize(
+    ("yaw", "found"),
+    [
+        (RNG.uniform(0, 360, 60), "--units angle=deg"),
+        (RNG.uniform(-180, 180, 60), "--units angle=deg"),
+        (np.r_[np.full(50, np.nan), RNG.uniform(0, 360, 30)], "--units angle=deg"),
+        (RNG.uniform(-np.pi, np.pi, 60), None),
+        (RNG.uniform(0, 2 * np.pi, 60), None),
+        (np.r_[RNG.uniform(-3, 3, 99), 7.0], None),  # one that was not wrapped
+        (np.full(60, np.nan), None),
+        (np.array([90.0]), None),  # too few to tell
+    ],
+)
+def test_headings_in_degrees(yaw: np.ndarray, found: str | None) -> None:
+    assert option(headings_in_degrees(yaw)) == found
+
+
+@pytest.mark.parametrize(
+    ("score", "what"),
+    [
+        (RNG.uniform(5, 99, 60), "percent"),
+        (RNG.normal(0, 4, 60), "logits"),
+        (RNG.uniform(0, 1, 60), None),
+        (np.ones(60), None),
+        (np.full(5, 90.0), None),
+    ],
+)
+def test_scores_beyond_one(score: np.ndarray, what: str | None) -> None:
+    doubt = scores_beyond_one(score)
+    assert (doubt is None) == (what is None)
+    assert doubt is None or f"look like {what}" in doubt.what
+
+
+@pytest.mark.parametrize(
+    ("label", "size", "found"),
+    [
+        ("car", (1.9, 4.5, 1.6), True),
+        ("REGULAR_VEHICLE", (1.9, 4.5, 1.6), True),
+        ("car", (4.5, 1.9, 1.6), False),
+        ("pedestrian", (0.6, 0.8, 1.7), False),
+        ("barrier", (0.5, 2.6, 1.0), False),  # these are wider than long
+        ("car", (np.nan, np.nan, np.nan), False),
+    ],
+)
+def test_length_below_width(label: str, size: tuple[float, ...], found: bool) -> None:
+    doubt = length_below_width(np.full(60, label), np.tile(size, (60, 1)))
+    assert option(doubt) == ("--columns length=width,width=length" if found else None)
+
+
+@pytest.mark.parametrize(
+    ("label", "size", "unit"),
+    [
+        ("car", (4500.0, 1900.0, 1600.0), "mm"),
+        ("car", (450.0, 190.0, 160.0), "cm"),
+        ("car", (0.0045, 0.0019, 0.0016), "km"),
+        ("car", (15.0, 6.2, 5.0), "ft"),
+        ("car", (4.5, 1.9, 1.6), None),
+        ("truck", (16.0, 2.6, 3.5), None),
+        ("pedestrian", (0.5, 0.5, 1.7), None),
+        ("tram", (40.0, 2.6, 3.5), None),
+    ],
+)
+def test_unlikely_sizes(label: str, size: tuple[float, ...], unit: str | None) -> None:
+    found = option(unlikely_sizes(np.full(60, label), np.tile(size, (60, 1))))
+    assert found == (None if unit is None else f"--units length={unit}")
+
+
+def test_within_a_metre() -> None:
+    frame = np.repeat(np.arange(20), 5)
+    position = RNG.uniform(0, 100, (100, 3))
+    assert within_a_metre(frame, position) is None
+    doubt = within_a_metre(frame, position / 1000)
+    assert doubt is not None
+    assert "look like km" in doubt.what
+    lonely = np.zeros((100, 3)) + RNG.normal(0, 0.1, (100, 3))
+    assert within_a_metre(np.arange(100), lonely) is None  # one parked object
+
+
+@pytest.mark.parametrize(
+    ("label", "speed", "found"),
+    [
+        ("car", 100.0, True),
+        ("pedestrian", 15.0, True),
+        ("car", 45.0, False),
+        ("pedestrian", 2.0, False),
+        ("drone", 90.0, False),
+    ],
+)
+def test_far_too_fast(label: str, speed: float, found: bool) -> None:
+    velocity = np.column_stack([np.full(60, speed), np.zeros(60)])
+    assert option(far_too_fast(np.full(60, label), velocity)) == ("--units speed=km/h" if found else None)
+    velocity[3:] = 1.0  # a few strange ones are no rule
+    assert far_too_fast(np.full(60, label), velocity) is None
+
+
+@pytest.mark.parametrize(
+    ("step", "found"),
+    [(100.0, "ms"), (5e5, "ms"), (1e5, "us"), (1e8, "ns"), (0.1, None), (0.4, None), (2.0, None), (10.0, None)],
+)
+def test_strange_time_steps(step: float, found: str | None) -> None:
+    doubt = strange_time_steps(np.arange(20) * step, np.full(20, "lidar"))
+    assert (doubt is None) == (found is None)
+    if step != 5e5:
+        assert doubt is None or doubt.option == f"--units time={found}"
+
+
+def test_a_long_pause_is_no_strange_step() -> None:
+    time = np.r_[np.arange(20) * 0.1, 500 + np.arange(20) * 0.1]
+    assert strange_time_steps(time, np.full(40, "lidar")) is None
+    doubt = strange_time_steps(np.arange(20) * 1e-5, np.full(20, "lidar"))
+    assert doubt is not None
+    assert "coarser unit" in doubt.what
+
+
+def drive(coordinates: str, start: float, speed: float = 10.0, traffic: float = 0.0) -> list[Frame]:
+    """A vehicle that passes standing objects, and traffic; boxes given in coordinates, all called world."""
+    place = RNG.uniform([start - 20, -20], [start + 60, 20], (30, 2))
+    frames = []
+    for k in range(30):
+        pose = yaw_transform(start + speed * k / 10, 3.0, 0.0, 0.1)
+        at = place + np.array([traffic * k / 10, 0.0])
+        if coordinates == "ego":
+            at = (at - pose[:2, 3]) @ pose[:2, :2]
+        boxes = Boxes.of(["car"] * 30, np.column_stack([at + RNG.normal(0, 0.1, at.shape), np.zeros(30)]))
+        frames.append(Frame(k / 10, "lidar", Detections(boxes, np.full(30, 0.9)), pose))
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("frames", "found"),
+    [
+        (drive("ego", 0.0), True),  # it moves with the vehicle
+        (drive("ego", 3000.0, 0.0), True),  # it stands far away from all of it
+        (drive("world", 0.0), False),
+        (drive("world", 3000.0), False),
+        (drive("world", 0.0, traffic=12.0), False),
+        (drive("world", 0.0, traffic=10.0), False),  # all go along with the vehicle
+        (drive("ego", 0.0, 0.0), False),  # nothing tells
+    ],
+)
+def test_ego_taken_for_world(frames: Sequence[Frame], found: bool) -> None:
+    s = Sample.of(frames)
+    doubt = ego_taken_for_world(s.frame, s.boxes.position, s.world_T_ego, s.in_world, s.sensor)
+    assert option(doubt) == ("--coordinates ego" if found else None)
+
+
+def test_a_sample_has_all_doubts_and_none_where_scores_are_declared() -> None:
+    frames = drive("world", 0.0)
+    assert doubts_of(Sample.of(frames)) == []
+    logits = [Frame(f.timestamp, "lidar", Detections(f.detections.boxes, np.full(30, -2.0))) for f in frames]
+    assert [doubt.kind for doubt in doubts_of(Sample.of(logits))] == ["scores"]
+    assert doubts_of(Sample.of(logits), lambda sensor: sensor == "lidar") == []
+    assert doubts_of(Sample.of([])) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [
+        ("REGULAR_VEHICLE", "car"),
+        ("LARGE_VEHICLE", "truck"),
+        ("BOX_TRUCK", "truck"),
+        ("VEHICULAR_TRAILER", "trailer"),
+        ("vehicle.bus.rigid", "bus"),
+        ("human.pedestrian.adult", "pedestrian"),
+        ("Cyclist", "bicycle"),
+        ("MotorCycle", "motorcycle"),
+        ("RegularVehicle", "car"),
+        ("passenger_car", "car"),
+        ("CAR", "car"),
+        ("person_sitting", "pedestrian"),
+        ("dog", None),
+        ("carton", None),
+    ],
+)
+def test_names_of_classes(name: str, ours: str | None) -> None:
+    assert usual_class(name) == ours
+
+
+def test_rules_that_meet_no_class() -> None:
+    doubt = idle_rules({"car", "pedestrian"}, {"REGULAR_VEHICLE", "PERSON", "dog"})
+    assert doubt is not None
+    assert doubt.option == "--classes PERSON=pedestrian,REGULAR_VEHICLE=car"
+    assert option(idle_rules({"car"}, {"dog"})) == "--classes dog=car"
+    assert idle_rules({"car"}, {"car", "dog"}) is None
+    assert idle_rules(set(), {"dog"}) is None
+    assert idle_rules({"car"}, set()) is None
+    assert usual_classes(["car", "Van", "dog"], {"car"}) == {"Van": "car"}
+
+
+def test_settings_without_data() -> None:
+    doubt = settings_without_data("tracker.classes", {"Pedestrian", "car"}, {"pedestrian", "car"})
+    assert doubt is not None
+    assert doubt.text(options=True) == (
+        "tracker.classes.Pedestrian has settings and the data have none of it; pedestrian have the default ones; "
+        "is tracker.classes.pedestrian meant?"
+    )
+    assert settings_without_data("sensors", {"lidar", "radar"}, {"lidar"}) is None  # all that is there has its own
+    assert settings_without_data("sensors", {"lidar"}, {"lidar", "radar"}) is None

@@ -1,0 +1,216 @@
+"""A table of a stranger: looked at, tracked by the command that is printed, judged beside his truth, shown."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from pipelines.cli import app
+from pipelines.report.run_record import read_run_record
+
+RNG = np.random.default_rng(11)
+T0 = 1_700_000_000_000_000_000
+
+
+def saga_fg(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def run_line(line: str) -> Result:
+    words = shlex.split(line)
+    assert words[0] == "saga-fg"
+    return saga_fg(*words[1:])
+
+
+def rows() -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Detections in no order, with other names, ns, degrees and percent; and true objects."""
+    found, true = [], []
+    for k in range(40):
+        for n in range(6):
+            way = 1 if n % 2 else -1
+            x, y = 500 + way * (k * 1.1 - 14 * (n // 2)), 50.0 + 4 * (n % 2)
+            box = {"l": 4.5, "w": 1.9, "h": 1.6, "hdg": 0.0 if way > 0 else 180.0}
+            stamp = T0 + k * 100_000_000
+            true.append({"ts_ns": stamp, "object_id": f"v{n}", "category": "VEHICLE", "pos_x": x, "pos_y": y, **box})
+            at = {"pos_x": x + RNG.normal(0, 0.1), "pos_y": y + RNG.normal(0, 0.1)}
+            found.append({"ts_ns": stamp, "category": "VEHICLE", **at, **box, "conf": RNG.uniform(60, 95)})
+    RNG.shuffle(found)
+    return found, true
+
+
+def write(path: Path, table: list[dict[str, Any]]) -> Path:
+    if path.suffix == ".csv":
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(table[0]))
+            writer.writeheader()
+            writer.writerows(table)
+    else:
+        pa = pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
+        import pyarrow.parquet
+
+        pyarrow.parquet.write_table(pa.Table.from_pylist(table), path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_from_a_strangers_table_to_a_judged_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, suffix: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found, true = rows()
+    write(tmp_path / f"det{suffix}", found)
+    write(tmp_path / f"gt{suffix}", true)
+    look = saga_fg("inspect", f"det{suffix}")
+    assert look.exit_code == 0, look.output
+    assert re.search(r"x +4\d\d\.\d+ .* from pos_x", look.stdout)
+    assert "det, sensor: 40 frames in 3.9 s, 10 Hz" in look.stdout
+    assert "VEHICLE: 240, 4.50 x 1.90 x 1.60 m, without interactions" in look.stdout
+    lines = look.stdout.split("Next:\n")[1].splitlines()
+    track, report = (line.strip() for line in lines)
+    options = "--classes VEHICLE=car --units score=percent,angle=deg --sort"
+    assert track == f"saga-fg track file det{suffix} {options} --output tracks.csv"
+    result = run_line(track)
+    assert result.exit_code == 0, result.output
+    assert not caplog.records
+    assert "6 tracks" in result.stdout
+    record = read_run_record(tmp_path / "tracks.csv")
+    assert record is not None
+    assert record.recordings["units"] == {"score": "percent", "angle": "deg"}
+
+    judged = saga_fg(
+        "evaluate", "file", "tracks.csv", "--truth", f"gt{suffix}", "--json", "f.json", "--markdown", "f.md"
+    )  # fmt: skip
+    assert judged.exit_code == 0, judged.output
+    assert all(len(line) <= 80 for line in judged.stdout.splitlines())
+    figures = json.loads((tmp_path / "f.json").read_text())
+    assert figures["sweep"]["car"]["amota"] > 0.9
+    assert figures["tracking"]["car"]["switches"] == 0
+    assert figures["errors"]["car"]["position"] < 0.2
+    assert figures["errors"]["car"]["heading"] < 0.1  # degrees of both tables are rad
+    assert "**Tracks beside the ground truth**" in (tmp_path / "f.md").read_text()
+    full = saga_fg("evaluate", "file", "tracks.csv", "--truth", f"gt{suffix}", "--full")
+    assert "Calibration" in full.stdout
+    assert "Calibration" not in judged.stdout
+
+    shown = run_line(f"{report} --truth gt{suffix}")
+    assert shown.exit_code == 0, shown.output
+    assert (tmp_path / "report.html").stat().st_size > 20_000
+
+
+def test_tracks_of_another_tracker_and_its_own_clock(tmp_path: Path) -> None:
+    _, true = rows()
+    gt = write(tmp_path / "gt.csv", true)
+    other = [
+        {"time_s": row["ts_ns"] / 1e9 + 0.001, "track": row["object_id"], "type": "auto", "cx": row["pos_x"] + 0.3,
+         "cy": row["pos_y"]} for row in true
+    ]  # fmt: skip
+    theirs = write(tmp_path / "theirs.csv", other)
+    result = saga_fg(
+        "evaluate", "file", theirs, "--truth", gt, "--classes", "VEHICLE=car,auto=car", "--units", "angle=deg",
+        "--columns", "id=track", "--json", tmp_path / "f.json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    figures = json.loads((tmp_path / "f.json").read_text())
+    assert figures["tracking"]["car"]["recall"] == 1.0
+    assert figures["errors"]["car"]["position"] == pytest.approx(0.3, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"ts_ns": lambda t: t + 10**12}, "expected tracks at the times of the ground truth"),
+        ({"scene": lambda _: "b"}, None),
+    ],
+)
+def test_tracks_that_do_not_fit_the_truth(tmp_path: Path, change: dict[str, Any], message: str | None) -> None:
+    _, true = rows()
+    gt = write(tmp_path / "gt.csv", true)
+    moved = write(tmp_path / "t.csv", [row | {name: f(row.get(name)) for name, f in change.items()} for row in true])
+    result = saga_fg("evaluate", "file", moved, "--truth", gt, "--units", "angle=deg")
+    assert (result.exit_code, result.stderr.startswith("error: ")) == ((2, True) if message else (0, False))
+    assert message is None or message in result.stderr
+
+
+def test_classes_that_have_nothing_in_common_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    _, true = rows()
+    gt, other = write(tmp_path / "gt.csv", true), write(tmp_path / "t.csv", [{**row, "category": "X"} for row in true])
+    result = saga_fg("evaluate", "file", other, "--truth", gt, "--units", "angle=deg")
+    assert result.exit_code == 0, result.output
+    assert "nothing can match; name them alike: --classes X=VEHICLE" in caplog.text
+
+
+def test_without_truth_it_is_asked_for(tmp_path: Path) -> None:
+    result = saga_fg("evaluate", "file", write(tmp_path / "t.csv", rows()[1]))
+    assert (result.exit_code, "name it: --truth TABLE" in result.stderr) == (2, True)
+
+
+def test_the_same_in_a_file_and_in_options(tmp_path: Path) -> None:
+    found, _ = rows()
+    table = write(tmp_path / "d.csv", found)
+    (tmp_path / "how.yaml").write_text("classes: {VEHICLE: car}\nunits: {angle: deg, score: percent}\nsort: true\n")
+    one = saga_fg("track", "file", table, "--import", tmp_path / "how.yaml", "-o", tmp_path / "a.csv")
+    other = saga_fg(
+        "track", "file", table, "--classes", "VEHICLE=car", "--units", "angle=deg,score=percent", "--sort",
+        "-o", tmp_path / "b.csv",
+    )  # fmt: skip
+    assert one.exit_code == other.exit_code == 0, one.output + other.output
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    (tmp_path / "how.yaml").write_text("clases: {VEHICLE: car}\n")
+    wrong = saga_fg("track", "file", table, "--import", tmp_path / "how.yaml", "-o", tmp_path / "a.csv")
+    assert "how.yaml: clases: unknown key, did you mean 'classes'?" in wrong.stderr
+
+
+@pytest.mark.parametrize("verb", ["track", "smooth"])
+def test_what_looks_wrong_is_told_once_with_what_mends_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, verb: str
+) -> None:
+    table = write(tmp_path / "d.csv", rows()[0])
+    output = tmp_path / ("t.csv" if verb == "track" else "labels")
+    assert saga_fg(verb, "file", table, "--sort", "--output", output).exit_code == 0
+    told = [record.getMessage() for record in caplog.records]
+    for mend in ("--units angle=deg", "--units score=percent"):
+        assert len([line for line in told if line.endswith(f"add {mend}")]) == 1, told
+
+
+def test_settings_for_a_class_or_sensor_that_the_data_lack(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    table = write(tmp_path / "d.csv", rows()[0])
+    config = tmp_path / "c.yaml"
+    options = ("--sort", "--classes", "VEHICLE=car", "--units", "angle=deg,score=percent", "-o", tmp_path / "t.csv")
+    for name, warnings in (("Car", 2), ("car", 1)):
+        caplog.clear()
+        config.write_text(f"tracker: {{classes: {{{name}: {{gate: 0.99}}}}}}\nsensors: {{lidar_top: {{}}}}\n")
+        assert saga_fg("track", "file", table, "--config", config, *options).exit_code == 0
+        told = [record.getMessage() for record in caplog.records]
+        assert len(told) == warnings, told
+        assert told[-1].startswith("sensors.lidar_top has settings and the data have none of it; sensor have")
+
+
+def test_a_look_at_true_objects_names_what_judges_with_them(tmp_path: Path) -> None:
+    table = write(tmp_path / "gt.csv", rows()[1])
+    result = saga_fg("inspect", table)
+    assert result.exit_code == 0, result.output
+    assert f"saga-fg evaluate file tracks.csv --truth {table} --classes VEHICLE=car --units angle=deg" in result.stdout
+
+
+def test_a_look_at_a_table_that_cannot_be_understood(tmp_path: Path) -> None:
+    table = write(tmp_path / "d.csv", [{"foo": 1, "bar": 2}])
+    result = saga_fg("inspect", table)
+    assert result.exit_code == 2
+    assert "the columns there are bar, foo; name it: --columns timestamp=NAME,x=NAME,y=NAME" in result.stderr
+
+
+def test_a_look_at_a_table_without_doubts(tmp_path: Path) -> None:
+    lines = "".join(f"{k / 10},car,{k},2\n" for k in (*range(10), *range(30, 40)))
+    (tmp_path / "d.csv").write_text("timestamp,label,x,y\n" + lines)
+    result = saga_fg("inspect", tmp_path / "d.csv")
+    assert "Nothing looks wrong." in result.stdout
+    assert "20 frames in 3.9 s, 10 Hz, 1 pause, the longest of 2.1 s" in result.stdout
+    assert "car: 20, ? x ? x ? m, with interactions" in result.stdout
