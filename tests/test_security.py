@@ -21,10 +21,14 @@ def dotted(node: ast.expr) -> str:
 
 
 def faults(tree: ast.AST) -> list[str]:
+    """What could run code that a file brings; writing a pickle, which the benchmark of Argoverse 2 wants, does not."""
     found = []
+    used = {dotted(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    writes = {use for use in used if use.startswith("pickle.")} == {"pickle.dump"}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names if alias.name.split(".")[0] in FORBIDDEN_MODULES]
+            names = [alias.name for alias in node.names if alias.name.split(".")[0] in FORBIDDEN_MODULES]
+            found += [name for name in names if name != "pickle" or not writes]
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in FORBIDDEN_MODULES:
             found.append(str(node.module))
         if isinstance(node, ast.Call):
@@ -50,3 +54,5 @@ def test_nothing_from_outside_is_executed(package: str) -> None:
 def test_the_search_finds_what_it_looks_for() -> None:
     bad = "import pickle\nfrom marshal import loads\nyaml.load(x)\nnp.load(p)\nrun(c, shell=True)\neval(x)\n"
     assert len(faults(ast.parse(bad))) == 6
+    assert faults(ast.parse("import pickle\npickle.dump(x, file)\n")) == []
+    assert faults(ast.parse("import pickle\npickle.dump(x, file)\npickle.load(file)\n")) == ["pickle"]

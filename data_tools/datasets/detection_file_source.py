@@ -33,6 +33,12 @@ class DetectionFileSource(DatasetSource):
 
     Time, x and y (m) are needed; label, score, sensor, size, heading and more are used where they are there. Columns,
     classes and units may be your own: `saga-fg inspect TABLE` shows how it is understood (see `saga-fg docs formats`).
+
+    \b
+    A table in columns, classes and units of its own:
+      saga-fg inspect found.parquet
+      saga-fg track file found.parquet --columns time=stamp,x=east,y=north \\
+          --classes REGULAR_VEHICLE=car,PERSON=pedestrian --units angle=deg --sort --output tracks.csv
     """
 
     name = "file"

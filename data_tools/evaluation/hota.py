@@ -47,12 +47,15 @@ def hota(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], thresholds: Mapping[st
 
 def _similarities(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]]) -> dict[str, Similarity]:
     """The overlaps that boxes have; where truth or tracks are points, the nearness of centres, 0 from 4 m on."""
+    known = []
     for one in zip(*scenes, strict=True):
         size = np.concatenate([table.boxes.size for table in one])
-        if len(size) and not np.isfinite(size[:, :2]).all(axis=1).any():
-            return {"centre": "centre"}
-        if len(size) and not np.isfinite(size[:, 2]).any():
-            return {"2D": "bev_iou"}
+        known.append(np.isfinite(size).any(axis=0) if len(size) else np.ones(3, dtype=np.bool_))
+    length, width, height = np.all(known, axis=0).tolist() if known else (True, True, True)
+    if not (length and width):
+        return {"centre": "centre"}
+    if not height:
+        return {"2D": "bev_iou"}
     return SIMILARITIES
 
 

@@ -6,7 +6,6 @@ Each returns a `Doubt` or None. Shares and numbers are such that none is raised 
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from data_tools.plausibility.class_names import usual_class
 from data_tools.plausibility.doubt import Doubt
@@ -125,6 +124,8 @@ def ego_taken_for_world(
     Either they lie about the origin and the vehicle is far from it; or objects stay nearer to where they were if they
     are placed by the poses of the vehicle (f, 4, 4), NaN where unknown.
     """
+    from scipy.spatial import cKDTree
+
     doubt = Doubt(
         "frame",
         "positions look like coordinates of the vehicle, but are taken for the world: they move with it",

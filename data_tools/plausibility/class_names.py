@@ -44,7 +44,8 @@ def idle_rules(acting: Collection[str], classes: Collection[str]) -> Doubt | Non
     """Edge rules that act on classes (`acting`), none of which the objects have."""
     if not acting or not classes or set(acting) & set(classes):
         return None
-    meant = usual_classes(sorted(classes), acting) or dict.fromkeys(sorted(classes), sorted(acting)[0])
+    likely = "car" if "car" in acting else min(acting)
+    meant = usual_classes(sorted(classes), acting) or dict.fromkeys(sorted(classes), likely)
     mend = ",".join(f"{name}={ours}" for name, ours in meant.items())
     what = (
         f"no edges: tracker.edges act on {', '.join(sorted(acting))}, and the tracks are of "

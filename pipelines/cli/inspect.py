@@ -76,6 +76,8 @@ def inspect_table(
         typer.echo("  rows are not in order of time; add --sort")
     if meant:
         typer.echo(f"  no edge rule acts on {', '.join(meant)}; {_named(meant)}")
+    if survey.raw.present("ego_x").any() and "coordinates" not in survey.raw.columns and not survey.how.coordinates:
+        typer.echo("\nPositions are taken for world coordinates; if the vehicle is their origin: --coordinates ego")
     _show_next(survey, table, meant, "" if import_file is None else f" --import {shlex.quote(str(import_file))}", given)
 
 

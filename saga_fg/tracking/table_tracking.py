@@ -18,8 +18,8 @@ def track(
     """Track a `pandas.DataFrame` of detections, and return one of tracks: a row for each track and moment.
 
     detections  a row for each: timestamp (s, or times of pandas), x, y (m, in a frame that does not move), and where
-                known z, label, score, sensor, length, width, height, yaw (rad), vx, vy, range_rate; a row without x and
-                y is a moment at which nothing was detected
+                known z, label, score, sensor, length, width, height, yaw (rad), vx, vy, range_rate,
+                cov_xx, cov_xy, cov_yy (m^2); a row without x and y is a moment at which nothing was detected
     settings    of the tracker; by default tracks are reported from their second detection on
     sensors     models by name of the sensor
 

@@ -101,7 +101,8 @@ class Detections(Columns):
         """Return the rows of a `pandas.DataFrame` as detections of one moment.
 
         Columns: x, y, and where known z, length, width, height (m), yaw (rad), vx, vy (m/s), range_rate (m/s), score or
-        confidence, label or class. Missing values are unknown. Raises `InputError` naming the column.
+        confidence, label or class, cov_xx, cov_xy, cov_yy (of the position, m^2). Missing values are
+        unknown. Raises `InputError` naming the column.
         """
         return cls(*boxes_of_table(table))
 

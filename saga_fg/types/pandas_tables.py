@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, from_upper_triangle
 from saga_fg.types.boxes import Boxes
 
 Table = Any
@@ -25,8 +25,8 @@ UNNAMED = "object"
 """Class of detections without a column of classes; any name will do."""
 
 
-def boxes_of_table(table: Table) -> tuple[Boxes, FloatArray, FloatArray]:
-    """Return the rows of a table as boxes (N), scores (N,) and range rates (N,), all of one moment.
+def boxes_of_table(table: Table) -> tuple[Boxes, FloatArray, FloatArray, FloatArray]:
+    """Return the rows of a table as boxes (N), scores (N,), range rates (N,) and covariances (N, 2, 2) of positions.
 
     `Detections.from_pandas` has the columns. Raises `InputError` naming one that is missing or holds no numbers.
     """
@@ -39,7 +39,8 @@ def boxes_of_table(table: Table) -> tuple[Boxes, FloatArray, FloatArray]:
         _numbers(table, "yaw"),
         np.column_stack([_numbers(table, name) for name in ("vx", "vy")]).reshape(n, 2),
     )
-    return boxes, np.where(np.isnan(score), 1.0, score), _numbers(table, "range_rate")
+    covariance = np.column_stack([_numbers(table, name) for name in ("cov_xx", "cov_xy", "cov_yy")]).reshape(n, 3)
+    return boxes, np.where(np.isnan(score), 1.0, score), _numbers(table, "range_rate"), from_upper_triangle(covariance)
 
 
 def moments_of_table(table: Table) -> Iterator[tuple[float, str, Table]]:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.argoverse2 import ArgoverseLogs
-from data_tools.datasets.detection_files import read_detections, read_tracks
+from data_tools.datasets.detection_files import TruthFile, read_detections, read_tracks
 from data_tools.datasets.eth_ucy import EthUcy
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
@@ -34,7 +34,7 @@ from pipelines.config import load_config
 from pipelines.explaining import read_events
 from pipelines.report.run_record import read_run_record
 from pipelines.serving import StreamTracker
-from saga_fg.types.dataset import Scene
+from saga_fg.types.dataset import Dataset, Scene
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.nuscenes_example import box, results, write_results, write_tables
@@ -51,6 +51,10 @@ CSV = "timestamp,sensor,label,x,y,length,ego_x,ego_y,ego_yaw\n0,a,car,1,2,3,0,0,
 NDJSON = '{"timestamp": 0, "x": 1, "y": 2, "label": "car", "yaw": 0.5}\n{"timestamp": 1, "sensor": "b"}\n'
 TRACKS = (
     "scene,timestamp,id,label,x,y,vx,cov_xx,cov_xy,cov_yy\na,0,1,car,1,2,3,0.5,0.1,0.5\na,1,1,car,2,2,3,0.5,0,0.5\n"
+)
+OTHERS = (
+    "time,track_id,category,pos_x,pos_y,qw,qz,visible\n2023-11-14T22:13:20Z,a,CAR,1,2,1,0,1\n"
+    "2023-11-14T22:13:20.1Z,a,CAR,1.5,2,0.8,0.6,0\n"
 )
 LABELS = TRACKS.replace("cov_yy\n", "cov_yy,yaw_variance,source,quality\n").replace("0.5\n", "0.5,0.1,observed,high\n")
 G2O_2D = (
@@ -133,6 +137,8 @@ def targets(folder: Path) -> dict[str, Target]:
         "detections, NDJSON": one("table.ndjson", NDJSON, _read_table),
         "detections, NumPy": Target((npz,), lambda: _read_table(npz)),
         "tracks": one("tracks.csv", TRACKS, read_tracks),
+        "tracks of others": one("others.csv", OTHERS, lambda path: _scenes_of(TruthFile(path))),
+        **_arrow(folder),
         "labels": one("labels.csv", LABELS, read_label_table),
         "pose graph, plane": one("plane.g2o", G2O_2D, read_g2o),
         "pose graph, space": one("space.g2o", G2O_3D, read_g2o),
@@ -152,6 +158,30 @@ def targets(folder: Path) -> dict[str, Target]:
         "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),
         "run record": Target((table("r.run.json", RECORD),), lambda: read_run_record(folder / "r.json")),
         "stream": one("messages.ndjson", MESSAGES, lambda path: _stream(path, lambda: config.new_tracker("saga"))),
+    }
+
+
+def _scenes_of(dataset: Dataset) -> list[Scene]:
+    return [dataset.scene(name) for name in dataset.scenes]
+
+
+def _arrow(folder: Path) -> dict[str, Target]:
+    """Tables in the files of pyarrow, where it is installed."""
+    if importlib.util.find_spec("pyarrow") is None:
+        return {}
+    import pyarrow
+    import pyarrow.feather
+    import pyarrow.parquet
+
+    table = pyarrow.table(
+        {"ts_ns": [10**18, 10**18 + 10**8], "x": [1.0, None], "y": [2.0, None], "class": ["car", None]}
+    )
+    parquet, feather = folder / "table.parquet", folder / "table.feather"
+    pyarrow.parquet.write_table(table, parquet)
+    pyarrow.feather.write_feather(table, feather, compression="uncompressed")
+    return {
+        "detections, Parquet": Target((parquet,), lambda: _read_table(parquet)),
+        "detections, Feather": Target((feather,), lambda: _read_table(feather)),
     }
 
 

@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import shlex
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,22 @@ def write(path: Path, table: list[dict[str, Any]]) -> Path:
 
         pyarrow.parquet.write_table(pa.Table.from_pylist(table), path)
     return path
+
+
+def test_overlaps_are_those_that_both_have(tmp_path: Path) -> None:
+    _, true = rows()
+    flat = [{name: value for name, value in row.items() if name != "h"} for row in true]
+    for table, overlaps in ((true, {"2D", "3D"}), (flat, {"2D"})):
+        gt = write(tmp_path / "gt.csv", table)
+        result = saga_fg(
+            "evaluate", "file", gt, "--truth", gt, "--units", "angle=deg", "--hota", "--json", tmp_path / "f.json"
+        )
+        if find_spec("trackeval") is None:
+            pytest.skip("the extra [eval] is not installed")
+        assert result.exit_code == 0, result.output
+        hota = json.loads((tmp_path / "f.json").read_text())["hota"]["VEHICLE"]
+        assert set(hota) == {"threshold", *overlaps}
+        assert hota["2D"]["hota"] > 0.99
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -121,6 +138,8 @@ def test_tracks_of_another_tracker_and_its_own_clock(tmp_path: Path) -> None:
     figures = json.loads((tmp_path / "f.json").read_text())
     assert figures["tracking"]["car"]["recall"] == 1.0
     assert figures["errors"]["car"]["position"] == pytest.approx(0.3, abs=1e-6)
+    if find_spec("trackeval") is not None:  # the tracks are points: judged by the distances of centres
+        assert figures["hota"]["car"]["centre"]["hota"] > 0.85
 
 
 @pytest.mark.parametrize(

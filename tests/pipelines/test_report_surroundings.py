@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.area_map import clipped
+from data_tools.datasets.argoverse2.source import ArgoverseSource
 from data_tools.datasets.kitti.source import KittiSource
 from data_tools.datasets.nuscenes import NuScenes
 from data_tools.datasets.nuscenes.source import NuScenesSource
 from pipelines.report import Report, report_page
 from pipelines.report.images import thumbnails
 from pipelines.report.scenes import ReportScene, scene_data
-from saga_fg import InputError
+from saga_fg import InputError, Scene
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import VERSION, tables, write_tables
 from tests.pipelines.page_in_browser import tried_in_browser
@@ -118,6 +119,35 @@ def test_broken_maps_are_refused(root: Path) -> None:
     path.write_text("[]")
     with pytest.raises(InputError, match=r"expected a map with the layer node"):
         source_of(root).maps(scene_of(root))
+
+
+def points(*places: tuple[float, float]) -> list[dict[str, float]]:
+    return [{"x": x, "y": y, "z": 0.0} for x, y in places]
+
+
+def test_maps_of_argoverse_are_found(tmp_path: Path) -> None:
+    scene = Scene("log", np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)), ("", ""), ())
+    source = ArgoverseSource(dataroot=str(tmp_path))
+    assert source.maps({"log": scene}) == {}
+    content = {
+        "drivable_areas": {"1": {"area_boundary": points((-9, -9), (500, -9), (0, 9))}},
+        "pedestrian_crossings": {"2": {"edge1": points((0, 0), (0, 4)), "edge2": points((3, 0), (3, 4))}},
+        "lane_segments": {
+            "3": {"left_lane_boundary": points((0, 2), (9, 2)), "right_lane_boundary": points((400, 0), (409, 0))}
+        },
+    }
+    path = tmp_path / "log" / "map" / "log_map_archive_log____PAO_city_1.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(content))
+    known = source.maps({"log": scene})["log"]
+    (_, (area,)), (kind, (crossing,)) = known.areas
+    assert area[:, 0].max() == 120
+    assert (kind, crossing.tolist()) == ("crossing", [[0, 0], [0, 4], [3, 4], [3, 0]])  # no bow tie
+    assert [line.tolist() for line in known.lines] == [[[0, 2], [9, 2]]]
+    del content["lane_segments"]["3"]["left_lane_boundary"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"city_1\.json: expected a map of Argoverse 2: KeyError"):
+        source.maps({"log": scene})
 
 
 def test_a_ring_is_clipped_to_a_rectangle() -> None:

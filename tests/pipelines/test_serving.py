@@ -47,6 +47,19 @@ def test_edge_rules_that_meet_no_class_are_told_once(caplog: pytest.LogCaptureFi
         assert [record.levelname for record in caplog.records] == ["WARNING"] * told
 
 
+def test_what_looks_wrong_in_a_stream_is_told_once(caplog: pytest.LogCaptureFixture):
+    config = load_config("file")
+    for degrees in (True, False):
+        service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, Doubts(config))
+        caplog.clear()
+        for k in range(250):
+            yaw = (90.0 if k % 2 else 270.0) if degrees else 1.5
+            car = {"label": "car", "x": 1.0 * k, "y": 2.0, "score": 90.0 if degrees else 0.9, "yaw": yaw}
+            answers(service, encode({"timestamp": 0.1 * k, "detections": [car]}))
+        told = [record.getMessage().partition(":")[0] for record in caplog.records]
+        assert told == (["headings look like degrees", "scores are no shares"] if degrees else [])
+
+
 def answers(service: StreamTracker[str], *lines: bytes) -> list[dict[str, Any]]:
     return [answer for line in lines for _, answer in service.handle(line, "me")]
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from data_tools.datasets.annotated import AnnotatedSource
+from data_tools.datasets.area_map import AreaMap
 from data_tools.datasets.argoverse2.detections import AnnotatedLogs, DetectedLogs, is_feather
 from data_tools.datasets.argoverse2.logs import FILES, ArgoverseLogs
 from data_tools.datasets.argoverse2.results import (
@@ -16,12 +17,13 @@ from data_tools.datasets.argoverse2.results import (
     write_feather_tracks,
     write_submission,
 )
+from data_tools.datasets.argoverse2.vector_maps import argoverse_maps
 from data_tools.datasets.detection_files import read_detections
 from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.datasets.source import ChosenScenes, TrackedScenes, option
-from data_tools.files.remote_files import local_copy, local_tree
+from data_tools.files.remote_files import is_url, local_copy, local_tree
 from saga_fg.errors import InputError
-from saga_fg.types.dataset import Dataset
+from saga_fg.types.dataset import Dataset, Scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +91,9 @@ class ArgoverseSource(AnnotatedSource):
             scenes = {name: dataset.scene(name) for name in names}
             rows = read_feather_tracks(result, scenes)
         return {name: scene_result(scene, rows, result) for name, scene in scenes.items()}
+
+    def maps(self, scenes: Mapping[str, Scene]) -> Mapping[str, AreaMap]:
+        return {} if is_url(self.dataroot) else argoverse_maps(Path(self.dataroot), scenes)
 
     def _chosen(self, dataset: Dataset) -> Dataset:
         return dataset if self.scenes is None else ChosenScenes(dataset, self.scenes)

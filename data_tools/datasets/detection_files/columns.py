@@ -158,17 +158,17 @@ class RawTable:
 
     def _in_our_unit(self, name: str) -> FloatArray:
         numbers = self.plain_numbers(name)
+        with np.errstate(over="ignore"):  # is infinite then
+            if name == "timestamp":
+                numbers = self.clock.seconds(numbers)
+            else:
+                of, power = _measured(name)
+                unit = self.how.unit(of, self.found.units.get(of))
+                numbers = numbers if unit is None else numbers * factor(of, unit) ** power
         if np.isinf(numbers).any():
             where = self.where(int(np.argmax(np.isinf(numbers))))
             raise InputError(f"{self.path}: {where}: {self.title(name)}: expected a finite number, got inf")
-        if name == "timestamp":
-            return self.clock.seconds(numbers)
-        if name.startswith("cov_"):
-            of = "vx" if name.startswith("cov_v") else "x"
-            unit = self.how.unit(of, self.found.units.get(of))
-            return numbers if unit is None else numbers * factor(of, unit) ** 2
-        unit = self.how.unit(name, self.found.units.get(name))
-        return numbers if unit is None else numbers * factor(name, unit)
+        return numbers
 
     def plain_numbers(self, name: str) -> FloatArray:
         """A column (N,) in the unit of the file, NaN where left out; dates as s. Raises as `numbers`."""
@@ -209,7 +209,8 @@ class RawTable:
         parts = np.stack([self.numbers(part, np.nan if part in self.columns else 0.0) for part in names], axis=-1)
         known = np.flatnonzero(np.isfinite(parts).all(axis=1))
         yaw = np.full(self.length, np.nan)
-        norm = np.linalg.norm(parts[known], axis=1)
+        with np.errstate(over="ignore"):  # is odd then
+            norm = np.linalg.norm(parts[known], axis=1)
         odd = np.abs(norm - 1) > 0.01
         if odd.any():
             at = int(np.argmax(odd))
@@ -218,6 +219,13 @@ class RawTable:
         unit = checked_quaternions(" ".join(names), parts[known] / norm[:, None])
         yaw[known] = yaw_of(quaternion_rotation(unit))
         return yaw
+
+
+def _measured(name: str) -> tuple[str, int]:
+    """The column whose unit a column has, and its power: covariances have the square of what varies."""
+    if name.startswith("cov_"):
+        return ("vx" if name.startswith("cov_v") else "x"), 2
+    return name, 1
 
 
 def clock_of(table: RawTable) -> Clock:

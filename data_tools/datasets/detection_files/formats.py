@@ -158,8 +158,14 @@ def _read_csv(reading: _Reading) -> Iterator[RawTable]:
 
 
 def _csv_rows(path: Path, file: TextIO) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers and values; a value in quotes ends on its line, so that a stray quote swallows no others."""
-    reader = csv.reader(file, strict=True)
+    """Line numbers and values, which commas, semicolons or tabs separate.
+
+    A value in quotes ends on its line, so that a stray quote swallows no others.
+    """
+    header = file.readline()
+    file.seek(0)
+    separator = next((each for each in ",;\t" if each in header), ",")
+    reader = csv.reader(file, delimiter=separator, strict=True)
     while True:
         number = reader.line_num + 1
         try:

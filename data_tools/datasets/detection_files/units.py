@@ -91,7 +91,8 @@ class Clock:
         largest = float(np.abs(known).max(initial=0.0))
         if largest <= _LARGEST_SECONDS:
             return cls()
-        step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+        with np.errstate(over="ignore"):  # damaged numbers
+            step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
         likely = [unit for unit, most in (("ms", 1e14), ("us", 1e17), ("ns", np.inf)) if largest < most]
         fitting = [unit for unit in likely if step * FACTORS["time"][unit] <= _LONGEST_STEP]
         return cls((fitting or likely)[0], guessed=True)

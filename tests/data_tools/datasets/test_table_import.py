@@ -74,6 +74,13 @@ def test_classes_are_renamed_and_left_out_and_their_frames_stay(tmp_path: Path, 
     assert [frame.detections.boxes.label.tolist() for frame in frames] == [["car"], []]
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_values_may_be_separated_by_other_signs(tmp_path: Path, separator: str) -> None:
+    path = tmp_path / "drive.csv"
+    path.write_text("time,x,y\n0,1,2\n".replace(",", separator), encoding="utf-8-sig")
+    assert read_detections(path).scene("drive").frames[0].detections[0].position == (1.0, 2.0, 0.0)
+
+
 def test_columns_that_are_named_win_and_may_be_left_out(tmp_path: Path) -> None:
     path = table(tmp_path, [{"time": 1, "x": 1, "y": 2, "weird": 7, "length": 3, "width": 4}])
     how = TableImport(columns={"x": "weird", "length": "width", "width": "length", "score": ""})

@@ -32,6 +32,7 @@ SIZES = {
     "poses, KITTI": 2,
     "poses, TUM": 2,
     "scan, KITTI": 3,
+    "tracks of others": 1,
     "scan, nuScenes": 3,
     "scan, PCD": 2,
     "scan, PLY": 2,
@@ -50,6 +51,8 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
 def test_what_is_whole_is_read(valid: dict[str, Target]) -> None:
     read: dict[str, Any] = {name: target.read() for name, target in valid.items()}
     assert len(read.pop("Argoverse", "ab")) == len(read.pop("OpenACC", "ab")) == 2  # need pyarrow
+    for name in ("detections, Parquet", "detections, Feather"):
+        assert len(read.pop(name, "a")) == 1
     assert {name: len(content) for name, content in read.items() if isinstance(content, Sized)} == SIZES
     assert [len(scene) for scene in read["nuScenes"]] == [3, 2]
     assert len(read["tracks"].id) == len(read["labels"].tracks.id) == 2

@@ -25,11 +25,14 @@ def test_all_columns_become_detections() -> None:
         {
             "x": [1.0, 2.0], "y": [3.0, 4.0], "z": [0.5, None], "length": [4.0, None], "width": [2.0, 1.0],
             "height": [1.5, 1.6], "yaw": [0.1, np.nan], "vx": [5.0, None], "vy": [0.0, None], "range_rate": [1.0, None],
+            "cov_xx": [0.4, 1.0], "cov_xy": [0.1, 0.0], "cov_yy": [0.3, 2.0],
             "confidence": [0.7, 0.8], "class": ["car", "truck"], "colour": ["red", "blue"],
         }
     )  # fmt: skip
     found = Detections.from_pandas(rows)
-    assert found[0] == Detection("car", (1.0, 3.0, 0.5), (4.0, 2.0, 1.5), found.boxes.yaw[0], (5.0, 0.0), 0.7, 1.0)
+    assert found[0] == Detection(
+        "car", (1.0, 3.0, 0.5), (4.0, 2.0, 1.5), found.boxes.yaw[0], (5.0, 0.0), 0.7, 1.0, (0.4, 0.1, 0.3)
+    )
     assert found.boxes.label.tolist() == ["car", "truck"]
     assert found.boxes.position[1].tolist() == [2.0, 4.0, 0.0]
     assert np.isnan(found.boxes.velocity[1]).all()
