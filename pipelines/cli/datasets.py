@@ -165,10 +165,13 @@ def _examples(verb: Verb, source: Source, examples: tuple[str, ...]) -> str:
     """Worked examples, in lines that are not too long."""
     required = [each.name for each in _parameters(source, verb, False) if each.default is inspect.Parameter.empty]
     options = source.example or " ".join(f"--{name.replace('_', '-')} {name.upper()}" for name in required)
-    recordings = f"{source.name} {options}"
     arguments = [f"--{each.name} " for each in fields(source) if each.metadata.get("argument")]
+    recordings = f"{source.name} {options}"
     result = "labels" if verb == "evaluate labels" else source.tracks_example
     beside = f"{source.name} {result} {''.join(arguments)}{options}"
+    if verb == "evaluate" and any(each.name == "truth" for each in fields(source)):  # there is none but by this option
+        recordings = f"{source.name} {''.join(arguments)}{options} --truth truth.csv"
+        beside = f"{source.name} {result} --truth truth.csv"
     lines = []
     for example in examples:
         line = "  saga-fg " + example.format(recordings=recordings, result=beside, name=source.name, tracks=result)
