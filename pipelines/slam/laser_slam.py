@@ -20,6 +20,7 @@ import numpy as np
 from data_tools.laser.carmen import LaserLog
 from data_tools.laser.line_map import Fit, LineMap, thinned
 from data_tools.laser.score_grid import ScoreGrid
+from pipelines.slam.planar_poses import heading, moved, transform, transforms, vector, vectors
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import Positive, Range, Settings, setting
@@ -36,7 +37,7 @@ _WAITING = 15.0  # m of way that a loop waits
 _LEAST_POINTS = 20
 _POOR = 0.8  # share of a scan that lies on the local map, below which the pose is searched
 _REACHES = (0.6, 0.3)  # m, of registrations with other passes, in turn
-_LONGEST = 60.0  # m of way from which the search for the heading does not grow
+_LONGEST = 60.0  # m of way from which the search of headings does not grow
 _RADIAN = 0.5  # m of way that a radian of turning counts as
 _DOUBT = 0.2  # share of a difference between wheels and registration that counts as standard deviation: one errs
 _TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
@@ -120,16 +121,15 @@ class LaserSlam:
             self._matched.append(self._at)
             self._add_keyframe(points, self._at, np.eye(3))
             return self._at
-        moved = np.linalg.inv(self._odometry) @ wheels
-        way, turn = np.hypot(moved[0, 2], moved[1, 2]), abs(heading(moved))
-        predicted = self._at @ moved
+        step = np.linalg.inv(self._odometry) @ wheels
+        way, turn = np.hypot(step[0, 2], step[1, 2]), abs(heading(step))
+        predicted = self._at @ step
         if (way < self.settings.scan_step and turn < np.deg2rad(3)) or len(points) < _LEAST_POINTS:
             self._matched.append(predicted)
             return self._now(predicted)
         self._at, self._odometry = self._registered(points, predicted, way, turn), wheels
         self._matched.append(self._at)
-        last = self._keyframes[-1].matched
-        since = np.linalg.inv(last) @ self._at
+        since = np.linalg.inv(self._keyframes[-1].matched) @ self._at
         if (
             np.hypot(since[0, 2], since[1, 2]) > self.settings.keyframe_step
             or abs(heading(since)) > self.settings.keyframe_turn
@@ -190,7 +190,7 @@ class LaserSlam:
             self._graph.append(since, _covariance(self._information, matched) + np.diag(doubt**2))
         self._wheels = self._odometry
         recent = [frame for frame in frames if frame.way > way - s.local_map]
-        self._map = LineMap.of(np.concatenate([_moved(frame.points, frame.matched) for frame in recent]))
+        self._map = LineMap.of(np.concatenate([moved(frame.points, frame.matched) for frame in recent]))
         self._grid = None
         first = self._submaps[-1].end if self._submaps else 0
         if way - frames[first].way > s.submap:
@@ -265,7 +265,7 @@ class LaserSlam:
 
     def _joined(self, frames: list[_Keyframe], centre: _Keyframe) -> FloatArray:
         back = np.linalg.inv(centre.matched)
-        return np.concatenate([_moved(frame.points, back @ frame.matched) for frame in frames])
+        return np.concatenate([moved(frame.points, back @ frame.matched) for frame in frames])
 
     def _passes(self, poses: FloatArray, reach: float) -> list[Measured]:
         """Registrations of each keyframe with the map of every other pass nearby."""
@@ -315,39 +315,6 @@ def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: P
         if progress is not None:
             progress("scans", row + 1, len(log))
     return slam.finish(progress)
-
-
-def transforms(x: FloatArray) -> FloatArray:
-    """Poses (n, 3): x, y, heading as (n, 3, 3)."""
-    c, s = np.cos(x[:, 2]), np.sin(x[:, 2])
-    T = np.tile(np.eye(3), (len(x), 1, 1))
-    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
-    T[:, :2, 2] = x[:, :2]
-    return T
-
-
-def transform(x: FloatArray) -> FloatArray:
-    """A pose (3,) as (3, 3)."""
-    return np.asarray(transforms(x[None])[0])
-
-
-def vectors(T: FloatArray) -> FloatArray:
-    """Poses (n, 3, 3) as x, y, heading (n, 3)."""
-    return np.stack([T[:, 0, 2], T[:, 1, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])], axis=1)
-
-
-def vector(T: FloatArray) -> FloatArray:
-    """A pose (3, 3) as x, y, heading."""
-    return np.asarray(vectors(T[None])[0])
-
-
-def heading(T: FloatArray) -> float:
-    """The heading of a pose (3, 3)."""
-    return float(np.arctan2(T[1, 0], T[0, 0]))
-
-
-def _moved(points: FloatArray, T: FloatArray) -> FloatArray:
-    return np.asarray(points @ T[:2, :2].T + T[:2, 2])
 
 
 def _between(frames: list[_Keyframe], one: int, other: int) -> FloatArray:
