@@ -39,9 +39,11 @@ if TYPE_CHECKING:
     from saga_fg.types.dataset import Dataset, Scene
     from saga_fg.types.track import Tracks
 
-Verb = Literal["track", "smooth", "evaluate", "evaluate labels", "report", "view", "learn noise", "learn interactions"]
+Verb = Literal[
+    "track", "smooth", "evaluate", "evaluate labels", "benchmark", "report", "view", "learn noise", "learn interactions"
+]
 
-TRACKING: tuple[Verb, ...] = ("track", "smooth", "evaluate labels", "learn noise")
+TRACKING: tuple[Verb, ...] = ("track", "smooth", "evaluate labels", "benchmark", "learn noise")
 """Verbs that need detections."""
 
 TrackedScenes = Iterable[tuple["Scene", Sequence["Tracks"]]]
@@ -127,6 +129,7 @@ class DatasetSource(ABC):
     example         options of the examples in the help
     tracks          what `track` writes, for the help; tracks_example: such a name
     merged          result of all parts in parallel, "" for none: of tracks, of labels
+    all_tracks      what holds the tracks of all parts of a parallel run, for `benchmark`; "" for none
     summarised      whether figures have a narrow summary
     """
 
@@ -137,6 +140,7 @@ class DatasetSource(ABC):
     tracks: ClassVar[str] = "Table of tracks to write: .csv, .ndjson or .jsonl."
     tracks_example: ClassVar[str] = "tracks.csv"
     merged: ClassVar[tuple[str, str]] = ("", "")
+    all_tracks: ClassVar[str] = ""
     summarised: ClassVar[bool] = False
 
     @property
@@ -218,6 +222,10 @@ class DatasetSource(ABC):
     def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         """Join the results of all parts of a parallel run to the file `merged`."""
         return
+
+    def write_submission(self, output: Path) -> Path | None:
+        """Write what the official server takes, beside the tracks of all parts; returns its place, None for none."""
+        return None
 
     def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         """Join the labels of all parts of a parallel run to the file `merged`."""

@@ -12,11 +12,13 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from data_tools.files.input_files import open_bytes
 from saga_fg.errors import InputError
 
 LEFTOVER = re.compile(r"\.(.*)\.[0-9a-f]{12}\.tmp", re.DOTALL)  # temporary name of a file or folder
@@ -68,6 +70,17 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def write_text(path: str | Path, content: str) -> None:
     """Write a whole UTF-8 text file atomically. Raises `InputError` as `atomic_file` does."""
     write_bytes(path, content.encode("utf-8"))
+
+
+def write_zip(path: str | Path, files: Iterable[Path]) -> Path:
+    """Write a ZIP archive of files, by their names without folders; the same files make the same bytes."""
+    with atomic_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for each in files:
+            entry = zipfile.ZipInfo(each.name)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with open_bytes(each) as source, archive.open(entry, "w") as target:
+                shutil.copyfileobj(source, target, 1 << 20)
+    return Path(path)
 
 
 def check_writable(path: str | Path) -> None:

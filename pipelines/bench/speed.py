@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from saga_fg.types.frame import Frame
 METHODS: tuple[Method, ...] = ("saga", "kf", "centerpoint")
 FROZEN = "centerpoint, frozen"
 RECORDINGS = {"nuscenes": ("megvii", "scene-0655"), "kitti": ("kitti", "0011")}  # set and scene, neither the smallest
+ISAM2_ON = ("nuscenes",)
 TIES: tuple[Ties, ...] = ("loose", "dense")
 WARM_UP = 5  # frames that are not counted: tracks are new
 EVERY = 5  # frames from one reading of the fixed clocks to the next
@@ -104,6 +105,14 @@ class SpeedCase:
     def name(self) -> str:
         return self.kind if self.size is None else f"{self.size} {self.kind}"
 
+    def contenders(self, methods: Sequence[Method]) -> dict[str, tuple[TrackConfig, Method]]:
+        """Trackers by name: the methods, and `saga` with iSAM2 on recordings of `ISAM2_ON`."""
+        found: dict[str, tuple[TrackConfig, Method]] = {method: (self.config, method) for method in methods}
+        if self.kind in ISAM2_ON and "saga" in methods:
+            tracker = replace(self.config.tracker, estimator="isam2")
+            found["saga, isam2"] = replace(self.config, tracker=tracker), "saga"
+        return found
+
 
 def speed_cases(settings: SpeedBenchSettings, data: Path | None) -> Iterator[SpeedCase]:
     """The recordings in `data`, then simulated objects, from few to many."""
@@ -148,19 +157,20 @@ def _measured(
     case: SpeedCase, methods: Sequence[Method], settings: SpeedBenchSettings, progress: Progress | None
 ) -> tuple[list[SpeedRow], dict[str, float]]:
     """The rows of a case, and the seconds that each method took; a case ends early when these run out."""
-    clocks = {str(method): StageClock() for method in methods}
-    trackers = {str(method): case.config.new_tracker(method, clocks[method]) for method in methods}
+    contenders = case.contenders(methods)
+    clocks = {name: StageClock() for name in contenders}
+    trackers = {name: config.new_tracker(method, clocks[name]) for name, (config, method) in contenders.items()}
     frozen, references = FrozenGreedy(), {"filters": _Filters().step, "svd": _svd}
-    times: dict[str, list[float]] = {name: [] for name in (*methods, FROZEN, *references)}
+    times: dict[str, list[float]] = {name: [] for name in (*contenders, FROZEN, *references)}
     stages: dict[str, dict[str, float]] = {}
-    reported: dict[str, list[int]] = {method: [] for method in methods}
+    reported: dict[str, list[int]] = {name: [] for name in contenders}
     for number, frame in enumerate(case.frames):
         if number == WARM_UP:
-            stages = {method: dict(clock.seconds) for method, clock in clocks.items()}
-        for method in methods:
-            clocks[method].start()
-            times[method].append(timed(partial(trackers[method].step, frame)))
-            reported[method].append(len(trackers[method].tracks(frame.timestamp).id))
+            stages = {name: dict(clock.seconds) for name, clock in clocks.items()}
+        for name, tracker in trackers.items():
+            clocks[name].start()
+            times[name].append(timed(partial(tracker.step, frame)))
+            reported[name].append(len(tracker.tracks(frame.timestamp).id))
         detections = sensor_model(case.config.sensors, frame.sensor).in_world(frame)
         boxes = detections.boxes
         taken = partial(frozen.step, frame.timestamp, boxes.label, boxes.position, detections.score)
@@ -169,7 +179,7 @@ def _measured(
             times[name].append(timed(run))
         if progress is not None:
             progress(case.name, number + 1, len(case.frames))
-        if number > WARM_UP and max((sum(times[m]) for m in methods), default=0.0) > 1e3 * settings.seconds:
+        if number > WARM_UP and max((sum(times[name]) for name in contenders), default=0.0) > 1e3 * settings.seconds:
             break
     first = min(WARM_UP, len(times[FROZEN]) - 1)
     counted = {name: spent if name in references else spent[first:] for name, spent in times.items()}

@@ -21,4 +21,4 @@ for command in (estimators, gaps, loops, service, slam, speed, tracking):
 
 @bench_app.callback()
 def bench() -> None:
-    """Measure: every figure is compared with a baseline in the same run. More of them: `python -m benchmarks`."""
+    """Measure saga-fg beside baselines in the same run. Official figures of a dataset: `saga-fg benchmark`."""

@@ -26,6 +26,7 @@ def dataset_commands(
     run: Callable[..., None],
     examples: tuple[str, ...],
     texts: Callable[[Source], Mapping[str, str | None]] = lambda source: {},
+    listed: Callable[[Source], bool] | None = None,
 ) -> type[TyperGroup]:
     """A group with a command `saga-fg VERB DATASET` for each dataset, beside those that are added to it.
 
@@ -34,13 +35,15 @@ def dataset_commands(
     examples  what follows `saga-fg`, with the fields {recordings}: name and options of the dataset, {result}: the same
               with a result, {name} alone, {tracks}: name of a result alone
     texts     of the verb's options that differ for a dataset, by parameter; None leaves the option out
+    listed    which datasets the help lists; all if left out
     """
 
     class DatasetGroup(TyperGroup):
         def list_commands(self, ctx: Any) -> list[str]:
             from data_tools.datasets.registry import dataset_names
 
-            return [*dataset_names(), *super().list_commands(ctx)]
+            names = [name for name in dataset_names() if listed is None or _is_listed(name, listed)]
+            return [*names, *super().list_commands(ctx)]
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
             from data_tools.datasets.registry import dataset_names, dataset_source
@@ -56,6 +59,15 @@ def dataset_commands(
                 return _broken(cmd_name, error)  # so that the list of all datasets can be shown
 
     return DatasetGroup
+
+
+def _is_listed(name: str, listed: Callable[[Source], bool]) -> bool:
+    from data_tools.datasets.registry import dataset_source
+
+    try:
+        return listed(dataset_source(name))
+    except InputError:
+        return True  # its command says what is wrong with it
 
 
 def _command(
@@ -165,10 +177,13 @@ def _examples(verb: Verb, source: Source, examples: tuple[str, ...]) -> str:
     """Worked examples, in lines that are not too long."""
     required = [each.name for each in _parameters(source, verb, False) if each.default is inspect.Parameter.empty]
     options = source.example or " ".join(f"--{name.replace('_', '-')} {name.upper()}" for name in required)
-    recordings = f"{source.name} {options}"
     arguments = [f"--{each.name} " for each in fields(source) if each.metadata.get("argument")]
+    recordings = f"{source.name} {options}"
     result = "labels" if verb == "evaluate labels" else source.tracks_example
     beside = f"{source.name} {result} {''.join(arguments)}{options}"
+    if verb == "evaluate" and any(each.name == "truth" for each in fields(source)):  # there is none but by this option
+        recordings = f"{source.name} {''.join(arguments)}{options} --truth truth.csv"
+        beside = f"{source.name} {result} --truth truth.csv"
     lines = []
     for example in examples:
         line = "  saga-fg " + example.format(recordings=recordings, result=beside, name=source.name, tracks=result)

@@ -43,6 +43,8 @@ NUMBERS = (*POSITION, *SIZE, "yaw", *VELOCITY, "score")
 MEASURED = (*NUMBERS, "range_rate")  # of a detection
 FRAME_KEYS = ("type", "seq", "timestamp", "sensor", "coordinates", "ego", "detections")
 DEFAULTS = {"z": 0.0, "score": 1.0}
+_ABSENT = tuple((name, None if name in ("x", "y") else DEFAULTS.get(name, np.nan)) for name in MEASURED)
+_DETECTION_KEYS = frozenset(("label", *MEASURED))
 LONGEST_NAME = 64  # characters of a label or a sensor: names are kept
 
 
@@ -226,6 +228,35 @@ def _frame_message(message: Mapping[str, Any], settings: StreamSettings) -> Fram
 
 def _detections(rows: Sequence[Any]) -> tuple[Detections, FloatArray]:
     """The detections, and their headings before they are wrapped."""
+    labels, numbers = _plain_rows(rows) or _checked_rows(rows)
+    columns = dict(zip(MEASURED, numbers.T, strict=True))
+
+    def stacked(names: Sequence[str]) -> FloatArray:
+        return np.stack([columns[name] for name in names], axis=-1)
+
+    boxes = Boxes.of(labels, stacked(POSITION), stacked(SIZE), columns["yaw"], stacked(VELOCITY))
+    return Detections(boxes, columns["score"], columns["range_rate"]), columns["yaw"]
+
+
+def _plain_rows(rows: Sequence[Any]) -> tuple[list[str], FloatArray] | None:
+    """Labels (m,) and numbers (m, len(MEASURED)) of detections; None where one of them is not as it should be."""
+    if not all(type(row) is dict and row.keys() <= _DETECTION_KEYS for row in rows):
+        return None
+    labels = [row.get("label", "object") for row in rows]
+    if not all(type(label) is str and 0 < len(label) <= LONGEST_NAME for label in labels):
+        return None
+    values = [row.get(name, absent) for row in rows for name, absent in _ABSENT]
+    if not {type(value) for value in values} <= {int, float}:
+        return None
+    try:
+        numbers = np.array(values, dtype=np.float64).reshape(len(rows), len(MEASURED))
+    except OverflowError:
+        return None
+    return None if np.isinf(numbers).any() else (labels, numbers)  # JSON has no NaN: that is what is left out
+
+
+def _checked_rows(rows: Sequence[Any]) -> tuple[list[str], FloatArray]:
+    """The same row by row; raises `InputError` for the first that is not as it should be."""
     numbers = np.empty((len(rows), len(MEASURED)))
     labels = []
     for k, row in enumerate(rows):
@@ -234,17 +265,8 @@ def _detections(rows: Sequence[Any]) -> tuple[Detections, FloatArray]:
             raise InputError(f"{where}: expected an object, got {_short(row)}")
         _known(f"{where}.", row, ("label", *MEASURED))
         labels.append(_name(f"{where}.", row, "label", "object"))
-        numbers[k] = [
-            _number(f"{where}.", row, name, None if name in ("x", "y") else DEFAULTS.get(name, np.nan))
-            for name in MEASURED
-        ]
-    columns = dict(zip(MEASURED, numbers.T, strict=True))
-
-    def stacked(names: Sequence[str]) -> FloatArray:
-        return np.stack([columns[name] for name in names], axis=-1)
-
-    boxes = Boxes.of(labels, stacked(POSITION), stacked(SIZE), columns["yaw"], stacked(VELOCITY))
-    return Detections(boxes, columns["score"], columns["range_rate"]), columns["yaw"]
+        numbers[k] = [_number(f"{where}.", row, name, absent) for name, absent in _ABSENT]
+    return labels, numbers
 
 
 def _pose(ego: Any) -> FloatArray:

@@ -17,7 +17,8 @@ from data_tools.laser import LaserLog, OccupancyGrid
 from data_tools.plots import occupancy_picture, png
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import write_tum_poses
-from pipelines.slam.laser_slam import LaserPath, transforms
+from pipelines.slam.laser_slam import LaserPath
+from pipelines.slam.planar_poses import transforms
 from pipelines.slam.results import planar_trajectory
 from saga_fg.numerics.arrays import FloatArray
 

@@ -2,10 +2,10 @@
 
 1. Each scan that has moved is registered with a map of the last keyframes, point to line; odometry is its prior.
 2. A keyframe comes every half metre or 30 degrees, and is measured from the one before: a graph that runs (iSAM2).
-3. Loops: each keyframe, with those just before it, is searched for in older submaps by branch and bound, inside the
-   window that the graph leaves open: it grows with the way along measurements between them, so that what has been
-   closed before is searched closely and what has drifted widely. A place that has a rival is no loop. What is found is
-   registered point to line, and must determine all three coordinates.
+3. Loops: each second keyframe, with those just before it, is searched for in older submaps by branch and bound, inside
+   the window that the graph leaves open: it grows with the way along measurements between them, so that what has been
+   closed before is searched closely and what has drifted widely. A place that has a rival is no loop; one found in a
+   wide window waits for another that agrees with it. A bare corridor says nothing along itself.
 4. At the end false loops are found by consensus, and all keyframes are registered anew with every other pass of the
    same place, twice.
 """
@@ -18,19 +18,29 @@ from typing import Annotated
 import numpy as np
 
 from data_tools.laser.carmen import LaserLog
-from data_tools.laser.line_map import LineMap, thinned
+from data_tools.laser.line_map import Fit, LineMap, thinned
 from data_tools.laser.score_grid import ScoreGrid
+from pipelines.slam.planar_poses import heading, moved, transform, transforms, vector, vectors
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import Positive, PositiveInt, Range, Settings, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
 from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
 
 _SMEAR = 4.0  # how often the points of a wall say the same: information of a registration is divided by this
 _FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any number of points, m^2 and rad^2
-_DETERMINED = 0.02  # least ratio of information along and across of a loop: not a bare corridor
+_DETERMINED = 0.05  # ratio of information along and across below which a place is a bare corridor
+_KNOWN = 0.8  # m, half width of a window up to which a corridor may be recognised: it then says nothing along it
+_UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
+_AGREED = np.array([0.3, 0.06])  # m and rad that two such may differ by, and 0.03 of the way between them
+_WAITING = 15.0  # m of way that a loop waits
 _LEAST_POINTS = 20
-_TIGHT = 60.0  # m of way up to which a window stays small
+_POOR = 0.8  # share of a scan that lies on the local map, below which the pose is searched
+_REACHES = (0.6, 0.3)  # m, of registrations with other passes, in turn
+_LONGEST = 60.0  # m of way from which the search of headings does not grow
+_RADIAN = 0.5  # m of way that a radian of turning counts as
+_DOUBT = 0.2  # share of a difference between wheels and registration that counts as standard deviation: one errs
+_TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
 
 
 @dataclass(frozen=True)
@@ -41,8 +51,8 @@ class LaserSettings(Settings):
     scan_step: Positive = setting(0.1, "m: scans that moved less, and turned less than 3 degrees, are not registered")
     keyframe_step: Positive = setting(0.5, "m between keyframes, 0.2 to 2; smaller costs time")
     keyframe_turn: Positive = setting(0.5, "rad between keyframes")
-    local_keyframes: PositiveInt = setting(12, "keyframes in the map that scans are registered with")
-    submap_keyframes: PositiveInt = setting(16, "keyframes of a submap in which loops are searched")
+    local_map: Positive = setting(10.0, "m of way whose keyframes scans are registered with")
+    submap: Positive = setting(10.0, "m of way in a submap in which loops are searched")
     odometry_drift: Positive = setting(0.15, "error of the wheels, share of the way: standard deviation")
     odometry_turn: Positive = setting(0.1, "error of the wheels, rad per rad and per 2 m: standard deviation")
     loop_score: Annotated[float, Range(0, 1)] = setting(0.6, "least mean score of a loop; raised: fewer, surer loops")
@@ -51,11 +61,23 @@ class LaserSettings(Settings):
 
 @dataclass(eq=False)
 class _Keyframe:
-    """A scan (n, 2) of the graph, its pose by scan matching alone, and the row of the scan."""
+    """A scan (n, 2) of the graph, its pose by scan matching alone, the row of the scan, and the way until there, m."""
 
     points: FloatArray
     matched: FloatArray
     row: int
+    way: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Submap:
+    """Keyframes from `first` to before `end`, in the frame of `centre`."""
+
+    first: int
+    end: int
+    centre: int
+    grid: ScoreGrid
+    lines: LineMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +104,13 @@ class LaserSlam:
     _matched: list[FloatArray] = field(default_factory=list)
     _graph: RunningPoseGraph | None = None
     _map: LineMap | None = None
+    _grid: ScoreGrid | None = None
     _at: FloatArray = field(default_factory=lambda: np.eye(3))
     _odometry: FloatArray | None = None
+    _wheels: FloatArray = field(default_factory=lambda: np.eye(3))
     _information: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
-    _submaps: dict[int, tuple[ScoreGrid, LineMap]] = field(default_factory=dict)
+    _submaps: list[_Submap] = field(default_factory=list)
+    _waiting: list[Measured] = field(default_factory=list)
 
     def step(self, points: FloatArray, odometry: FloatArray) -> FloatArray:
         """Take a scan, points (n, 2) in the laser's frame, and the wheels' pose (3,); returns the pose (3, 3) now."""
@@ -96,16 +121,15 @@ class LaserSlam:
             self._matched.append(self._at)
             self._add_keyframe(points, self._at, np.eye(3))
             return self._at
-        moved = np.linalg.inv(self._odometry) @ wheels
-        way, turn = np.hypot(moved[0, 2], moved[1, 2]), abs(heading(moved))
-        predicted = self._at @ moved
+        step = np.linalg.inv(self._odometry) @ wheels
+        way, turn = np.hypot(step[0, 2], step[1, 2]), abs(heading(step))
+        predicted = self._at @ step
         if (way < self.settings.scan_step and turn < np.deg2rad(3)) or len(points) < _LEAST_POINTS:
             self._matched.append(predicted)
             return self._now(predicted)
         self._at, self._odometry = self._registered(points, predicted, way, turn), wheels
         self._matched.append(self._at)
-        last = self._keyframes[-1].matched
-        since = np.linalg.inv(last) @ self._at
+        since = np.linalg.inv(self._keyframes[-1].matched) @ self._at
         if (
             np.hypot(since[0, 2], since[1, 2]) > self.settings.keyframe_step
             or abs(heading(since)) > self.settings.keyframe_turn
@@ -120,10 +144,10 @@ class LaserSlam:
         loops = int((np.abs(agreed.graph.second - agreed.graph.first) > 1).sum())
         rejected = int((~agreed.kept).sum())
         graph = agreed.graph
-        for turn in range(2):
-            again = self._passes(graph.world_T_pose)
+        for turn, reach in enumerate(_REACHES):
+            again = self._passes(graph.world_T_pose, reach)
             if progress is not None:
-                progress("registering passes", turn + 1, 2)
+                progress("registering passes", turn + 1, len(_REACHES))
             if again:
                 graph = self._graph.settled(again).graph
         rows = np.array([frame.row for frame in self._keyframes])
@@ -143,10 +167,10 @@ class LaserSlam:
         prior = np.diag(sigma**-2.0)
         scan = thinned(points, 0.05)
         fit = self._map.fit(scan, vector(predicted), prior, reach=min(1.0, 0.3 + way))
-        if fit.share < 0.5:  # the wheels slipped, or much of what is seen is new
+        if fit.share < _POOR:  # a fast turn, wheels that slipped, or much of what is seen is new
             local = scan if len(scan) <= 200 else scan[:: len(scan) // 200 + 1]
-            grid = ScoreGrid.of(self._map.points)
-            found = grid.search(local, vector(predicted), 0.3 + way, 0.2 + turn / 2, 0.5)
+            self._grid = self._grid or ScoreGrid.of(self._map.points)
+            found = self._grid.search(local, vector(predicted), 0.2 + way / 2, 0.1 + turn / 2, 0.4)
             if found is not None:
                 other = self._map.fit(scan, found.pose, 0.01 * prior, reach=0.3)
                 fit = max(fit, other, key=lambda each: each.share)
@@ -154,67 +178,85 @@ class LaserSlam:
         return transform(fit.pose)
 
     def _add_keyframe(self, points: FloatArray, matched: FloatArray, since: FloatArray) -> None:
-        self._keyframes.append(_Keyframe(thinned(points, 0.03), matched, len(self._matched) - 1))
+        frames, s, turn = self._keyframes, self.settings, abs(heading(since))
+        assert self._odometry is not None
+        way = frames[-1].way + float(np.hypot(since[0, 2], since[1, 2])) + _RADIAN * turn if frames else 0.0
+        frames.append(_Keyframe(thinned(points, 0.03), matched, len(self._matched) - 1, way))
         if self._graph is None:
             self._graph = RunningPoseGraph(matched)
         else:
-            self._graph.append(since, _covariance(self._information, matched))
-        recent = self._keyframes[-self.settings.local_keyframes :]
-        self._map = LineMap.of(np.concatenate([_moved(frame.points, frame.matched) for frame in recent]))
-        if len(self._keyframes) % 2 == 0:
-            loops = self._loops(len(self._keyframes) - 1)
-            if loops or len(self._keyframes) % 20 == 0:
+            off = vector(np.linalg.inv(since) @ np.linalg.inv(self._wheels) @ self._odometry)
+            doubt = _DOUBT * np.array([np.hypot(off[0], off[1])] * 2 + [abs(off[2])]) + [0.0, 0.0, _TURNING * turn]
+            self._graph.append(since, _covariance(self._information, matched) + np.diag(doubt**2))
+        self._wheels = self._odometry
+        recent = [frame for frame in frames if frame.way > way - s.local_map]
+        self._map = LineMap.of(np.concatenate([moved(frame.points, frame.matched) for frame in recent]))
+        self._grid = None
+        first = self._submaps[-1].end if self._submaps else 0
+        if way - frames[first].way > s.submap:
+            centre = (first + len(frames)) // 2
+            joined = self._joined(frames[first:], frames[centre])
+            self._submaps.append(_Submap(first, len(frames), centre, ScoreGrid.of(joined), LineMap.of(joined)))
+        if len(frames) % 2 == 0:
+            loops = self._loops(len(frames) - 1)
+            if loops or len(frames) % 20 == 0:
                 self._graph.close(loops)
 
     def _loops(self, row: int) -> list[Measured]:
-        """Loops of a keyframe to the two nearest older submaps whose windows reach it."""
+        """Loops of a keyframe to the nearest older submaps whose windows reach it."""
         assert self._graph is not None
-        graph, size = self._graph, self.settings.submap_keyframes
-        last = (row - 2 * size) // size  # the newest submap that is over
-        if last < 0:
+        frames = self._keyframes
+        over = [each for each in self._submaps if frames[each.end - 1].way < frames[row].way - self.settings.submap]
+        if not over:
             return []
-        centres = np.arange(last + 1) * size + size // 2
-        way = graph.distances(row)[centres]
-        poses = graph.poses
+        centres = np.array([each.centre for each in over])
+        way = self._graph.distances(row)[centres]
+        poses = self._graph.poses
         window = 0.5 + self.settings.loop_drift * way
         apart = np.linalg.norm(poses[centres, :2, 2] - poses[row, :2, 2], axis=1)
-        near = np.flatnonzero(apart < 4.0 + window)
-        near = near[np.argsort(apart[near])][:3]
-        found = []
+        near = np.flatnonzero(apart < 5.0 + window)
+        near = near[np.argsort(apart[near])]
         source = self._source(row)
-        for submap in near.tolist():
-            centre = int(centres[submap])
-            guess = np.linalg.inv(poses[centre]) @ poses[row]
-            turn = np.deg2rad(5) + 0.01 * min(way[submap], _TIGHT)
-            loop = self._loop(submap, centre, row, source, guess, float(window[submap]), float(turn))
+        found: list[Measured] = []
+        for at in near[: 3 + int(window[near].min(initial=0.0))].tolist():
+            guess = np.linalg.inv(poses[centres[at]]) @ poses[row]
+            turn = np.deg2rad(5) + 0.01 * min(way[at], _LONGEST)
+            loop = self._loop(over[at], row, source, guess, float(window[at]), float(turn))
             if loop is not None:
-                found.append(loop)
-                if len(found) == 2:
+                found += [loop] if window[at] < _UNSURE else self._confirmed(loop)
+                if len(found) >= 2:
                     break
         return found
 
+    def _confirmed(self, loop: Measured) -> list[Measured]:
+        """The loop with those of before that agree with it; it waits if there are none."""
+        frames, now = self._keyframes, self._keyframes[loop.second].way
+        agreed = []
+        for other in self._waiting:
+            way = [abs(frames[getattr(loop, end)].way - frames[getattr(other, end)].way) for end in ("first", "second")]
+            one = _between(frames, other.first, loop.first) @ loop.first_T_second
+            off = vector(np.linalg.inv(one) @ other.first_T_second @ _between(frames, other.second, loop.second))
+            if (
+                np.array([np.hypot(off[0], off[1]), abs(off[2])]) < _AGREED + 0.03 * np.array([1, 0.1]) * sum(way)
+            ).all():
+                agreed.append(other)
+        held = {id(other) for other in agreed}
+        self._waiting = [k for k in self._waiting if id(k) not in held and frames[k.second].way > now - _WAITING]
+        if not agreed:
+            self._waiting.append(loop)
+            return []
+        return [loop, *agreed]
+
     def _loop(
-        self, submap: int, centre: int, row: int, source: FloatArray, guess: FloatArray, window: float, turn: float
+        self, submap: _Submap, row: int, source: FloatArray, guess: FloatArray, window: float, turn: float
     ) -> Measured | None:
-        grid, lines = self._submap(submap, centre)
-        found = grid.search(source, vector(guess), window, turn, self.settings.loop_score)
+        found = submap.grid.search(source, vector(guess), window, turn, self.settings.loop_score)
         if found is None or found.rival > 0.92 * found.score:
             return None
-        fit = lines.fit(self._keyframes[row].points, found.pose, np.diag([1.0, 1.0, 10.0]), reach=0.4)
-        values = np.linalg.eigvalsh(fit.information[:2, :2])
-        if fit.share < self.settings.loop_score or values[0] < _DETERMINED * values[1]:
+        fit = submap.lines.fit(self._keyframes[row].points, found.pose, np.diag([1.0, 1.0, 10.0]), reach=0.4)
+        if fit.share < self.settings.loop_score or (window > _KNOWN and not _determined(fit.information)):
             return None
-        measured = transform(fit.pose)
-        return Measured(centre, row, measured, _covariance(fit.information / _SMEAR, measured))
-
-    def _submap(self, submap: int, centre: int) -> tuple[ScoreGrid, LineMap]:
-        """Points of a submap in the frame of its middle keyframe."""
-        if submap not in self._submaps:
-            size = self.settings.submap_keyframes
-            frames = self._keyframes[submap * size : (submap + 1) * size]
-            points = self._joined(frames, self._keyframes[centre])
-            self._submaps[submap] = ScoreGrid.of(points), LineMap.of(points)
-        return self._submaps[submap]
+        return _measured(submap.centre, row, fit)
 
     def _source(self, row: int) -> FloatArray:
         """Points of a keyframe and of the four before it, in its frame."""
@@ -223,31 +265,29 @@ class LaserSlam:
 
     def _joined(self, frames: list[_Keyframe], centre: _Keyframe) -> FloatArray:
         back = np.linalg.inv(centre.matched)
-        return np.concatenate([_moved(frame.points, back @ frame.matched) for frame in frames])
+        return np.concatenate([moved(frame.points, back @ frame.matched) for frame in frames])
 
-    def _passes(self, poses: FloatArray) -> list[Measured]:
+    def _passes(self, poses: FloatArray, reach: float) -> list[Measured]:
         """Registrations of each keyframe with the map of every other pass nearby."""
         found: list[Measured] = []
         maps: dict[int, LineMap] = {}
-        places = poses[:, :2, 2]
+        places, frames = poses[:, :2, 2], self._keyframes
+        way = np.array([frame.way for frame in frames])
         for row in range(len(poses)):
             apart = np.linalg.norm(places[:row] - places[row], axis=1)
-            others = np.flatnonzero((apart < 3.0) & (np.arange(row) < row - 2 * self.settings.local_keyframes))
+            others = np.flatnonzero((apart < 3.0) & (way[:row] < way[row] - 2 * self.settings.local_map))
             if not len(others):
                 continue
-            runs = np.split(others, np.flatnonzero(np.diff(others) > 10) + 1)
+            runs = np.split(others, np.flatnonzero(np.diff(way[others]) > 5.0) + 1)
             nearest = sorted((int(run[np.argmin(apart[run])]) for run in runs), key=lambda k: apart[k])
             for other in dict.fromkeys(near // 3 * 3 for near in nearest[:4]):
                 if other not in maps:
-                    around = self._keyframes[max(0, other - 5) : other + 6]
-                    maps[other] = LineMap.of(self._joined(around, self._keyframes[other]))
+                    around = [frame for frame in frames if abs(frame.way - way[other]) < self.settings.local_map / 3]
+                    maps[other] = LineMap.of(self._joined(around, frames[other]))
                 guess = np.linalg.inv(poses[other]) @ poses[row]
-                fit = maps[other].fit(self._keyframes[row].points, vector(guess), np.diag([100.0, 100.0, 1000.0]), 0.4)
-                values = np.linalg.eigvalsh(fit.information[:2, :2])
-                if fit.share < 0.6 or values[0] < _DETERMINED * values[1]:
-                    continue
-                measured = transform(fit.pose)
-                found.append(Measured(other, row, measured, _covariance(fit.information / _SMEAR, measured)))
+                fit = maps[other].fit(frames[row].points, vector(guess), np.diag([100.0, 100.0, 1000.0]), reach)
+                if fit.share > self.settings.loop_score:
+                    found.append(_measured(other, row, fit))
         return found
 
     def _all_poses(self, poses: FloatArray, rows: IntArray) -> FloatArray:
@@ -277,37 +317,29 @@ def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: P
     return slam.finish(progress)
 
 
-def transforms(x: FloatArray) -> FloatArray:
-    """Poses (n, 3): x, y, heading as (n, 3, 3)."""
-    c, s = np.cos(x[:, 2]), np.sin(x[:, 2])
-    T = np.tile(np.eye(3), (len(x), 1, 1))
-    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
-    T[:, :2, 2] = x[:, :2]
-    return T
+def _between(frames: list[_Keyframe], one: int, other: int) -> FloatArray:
+    return np.asarray(np.linalg.inv(frames[one].matched) @ frames[other].matched)
 
 
-def transform(x: FloatArray) -> FloatArray:
-    """A pose (3,) as (3, 3)."""
-    return np.asarray(transforms(x[None])[0])
+def _measured(first: int, second: int, fit: Fit) -> Measured:
+    measured = transform(fit.pose)
+    return Measured(first, second, measured, _covariance(_firm(fit.information) / _SMEAR, measured))
 
 
-def vectors(T: FloatArray) -> FloatArray:
-    """Poses (n, 3, 3) as x, y, heading (n, 3)."""
-    return np.stack([T[:, 0, 2], T[:, 1, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])], axis=1)
+def _determined(information: FloatArray) -> bool:
+    values = np.linalg.eigvalsh(information[:2, :2])
+    return bool(values[0] > _DETERMINED * values[1])
 
 
-def vector(T: FloatArray) -> FloatArray:
-    """A pose (3, 3) as x, y, heading."""
-    return np.asarray(vectors(T[None])[0])
-
-
-def heading(T: FloatArray) -> float:
-    """The heading of a pose (3, 3)."""
-    return float(np.arctan2(T[1, 0], T[0, 0]))
-
-
-def _moved(points: FloatArray, T: FloatArray) -> FloatArray:
-    return np.asarray(points @ T[:2, :2].T + T[:2, 2])
+def _firm(information: FloatArray) -> FloatArray:
+    """Information without what scatter seems to say along a bare corridor."""
+    values, vectors = np.linalg.eigh(information[:2, :2])
+    ratio = values[0] / max(values[1], 1e-9)
+    if ratio >= _DETERMINED:
+        return information
+    S = np.eye(3)
+    S[:2, :2] -= (1 - max(ratio, 0.0) / _DETERMINED) * np.outer(vectors[:, 0], vectors[:, 0])
+    return np.asarray(S @ information @ S)
 
 
 def _covariance(information: FloatArray, pose: FloatArray) -> FloatArray:

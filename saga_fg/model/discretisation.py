@@ -211,8 +211,8 @@ def _phi_and_noise(
     degree, noise_degree, doublings = _TAYLOR_DEGREE, _TAYLOR_DEGREE + 1, 0
     if nilpotency is not None:
         degree, noise_degree = max(nilpotency - 1, 0), max(2 * nilpotency - 1, 1)
-    elif (norm := float(np.abs(M).sum(axis=-1).max(initial=0.0)) * dt) > 0:
-        doublings = max(0, math.ceil(math.log2(norm / _TAYLOR_RADIUS)))
+    else:
+        doublings = _doublings(float(np.abs(M).sum(axis=-1).max(initial=0.0)) * dt)
     h = dt / 2**doublings
     Z = M * h
     eye = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
@@ -254,30 +254,47 @@ def _coupling_blocks(
     target, source = edges.target[acting], edges.source[acting]
     C = edges.rate[acting, None, None] * edges.A_other[acting]
     at = position[target]
-    used = {int(k): kinds[k] for k in np.unique(kind[source])}
-    A_j = np.stack([kinds[k].generator for k in kind[source]])
-    steps = _nilpotency(list(used.values()))
+    numbers, of_edge = np.unique(kind[source], return_inverse=True)
+    A = np.stack([kinds[k].generator for k in numbers.tolist()])
+    steps = _nilpotency([kinds[k] for k in numbers.tolist()])
     if steps is None:
-        return Blocks(target, source, _van_loan(M[at], C, A_j, dt))
+        return Blocks(target, source, _van_loan(M, at, C, A, of_edge, dt))
     values = np.zeros_like(C)
     for k in range(steps):
         values += dt ** (k + 1) * (phi[k + 1][at] @ C)
-        C = C @ A_j
+        C = C @ A[of_edge]
     return Blocks(target, source, values)
 
 
-def _van_loan(M: FloatArray, C: FloatArray, A: FloatArray, dt: float) -> FloatArray:
-    """int_0^dt exp(M (dt - s)) C exp(A s) ds for stacks M (m, d_i, d_i), C (m, d_i, d_j), A (m, d_j, d_j)."""
-    m, d_i, d_j = C.shape
-    block = np.zeros((m, d_i + d_j, d_i + d_j))
-    block[:, :d_i, :d_i], block[:, :d_i, d_i:], block[:, d_i:, d_i:] = M, C, A
-    return _exponential(block * dt)[:, :d_i, d_i:]
+def _van_loan(M: FloatArray, at: IntArray, C: FloatArray, A: FloatArray, of: IntArray, dt: float) -> FloatArray:
+    """int_0^dt exp(M_at (dt - s)) C exp(A_of s) ds for stacks M (n, d_i, d_i), C (m, d_i, d_j), A (k, d_j, d_j).
+
+    at (m,) and of (m,) are rows of M and A. This is the corner of the exponential of [[M, C], [0, A]] dt, whose other
+    blocks are those of a node and of a type.
+    """
+    row_sums = np.abs(M).sum(axis=-1)[at] + np.abs(C).sum(axis=-1)
+    doublings = _doublings(dt * max(row_sums.max(initial=0.0), np.abs(A).sum(axis=-1).max(initial=0.0)))
+    h = dt / 2**doublings
+    M, C, A, mine = M * h, C * h, A * h, M[at] * h
+    first, second = (np.broadcast_to(np.eye(Z.shape[-1]), Z.shape) for Z in (M, A))
+    corner = np.zeros_like(C)
+    for j in range(_TAYLOR_DEGREE, 0, -1):
+        corner = (mine @ corner + C @ second[of]) / j
+        first, second = (np.eye(Z.shape[-1]) + Z @ power / j for Z, power in ((M, first), (A, second)))
+    for _ in range(doublings):
+        corner = first[at] @ corner + corner @ second[of]
+        first, second = first @ first, second @ second
+    return np.asarray(corner)
+
+
+def _doublings(norm: float) -> int:
+    """How often a matrix of this norm is halved until its Taylor series converges fast."""
+    return max(0, math.ceil(math.log2(norm / _TAYLOR_RADIUS))) if 0 < norm < math.inf else 0
 
 
 def _exponential(Z: FloatArray) -> FloatArray:
     """exp(Z) of matrices (..., d, d): the Taylor series of Z / 2^s, squared s times."""
-    norm = float(np.abs(Z).sum(axis=-1).max(initial=0.0))
-    doublings = max(0, math.ceil(math.log2(norm / _TAYLOR_RADIUS))) if 0 < norm < math.inf else 0
+    doublings = _doublings(float(np.abs(Z).sum(axis=-1).max(initial=0.0)))
     Z = Z / 2**doublings
     eye = np.eye(Z.shape[-1])
     result = eye + Z / _TAYLOR_DEGREE

@@ -31,7 +31,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     unresolved = unresolved_frames(state, matching, boxes, p, measurements.R[rows, :2, :2])
     kinematics, stationary = initial_kinematics(state, measurements, rows)
     relative = None if measurements.relative is None else measurements.relative.select(rows)
-    state.joint.add(ids, boxes.label, kinematics, delay, relative)
+    state.joint.add(ids, boxes.label, kinematics, delay, relative, appended=True)
     update_range_rates(state, measurements, rows, ids, boxes.label)
     likelihood, time = measurements.class_likelihood[rows], state.time - delay
     z_noise, yaw_noise = measurements.z_noise[rows], measurements.yaw_noise[rows]

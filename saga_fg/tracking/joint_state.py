@@ -81,11 +81,14 @@ class JointTrackState:
         now: Kinematics,
         delay: float = 0.0,
         relative: RelativePositions | None = None,
+        appended: bool = False,
     ) -> None:
         """Add tracks as they were `delay` s ago; components that `now` does not have start at 0.
 
-        Where `relative` positions, seen from the vehicle, are given, they stand in for those of `now`.
+        Where `relative` positions, seen from the vehicle, are given, they stand in for those of `now`. If `appended`,
+        the rows come after those of the last call of `kinematics`, whose estimates stay as they are.
         """
+        before = self._kinematics if appended and relative is None else None
         if relative is not None:
             now = now._replace(P=np.tile(_UNKNOWN_POSITION**2 * np.eye(2), (len(ids), 1, 1)))
         for node_type, rows in self.rows_by_type(label, delay > 0):
@@ -110,6 +113,8 @@ class JointTrackState:
         self._initiated.update(dict.fromkeys(ids.tolist(), self.estimator.time))
         if relative is not None:
             self._add_relative(ids, label, relative)
+        if before is not None:
+            self._kinematics = before.append(self.kinematics_of(ids, label))
 
     def remove(self, ids: IntArray, kept: IntArray | None = None) -> None:
         """Marginalise tracks; their information on their neighbours stays, and so do the estimates of all others.

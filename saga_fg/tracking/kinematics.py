@@ -27,6 +27,10 @@ class Kinematics(NamedTuple):
         """The tracks `rows` (k,)."""
         return Kinematics._make(column[rows] for column in self)
 
+    def append(self, other: Kinematics) -> Kinematics:
+        """With the tracks of another after these."""
+        return Kinematics._make(np.concatenate(columns) for columns in zip(self, other, strict=True))
+
     @property
     def speed_deviation(self) -> FloatArray:
         """(n,) standard deviation of the velocity in a mean direction, m/s."""

@@ -49,11 +49,12 @@ def unresolved_frames(
     """
     rank = np.empty(len(boxes))
     rank[np.argsort(-probability, kind="stable")] = np.arange(len(boxes))
-    covered = _overlaps(state, boxes, boxes, rank[None] < rank[:, None]).max(axis=1, initial=0.0) > OVERLAP
     detected, now = matching.track, state.kinematics()
+    live = state.boxes(now.position, now.velocity).select(detected)
     surer = (state.table.unresolved[detected] == 0) & (state.table.existence[detected] >= probability[:, None])
-    live = _overlaps(state, boxes, state.boxes(now.position, now.velocity).select(detected), surer)
-    covered |= live.max(axis=1, initial=0.0) > OVERLAP
+    surer = np.concatenate([rank[None] < rank[:, None], surer], axis=1)
+    overlap = _overlaps(state, boxes, Boxes.concatenate([boxes, live]), surer)
+    covered = overlap.max(axis=1, initial=0.0) > OVERLAP
     precise = np.sqrt(np.linalg.eigvalsh(R)[:, -1]) < PRECISE * boxes.size[:, :2].min(axis=1)
     return np.where(covered & precise, FRAMES, 0.0)
 

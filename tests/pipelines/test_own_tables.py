@@ -233,3 +233,17 @@ def test_a_look_at_a_table_without_doubts(tmp_path: Path) -> None:
     assert "Nothing looks wrong." in result.stdout
     assert "20 frames in 3.9 s, 10 Hz, 1 pause, the longest of 2.1 s" in result.stdout
     assert "car: 20, ? x ? x ? m, with interactions" in result.stdout
+
+
+def test_the_examples_of_the_help_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    found, true = rows()
+    write(tmp_path / "detections.csv", sorted(found, key=lambda row: row["ts_ns"]))
+    write(tmp_path / "truth.csv", true)
+    write(tmp_path / "tracks.csv", true)
+    text = saga_fg("evaluate", "file", "--help").stdout
+    lines = [line.strip() for line in text.replace(" \\\n", " ").splitlines() if "saga-fg evaluate file" in line]
+    assert len(lines) == 3
+    for line in lines:
+        result = run_line(line)
+        assert result.exit_code == 0, result.output

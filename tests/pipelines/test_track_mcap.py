@@ -159,7 +159,7 @@ def test_several_recordings_in_parallel_and_again(tmp_path, drive):
         (("--topic", "/objects"), "unknown topic '/objects', expected one of: /perception/lidar/objects"),
         (("--topic", "lidar="), "expected a topic, or SENSOR=TOPIC"),
         (("--topic", f"a={LIDAR}", "--topic", f"a={LIDAR}"), "the sensor a is given twice"),
-        (("--classes", "car"), "--classes: expected THEIRS=OURS with commas between them, got 'car'"),
+        (("--classes", "car"), "--classes: expected NAME=VALUE with commas between them, got 'car'"),
     ],
 )
 def test_wrong_options(tmp_path, drive, options, message):

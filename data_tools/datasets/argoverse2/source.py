@@ -36,6 +36,7 @@ class ArgoverseSource(AnnotatedSource):
     tracks = "File to write: .feather (boxes with track_id), .pkl (official submission), or a table: .csv, .ndjson."
     tracks_example = "tracks.feather"
     merged = ("tracks.feather", "")
+    all_tracks = "tracks.feather"
     dataroot: str = option("Folder of the logs, in each annotations.feather, city_SE3_egovehicle.feather; or its URL.")
     detections: str | None = option(
         "Official detections (.feather) of any number of logs, or a table (.csv, .ndjson, .jsonl, .npz), s from the "

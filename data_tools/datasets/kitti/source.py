@@ -26,6 +26,7 @@ from data_tools.datasets.source import (
     option,
     tracks_of,
 )
+from data_tools.files.atomic_files import write_zip
 from data_tools.files.remote_files import is_url
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
@@ -44,20 +45,21 @@ class KittiSource(DatasetSource):
     example = "--dataroot data/kitti --detections data/kitti/detections/pointrcnn --sequences 0000,0011"
     tracks = "Folder to write: NNNN.txt in the benchmark's format, tracks.csv with velocities and covariances."
     tracks_example = "results"
+    all_tracks = "tracks"
     merged = (f"tracks/{TRACK_TABLE}", f"results/{TRACK_TABLE}")
     dataroot: str = option("Folder that holds training/, or oxts/, calib/ and, for scores, label_02/; or its URL.")
     detections: str | None = option(
         "Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.", None, required=TRACKING
     )
     sequences: str | None = option("Sequences with commas between them; all if left out.", None)
-    iou: str = option("Least 3D overlaps of a pair, with commas.", "0.25,0.5,0.7", verbs=("evaluate",))
-    classes: str = option("Classes, with commas.", "car,pedestrian,cyclist", verbs=("evaluate",))
+    iou: str = option("Least 3D overlaps of a pair, with commas.", "0.25,0.5,0.7", verbs=("evaluate", "benchmark"))
+    classes: str = option("Classes, with commas.", "car,pedestrian,cyclist", verbs=("evaluate", "benchmark"))
 
     persons: str = option(
         "Boxes at `Person` labels (who sits): false, as in the usual evaluation, or exempt, as in HOTA.",
         "false",
         metavar="false|exempt",
-        verbs=("evaluate",),
+        verbs=("evaluate", "benchmark"),
     )
 
     def __post_init__(self) -> None:
@@ -110,6 +112,9 @@ class KittiSource(DatasetSource):
 
     def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         merge_tables(output / self.merged[0], [output / "tracks" / f"{stem}.csv" for stem in stems])
+
+    def write_submission(self, output: Path) -> Path:
+        return write_zip(output / "submission.zip", sorted((output / self.all_tracks).glob("[0-9]*.txt")))
 
     def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         merge_tables(output / self.merged[1], [output / "results" / f"{stem}.csv" for stem in stems])

@@ -9,6 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Literal, Self
 
+from data_tools.datasets.detection_files.table_import import pairs
 from data_tools.datasets.mcap.dataset import McapRecording, RecordingOptions
 from data_tools.datasets.mcap.messages import DEFAULT_EGO
 from data_tools.datasets.mcap.results import read_track_messages, write_track_messages
@@ -84,7 +85,11 @@ class McapSource(DatasetSource):
             if result.suffix != ".mcap":
                 return read_table_results(result, dataset, every_scene=True)
             (name,) = dataset.scenes
-            return {name: scene_result(dataset.scene(name), read_track_messages(result, name, self._classes()), result)}
+            return {
+                name: scene_result(
+                    dataset.scene(name), read_track_messages(result, name, pairs("--classes", self.classes)), result
+                )
+            }
 
     def _options(self) -> RecordingOptions:
         topics: dict[str, str] = {}
@@ -96,17 +101,7 @@ class McapSource(DatasetSource):
             if sensor in topics:
                 raise InputError(f"--topic {value}: the sensor {sensor} is given twice")
             topics[sensor] = topic
-        return RecordingOptions(topics, self._classes(), self.world, self.ego, self.odometry)
-
-    def _classes(self) -> dict[str, str]:
-        classes: dict[str, str] = {}
-        for entry in (self.classes or "").split(","):
-            theirs, equals, ours = (part.strip() for part in entry.partition("="))
-            if entry.strip() and not (theirs and equals):
-                raise InputError(f"--classes: expected THEIRS=OURS with commas between them, got {entry.strip()!r}")
-            if theirs:
-                classes[theirs] = ours
-        return classes
+        return RecordingOptions(topics, pairs("--classes", self.classes), self.world, self.ego, self.odometry)
 
     def _one(self) -> str:
         if len(self.recording or ()) != 1:

@@ -31,6 +31,7 @@ from data_tools.datasets.source import (
     option,
     tracks_of,
 )
+from data_tools.files.atomic_files import write_zip
 from data_tools.files.remote_files import is_url, local_copy, local_tree
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
@@ -49,6 +50,7 @@ class NuScenesSource(DatasetSource):
     tracks = "Official tracking-result JSON to write."
     tracks_example = "tracks.json"
     merged = ("tracks.json", "tracking.json")
+    all_tracks = "tracks.json"
     dataroot: str = option("Folder that holds the folder of tables, or its URL.")
     detections: list[str] | None = option(
         "Detection-result JSON of a sensor, or its URL; repeatable.", None, metavar="NAME=FILE", required=TRACKING
@@ -112,6 +114,9 @@ class NuScenesSource(DatasetSource):
         assert isinstance(dataset, NuScenes)
         parts = (output / "tracks" / f"{stem}.json" for stem in stems)
         merge_tracking_results(output / self.merged[0], parts, dataset.meta)
+
+    def write_submission(self, output: Path) -> Path:
+        return write_zip(output / "submission.zip", [output / self.all_tracks])
 
     def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         assert isinstance(dataset, NuScenes)

@@ -51,6 +51,8 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
 def test_what_is_whole_is_read(valid: dict[str, Target]) -> None:
     read: dict[str, Any] = {name: target.read() for name, target in valid.items()}
     assert len(read.pop("Argoverse", "ab")) == len(read.pop("OpenACC", "ab")) == 2  # need pyarrow
+    for name in ("recording, MCAP", "recording, SQLite"):
+        assert len(read.pop(name, "ab")) == 2  # need the packages that write them
     for name in ("detections, Parquet", "detections, Feather"):
         assert len(read.pop(name, "a")) == 1
     assert {name: len(content) for name, content in read.items() if isinstance(content, Sized)} == SIZES

@@ -1,0 +1,111 @@
+"""`saga-fg benchmark`: figures, a page and a submission from one command that goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from pipelines.cli import app
+from pipelines.scale_out import TrackTask
+from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset
+from tests.data_tools.kitti_example import write_sequence
+from tests.pipelines.scale_out_example import InThisProcess
+
+
+def saga_fg(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(autouse=True)
+def _here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipelines.scale_out.LocalPool", lambda workers, scratch: InThisProcess())
+
+
+@pytest.fixture(scope="module")
+def nuscenes(tmp_path_factory: pytest.TempPathFactory) -> list[str | Path]:
+    """Options of four short simulated scenes."""
+    folder = tmp_path_factory.mktemp("simulated")
+    (folder / "short.yaml").write_text("duration: 3.0\nwarm_up: 3.0\n")
+    result = saga_fg("simulate", "-o", folder / "data", "--scenes", "4", "--config", folder / "short.yaml")
+    assert result.exit_code == 0, result.output
+    detections = f"lidar={folder / 'data' / 'detections' / 'lidar.json'}"
+    return ["nuscenes", "--dataroot", folder / "data", "--detections", detections, "--split", "all"]
+
+
+def test_the_figures_are_those_of_evaluate(nuscenes: list[str | Path], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    result = saga_fg("benchmark", *nuscenes, "--output", run)
+    assert result.exit_code == 0, result.output
+    assert "4 scenes: 4 done" in result.output
+    assert "AMOTA" in result.output
+    figures = json.loads((run / "figures.json").read_text())
+    assert figures["method"] == "saga"
+    judged = saga_fg("evaluate", *nuscenes, run / "tracks.json", "--json", tmp_path / "evaluated.json")
+    assert judged.exit_code == 0, judged.output
+    assert figures["figures"] == json.loads((tmp_path / "evaluated.json").read_text())
+    page = (run / "report.html").read_text()
+    assert "The player shows 3 of 4 scenes." in page
+    with zipfile.ZipFile(run / "submission.zip") as archive:
+        assert archive.namelist() == ["tracks.json"]
+        assert archive.read("tracks.json") == (run / "tracks.json").read_bytes()
+    submission = (run / "submission.zip").read_bytes()
+    again = saga_fg("benchmark", *nuscenes, "--output", run)
+    assert "0 done, 4 unchanged" in again.output
+    assert json.loads((run / "figures.json").read_text()) == figures
+    assert (run / "submission.zip").read_bytes() == submission
+
+
+def test_a_run_that_was_stopped_goes_on(
+    nuscenes: list[str | Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = TrackTask.run
+
+    def run(task: TrackTask, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
+        if name == "scene-0003":
+            raise InputError("bad weather")
+        return done(task, name, dataset, folder)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(TrackTask, "run", run)
+        result = saga_fg("benchmark", *nuscenes, "--output", tmp_path / "run", "--method", "kf")
+    assert result.exit_code == 1
+    assert "failed: scene-0003: bad weather" in result.output
+    assert not (tmp_path / "run" / "figures.json").exists()
+    assert not (tmp_path / "run" / "submission.zip").exists()
+    result = saga_fg("benchmark", *nuscenes, "--output", tmp_path / "run", "--method", "kf")
+    assert result.exit_code == 0, result.output
+    assert "1 done, 3 unchanged" in result.output
+    assert (tmp_path / "run" / "figures.json").exists()
+
+
+def test_a_test_split_has_a_submission_alone(nuscenes: list[str | Path], tmp_path: Path) -> None:
+    result = saga_fg("benchmark", *nuscenes, "--output", tmp_path / "run", "--without-truth")
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "run" / "submission.zip").exists()
+    assert not (tmp_path / "run" / "figures.json").exists()
+
+
+def test_kitti(tmp_path: Path) -> None:
+    root, run = write_sequence(tmp_path / "kitti"), tmp_path / "run"
+    result = saga_fg("benchmark", "kitti", "--dataroot", root, "--detections", root / "found", "--output", run)
+    assert result.exit_code == 0, result.output
+    assert "sAMOTA" in result.output
+    with zipfile.ZipFile(run / "submission.zip") as archive:
+        assert archive.namelist() == ["0007.txt"]
+    assert json.loads((run / "figures.json").read_text())["figures"]["sequences"] == ["0007"]
+    assert "KITTI 3D tracking metrics" in (run / "report.html").read_text()
+
+
+def test_a_dataset_without_official_results(tmp_path: Path) -> None:
+    result = saga_fg("benchmark", "simulated", "--output", tmp_path / "run")
+    assert result.exit_code != 0
+    assert "expected a dataset with official results" in " ".join(result.output.split())
+    shown = saga_fg("benchmark", "--help").output
+    assert all(name in shown for name in ("nuscenes", "kitti", "argoverse2"))
+    assert "eth_ucy" not in shown
