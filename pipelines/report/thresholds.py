@@ -1,4 +1,4 @@
-"""The score from which on a page shows tracks: that of the best MOTA where there is ground truth, as `evaluate` has it."""
+"""The score from which on a page shows tracks: that of the best MOTA, as `evaluate` has it, where there is truth."""
 
 from __future__ import annotations
 
