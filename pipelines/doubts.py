@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from data_tools.datasets.source import DatasetSource
 from data_tools.plausibility import (
     Doubt,
+    Mend,
     Sample,
     doubts_of,
     headings_in_degrees,
@@ -35,13 +36,18 @@ SCENES = 3  # of a dataset, whose first frames are judged
 class Doubts:
     """Warns of each suspicion once.
 
-    settings  of the run
-    usual     the shipped settings: what a file for --config adds to them should meet something in the data
-    options   whether the command has the options of tables, which warnings then name
+    settings    of the run
+    usual       the shipped settings: what a file for --config adds to them should meet something in the data
+    option_for  the options of the command that mend a suspicion, "" for none
     """
 
-    def __init__(self, settings: TrackConfig, usual: TrackConfig | None = None, options: bool = False) -> None:
-        self._settings, self._options = settings, options
+    def __init__(
+        self,
+        settings: TrackConfig,
+        usual: TrackConfig | None = None,
+        option_for: Callable[[Mend], str] = lambda mend: "",
+    ) -> None:
+        self._settings, self._option_for = settings, option_for
         rules = settings.tracker.edges
         self._acting = {label for rule in rules for label in getattr(rule, "classes", getattr(rule, "attached", ()))}
         usual = usual or settings
@@ -121,7 +127,7 @@ class Doubts:
         for doubt in doubts:
             if doubt.kind not in self._told:
                 self._told.add(doubt.kind)
-                log.warning("%s", doubt.text(self._options))
+                log.warning("%s", doubt.text("" if doubt.mend is None else self._option_for(doubt.mend)))
 
 
 class Doubted:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from data_tools.datasets.detection_files import TableImport, TruthFile
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files.formats import column_names
 from data_tools.datasets.detection_files.table_import import pairs
 from data_tools.datasets.parts import OpenedPart, Parts, file_digest
 from data_tools.datasets.results import SceneResult, read_judged_results, read_table_results
@@ -21,6 +22,7 @@ from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
+    from data_tools.plausibility import Mend
     from saga_fg.numerics.arrays import FloatArray
 
 JUDGED: tuple[Verb, ...] = ("evaluate", "report", "view")
@@ -164,6 +166,13 @@ class DetectionFileSource(DatasetSource):
 
         hota = hota or find_spec("trackeval") is not None
         return evaluate_tracks([(each.scene, each.found) for each in results.values()], hota, innovations, sweep=True)
+
+    def option_for(self, mend: Mend) -> str:
+        names: Mapping[str, str] = {}
+        if mend.columns and self.detections:
+            with local_copy(expanded(self.detections)[0]) as path:
+                names = column_names(path, self.how)
+        return self.how.option_for(mend, names)
 
     def kept(self) -> Mapping[str, Any]:
         return self.how.values()

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from data_tools.datasets.results import SceneResult
     from data_tools.evaluation import Evaluation
     from data_tools.lidar.scan import ScanSequence
+    from data_tools.plausibility import Mend
     from saga_fg.numerics.arrays import FloatArray
     from saga_fg.smoothing import Labels
     from saga_fg.types.dataset import Dataset, Scene
@@ -168,6 +169,10 @@ class DatasetSource(ABC):
     def input_files(self) -> tuple[Path, ...]:
         """Files that the options name, which no result may overwrite."""
         return ()
+
+    def option_for(self, mend: Mend) -> str:
+        """The options of the command that mend a suspicion about the recordings; "" where it has none."""
+        return ""
 
     def kept(self) -> Mapping[str, Any]:
         """What a result has to say on how its recordings were read: values of JSON."""

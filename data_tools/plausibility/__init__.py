@@ -11,11 +11,13 @@ from data_tools.plausibility.checks import (
     within_a_metre,
 )
 from data_tools.plausibility.class_names import idle_rules, settings_without_data, usual_classes
-from data_tools.plausibility.doubt import Doubt
+from data_tools.plausibility.doubt import FILL_IN, Doubt, Mend
 from data_tools.plausibility.sample import Sample, doubts_of
 
 __all__ = [
+    "FILL_IN",
     "Doubt",
+    "Mend",
     "Sample",
     "doubts_of",
     "ego_taken_for_world",

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from data_tools.plausibility.class_names import usual_class
-from data_tools.plausibility.doubt import Doubt
+from data_tools.plausibility.doubt import Doubt, Mend
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import transform_points
 
@@ -26,7 +26,7 @@ def headings_in_degrees(yaw: FloatArray) -> Doubt | None:
     if len(known) < FEWEST or share < 0.05:
         return None
     what = f"headings look like degrees: {share:.0%} of them are beyond 2 pi, the largest is {known.max():.4g}"
-    return Doubt("degrees", what, "expected rad", "--units angle=deg")
+    return Doubt("degrees", what, "expected rad", Mend(units={"angle": "deg"}))
 
 
 def scores_beyond_one(score: FloatArray) -> Doubt | None:
@@ -37,7 +37,7 @@ def scores_beyond_one(score: FloatArray) -> Doubt | None:
     low, high = float(score.min()), float(score.max())
     what = f"scores are no shares: {share:.0%} of them are outside 0 to 1, from {low:.3g} to {high:.3g}; "
     if low >= 0 and 5 < high <= 100.5:
-        return Doubt("scores", what + "they look like percent", "expected 0 to 1", "--units score=percent")
+        return Doubt("scores", what + "they look like percent", "expected 0 to 1", Mend(units={"score": "percent"}))
     setting = "put `sensors: {default: {score: logit}}` into a file for --config"
     return Doubt("scores", what + "they look like logits", setting)
 
@@ -50,7 +50,8 @@ def length_below_width(label: StrArray, size: FloatArray) -> Doubt | None:
     if large.sum() < FEWEST or _share(wide) < 0.7:
         return None
     what = f"{_share(wide):.0%} of the large boxes are wider than long: length and width look exchanged"
-    return Doubt("sides", what, "expected the length along the heading", "--columns length=width,width=length")
+    exchanged = Mend(columns={"length": "width", "width": "length"})
+    return Doubt("sides", what, "expected the length along the heading", exchanged)
 
 
 def unlikely_sizes(label: StrArray, size: FloatArray) -> Doubt | None:
@@ -68,7 +69,7 @@ def unlikely_sizes(label: StrArray, size: FloatArray) -> Doubt | None:
     if not unit:
         return None
     what = f"objects have a usual length of {middle:.3g}: this looks like {unit}"
-    return Doubt("lengths", what, "expected metres", f"--units length={unit}")
+    return Doubt("lengths", what, "expected metres", Mend(units={"length": unit}))
 
 
 def within_a_metre(frame: IntArray, position: FloatArray) -> Doubt | None:
@@ -80,8 +81,11 @@ def within_a_metre(frame: IntArray, position: FloatArray) -> Doubt | None:
     spread = float(np.ptp(mine, axis=0).max())
     if spread >= 1.0:
         return None
-    what = f"all objects of all frames are within {spread:.2g} m: positions look like km, or degrees of latitude"
-    return Doubt("places", what, "expected metres", "--units length=km, or give metres in a plane (such as UTM)")
+    what = f"all objects of all frames are within {spread:.2g} m: positions look like "
+    middle = np.abs(np.median(mine, axis=0))
+    if middle.max() > 5 and middle.min() <= 90 and middle.max() <= 180:
+        return Doubt("places", what + "degrees of latitude and longitude", "expected metres in a plane, such as UTM")
+    return Doubt("places", what + "km", "expected metres", Mend(units={"length": "km"}))
 
 
 def far_too_fast(label: StrArray, velocity: FloatArray) -> Doubt | None:
@@ -95,7 +99,7 @@ def far_too_fast(label: StrArray, velocity: FloatArray) -> Doubt | None:
         share = _share(mine > limits[k])
         if len(mine) >= FEWEST and share > 0.05:
             what = f"{share:.0%} of the velocities of {name} are above {limits[k]:g} m/s, up to {mine.max():.3g}"
-            return Doubt("speeds", f"{what}: they look like km/h", "expected m/s", "--units speed=km/h")
+            return Doubt("speeds", f"{what}: they look like km/h", "expected m/s", Mend(units={"speed": "km/h"}))
     return None
 
 
@@ -109,10 +113,10 @@ def strange_time_steps(time: FloatArray, sensor: StrArray) -> Doubt | None:
     if middle >= 20:
         unit = "ms" if middle < 2e4 else "us" if middle < 2e7 else "ns"
         what = f"frames are usually {middle:.4g} s apart: their times look like {unit}"
-        return Doubt("times", what, "expected seconds", f"--units time={unit}")
+        return Doubt("times", what, "expected seconds", Mend(units={"time": unit}))
     if middle <= 1e-4:
         what = f"frames are usually {middle:.1g} s apart: their times look like a coarser unit than seconds"
-        return Doubt("times", what, "expected seconds", "--units time=s, or the unit that fits")
+        return Doubt("times", what, "expected seconds", Mend(units={"time": "s"}))
     return None
 
 
@@ -130,7 +134,7 @@ def ego_taken_for_world(
         "frame",
         "positions look like coordinates of the vehicle, but are taken for the world: they move with it",
         "expected world coordinates, or coordinates: ego",
-        "--coordinates ego",
+        Mend(coordinates="ego"),
     )
     posed = in_world & np.isfinite(world_T_ego).all(axis=(1, 2))
     rows = np.flatnonzero(posed[frame])

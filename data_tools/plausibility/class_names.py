@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 
-from data_tools.plausibility.doubt import Doubt
+from data_tools.plausibility.doubt import FILL_IN, Doubt, Mend
 
 _WORDS = {
     "pedestrian": "pedestrian pedestrians person people human walker adult child",
@@ -44,16 +44,13 @@ def idle_rules(acting: Collection[str], classes: Collection[str]) -> Doubt | Non
     """Edge rules that act on classes (`acting`), none of which the objects have."""
     if not acting or not classes or set(acting) & set(classes):
         return None
-    likely = "car" if "car" in acting else min(acting)
-    meant = usual_classes(sorted(classes), acting) or dict.fromkeys(sorted(classes), likely)
-    mend = ",".join(f"{name}={ours}" for name, ours in meant.items())
+    meant = usual_classes(sorted(classes), acting) or dict.fromkeys(sorted(classes), FILL_IN)
     what = (
         f"no edges: tracker.edges act on {', '.join(sorted(acting))}, and the tracks are of "
         f"{', '.join(sorted(classes))}; objects are tracked one by one"
     )
-    return Doubt(
-        "edges", what, "name the classes as the rules do, or the rules' `classes` as the data", f"--classes {mend}"
-    )
+    expected = "name the classes as the rules do, or the rules' `classes` as the data"
+    return Doubt("edges", what, expected, Mend(classes=meant))
 
 
 def settings_without_data(where: str, set_up: Collection[str], there: Collection[str]) -> Doubt | None:

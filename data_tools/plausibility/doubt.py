@@ -1,8 +1,29 @@
-"""One suspicion about data."""
+"""One suspicion about data, and what mends it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+FILL_IN = "..."
+"""Stands for a name that only the owner of the data knows."""
+
+
+@dataclass(frozen=True)
+class Mend:
+    """Entries of a `TableImport` that mend a suspicion.
+
+    columns      by our name: the column, by our name for it as it is read now, that it should be read from
+    classes      by the name as it is read now; `FILL_IN` where it is not known
+    units        by kind
+    coordinates  of rows that say none, "" to leave them
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    classes: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    coordinates: Literal["", "ego"] = ""
 
 
 @dataclass(frozen=True)
@@ -12,14 +33,16 @@ class Doubt:
     kind      names it; each is told once
     what      what is seen, and what it looks like
     expected  what should be given instead
-    option    of a command that reads a table, that mends it; "" for none
+    mend      what mends it where a table is read; None for none
     """
 
     kind: str
     what: str
     expected: str
-    option: str = ""
+    mend: Mend | None = None
 
-    def text(self, options: bool) -> str:
-        """One line: with the option where the command has `options` for tables."""
-        return f"{self.what}; {f'add {self.option}' if options and self.option else self.expected}"
+    def text(self, option: str = "") -> str:
+        """One line, with the `option` of the command that mends it; "" where it has none."""
+        if not option:
+            return f"{self.what}; {self.expected}"
+        return f"{self.what}; {'fill in and add' if FILL_IN in option else 'add'} {option}"

@@ -95,7 +95,7 @@ def _tracked(
     from pipelines.observers import InnovationRecorder
     from pipelines.tracking import track_dataset
 
-    doubts = Doubts(settings.of_method(method), options=source.summarised)
+    doubts = Doubts(settings.of_method(method), option_for=source.option_for)
     recorder = InnovationRecorder()
     with TemporaryDirectory() as folder, source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
         runs = track_dataset(

@@ -13,8 +13,11 @@ from pipelines.cli import options
 from pipelines.cli.summary import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from data_tools.datasets.detection_files import TableImport
     from data_tools.datasets.detection_files.survey import TableSurvey
+    from data_tools.plausibility import Doubt
 
 MOST = 12  # scenes and classes that are listed
 EPOCH = 1e8  # s, from which times count from 1970
@@ -68,17 +71,16 @@ def inspect_table(
     survey = survey_table(table, given.over(base))
     _show_columns(survey)
     _show_times(survey)
-    meant = _show_classes(survey)
-    typer.echo("\nWhat looks wrong:" if survey.doubts or not survey.sorted or meant else "\nNothing looks wrong.")
-    for doubt in survey.doubts:
-        typer.echo(f"  {doubt.text(options=True)}")
+    doubts = (*survey.doubts, *_show_classes(survey))
+    typer.echo("\nWhat looks wrong:" if doubts or not survey.sorted else "\nNothing looks wrong.")
+    for doubt in doubts:
+        typer.echo(f"  {doubt.text(survey.how.option_for(doubt.mend, survey.raw.found.names))}")
     if not survey.sorted:
         typer.echo("  rows are not in order of time; add --sort")
-    if meant:
-        typer.echo(f"  no edge rule acts on {', '.join(meant)}; {_named(meant)}")
     if survey.raw.present("ego_x").any() and "coordinates" not in survey.raw.columns and not survey.how.coordinates:
         typer.echo("\nPositions are taken for world coordinates; if the vehicle is their origin: --coordinates ego")
-    _show_next(survey, table, meant, "" if import_file is None else f" --import {shlex.quote(str(import_file))}", given)
+    base_option = "" if import_file is None else f" --import {shlex.quote(str(import_file))}"
+    _show_next(survey, table, base_option + _mended(survey, doubts, given).options())
 
 
 def _show_columns(survey: TableSurvey) -> None:
@@ -118,15 +120,14 @@ def _show_times(survey: TableSurvey) -> None:
         typer.echo(f"  ... {len(survey.times)} in all")
 
 
-def _show_classes(survey: TableSurvey) -> dict[str, str]:
-    """List the classes; return those that no edge rule acts on, with what they seem to mean."""
-    from data_tools.plausibility import usual_classes
+def _show_classes(survey: TableSurvey) -> list[Doubt]:
+    """List the classes; return what is doubtful about those that no edge rule acts on."""
+    from data_tools.plausibility import Doubt, Mend, idle_rules, usual_classes
     from pipelines.config import load_config
 
     rules = load_config("file").tracker.edges
     acting = {label for rule in rules for label in getattr(rule, "classes", getattr(rule, "attached", ()))}
     mapped = {name: survey.how.classes.get(name, name) for name in survey.classes}
-    meant = usual_classes([name for name, ours in mapped.items() if ours == name], acting)
     typer.echo("\nClasses, with rows and median length, width, height:")
     for name in sorted(survey.classes, key=lambda name: -survey.classes[name])[:MOST]:
         size = " x ".join("?" if x != x else f"{x:.2f}" for x in survey.sizes[name].tolist())
@@ -136,39 +137,31 @@ def _show_classes(survey: TableSurvey) -> dict[str, str]:
         typer.echo(f"  {name}: {survey.classes[name]}, {size} m{renamed}, {role}")
     if len(survey.classes) > MOST:
         typer.echo(f"  ... {len(survey.classes)} in all")
-    return meant
+    idle = None if survey.has_identities else idle_rules(acting, set(mapped.values()) - {""})
+    meant = usual_classes(sorted(set(mapped.values())), acting)
+    if idle is not None:
+        return [idle]
+    what = f"no edge rule acts on {', '.join(meant)}"
+    return [Doubt("edges", what, "name them as the rules do", Mend(classes=meant))] if meant else []
 
 
-def _named(meant: dict[str, str]) -> str:
-    return f"add --classes {','.join(f'{name}={ours}' for name, ours in meant.items())}"
-
-
-def _mended(survey: TableSurvey, meant: dict[str, str], given: TableImport) -> TableImport:
-    """What was given, with the options that mend what looks wrong."""
+def _mended(survey: TableSurvey, doubts: Sequence[Doubt], given: TableImport) -> TableImport:
+    """The options that were given, with those that mend what looks wrong."""
     from dataclasses import replace
 
-    from data_tools.datasets.detection_files import TableImport
-    from data_tools.datasets.detection_files.table_import import pairs
+    from data_tools.plausibility import Mend
 
-    how = replace(given, sort=survey.how.sort)
+    mends = [doubt.mend for doubt in doubts if doubt.mend is not None]
     if survey.raw.clock.guessed:
-        how = TableImport(units={"time": survey.raw.clock.unit}).over(how)
-    for doubt in survey.doubts:
-        option, _, value = doubt.option.partition(" ")
-        if option in ("--units", "--columns") and " " not in value:
-            values = pairs(option, value)
-            if option == "--columns":
-                values = {ours: survey.raw.found.names.get(theirs, theirs) for ours, theirs in values.items()}
-                how = TableImport(columns=values).over(how)
-            else:
-                how = TableImport(units=values).over(how)
-        elif option == "--coordinates":
-            how = TableImport(coordinates="ego").over(how)
-    return TableImport(classes=meant).over(how)
+        mends.insert(0, Mend(units={"time": survey.raw.clock.unit}))
+    names, how, changed = survey.raw.found.names, survey.how, {"sort"}
+    for mend in mends:
+        how = how.mended(mend, names)
+        changed |= {name for name, value in vars(mend).items() if value}
+    return replace(given, **{name: getattr(how, name) for name in changed})
 
 
-def _show_next(survey: TableSurvey, table: Path, meant: dict[str, str], base: str, given: TableImport) -> None:
-    options = base + _mended(survey, meant, given).options()
+def _show_next(survey: TableSurvey, table: Path, options: str) -> None:
     name = shlex.quote(str(table))
     typer.echo("\nNext:")
     if survey.has_identities:

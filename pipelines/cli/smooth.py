@@ -54,7 +54,7 @@ def _smooth(
     tracking = how.with_interactions(settings.tracking, method, interactions)
     settings = replace(settings, tracking=tracking.with_association(association))
     usual = load_smooth_config(source.family).tracking
-    doubts = Doubts(settings.tracking.of_method(method), usual, source.summarised)
+    doubts = Doubts(settings.tracking.of_method(method), usual, source.option_for)
     if at_scale(workers, ray):
         doubts.see_first(source)
         task = SmoothTask(settings, method, source, f".{table}")

@@ -43,7 +43,7 @@ def _track(
     settings = how.configured(source.family, config, method, estimator, lag, association, interactions)
     options.apart(output, *source.input_files())
     kept, horizons = how.journal(explain, output, at_scale(workers, ray)), how.horizons(predict, method)
-    doubts = Doubts(settings.of_method(method), load_config(source.family), source.summarised)
+    doubts = Doubts(settings.of_method(method), load_config(source.family), source.option_for)
     if at_scale(workers, ray):
         doubts.see_first(source)
         task = TrackTask(settings, method, source, horizons)

@@ -3,20 +3,21 @@ const CLASS_COLOURS = {car: "#0b6bcb", pedestrian: "#d1495b", cyclist: "#2a9d61"
   bus: "#8e5bd0", trailer: "#7a5c48", motorcycle: "#c2529a", van: "#1aa0b8"};
 const CONFIRMED = 3;  // moments at which a track was detected
 
-function classColour(label) {
-  if (CLASS_COLOURS[label]) return CLASS_COLOURS[label];
-  const sum = [...label].reduce((total, letter) => total * 31 + letter.charCodeAt(0) | 0, 7);
-  return COLOURS[Math.abs(sum) % COLOURS.length];
+function coloursOf(scenes) {  // of all classes; those without a colour of their own get the free ones, in order of their names
+  const labels = [...new Set(scenes.flatMap(scene => scene.labels))].sort(), own = Object.entries(CLASS_COLOURS);
+  const taken = new Set(own.filter(([label]) => labels.includes(label)).map(([, colour]) => colour));
+  const free = COLOURS.filter(colour => !taken.has(colour)), others = labels.filter(label => !Object.hasOwn(CLASS_COLOURS, label));
+  return new Map([...own, ...others.map((label, at) => [label, free[at % free.length]])]);
 }
 
 function makeFilters(scenes, thresholds, ghosts, changed) {
   const state = {confirmed: true, ghosts, byTrack: false, off: new Set(), thresholds: {...thresholds}};
-  const counted = new Map();
+  const counted = new Map(), colours = coloursOf(scenes), classColour = label => colours.get(label);
 
   function detectedMoments(result) {  // of each track of a result
     if (!counted.has(result)) {
       const counts = new Int32Array(result.ids.length);
-      for (const rows of result.moments) for (const row of rows) if (!(row[COASTING] > COASTS)) counts[row[ID]]++;
+      for (const rows of result.moments) for (const row of rows) if (!(row[COASTING] > unseenFrom)) counts[row[ID]]++;
       counted.set(result, counts);
     }
     return counted.get(result);
@@ -27,7 +28,7 @@ function makeFilters(scenes, thresholds, ghosts, changed) {
   function rows(scene, name, k, followed) {
     const result = scene.methods[name], counts = detectedMoments(result), least = 1000 * state.thresholds[name];
     return result.moments[k].filter(row => row[ID] === followed || (row[SCORE] >= least && shownClass(scene, row[LABEL])
-      && (state.ghosts || !(row[COASTING] > COASTS)) && (!state.confirmed || counts[row[ID]] >= CONFIRMED)));
+      && (state.ghosts || !(row[COASTING] > unseenFrom)) && (!state.confirmed || counts[row[ID]] >= CONFIRMED)));
   }
 
   const colour = (scene, row) => state.byTrack ? COLOURS[row[ID] % COLOURS.length] : classColour(scene.labels[row[LABEL]]);

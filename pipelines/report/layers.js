@@ -2,7 +2,8 @@
 //   view  {g, thin: m of a pixel, scene, k, result: tracks of a method, tracks: rows shown, focus: row followed, colour(row)}
 // A layer that is off still draws what concerns the followed track (`focused`).
 const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, SCORE = 9, XX = 10, XY = 11, YY = 12, COASTING = 13;
-const ELLIPSE_95 = 5.991, TRAIL = 3, COASTS = 150;  // chi-square with 2 degrees of freedom; s; ms
+const ELLIPSE_95 = 5.991, TRAIL = 3;  // chi-square with 2 degrees of freedom; s
+let unseenFrom;  // ms since the last detection, from which a track coasts
 const SOFT = "#5c6b7a";
 
 const LAYERS = [
@@ -119,7 +120,7 @@ function drawTracks(view) {
     const alpha = mine ? 1 : (.35 + .65 * Math.max(0, Math.min(1, row[SCORE] / 1000))) * pale(view, row);
     g.strokeStyle = g.fillStyle = view.colour(row);
     g.lineWidth = (mine ? 4 : 2) * thin;
-    g.setLineDash(row[COASTING] > COASTS ? [5 * thin, 4 * thin] : []);
+    g.setLineDash(row[COASTING] > unseenFrom ? [5 * thin, 4 * thin] : []);
     box(g, row, X);
     g.globalAlpha = alpha * (mine ? .35 : .14); g.fill();
     g.globalAlpha = alpha; g.stroke(); g.setLineDash([]);

@@ -18,6 +18,7 @@ from data_tools.figures import FigureTable, as_json
 from pipelines.report.charts import Chart
 from pipelines.report.scenes import ReportScene, scene_data
 from pipelines.report.thresholds import start_thresholds
+from pipelines.report.track_figures import UNSEEN
 
 SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.js", "player.js")
 
@@ -26,7 +27,7 @@ SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.
 class Report:
     """Content of a page; `facts` are lines under the title, `notes` paragraphs above the player.
 
-    start   moment of the first scene that the player shows first
+    start   moment of the first scene that the player shows first; None: the one with the most tracks
     ghosts  whether it shows tracks that nobody sees now from the start
     beside  the method that it shows beside the last one from the start, "" for none
     """
@@ -38,7 +39,7 @@ class Report:
     charts: Sequence[Chart] = ()
     configuration: str = ""
     notes: Sequence[str] = ()
-    start: int = 0
+    start: int | None = None
     ghosts: bool = False
     beside: str = ""
 
@@ -51,6 +52,7 @@ def report_page(report: Report) -> str:
         "start": report.start,
         "ghosts": report.ghosts,
         "beside": report.beside,
+        "unseen": round(1000 * UNSEEN),
         "thresholds": start_thresholds(report.scenes),
     }
     configuration = f"<pre>{html.escape(report.configuration)}</pre>" if report.configuration else ""

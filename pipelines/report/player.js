@@ -33,8 +33,14 @@ function player({scenes, start, thresholds, ghosts, beside}) {
     home = moves(scene) ? null : extent(scene);
     picked = null;
     goHome();
+    k = 0;
     chooseMethods();
-    show(0);
+    show(fullest());
+  }
+
+  function fullest() {  // the first of the moments with the most tracks that are shown
+    const counts = scene.times.map((_, at) => names().reduce((sum, name) => sum + filters.rows(scene, name, at, null).length, 0));
+    return counts.reduce((best, count, at) => count > counts[best] ? at : best, 0);
   }
 
   function chooseMethods() {
@@ -222,7 +228,7 @@ function player({scenes, start, thresholds, ghosts, beside}) {
   canvas.onpointerup = e => { held = null; if (moved < 5) pick(e); };
   canvas.onwheel = e => { e.preventDefault(); resize(Math.exp(-e.deltaY / 500)); };
   document.onkeydown = e => {
-    if (["SELECT", "INPUT", "BUTTON", "SUMMARY"].includes(e.target.tagName) || $("help").open || e.ctrlKey || e.metaKey || e.altKey) return;
+    if (takesKey(e.target, e.key) || $("help").open || e.ctrlKey || e.metaKey || e.altKey) return;
     if (KEYS[e.key]) { e.preventDefault(); KEYS[e.key][2](e); }
   };
   window.onresize = draw;
@@ -252,8 +258,15 @@ function player({scenes, start, thresholds, ghosts, beside}) {
   for (const [name, text] of filters.toggles) check(name, text, filters.state[name], on => { filters.state[name] = on; });
   for (const layer of LAYERS) check(layer.name, layer.text ?? layer.name, layer.on, on => { shown[layer.name] = on; });
   chooseScene(0);
-  show(start);
+  if (start !== null) show(start);
   visit(location.hash);
+}
+
+function takesKey(control, key) {  // whether a control that has the focus does something with a key itself
+  const kind = control.tagName === "INPUT" ? control.type : control.tagName;
+  if (["text", "search", "number", "TEXTAREA"].includes(kind)) return true;
+  if (key === " ") return ["checkbox", "radio", "BUTTON", "SUMMARY", "SELECT"].includes(kind);
+  return key.startsWith("Arrow") && ["range", "radio", "SELECT"].includes(kind);
 }
 
 function showImages(scene, k) {  // those of the cameras at a moment, as a strip
@@ -269,6 +282,7 @@ unpack($("data").textContent).then(data => {
   $("charts").append(...data.charts.map(drawChart));
   $("configuration").hidden = !$("configuration").querySelector("pre");
   $("player").hidden = !data.scenes.length;
+  unseenFrom = data.unseen;
   if (data.scenes.length) player(data);
   document.body.dataset.ready = "yes";
 });

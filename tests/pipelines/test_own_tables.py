@@ -199,6 +199,69 @@ def test_what_looks_wrong_is_told_once_with_what_mends_it(
         assert len([line for line in told if line.endswith(f"add {mend}")]) == 1, told
 
 
+def added(text: str) -> list[str]:
+    """The options that a warning or a look says to add."""
+    (mend,) = re.findall(r"; (?:fill in and )?add (--\S+ \S+)$", text, re.MULTILINE)
+    return shlex.split(str(mend))
+
+
+UNITS, CLASSES = ("--units", "angle=deg,score=percent"), ("--classes", "VEHICLE=car")
+
+
+@pytest.mark.parametrize(
+    ("renamed", "given", "option"),
+    [
+        ({"l": "wid", "w": "len"}, [*UNITS, *CLASSES], ["--columns", "length=wid,width=len"]),
+        ({"l": "width", "w": "length"}, [*UNITS, *CLASSES], ["--columns", "length=width,width=length"]),
+        ({}, ["--units", "score=percent", *CLASSES], ["--units", "score=percent,angle=deg"]),
+        ({"category": "kind"}, ["--columns", "label=kind", *UNITS], ["--classes", "VEHICLE=car"]),
+    ],
+)
+@pytest.mark.parametrize("command", ["inspect", "track"])
+def test_what_is_told_mends_it_when_pasted(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    command: str,
+    renamed: dict[str, str],
+    given: list[str],
+    option: list[str],
+) -> None:
+    found = [{renamed.get(name, name): value for name, value in row.items()} for row in rows()[0]]
+    table = write(tmp_path / "d.csv", sorted(found, key=lambda row: row["ts_ns"]))
+
+    def told(*more: str) -> list[str]:
+        caplog.clear()
+        output = [] if command == "inspect" else ["--output", tmp_path / "t.csv"]
+        result = saga_fg(*(["inspect"] if command == "inspect" else ["track", "file"]), table, *given, *more, *output)
+        assert result.exit_code == 0, result.output
+        lines = [*(record.getMessage() for record in caplog.records), *result.stdout.splitlines()]
+        return [line for line in lines if "; add --" in line]
+
+    (doubt,) = told()
+    assert shlex.split(doubt.rpartition("; add ")[2]) == option
+    assert not told(*option)
+
+
+@pytest.mark.parametrize("command", ["inspect", "track"])
+def test_classes_that_are_numbers_are_to_be_filled_in(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, command: str
+) -> None:
+    found = [{**row, "category": n % 2} for n, row in enumerate(rows()[0])]
+    table = write(tmp_path / "d.csv", found)
+    units = ["--units", "angle=deg,score=percent"]
+    if command == "inspect":
+        text = saga_fg("inspect", table, *units).stdout
+        assert "saga-fg track file" in text.split("Next:")[1]
+        assert "--classes 0=...,1=... " in text.split("Next:")[1]
+    else:
+        assert saga_fg("track", "file", table, *units, "--sort", "-o", tmp_path / "t.csv").exit_code == 0
+        text = caplog.text
+    assert "objects are tracked one by one; fill in and add --classes 0=...,1=..." in text
+    pasted = saga_fg("track", "file", table, "--classes", "0=...,1=...", "-o", tmp_path / "t.csv")
+    assert pasted.exit_code == 2
+    assert "--classes: 0=...: expected a name in place of the dots" in pasted.stderr
+
+
 def test_settings_for_a_class_or_sensor_that_the_data_lack(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     table = write(tmp_path / "d.csv", rows()[0])
     config = tmp_path / "c.yaml"

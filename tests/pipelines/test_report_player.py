@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from data_tools.evaluation.score_sweep import best_thresholds, score_sweep
 from data_tools.metrics import SceneBoxes
 from pipelines.report import Report, ReportScene, report_page
 from pipelines.report.thresholds import PLAIN, start_thresholds
@@ -56,6 +58,16 @@ def page() -> str:
     return report_page(Report("player", [], [scene("first"), scene("second")]))
 
 
+def crowded(names: list[str], first: int = 0) -> ReportScene:
+    """A car for each name, all in view from a moment on; the first of them twice as long."""
+    rows = [(k, n) for k in range(MOMENTS) for n in range(len(names)) if k >= (first if n else max(first - 2, 0))]
+    boxes = Boxes.of([names[n] for _, n in rows], [[2.0 * k, 4.0 * n, 0] for k, n in rows], yaw=[0.0] * len(rows))
+    ids = np.array([f"{n}" for _, n in rows])
+    table = SceneBoxes(np.array([k for k, _ in rows]), ids, boxes, np.full(len(rows), 0.9))
+    recorded = Scene("s", np.arange(MOMENTS) * 0.1, np.tile(np.eye(4), (MOMENTS, 1, 1)), ("",) * MOMENTS, ())
+    return ReportScene(recorded, {"saga": table}, {})
+
+
 HELPERS = """
   const $of = id => document.getElementById(id);
   const counts = () => $of("view").dataset.tracks;
@@ -93,6 +105,45 @@ def test_weak_brief_and_unseen_tracks_are_hidden_until_asked_for(tmp_path: Path)
     assert found["brief"] == "5"
     assert found["weak"] == "5"
     assert found["strong"] == "3"  # car-1, car-2, ghost-6
+
+
+def test_the_page_starts_at_the_fullest_moment_with_its_tracks_drawn(tmp_path: Path) -> None:
+    page = report_page(Report("own data", [], [crowded(["car"] * 3, first=4)]))
+    script = """
+  found.counts = counts(); found.clock = $of("clock").value;
+  const g = $of("view").getContext("2d"), data = g.getImageData(0, 0, g.canvas.width, g.canvas.height).data;
+  found.drawn = data.filter((value, at) => at % 4 === 3 && value > 0).length;
+"""
+    found = tried_in_browser(page, HELPERS + script, tmp_path)
+    assert found["faults"] == []
+    assert (found["counts"], found["clock"]) == ("3", "0.4 s")
+    assert found["drawn"] > 500
+
+
+def test_classes_without_a_colour_of_their_own_get_free_ones(tmp_path: Path) -> None:
+    names = ["car", "pedestrian", "bicycle", "bollard", "dog", "sign", "wheeled_device"]
+    page = report_page(Report("colours", [], [crowded(names)]))
+    script = 'found.colours = [...$of("classes").children].map(each => each.style.getPropertyValue("--colour"));'
+    found = tried_in_browser(page, HELPERS + script, tmp_path)
+    assert len(found["colours"]) == len(set(found["colours"])) == len(names)
+
+
+def test_keys_work_after_a_click_on_a_control(tmp_path: Path) -> None:
+    found = tried(
+        """
+  const on = (id, name) => $of(id).dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
+  at(5); $of("show-ids").click(); on("show-ids", "ArrowRight"); found.box = $of("clock").value;
+  on("play", "ArrowRight"); found.button = $of("clock").value;
+  on("time", "ArrowRight"); found.slider = $of("clock").value;
+  on("time", "n"); found.followed = followed();
+  on("show-ids", " "); found.playing = $of("play").textContent;
+""",
+        tmp_path,
+    )
+    assert (found["box"], found["button"]) == ("3.0 s", "3.5 s")
+    assert found["slider"] == "3.5 s"  # the slider moves itself
+    assert found["followed"] == "track car-1"
+    assert found["playing"] == "Play"  # space is the check box's
 
 
 def test_classes_can_be_switched_off_or_shown_alone(tmp_path: Path) -> None:
@@ -184,6 +235,19 @@ def test_the_first_threshold_is_that_of_the_best_mota() -> None:
     thresholds = start_thresholds([scene("a", truth=True)])
     assert thresholds["few"] == pytest.approx(0.8)
     assert thresholds["whole"] == pytest.approx(0.8)  # below come false boxes alone
+
+
+def test_the_first_threshold_is_that_of_evaluate() -> None:
+    report = scene("a", truth=True)
+    swept = best_thresholds(score_sweep([(report.scene, report.tracks["whole"])]))
+    assert start_thresholds([report])["whole"] == pytest.approx(swept["car"], abs=0.01)
+
+
+def test_tracks_with_low_scores_are_shown() -> None:
+    report = crowded(["car"])
+    table = report.tracks["saga"]
+    weak = replace(table, score=np.full(len(table), 0.1))
+    assert start_thresholds([replace(report, tracks={"saga": weak})]) == {"saga": 0.0}
 
 
 def test_boxes_at_hidden_objects_do_not_count() -> None:

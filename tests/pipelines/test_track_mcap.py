@@ -7,8 +7,11 @@ from typer.testing import CliRunner
 pytest.importorskip("mcap_ros2")
 pytest.importorskip("rosbags")
 
+from data_tools.datasets.mcap.dataset import McapRecording
 from data_tools.datasets.mcap.results import TOPIC, read_track_messages
+from data_tools.datasets.mcap.source import McapSource
 from pipelines.cli import app
+from pipelines.report.run_record import read_run_record
 from tests.data_tools import mcap_example as example
 from tests.data_tools.mcap_example import ARRAY, LIDAR, MOMENTS, START, STEP
 
@@ -123,12 +126,33 @@ def test_results_are_shown_and_judged(tmp_path, drive, suffix):
     assert saga_fg("evaluate", "labels", "mcap", tmp_path / "labels", *options)[0] == 0
 
 
+def test_tracks_in_another_frame_are_shown_in_it_or_refused(tmp_path, drive):
+    for suffix in ("mcap", "csv"):
+        tracks = tmp_path / f"tracks.{suffix}"
+        assert saga_fg("track", "mcap", drive, "--world", "base_link", "--output", tracks)[0] == 0
+        page = ("report", "mcap", tracks, "--recording", drive, "--output", tmp_path / "report.html")
+        code, output = saga_fg(*page)  # the record beside the result tells its frame
+        assert code == 0, output
+        record = tmp_path / "tracks.run.json"
+        if suffix == "mcap":
+            record.unlink()
+            code, output = saga_fg(*page)
+            assert code != 0
+            text = " ".join(output.split())
+            assert "expected tracks in the frame map of the recording, got base_link; add --world base_link" in text
+            assert saga_fg(*page, "--world", "base_link")[0] == 0
+        else:
+            assert McapSource(recording=[str(drive)]).with_kept(read_run_record(tracks).recordings).world == "base_link"
+
+
 def test_tracks_are_read_back_as_they_were(tmp_path, drive):
     from data_tools.datasets.detection_files import read_tracks
 
     for suffix in ("mcap", "csv"):
         assert saga_fg("track", "mcap", drive, "--output", tmp_path / f"tracks.{suffix}")[0] == 0
-    a, b = read_track_messages(tmp_path / "tracks.mcap", "drive", {}), read_tracks(tmp_path / "tracks.csv")
+    recording = McapRecording(drive)
+    scene = recording.scene("drive")
+    a, b = read_track_messages(tmp_path / "tracks.mcap", scene, {}), read_tracks(tmp_path / "tracks.csv")
     assert a.id.tolist() == b.id.tolist()
     assert a.timestamp == pytest.approx(b.timestamp, abs=1e-6)
     assert a.boxes.label.tolist() == b.boxes.label.tolist()

@@ -20,15 +20,15 @@ _PLACE = (
     "pos_# position_# #_position #_pos p# t# c# center_# #_center centre_# #_centre translation_# location_# #_world "
     "world_# bbox_center_# box_center_#"
 )
-_SPEED = "vel_# velocity_# #_velocity #_vel v_# speed_#"
+_SPEED = "v#_m vel_# velocity_# #_velocity #_vel v_# speed_#"
 _QUATERNION = "quat_# quaternion_# q_# rotation_# orientation_#"
 _EGO = "ego_pos_# ego_position_# ego_t# ego_translation_# ego_vehicle_#"
 _ALIASES = {
     "timestamp": "time ts t stamp time_stamp datetime date_time utc_time epoch unix_time",
     **{axis: _PLACE.replace("#", axis) for axis in "xyz"},
     "length": "l len size_x size_l dim_x dimension_x dimensions_x box_length",
-    "width": "w size_y size_w dim_y dimension_y dimensions_y box_width",
-    "height": "h size_z size_h dim_z dimension_z dimensions_z box_height",
+    "width": "w wid size_y size_w dim_y dimension_y dimensions_y box_width",
+    "height": "h hgt ht size_z size_h dim_z dimension_z dimensions_z box_height",
     "yaw": "heading hdg theta yaw_angle heading_angle rot_z orientation",
     **{f"v{axis}": _SPEED.replace("#", axis) for axis in "xy"},
     "score": "confidence conf prob probability detection_score tracking_score existence",
@@ -46,6 +46,8 @@ _ALIASES = {
     "visible": "is_visible visibility",
 }
 ALIASES = MappingProxyType({ours: tuple(aliases.split()) for ours, aliases in _ALIASES.items()})
+_SHORTEST_GUESS = 4  # letters of a name that may be a misspelt one
+_OF_TRACKS = {"id", "coasting", "cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy"}
 _OURS = {alias: ours for ours, aliases in ALIASES.items() for alias in aliases}
 
 
@@ -124,8 +126,9 @@ def understood(
     doubtful = {name for candidates in possible.values() for name in candidates}
     unread = sorted(set(names) - set(chosen.values()) - doubtful)
     for name in unread:
-        if meaning(name) is None:
-            nearest = get_close_matches(name, set(columns) - chosen.keys() - given.keys(), n=1, cutoff=0.75)
+        if meaning(name) is None and len(name) >= _SHORTEST_GUESS:
+            free_columns = set(columns) - chosen.keys() - given.keys() - (set() if "id" in chosen else _OF_TRACKS)
+            nearest = get_close_matches(name, free_columns, n=1, cutoff=0.75)
             if nearest:
                 mend = f"--columns {nearest[0]}={name[:40]}, or {nearest[0]}= if it is another"
                 faults.append(f"unknown column {name[:40]!r}; did you mean {nearest[0]!r}? ({mend})")
@@ -139,7 +142,11 @@ def understood(
     if faults:
         raise InputError(f"{path}: {'; '.join(faults)}")
     ends = {ours: meaning(name) for ours, name in chosen.items()}
-    units = {ours: found[1] for ours, found in ends.items() if found is not None and found[1] and found[0] == ours}
+    units = {
+        ours: found[1]
+        for ours, found in ends.items()
+        if found is not None and found[1] and kind_of.get(found[0]) == kind_of.get(ours)
+    }
     return Columns(chosen, units, tuple(unread))
 
 

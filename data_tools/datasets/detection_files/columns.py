@@ -102,7 +102,7 @@ class RawTable:
         """Warn where headings look like degrees; they are wrapped later on, and cannot be told then."""
         doubt = headings_in_degrees(self.numbers("yaw"))
         if doubt is not None:
-            log.warning("%s: %s", self.path, doubt.text(options=True))
+            log.warning("%s: %s", self.path, doubt.text(self.how.option_for(doubt.mend, self.found.names)))
 
     def texts(self, name: str, default: str) -> StrArray:
         """A column (N,) of names; `default` where left out. A whole number is a name too, but in NumPy archives.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -86,6 +86,26 @@ def read_raw_parts(
     A file without rows is one empty part; a table that is no text, or is to be sorted, is one part. Columns
     that nobody gives in a part are missing from it. Warns of columns that are not read, and of a clock that is guessed.
     """
+    how = how or TableImport()
+    clock: Clock | None = None
+    told: set[str] = set()
+    reading = _Reading(path, layout or Layout(), how, sys.maxsize if how.sort else rows, own)
+    for table in _tables(reading):
+        if clock is None and table.length:
+            clock = clock_of(table)
+            _tell(table, clock)
+        unread = set(table.found.unread) - told - set(TRACK_MEANINGS)
+        if unread:
+            names = [name[:40] for name in sorted(unread)]
+            more = f", ... ({len(names)} in all)" if len(names) > 12 else ""
+            log.warning("%s: columns without a meaning here, not read: %s", path, ", ".join(names[:12]) + more)
+        told |= unread
+        table = replace(table, clock=clock or Clock())
+        yield sorted_by_time(table) if how.sort else table
+
+
+def _tables(reading: _Reading) -> Iterator[RawTable]:
+    """The parts of a file as they are read."""
     readers: dict[str, Callable[[_Reading], Iterator[RawTable]]] = {
         ".csv": _read_csv,
         ".ndjson": _read_ndjson,
@@ -93,29 +113,20 @@ def read_raw_parts(
         ".npz": _read_npz,
         **dict.fromkeys(SUFFIXES, _read_arrow),
     }
+    path = reading.path
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected a file name that ends in {', '.join(readers)}")
-    how = how or TableImport()
-    clock: Clock | None = None
-    told: set[str] = set()
-    reading = _Reading(path, layout or Layout(), how, sys.maxsize if how.sort else rows, own)
     try:
-        for table in readers[path.suffix.lower()](reading):
-            if clock is None and table.length:
-                clock = clock_of(table)
-                _tell(table, clock)
-            unread = set(table.found.unread) - told - set(TRACK_MEANINGS)
-            if unread:
-                names = [name[:40] for name in sorted(unread)]
-                more = f", ... ({len(names)} in all)" if len(names) > 12 else ""
-                log.warning("%s: columns without a meaning here, not read: %s", path, ", ".join(names[:12]) + more)
-            told |= unread
-            table = replace(table, clock=clock or Clock())
-            yield sorted_by_time(table) if how.sort else table
+        yield from readers[path.suffix.lower()](reading)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected text in UTF-8: {error}") from error
+
+
+def column_names(path: Path, how: TableImport | None = None) -> Mapping[str, str]:
+    """The file's name of each column of ours that a table of detections has. Raises as `read_raw_table`."""
+    return next(_tables(_Reading(path, Layout(), how or TableImport(), 1, None))).found.names
 
 
 def sorted_by_time(table: RawTable) -> RawTable:

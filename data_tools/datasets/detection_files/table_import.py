@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from difflib import get_close_matches
 from typing import Any, Literal
 
 from data_tools.datasets.detection_files.column_names import ALIASES, canonical
 from data_tools.datasets.detection_files.units import checked_unit, kind_of, unit_of_speed
+from data_tools.plausibility import FILL_IN, Mend
 from saga_fg.errors import InputError
 from saga_fg.settings import Settings, setting, settings_group
 
@@ -75,6 +76,25 @@ class TableImport(Settings):
             self.sort or other.sort,
         )
 
+    def mended(self, mend: Mend, names: Mapping[str, str]) -> TableImport:
+        """The same with the entries that mend a suspicion; `names`: the file's name of each column of ours."""
+        classes = {theirs: mend.classes.get(ours, ours) for theirs, ours in self.classes.items()}
+        return replace(
+            self,
+            columns={**self.columns, **{ours: names.get(other, other) for ours, other in mend.columns.items()}},
+            classes={**classes, **{name: ours for name, ours in mend.classes.items() if name not in classes}},
+            units={**self.units, **mend.units},
+            coordinates=mend.coordinates or self.coordinates,
+        )
+
+    def option_for(self, mend: Mend | None, names: Mapping[str, str]) -> str:
+        """The options that mend a suspicion, in place of those of the same name; "" for none."""
+        if mend is None:
+            return ""
+        mended = self.mended(mend, names)
+        changed = {field.name: getattr(mended, field.name) for field in fields(Mend) if getattr(mend, field.name)}
+        return TableImport(**changed).options().strip()
+
     def options(self) -> str:
         """The options of the command that say the same, with a space before each; empty if there are none."""
         text = ""
@@ -99,5 +119,7 @@ def pairs(option: str, text: str | None) -> dict[str, str]:
             raise InputError(f"{option}: expected NAME=VALUE with commas between them, got {entry.strip()[:40]!r}")
         if name in found:
             raise InputError(f"{option}: expected {name[:40]!r} once")
+        if value == FILL_IN:
+            raise InputError(f"{option}: {name[:40]}={FILL_IN}: expected a name in place of the dots")
         found[name] = value
     return found

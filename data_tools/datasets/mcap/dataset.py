@@ -50,6 +50,13 @@ class RecordingOptions:
     odometry: str | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class RecordedScene(Scene):
+    """The scene of a recording; world: name of the frame that is tracked in."""
+
+    world: str = field(kw_only=True)
+
+
 class McapRecording:
     """The one scene of a recording, named for its file or folder; it is read when asked for.
 
@@ -62,7 +69,6 @@ class McapRecording:
         self.scenes = (self._recording.name,)
         with error_context(str(self._recording.path)):
             self.sensors = self._chosen()
-        self.world = ""  # frame of the results, known when the scene is read
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -75,7 +81,7 @@ class McapRecording:
         topic = next(iter(self.sensors.values()))
         return OBJECT_TYPES[self._recording.topics[topic].type]
 
-    def scene(self, name: str) -> Scene:
+    def scene(self, name: str) -> RecordedScene:
         """Read the recording. Raises `InputError` naming file, topic, message and field; and for another name.
 
         Messages at times of which the pose is unknown are left out; a warning says how many.
@@ -102,11 +108,13 @@ class McapRecording:
         with error_context(str(self._recording.path)):
             if not seen:
                 raise InputError(f"expected messages of {', '.join(sensor_of)}, there are none")
-            frames = _frames(seen, sensor_of, self._placed(seen, TransformTree(records)))
+            places = self._placed(seen, TransformTree(records))
+            frames = _frames(seen, sensor_of, places)
             times, first = np.unique([frame.timestamp for frame in frames], return_index=True)
             moments = [frames[k] for k in first.tolist()]
             world_T_ego = [np.eye(4) if frame.world_T_ego is None else frame.world_T_ego for frame in moments]
-            return Scene(name, times, np.array(world_T_ego), tuple(frame.token for frame in moments), frames)
+            tokens = tuple(frame.token for frame in moments)
+            return RecordedScene(name, times, np.array(world_T_ego), tokens, frames, world=places.world)
 
     def _placed(self, seen: list[tuple[LoggedMessage, MessageObjects]], tree: TransformTree) -> _Places:
         """Where the vehicle and the frames of the messages are, at the times of the messages."""
@@ -117,13 +125,13 @@ class McapRecording:
         if not len(tree):
             if len(used) > 1:
                 raise InputError(f"expected transforms (/tf) between the frames {', '.join(used)}, there are none")
-            self.world = self.options.world or (used or ["world"])[0]
+            world = self.options.world or (used or ["world"])[0]
             log.warning(
                 "%s: no transforms (/tf) and no odometry: frame %s is taken for one that stands still",
                 self._recording.path,
-                self.world,
+                world,
             )
-            return _Places(self.world, None, np.ones(len(time), dtype=bool), {})
+            return _Places(world, None, np.ones(len(time), dtype=bool), {})
         for frame in (*used, *([self.options.world] if self.options.world else [])):
             if frame not in tree.frames:
                 message = next(
@@ -133,30 +141,30 @@ class McapRecording:
         ego = self.options.ego if self.options.ego in tree.frames else None
         if ego is None and self.options.ego != DEFAULT_EGO:
             raise InputError(f"--ego: {unknown_name('frame', self.options.ego, tree.frames)}")
-        self.world = self.options.world or tree.root(ego or used[0])
+        world = self.options.world or tree.root(ego or used[0])
         for frame in (*used, *([ego] if ego else [])):
-            if not tree.connected(self.world, frame):
-                raise InputError(f"expected transforms between the frames {self.world} and {frame}, there are none")
-        world_T_ego, known = tree.lookup(self.world, ego, time) if ego else (None, np.ones(len(time), dtype=bool))
-        base = ego or self.world
-        places = {frame: tree.lookup(base, frame, time) for frame in used if frame != self.world}
+            if not tree.connected(world, frame):
+                raise InputError(f"expected transforms between the frames {world} and {frame}, there are none")
+        world_T_ego, known = tree.lookup(world, ego, time) if ego else (None, np.ones(len(time), dtype=bool))
+        base = ego or world
+        places = {frame: tree.lookup(base, frame, time) for frame in used if frame != world}
         for k, (_, objects) in enumerate(seen):
             if objects.frame in places:
                 known[k] &= places[objects.frame][1][k]
         if not known.all():
             if not known.any():
                 raise InputError(
-                    f"expected transforms between {self.world} and {base} at the times of the messages, there are none"
+                    f"expected transforms between {world} and {base} at the times of the messages, there are none"
                 )
             log.warning(
                 "%s: left out %d of %d messages, at whose times the transforms between %s and %s are unknown",
                 self._recording.path,
                 int((~known).sum()),
                 len(known),
-                self.world,
+                world,
                 " and ".join(dict.fromkeys([base, *places])),
             )
-        return _Places(self.world, world_T_ego, known, {frame: T for frame, (T, _) in places.items()})
+        return _Places(world, world_T_ego, known, {frame: T for frame, (T, _) in places.items()})
 
     def _chosen(self) -> dict[str, str]:
         """Topic by sensor."""

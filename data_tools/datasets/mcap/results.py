@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from data_tools.datasets.detection_files import TrackRows
-from data_tools.datasets.mcap.dataset import McapRecording
+from data_tools.datasets.mcap.dataset import McapRecording, RecordedScene
 from data_tools.datasets.mcap.definitions import definition
 from data_tools.datasets.mcap.messages import OBJECT_TYPES
 from data_tools.datasets.mcap.objects import MessageObjects, message_objects
@@ -38,9 +38,10 @@ def write_track_messages(path: Path, dataset: McapRecording, scenes: Iterable[tu
     with atomic_file(path) as file:
         write, finish = _writer(file, dataset.form.RESULT)
         for scene, moments in scenes:
+            assert isinstance(scene, RecordedScene)
             for token, tracks in zip(scene.tokens, moments, strict=True):
                 stamp = int(token)
-                message = dataset.form.result(tracks, stamp, dataset.world, names)
+                message = dataset.form.result(tracks, stamp, scene.world, names)
                 write(message, stamp)
         finish()
 
@@ -59,8 +60,10 @@ def _writer(file: BinaryIO, type_: str) -> tuple[Callable[[Any, int], None], Cal
     return lambda message, time: ros.write_message(TOPIC, schema, message, time, time), ros.finish
 
 
-def read_track_messages(path: Path, scene: str, classes: Mapping[str, str], topic: str = TOPIC) -> TrackRows:
-    """Tracks of one scene, of this or another tracker. Raises `InputError` naming file, topic, message and field.
+def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, str], topic: str = TOPIC) -> TrackRows:
+    """Tracks of one scene, of this or another tracker.
+
+    Raises `InputError` naming file, topic, message and field; and for tracks in another frame than the scene's.
 
     topic  the one that is read; where it is missing, the only one that holds objects
     """
@@ -78,12 +81,17 @@ def read_track_messages(path: Path, scene: str, classes: Mapping[str, str], topi
             found = message_objects(rows, classes)
             if (found.id == "").any():
                 raise InputError(f"expected objects with ids, object {int(np.argmax(found.id == ''))} has none")
+            if len(found.id) and found.frame not in ("", scene.world.lstrip("/")):
+                raise InputError(
+                    f"expected tracks in the frame {scene.world} of the recording, got {found.frame}; "
+                    f"add --world {found.frame}, if they were tracked in it"
+                )
             parts.append(found)
     n = [len(each.id) for each in parts]
     boxes = Boxes.concatenate([each.detections.boxes for each in parts])
     none = np.empty((0, 2, 2))
     return TrackRows(
-        np.full(sum(n), scene),
+        np.full(sum(n), scene.name),
         np.repeat([each.stamp / 1e9 for each in parts], n),
         np.concatenate([np.empty(0, dtype="<U1"), *(each.id for each in parts)]),
         boxes,

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from data_tools.datasets.detection_files.table_import import pairs
 from data_tools.datasets.mcap.dataset import McapRecording, RecordingOptions
@@ -80,16 +80,20 @@ class McapSource(DatasetSource):
         assert isinstance(dataset, McapRecording)
         write_track_messages(output, dataset, scenes)
 
+    def kept(self) -> Mapping[str, Any]:
+        return {} if self.world is None else {"world": self.world}
+
+    def with_kept(self, kept: Mapping[str, Any]) -> Self:
+        return self if self.world is not None or "world" not in kept else replace(self, world=str(kept["world"]))
+
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
         with self.open() as dataset:
             if result.suffix != ".mcap":
                 return read_table_results(result, dataset, every_scene=True)
             (name,) = dataset.scenes
-            return {
-                name: scene_result(
-                    dataset.scene(name), read_track_messages(result, name, pairs("--classes", self.classes)), result
-                )
-            }
+            scene = dataset.scene(name)
+            rows = read_track_messages(result, scene, pairs("--classes", self.classes))
+            return {name: scene_result(scene, rows, result)}
 
     def _options(self) -> RecordingOptions:
         topics: dict[str, str] = {}

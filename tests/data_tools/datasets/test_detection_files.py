@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import data_tools.datasets.detection_files
-from data_tools.datasets.detection_files import read_detections, read_tracks, write_tracks
+from data_tools.datasets.detection_files import TableImport, read_detections, read_tracks, write_tracks
+from data_tools.datasets.detection_files.survey import survey_table
 from saga_fg import Boxes, Dataset, InputError, Scene, Tracks
 from saga_fg.numerics.geometry import yaw_of
 
@@ -424,3 +425,21 @@ def test_own_measurements_that_make_no_sense(tmp_path: Path, columns: str, row: 
     path = write(tmp_path, ".csv", f"timestamp,x,y,{columns}\n0.0,1.0,2.0,{row}\n")
     with pytest.raises(InputError, match=f"line 2: {message}"):
         read_detections(path)
+
+
+def test_short_names_of_sides_and_no_guesses_at_others(tmp_path: Path) -> None:
+    path = tmp_path / "detections.csv"
+    path.write_text("timestamp,x,y,len,wid,hgt,vx_m,vy_m,dx,idx\n0,1,2,4,2,1.5,3,0,9,7\n")
+    (frame,) = read_detections(path).scene("detections").frames
+    np.testing.assert_array_equal(frame.detections.boxes.size, [[4, 2, 1.5]])
+    np.testing.assert_array_equal(frame.detections.boxes.velocity, [[3, 0]])
+    path.write_text("timestamp,x,y,coastin,cov_x\n0,1,2,4,2\n")  # columns of tracks are no guess for detections
+    assert survey_table(path).raw.found.unread == ("coastin", "cov_x")
+
+
+def test_exchanged_sides_keep_the_units_of_their_names(tmp_path: Path) -> None:
+    path = tmp_path / "detections.csv"
+    path.write_text("timestamp,x,y,length_cm,width_cm\n0,1,2,190,450\n")
+    how = TableImport(columns={"length": "width_cm", "width": "length_cm"})
+    (frame,) = read_detections(path, how).scene("detections").frames
+    np.testing.assert_allclose(frame.detections.boxes.size[0, :2], [4.5, 1.9])

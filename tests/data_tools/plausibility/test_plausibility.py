@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from data_tools.datasets.detection_files import TableImport
 from data_tools.plausibility import (
     Doubt,
     Sample,
@@ -32,7 +33,7 @@ CARS = np.full(60, "car")
 
 
 def option(doubt: Doubt | None) -> str | None:
-    return None if doubt is None else doubt.option
+    return None if doubt is None else TableImport().option_for(doubt.mend, {"length": "len", "width": "wid"})
 
 
 @pytest.mark.parametrize(
@@ -81,7 +82,7 @@ def test_scores_beyond_one(score: np.ndarray, what: str | None) -> None:
 )
 def test_length_below_width(label: str, size: tuple[float, ...], found: bool) -> None:
     doubt = length_below_width(np.full(60, label), np.tile(size, (60, 1)))
-    assert option(doubt) == ("--columns length=width,width=length" if found else None)
+    assert option(doubt) == ("--columns length=wid,width=len" if found else None)
 
 
 @pytest.mark.parametrize(
@@ -109,6 +110,10 @@ def test_within_a_metre() -> None:
     doubt = within_a_metre(frame, position / 1000)
     assert doubt is not None
     assert "look like km" in doubt.what
+    degrees = within_a_metre(frame, position / 1000 + [48.1, 11.6, 0.0])
+    assert degrees is not None
+    assert "degrees of latitude" in degrees.what
+    assert degrees.mend is None
     lonely = np.zeros((100, 3)) + RNG.normal(0, 0.1, (100, 3))
     assert within_a_metre(np.arange(100), lonely) is None  # one parked object
 
@@ -138,7 +143,7 @@ def test_strange_time_steps(step: float, found: str | None) -> None:
     doubt = strange_time_steps(np.arange(20) * step, np.full(20, "lidar"))
     assert (doubt is None) == (found is None)
     if step != 5e5:
-        assert doubt is None or doubt.option == f"--units time={found}"
+        assert doubt is None or option(doubt) == f"--units time={found}"
 
 
 def test_a_long_pause_is_no_strange_step() -> None:
@@ -216,8 +221,11 @@ def test_names_of_classes(name: str, ours: str | None) -> None:
 def test_rules_that_meet_no_class() -> None:
     doubt = idle_rules({"car", "pedestrian"}, {"REGULAR_VEHICLE", "PERSON", "dog"})
     assert doubt is not None
-    assert doubt.option == "--classes PERSON=pedestrian,REGULAR_VEHICLE=car"
-    assert option(idle_rules({"car"}, {"dog"})) == "--classes dog=car"
+    assert option(doubt) == "--classes PERSON=pedestrian,REGULAR_VEHICLE=car"
+    numbered = idle_rules({"car", "pedestrian"}, {"0", "1"})  # 1 may be the pedestrians
+    assert option(numbered) == "--classes 0=...,1=..."
+    assert numbered is not None
+    assert numbered.text("--classes 0=...,1=...").endswith("; fill in and add --classes 0=...,1=...")
     assert idle_rules({"car"}, {"car", "dog"}) is None
     assert idle_rules(set(), {"dog"}) is None
     assert idle_rules({"car"}, set()) is None
@@ -227,7 +235,7 @@ def test_rules_that_meet_no_class() -> None:
 def test_settings_without_data() -> None:
     doubt = settings_without_data("tracker.classes", {"Pedestrian", "car"}, {"pedestrian", "car"})
     assert doubt is not None
-    assert doubt.text(options=True) == (
+    assert doubt.text() == (
         "tracker.classes.Pedestrian has settings and the data have none of it; pedestrian have the default ones; "
         "is tracker.classes.pedestrian meant?"
     )
