@@ -50,5 +50,15 @@ def test_so_do_the_processes_it_starts(folder: Path) -> None:
     assert len(list((folder / "run" / "tracks").iterdir())) == 2
 
 
+def test_a_program_is_told_of_another_factors_before_it_is_run(folder: Path) -> None:
+    run = python(folder, "-c", "import saga_fg; saga_fg.Tracker()")
+    assert "the other factors" not in run.stderr
+    last = run.stderr.strip().splitlines()[-1]
+    assert last.startswith(f"ImportError: saga_fg needs its package factors in {ROOT}, and Python finds {folder}")
+    assert "python -P" in last
+    (folder / "factors").rename(folder / "my_factors")
+    assert python(folder, "-c", "import saga_fg; saga_fg.Tracker()").returncode == 0
+
+
 def test_a_program_that_uses_the_library_keeps_its_own_packages(folder: Path) -> None:
     assert "the other pipelines" in python(folder, "-c", "import saga_fg, pipelines").stderr

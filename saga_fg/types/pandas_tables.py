@@ -12,12 +12,19 @@ import numpy as np
 
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, from_upper_triangle
-from saga_fg.types.boxes import Boxes
+from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED, Boxes
 
 Table = Any
-"""A `pandas.DataFrame`; pandas may be missing, and its types are none of ours."""
+"""A `pandas.DataFrame`; pandas may be missing, and its types are not known here."""
 
 PLACE = ("x", "y")
+SIZE = ("length", "width", "height")
+COVARIANCE = ("cov_xx", "cov_xy", "cov_yy")
+LARGEST = {
+    **dict.fromkeys((*PLACE, "z"), MAX_POSITION),
+    **dict.fromkeys(SIZE, MAX_SIZE),
+    **dict.fromkeys(("vx", "vy", "range_rate"), MAX_SPEED),
+}
 ANY_OF = {"score": ("score", "confidence"), "label": ("label", "class")}
 """Names under which a column is read."""
 
@@ -28,19 +35,25 @@ UNNAMED = "object"
 def boxes_of_table(table: Table) -> tuple[Boxes, FloatArray, FloatArray, FloatArray]:
     """Return the rows of a table as boxes (N), scores (N,), range rates (N,) and covariances (N, 2, 2) of positions.
 
-    `Detections.from_pandas` has the columns. Raises `InputError` naming one that is missing or holds no numbers.
+    `Detections.from_pandas` has the columns. Raises `InputError` naming a column that is missing, or column and row (by
+    its label in the index) of a value that can't be used.
     """
-    n = len(_checked(table, PLACE))
-    score, z = (_numbers(table, name) for name in ("score", "z"))
+    n = len(checked_table(table, PLACE))
+    score, z = (_usable(table, name) for name in ("score", "z"))
     boxes = Boxes(
-        _texts(table, "label", UNNAMED),
-        np.column_stack([_numbers(table, "x"), _numbers(table, "y"), np.nan_to_num(z)]).reshape(n, 3),
-        np.column_stack([_numbers(table, name) for name in ("length", "width", "height")]).reshape(n, 3),
-        _numbers(table, "yaw"),
-        np.column_stack([_numbers(table, name) for name in ("vx", "vy")]).reshape(n, 2),
+        texts(table, "label", UNNAMED),
+        np.column_stack([_usable(table, "x"), _usable(table, "y"), np.nan_to_num(z)]).reshape(n, 3),
+        np.column_stack([_usable(table, name) for name in SIZE]).reshape(n, 3),
+        _usable(table, "yaw"),
+        np.column_stack([_usable(table, name) for name in ("vx", "vy")]).reshape(n, 2),
     )
-    covariance = np.column_stack([_numbers(table, name) for name in ("cov_xx", "cov_xy", "cov_yy")]).reshape(n, 3)
-    return boxes, np.where(np.isnan(score), 1.0, score), _numbers(table, "range_rate"), from_upper_triangle(covariance)
+    xx, xy, yy = (_usable(table, name) for name in COVARIANCE)
+    given = ~(np.isnan(xx) & np.isnan(xy) & np.isnan(yy))
+    _refuse(
+        table, ", ".join(COVARIANCE), given & ~((xx > 0) & (yy > 0) & (xx * yy > xy**2)), "a positive definite matrix"
+    )
+    covariance = from_upper_triangle(np.column_stack([xx, xy, yy]).reshape(n, 3))
+    return boxes, np.where(np.isnan(score), 1.0, score), _usable(table, "range_rate"), covariance
 
 
 def moments_of_table(table: Table) -> Iterator[tuple[float, str, Table]]:
@@ -48,9 +61,9 @@ def moments_of_table(table: Table) -> Iterator[tuple[float, str, Table]]:
 
     Rows without a place are left out, so that there may be none. Raises `InputError` naming the column.
     """
-    times = _seconds(_checked(table, ("timestamp", *PLACE)))
-    sensors = _texts(table, "sensor", "sensor")
-    there: BoolArray = ~(np.isnan(_numbers(table, "x")) & np.isnan(_numbers(table, "y")))
+    times = _seconds(checked_table(table))
+    sensors = texts(table, "sensor", "sensor")
+    there: BoolArray = ~(np.isnan(numbers(table, "x")) & np.isnan(numbers(table, "y")))
     order = np.lexsort((sensors, times))
     new = np.ones(len(order), dtype=np.bool_)
     new[1:] = (np.diff(times[order]) > 0) | (sensors[order][1:] != sensors[order][:-1])
@@ -74,7 +87,8 @@ def _pandas() -> Any:
     return pandas
 
 
-def _checked(table: Table, required: Sequence[str]) -> Table:
+def checked_table(table: Table, required: Sequence[str] = ("timestamp", *PLACE)) -> Table:
+    """The table itself. Raises `InputError` for something else, and for missing columns."""
     if not hasattr(table, "columns") or not hasattr(table, "iloc"):
         raise InputError(f"expected a pandas.DataFrame, got {type(table).__name__}")
     missing = [name for name in required if name not in table.columns]
@@ -84,11 +98,38 @@ def _checked(table: Table, required: Sequence[str]) -> Table:
     return table
 
 
+def _names(table: Table, name: str) -> list[str]:
+    """The names of a column that the table has; the first of them is read."""
+    return [each for each in ANY_OF.get(name, (name,)) if each in table.columns][:1]
+
+
 def _column(table: Table, name: str) -> Any:
-    return next((table[each] for each in ANY_OF.get(name, (name,)) if each in table.columns), None)
+    return next((table[each] for each in _names(table, name)), None)
 
 
-def _numbers(table: Table, name: str, default: float = np.nan) -> FloatArray:
+def _usable(table: Table, name: str) -> FloatArray:
+    """A column of numbers, NaN where unknown. Raises `InputError` naming column and row of one that can't be used."""
+    values, largest = numbers(table, name), LARGEST.get(name, np.inf)
+    bad = np.isinf(values) | (np.abs(values) > largest)
+    limit = f" of at most {largest:g}" if np.isfinite(largest) else ""
+    if name in PLACE:
+        _refuse(table, name, bad | np.isnan(values), f"a finite number{limit}")
+    if name in SIZE:
+        _refuse(table, name, bad | (values <= 0), f"a size above 0 m{limit}, or nothing for unknown")
+    _refuse(table, name, bad, f"a finite number{limit}, or nothing for unknown")
+    return values
+
+
+def _refuse(table: Table, name: str, bad: BoolArray, expected: str) -> None:
+    if bad.any():
+        row = int(np.argmax(bad))
+        there = [each for column in name.split(", ") for each in _names(table, column)]
+        got = ", ".join(str(table[each].iloc[row]) for each in there)
+        raise InputError(f"{', '.join(there)}: row {table.index[row]}: expected {expected}, got {got}")
+
+
+def numbers(table: Table, name: str, default: float = np.nan) -> FloatArray:
+    """A column as numbers (N,), `default` where there is none. Raises `InputError` where it holds others."""
     column = _column(table, name)
     if column is None:
         return np.full(len(table), default)
@@ -98,7 +139,8 @@ def _numbers(table: Table, name: str, default: float = np.nan) -> FloatArray:
         raise InputError(f"{name}: expected numbers: {error}") from error
 
 
-def _texts(table: Table, name: str, default: str) -> StrArray:
+def texts(table: Table, name: str, default: str) -> StrArray:
+    """A column as texts (N,), `default` where there is none."""
     column = _column(table, name)
     if column is None:
         return np.full(len(table), default)
@@ -111,4 +153,4 @@ def _seconds(table: Table) -> FloatArray:
         return np.asarray(column.to_numpy(dtype="datetime64[ns]").astype(np.int64) / 1e9)
     if column.dtype.kind == "m":
         return np.asarray(column.to_numpy(dtype="timedelta64[ns]").astype(np.int64) / 1e9)
-    return _numbers(table, "timestamp")
+    return numbers(table, "timestamp")

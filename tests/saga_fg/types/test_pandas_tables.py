@@ -93,6 +93,52 @@ def test_tables_that_cannot_be_used_are_refused(rows, message: str) -> None:
         saga_fg.track(rows)
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("x", np.inf, r"^x: row 500: expected a finite number of at most 1e\+09, got inf"),
+        ("y", 1e12, r"^y: row 500: expected a finite number of at most 1e\+09, got 1e\+12|1000000000000"),
+        (
+            "width",
+            -2.0,
+            r"^width: row 500: expected a size above 0 m of at most 100000, or nothing for unknown, got -2",
+        ),
+        ("confidence", np.inf, r"^confidence: row 500: expected a finite number, or nothing for unknown, got inf"),
+        ("cov_xy", 3.0, r"^cov_xx, cov_xy, cov_yy: row 500: expected a positive definite matrix, got 1.0, 3.0, 1.0"),
+    ],
+)
+def test_a_value_is_named_by_its_column_and_row(column: str, value: float, message: str) -> None:
+    rows = table(label="car", width=1.8, confidence=0.5, cov_xx=1.0, cov_xy=0.0, cov_yy=1.0)
+    rows.index = rows.index + 490
+    rows.loc[500, column] = value
+    with pytest.raises(InputError, match=message):
+        saga_fg.track(rows)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"label": "car", "score": 87.0}, r"score: expected 0 to 1, got 87 to 87; divide percent by 100"),
+        ({"label": "car", "score": -2.5}, r'Sensor\(score="logit"\)'),
+        ({"label": "car", "yaw": 90.0}, r"yaw: expected rad, got up to 90, which looks like degrees"),
+        (
+            {"label": "REGULAR_VEHICLE"},
+            r"label: no edges: the rules act on .*car.*, the detections are of REGULAR_VEHICLE",
+        ),
+    ],
+)
+def test_what_is_probably_wrong_is_warned_of(columns: dict[str, object], message: str) -> None:
+    with pytest.warns(UserWarning, match=message):
+        saga_fg.track(table(**columns))
+
+
+def test_usual_tables_are_not_warned_of() -> None:
+    saga_fg.track(table(label=["car", "dog"] * 12, score=[0.0, 1.0] * 12, yaw=[6.28, -6.28] * 12))
+    saga_fg.track(table(label="car", score=3.0), sensors={"default": saga_fg.Sensor(score="logit")})
+    saga_fg.track(table())
+    saga_fg.track(table(label="DRONE"), saga_fg.TrackerSettings(edges=()))
+
+
 def test_without_pandas_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'saga-fg\[pandas\]'"):
