@@ -3,6 +3,7 @@
 from data_tools.plausibility.checks import (
     ego_taken_for_world,
     far_too_fast,
+    frames_taken_for_seconds,
     headings_in_degrees,
     length_below_width,
     scores_beyond_one,
@@ -22,6 +23,7 @@ __all__ = [
     "doubts_of",
     "ego_taken_for_world",
     "far_too_fast",
+    "frames_taken_for_seconds",
     "headings_in_degrees",
     "idle_rules",
     "length_below_width",

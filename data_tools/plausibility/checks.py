@@ -5,6 +5,8 @@ Each returns a `Doubt` or None. Shares and numbers are such that none is raised 
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from data_tools.plausibility.class_names import usual_class
@@ -15,6 +17,7 @@ from saga_fg.numerics.geometry import transform_points
 FEWEST = 20  # values that allow a judgement
 _FASTEST = {"pedestrian": 12.0, "bicycle": 25.0}  # m/s
 _FASTEST_VEHICLE, _FASTEST_OTHER = 75.0, 110.0  # m/s
+_COUNTS = {"frame", "frames", "step", "timestep", "tick", "index", "idx", "sweep"}
 _TRAVELLED = 3.0  # m of the vehicle, from which it shows what moves with it
 _PAIRS = 20  # pairs of frames that are compared
 
@@ -118,6 +121,16 @@ def strange_time_steps(time: FloatArray, sensor: StrArray) -> Doubt | None:
         what = f"frames are usually {middle:.1g} s apart: their times look like a coarser unit than seconds"
         return Doubt("times", what, "expected seconds", Mend(units={"time": "s"}))
     return None
+
+
+def frames_taken_for_seconds(column: str, time: FloatArray) -> Doubt | None:
+    """Times (n,) read as s from a column whose name is that of a count, and which are whole numbers."""
+    words = set(re.findall(r"[a-z]+", column.lower()))
+    known = np.unique(time[np.isfinite(time)])
+    if not words & _COUNTS or len(known) < 3 or (known % 1).any():
+        return None
+    what = f"times are whole numbers of the column {column[:40]!r}: they look like frames, such as 10 a second"
+    return Doubt("frames", what, "expected seconds", Mend(units={"time": "10Hz"}))
 
 
 def ego_taken_for_world(

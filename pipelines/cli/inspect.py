@@ -72,7 +72,9 @@ def inspect_table(
     _show_columns(survey)
     _show_times(survey)
     doubts = (*survey.doubts, *_show_classes(survey))
-    typer.echo("\nWhat looks wrong:" if doubts or not survey.sorted else "\nNothing looks wrong.")
+    typer.echo("\nWhat looks wrong:" if survey.faults or doubts or not survey.sorted else "\nNothing looks wrong.")
+    for fault in survey.faults:
+        typer.echo(f"  {fault}")
     for doubt in doubts:
         typer.echo(f"  {doubt.text(survey.how.option_for(doubt.mend, survey.raw.found.names))}")
     if not survey.sorted:
@@ -87,7 +89,7 @@ def _show_columns(survey: TableSurvey) -> None:
     raw = survey.raw
     typer.echo(f"{raw.path}: {counted(raw.length, 'row')}\n\nColumns, and their least, median and largest value:")
     names = raw.found.names
-    for ours, theirs in sorted(names.items(), key=lambda pair: list(raw.columns).index(pair[0])):
+    for ours, theirs in ((ours, names.get(ours, ours)) for ours in raw.columns):
         how = theirs if theirs != ours else ""
         unit = raw.clock.unit if ours == "timestamp" else raw.how.unit(ours, raw.found.units.get(ours)) or ""
         origin = " ".join(part for part in (f"from {how}" if how else "", f"in {unit}" if unit else "") if part)
@@ -158,13 +160,24 @@ def _mended(survey: TableSurvey, doubts: Sequence[Doubt], given: TableImport) ->
     for mend in mends:
         how = how.mended(mend, names)
         changed |= {name for name, value in vars(mend).items() if value}
+    if survey.raw.found.open:
+        how = replace(how, columns={**how.columns, **survey.raw.found.open})
+        changed.add("columns")
     return replace(given, **{name: getattr(how, name) for name in changed})
 
 
 def _show_next(survey: TableSurvey, table: Path, options: str) -> None:
+    from data_tools.plausibility import FILL_IN
+
     name = shlex.quote(str(table))
-    typer.echo("\nNext:")
-    if survey.has_identities:
+    command = survey.raw.argoverse_command()
+    to_mend = survey.faults and not survey.raw.found.open
+    unknown = FILL_IN in options + command
+    text = ", when the table is mended" if to_mend else f", with what fits in place of {FILL_IN}" if unknown else ""
+    typer.echo(f"\nNext{text}:")
+    if command:
+        typer.echo(f"  {command}")
+    elif survey.has_identities:
         typer.echo("  these are tracks or true objects; as the truth beside tracks, or as tracks beside the truth:")
         typer.echo(f"  saga-fg evaluate file tracks.csv --truth {name}{options}")
         typer.echo(f"  saga-fg evaluate file {name} --truth truth.csv{options}")

@@ -276,8 +276,7 @@ def _trails(parts: Sequence[RecordedTracks], moments: FloatArray) -> TrailPoints
         speed = np.hypot(*part.mean[:, 2:4].T)
         moving = part.select((part.table.last_detected >= -1e-6) & (speed > MOVING))
         v, times = moving.mean[:, 2:4], np.full(len(moving), time)
-        trails.update(
-            TrailPoints(moving.table.id, moving.mean[:, :2], np.arctan2(v[:, 1], v[:, 0]), np.hypot(*v.T), times)
-        )
+        heading = np.arctan2(v[:, 1], v[:, 0])
+        trails.update(TrailPoints(moving.table.id, moving.mean[:, :2], heading, np.hypot(*v.T), times), float(time))
     none = np.empty(0)
     return trails.points or TrailPoints(none.astype(np.int64), np.empty((0, 2)), none, none, none)

@@ -83,17 +83,19 @@ class NodeTable:
         return along_paths(self.position, self.heading, self.paths, target, source)
 
     def select(self, rows: IntArray) -> NodeTable:
-        """The nodes `rows` (k,), ascending."""
+        """The nodes `rows` (k,), ascending. Raises `TypeError` for a column of a kind that cannot be selected."""
         place = dict(zip(rows.tolist(), range(len(rows)), strict=True))
         columns: dict[str, Any] = {"types": tuple(map(self.types.__getitem__, place))}
         for each in fields(self):
             value = getattr(self, each.name)
             if isinstance(value, np.ndarray):
                 columns[each.name] = value[rows]
-            elif isinstance(value, Paths):
+            elif isinstance(value, Paths | LanesAcross):
                 columns[each.name] = value.of_nodes(rows)
             elif isinstance(value, Mapping) and each.init:
                 columns[each.name] = {place[row]: entry for row, entry in value.items() if row in place}
+            elif each.init and each.name != "types" and value is not None:
+                raise TypeError(f"nodes: {each.name} is a {type(value).__name__}, which cannot be selected by rows")
         return replace(self, **columns)
 
 

@@ -76,7 +76,7 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
             own, way = paths.select(path[rows[led]]), speed[led] * dt
             turn = _at(own.heading, way) - own.heading[:, 0]
             heading[led], across[led] = own.heading[:, 0], _across(own, speed[led])
-            typical, weight = _at(own.speed, way), _at(own.weight, way)
+            typical, weight = typical_speed(own, way)
             pull[led] = weight / (weight + 1) * np.where(speed[led] > MOVING, typical - speed[led], 0.0) / FLOW_TIME
             after[rows[led]] = wrap_angle(heading[led] + turn)
             rate[led], settling[led] = turn / turning_time(motion, dt), 1 / motion.course_time
@@ -86,6 +86,12 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
     if turn_time.any():
         table.turn.predict(dt, turn_time)
     return tuple(found), after
+
+
+def typical_speed(paths: Paths, way: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The speed (k,) of earlier traffic at some way (k,), m, along k paths, m/s, and its weight (k,)."""
+    weight = _at(paths.weight, way)
+    return _at(paths.weight * paths.speed, way) / np.maximum(weight, _LEAST), weight
 
 
 def _across(paths: Paths, speed: FloatArray) -> FloatArray:

@@ -83,22 +83,27 @@ class Trails:
     latest: TrailPoints | None = None  # of each track, by id
     _tree: cKDTree | None = field(default=None, repr=False)
 
-    def update(self, passing: TrailPoints) -> None:
-        """Remember where moving tracks are, if that is `SPACING` m from their last point."""
-        if self.settings.memory == 0 or len(passing) == 0:
+    def update(self, passing: TrailPoints, time: float) -> None:
+        """Remember where moving tracks are at `time`, s, every `SPACING` m, and forget what is older than `memory`."""
+        if self.settings.memory == 0:
             return
+        self._forget(time - self.settings.memory)
         if self.points is None or self.latest is None:
-            self.points = passing
+            self.points, latest = passing, passing
         else:
-            new = np.flatnonzero(self._moved(passing, self.latest))
+            new = passing.select(np.flatnonzero(self._moved(passing, self.latest)))
             if len(new) == 0:
                 return
-            passing, since = passing.select(new), passing.time[0] - self.settings.memory
-            gone = np.isin(self.latest.id, passing.id) | (self.latest.time < since)
-            self.latest = self.latest.select(~gone)
-            self.points = self.points.select(self.points.time >= since).append(passing)
-        latest = passing if self.latest is None else self.latest.append(passing)
+            self.points = self.points.append(new)
+            latest = self.latest.select(~np.isin(self.latest.id, new.id)).append(new)
         self.latest, self._tree = latest.select(np.argsort(latest.id)), None
+
+    def _forget(self, since: float) -> None:
+        """Drop the points before `since`, s."""
+        if self.points is None or self.latest is None or len(self.points) == 0 or self.points.time[0] >= since:
+            return  # points are in the order of time
+        self.points, self._tree = self.points.select(self.points.time >= since), None
+        self.latest = self.latest.select(self.latest.time >= since)
 
     @staticmethod
     def _moved(passing: TrailPoints, latest: TrailPoints) -> BoolArray:

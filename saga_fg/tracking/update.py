@@ -49,7 +49,8 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
         table.has_moved[t] |= moves[t]
         seen = t[moves[t]]
         heading, time = np.arctan2(*now.velocity[seen, ::-1].T), np.full(len(seen), state.time)
-        state.trails.update(TrailPoints(table.id[seen], now.position[seen] + state.origin, heading, speed[seen], time))
+        passing = TrailPoints(table.id[seen], now.position[seen] + state.origin, heading, speed[seen], time)
+        state.trails.update(passing, state.time)
     if state.settings.traffic_flow_prior.weight > 0:
         state.traffic.update(Passages.of(table, t, state.kinematics().select(t), state.origin, state.time))
 

@@ -72,6 +72,13 @@ class LanesAcross:
             self, origin=origin, line=rows[self.line], s=self.s + along, e=self.e + x * by[:, 1] - y * by[:, 0]
         )
 
+    def of_nodes(self, rows: IntArray) -> LanesAcross:
+        """The lanes across the lines that are among the nodes `rows` (k,), ascending, which are counted from 0 then."""
+        place = np.searchsorted(rows, self.line).clip(max=max(len(rows) - 1, 0))
+        kept = rows[place] == self.line if len(rows) else np.zeros(len(self.line), dtype=np.bool_)
+        line, lane, s, e = place[kept], self.lane[kept], self.s[kept], self.e[kept]
+        return replace(self, line=line, lane=lane, s=s, e=e, direction=self.direction[kept])
+
     def inside(self, position: FloatArray, facing: FloatArray) -> InLane:
         """Vehicles at `position` (V, 2), m, in lanes that lead where they are `facing`, unit vectors (V, 2)."""
         place = position + self.origin

@@ -251,8 +251,8 @@ def test_classes_that_are_numbers_are_to_be_filled_in(
     units = ["--units", "angle=deg,score=percent"]
     if command == "inspect":
         text = saga_fg("inspect", table, *units).stdout
-        assert "saga-fg track file" in text.split("Next:")[1]
-        assert "--classes 0=...,1=... " in text.split("Next:")[1]
+        assert "saga-fg track file" in text.split("Next, with what fits in place of ...:")[1]
+        assert "--classes 0=...,1=... " in text.split("Next, with what fits in place of ...:")[1]
     else:
         assert saga_fg("track", "file", table, *units, "--sort", "-o", tmp_path / "t.csv").exit_code == 0
         text = caplog.text
@@ -287,6 +287,58 @@ def test_a_look_at_a_table_that_cannot_be_understood(tmp_path: Path) -> None:
     result = saga_fg("inspect", table)
     assert result.exit_code == 2
     assert "the columns there are bar, foo; name it: --columns timestamp=NAME,x=NAME,y=NAME" in result.stderr
+
+
+def test_a_look_at_a_table_with_faults_shows_what_is_understood(tmp_path: Path) -> None:
+    table = tmp_path / "d.csv"
+    table.write_text("when,x,y,lenght,label,score\n0,1,2,4.5,car,high\n1,1.5,2,4.5,car,0.5\n")
+    result = saga_fg("inspect", table)
+    assert result.exit_code == 0, result.output
+    assert re.search(r"x +1 +1\.25 +1\.5", result.stdout)
+    assert "car: 2, ? x ? x ? m, with interactions" in result.stdout
+    wrong, following = result.stdout.split("What looks wrong:")[1].split("Next, with what fits in place of ...:")
+    assert "expected a column 'timestamp'" in wrong
+    assert "unknown column 'lenght'; did you mean 'length'?" in wrong
+    assert "line 2: score: expected a number, got 'high'" in wrong
+    assert f"saga-fg track file {table} --columns length=lenght,timestamp=... " in following
+    assert "expected a name in place of the dots" in run_line(following.strip().splitlines()[0]).stderr
+    told = saga_fg("inspect", table, "--columns", "timestamp=when,length=lenght,score=")
+    assert "Nothing looks wrong." in told.stdout
+
+
+def test_numbers_of_frames_taken_for_seconds(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    found = [{"frame": k // 2, "x": k // 2 + 20 * (k % 2), "y": 2, "label": "car"} for k in range(40)]
+    table = write(tmp_path / "d.csv", found)
+    track = ["track", "file", table, "--columns", "time=frame", "-o", tmp_path / "t.csv"]
+    assert saga_fg(*track).exit_code == 0
+    assert "they look like frames, such as 10 a second; add --units time=10Hz" in caplog.text
+    assert "add --units time=10Hz" in saga_fg("inspect", table, "--columns", "time=frame").stdout
+    caplog.clear()
+    assert saga_fg(*track, "--units", "time=10Hz").exit_code == 0
+    assert not caplog.records
+    assert saga_fg(*track, "--units", "time=s").exit_code == 0  # they are seconds
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("tracks", [False, True])
+def test_boxes_of_argoverse_are_not_taken_for_the_world(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, tracks: bool
+) -> None:
+    pose = {"qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "tz_m": 0.0}
+    found = [
+        {"log_id": "a", "timestamp_ns": T0 + k * 10**8, "category": "BUS", "score": 0.5, "length_m": 10.0,
+         "width_m": 2.5, "height_m": 3.0, "tx_m": 5.0 + k, "ty_m": 1.0, **pose, **({"track_id": 3} if tracks else {})}
+        for k in range(30)
+    ]  # fmt: skip
+    table = write(tmp_path / "d.feather.parquet", found)
+    shown = saga_fg("inspect", table).stdout
+    command = f"saga-fg track argoverse2 --dataroot ... --detections {table} --output tracks.feather"
+    if tracks:
+        command = f"saga-fg evaluate argoverse2 {table} --dataroot ..."
+    assert shown.endswith(f"Next, with what fits in place of ...:\n  {command}\n")
+    if not tracks:
+        assert saga_fg("track", "file", table, "--classes", "BUS=bus", "-o", tmp_path / "t.csv").exit_code == 0
+        assert f"in the frame of the vehicle, and are taken for the world; read them with the poses of their logs: {command}" in caplog.text  # fmt: skip # noqa: E501
 
 
 def test_a_look_at_a_table_without_doubts(tmp_path: Path) -> None:

@@ -10,11 +10,10 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from pathlib import Path
 from types import MappingProxyType
 
 from data_tools.datasets.detection_files.units import UNITS, kind_of
-from saga_fg.errors import InputError
+from data_tools.plausibility import FILL_IN
 
 _PLACE = (
     "pos_# position_# #_position #_pos p# t# c# center_# #_center centre_# #_centre translation_# location_# #_world "
@@ -58,11 +57,15 @@ class Columns:
     names   the file's name of each column of ours
     units   by our name, where the file's name ends in one
     unread  columns of the file that have no meaning here
+    faults  what is wrong with the names, a text each
+    open    by our name, the file's name that mends a fault, `FILL_IN` where it is not known
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+    open: Mapping[str, str] = field(default_factory=dict)
 
 
 def canonical(name: str) -> str | None:
@@ -83,27 +86,26 @@ def meaning(name: str) -> tuple[str, str | None] | None:
 
 
 def understood(
-    path: Path,
     names: Collection[str],
     columns: Collection[str],
     required: Collection[str],
     given: Mapping[str, str],
     lenient: bool = False,
 ) -> Columns:
-    """Find the columns of a file by their names.
+    """Find the columns of a file by their names; faults are all that are missing, misspelt, or could be either of two.
 
     names     of the file
     columns   of ours that have a meaning in it; required: those of them that it must have
     given     by our name, the file's name, "" for none; lenient: they need not be there
-
-    Raises one `InputError` for all that are missing, misspelt, or could be either of two.
     """
     chosen: dict[str, str] = {}
     faults: list[str] = []
+    mends: dict[str, str] = {}
     for ours, name in given.items():
         if name in names and ours in columns:
             chosen[ours] = name
         elif name and ours in columns and not lenient:
+            mends[ours] = FILL_IN
             faults.append(f"--columns {ours}={name[:40]}: there is no column {name[:40]!r}")
     taken = set(chosen.values())
     free = [name for name in names if name not in taken]
@@ -119,6 +121,7 @@ def understood(
         if len(candidates) == 1:
             chosen[ours] = candidates[0]
         else:
+            mends[ours] = FILL_IN
             either = " or ".join(repr(name[:40]) for name in sorted(candidates))
             faults.append(
                 f"{ours}: expected one column, {either} could be it; choose: --columns {ours}={candidates[0]}"
@@ -130,24 +133,24 @@ def understood(
             free_columns = set(columns) - chosen.keys() - given.keys() - (set() if "id" in chosen else _OF_TRACKS)
             nearest = get_close_matches(name, free_columns, n=1, cutoff=0.75)
             if nearest:
+                mends[nearest[0]] = name
                 mend = f"--columns {nearest[0]}={name[:40]}, or {nearest[0]}= if it is another"
                 faults.append(f"unknown column {name[:40]!r}; did you mean {nearest[0]!r}? ({mend})")
     missing = [ours for ours in required if ours not in chosen and ours not in possible]
     if missing:
+        mends |= dict.fromkeys(missing, FILL_IN)
         there = ", ".join(name[:40] for name in sorted(names)[:12]) or "none"
         there += f", ... ({len(names)} in all)" if len(names) > 12 else ""
         wanted = " and ".join(f"a column {ours!r}" for ours in missing)
         mend = f"; name it: --columns {','.join(f'{ours}=NAME' for ours in missing)}" if names else ""
         faults.insert(0, f"expected {wanted}, the columns there are {there}{mend}")
-    if faults:
-        raise InputError(f"{path}: {'; '.join(faults)}")
     ends = {ours: meaning(name) for ours, name in chosen.items()}
     units = {
         ours: found[1]
         for ours, found in ends.items()
         if found is not None and found[1] and kind_of.get(found[0]) == kind_of.get(ours)
     }
-    return Columns(chosen, units, tuple(unread))
+    return Columns(chosen, units, tuple(unread), tuple(faults), mends)
 
 
 def _plain(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from data_tools.datasets.detection_files.column_names import Columns
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.units import ISO, Clock, factor, is_date, seconds_of_dates
-from data_tools.plausibility import headings_in_degrees
+from data_tools.plausibility import FILL_IN, Doubt, frames_taken_for_seconds, headings_in_degrees
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
@@ -29,6 +30,7 @@ GPS = ("gps_x", "gps_y", "gps_z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ROTATIONS = {"yaw": QUATERNION, "ego_yaw": tuple(f"ego_{name}" for name in QUATERNION)}
 COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, *ODOMETRY, *GPS, *QUATERNION, *ROTATIONS["ego_yaw"], "empty")
+_ARGOVERSE = {"log_id", "timestamp_ns", "category", "length_m", "qw", "qz", "tx_m", "ty_m", "tz_m"}
 LONGEST_NAME = 256  # characters; NumPy stores all texts of an array as wide as the widest
 
 Values = Sequence[Any] | np.ndarray[Any, Any]
@@ -98,10 +100,31 @@ class RawTable:
         if faults:
             raise InputError(f"{self.path}: {'; '.join(faults)}")
 
-    def warn_of_headings(self) -> None:
-        """Warn where headings look like degrees; they are wrapped later on, and cannot be told then."""
-        doubt = headings_in_degrees(self.numbers("yaw"))
-        if doubt is not None:
+    def doubts(self) -> list[Doubt]:
+        """What is doubtful about columns as they are given, which cannot be seen in frames."""
+        doubts = [headings_in_degrees(self.numbers("yaw"))]
+        if "timestamp" in self.columns and "time" not in self.how.units and self.clock.unit == "s":
+            doubts.append(frames_taken_for_seconds(self.found.names.get("timestamp", ""), self.numbers("timestamp")))
+        command = self.argoverse_command()
+        if command:
+            what = "these are boxes of Argoverse 2, in the frame of the vehicle, and are taken for the world"
+            doubts.append(Doubt("argoverse2", what, f"read them with the poses of their logs: {command}"))
+        return [doubt for doubt in doubts if doubt is not None]
+
+    def argoverse_command(self) -> str:
+        """The command for a file in Argoverse's format without poses, "" for another."""
+        if not {*self.found.names.values(), *self.found.unread} >= _ARGOVERSE:
+            return ""
+        if self.how.coordinates or "coordinates" in self.columns or self.present("ego_x").any():
+            return ""
+        name = shlex.quote(str(self.path))
+        if "track_id" in self.found.names.values() or "track_id" in self.found.unread:
+            return f"saga-fg evaluate argoverse2 {name} --dataroot {FILL_IN}"
+        return f"saga-fg track argoverse2 --dataroot {FILL_IN} --detections {name} --output tracks.feather"
+
+    def warn_of_doubts(self) -> None:
+        """Warn of what is doubtful about columns as they are given."""
+        for doubt in self.doubts():
             log.warning("%s: %s", self.path, doubt.text(self.how.option_for(doubt.mend, self.found.names)))
 
     def texts(self, name: str, default: str) -> StrArray:

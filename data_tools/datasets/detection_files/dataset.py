@@ -121,7 +121,7 @@ def read_detections(path: str | Path, how: TableImport | None = None) -> Detecti
     """
     raw = read_raw_table(Path(path), how=how)
     table = DetectionFile(raw)
-    raw.warn_of_headings()
+    raw.warn_of_doubts()
     return table
 
 
@@ -140,7 +140,7 @@ def read_scenes_in_parts(
     for table in read_raw_parts(Path(path), how=how, rows=rows):
         part = DetectionFile(table)
         if with_poses is None:
-            table.warn_of_headings()
+            table.warn_of_doubts()
         if with_poses not in (None, part.with_poses):
             raise InputError(f"{path}: {table.where(0)}: ego_x, ego_y, ego_yaw: expected in all rows or in none")
         with_poses = part.with_poses

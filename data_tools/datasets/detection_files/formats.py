@@ -34,11 +34,16 @@ _OPEN_QUOTE = "a quote is opened and not closed on this line"
 
 @dataclass(frozen=True)
 class Layout:
-    """The columns a table may have, and those it must; `lenient`: a column that --columns names need not be there."""
+    """The columns a table may have, and those it must.
+
+    lenient  a column that --columns names need not be there
+    faulty   columns that are missing or misspelt are no error where some are understood
+    """
 
     columns: tuple[str, ...] = COLUMNS
     required: tuple[str, ...] = REQUIRED
     lenient: bool = False
+    faulty: bool = False
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,10 @@ class _Reading:
     def understood(self, names: Collection[str]) -> Columns:
         """The columns of the file by their meaning. Raises `InputError` for all that is wrong with their names."""
         wanted, layout = self.way(names).columns, self.layout
-        return understood(self.path, names, layout.columns, layout.required, wanted, layout.lenient)
+        found = understood(names, layout.columns, layout.required, wanted, layout.lenient)
+        if found.faults and not (layout.faulty and found.names):
+            raise InputError(f"{self.path}: {'; '.join(found.faults)}")
+        return found
 
 
 def read_raw_table(
@@ -255,10 +263,11 @@ def _read_npz(reading: _Reading) -> Iterator[RawTable]:
         with error_context(str(path)):
             _, arrays = load_archive(file, found.names.values())
     columns: dict[str, Values] = {ours: arrays[theirs] for ours, theirs in found.names.items()}
-    length = len(columns["timestamp"]) if np.ndim(columns["timestamp"]) == 1 else 0
+    first = "timestamp" if "timestamp" in columns else next(iter(columns))
+    length = len(columns[first]) if np.ndim(columns[first]) == 1 else 0
     for name, column in columns.items():
         if np.shape(column) != (length,):
-            raise InputError(f"{path}: {name}: expected shape ({length},) as timestamp has, got {np.shape(column)}")
+            raise InputError(f"{path}: {name}: expected shape ({length},) as {first} has, got {np.shape(column)}")
     yield RawTable(path, columns, length, _row, False, found, reading.way(names))
 
 

@@ -13,10 +13,11 @@ from data_tools.datasets.detection_files.dataset import DetectionFile
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table, sorted_by_time
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS
-from data_tools.plausibility import Doubt, Sample, doubts_of, headings_in_degrees
+from data_tools.plausibility import Doubt, Sample, doubts_of
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
-_ALL = Layout(tuple(dict.fromkeys((*COLUMNS, *TRACK_COLUMNS, "visible"))), REQUIRED)
+_ALL = Layout(tuple(dict.fromkeys((*COLUMNS, *TRACK_COLUMNS, "visible"))), REQUIRED, faulty=True)
 SHOWN = (*REQUIRED, *BOX, *POSE)
 GAP = 3.0  # usual steps, from which a pause counts
 
@@ -45,6 +46,7 @@ class TableSurvey:
     sizes     median length, width and height of each class, m
     times     of each sensor in each scene
     doubts    about the table as it is read now
+    faults    why it cannot be read as it is, a text each
     """
 
     raw: RawTable
@@ -55,6 +57,7 @@ class TableSurvey:
     sizes: Mapping[str, FloatArray]
     times: tuple[SensorTimes, ...]
     doubts: tuple[Doubt, ...]
+    faults: tuple[str, ...] = ()
 
     @property
     def has_identities(self) -> bool:
@@ -65,21 +68,24 @@ class TableSurvey:
 def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
     """Look at a table of detections, tracks or true objects. Raises `InputError` for one that cannot be read at all."""
     how = how or TableImport()
-    raw = read_raw_table(path, _ALL, replace(how, sort=False))
+    raw, faults = _without_faults(read_raw_table(path, _ALL, replace(how, sort=False)))
     scene, time = raw.texts("scene", raw.path.stem), raw.numbers("timestamp")
     _, of_scene = np.unique(scene, return_inverse=True)
     backwards = np.diff(time[np.argsort(of_scene, kind="stable")]) < 0
     backwards &= np.diff(np.sort(of_scene)) == 0
     in_order = not backwards.any()
     ordered = raw if in_order else sorted_by_time(raw)
-    dataset = DetectionFile(replace(ordered, columns={k: v for k, v in ordered.columns.items() if k in COLUMNS}))
-    degrees = headings_in_degrees(raw.numbers("yaw"))
-    doubts = [degrees] if degrees is not None else []
-    for name in dataset.scenes[:3]:
-        doubts += doubts_of(Sample.of(dataset.scene(name).frames))
+    doubts = raw.doubts()
+    if not faults:
+        try:
+            table = DetectionFile(replace(ordered, columns={k: v for k, v in ordered.columns.items() if k in COLUMNS}))
+            for name in table.scenes[:3]:
+                doubts += doubts_of(Sample.of(table.scene(name).frames))
+        except InputError as error:
+            faults.append(_of_file(error, raw))
     known = {doubt.kind: doubt for doubt in reversed(doubts)}
     labels = raw.texts("label", "object")
-    detected = raw.present("x")
+    detected = raw.present("x") if "x" in raw.columns else np.ones(raw.length, dtype=np.bool_)
     return TableSurvey(
         raw,
         replace(how, sort=how.sort or not in_order),
@@ -87,9 +93,26 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
         {name: _range(raw.numbers(name)) for name in SHOWN if name in raw.columns or _rotated(raw, name)},
         {name: int((detected & (labels == name)).sum()) for name in np.unique(labels[detected]).tolist()},
         _sizes(raw, labels, detected),
-        _times(ordered),
+        _times(ordered) if "timestamp" in raw.columns else (),
         tuple(known.values()),
+        tuple(faults),
     )
+
+
+def _without_faults(raw: RawTable) -> tuple[RawTable, list[str]]:
+    """The table without the columns that hold anything but finite numbers, and what is wrong with it."""
+    faults, broken = list(raw.found.faults), set()
+    for name in (*SHOWN, *QUATERNION):
+        try:
+            raw.numbers(name)
+        except InputError as error:
+            faults.append(_of_file(error, raw))
+            broken |= {name, *ROTATIONS.get(name, ())}
+    return replace(raw, columns={name: values for name, values in raw.columns.items() if name not in broken}), faults
+
+
+def _of_file(error: InputError, raw: RawTable) -> str:
+    return str(error).removeprefix(f"{raw.path}: ")
 
 
 def _rotated(raw: RawTable, name: str) -> bool:

@@ -63,7 +63,7 @@ def track_rows_of(raw: RawTable) -> TrackRows:
     _, left_out = raw.labels()
     kept = np.flatnonzero(~left_out)
     found = box_columns(raw, left_out)
-    raw.warn_of_headings()
+    raw.warn_of_doubts()
     timestamp = raw.numbers("timestamp")
     if np.isnan(timestamp).any():
         row = int(np.argmax(np.isnan(timestamp)))

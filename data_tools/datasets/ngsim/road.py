@@ -101,9 +101,9 @@ def road_of(entry: Any, what: str, with_cycles: bool) -> tuple[RoadMap, dict[str
     lanelets = _by_id([_lanelet(each, what) for each in _list(entry, "lanelets", what)], f"{what}: lanelets")
     lights = _by_id([_light(each, what, with_cycles) for each in _list(entry, "lights", what)], f"{what}: lights")
     for lanelet in lanelets.values():
-        unknown = next((light for light in lanelet.lights if light not in lights), None)
-        if unknown is not None:
-            raise InputError(f"{what}: lanelet {lanelet.id}: lights: there is no light {unknown}")
+        unknown = [light for light in lanelet.lights if light not in lights]
+        if unknown:
+            raise InputError(f"{what}: lanelet {lanelet.id}: lights: there is no light {unknown[0]}")
     mapped: list[TrafficLight] = []
     lines: list[StopLine] = []
     cycles: dict[str, Colours] = {}

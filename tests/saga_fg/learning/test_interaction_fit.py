@@ -88,6 +88,7 @@ def test_how_wide_the_process_noise_is_does_not_matter():
 def test_all_finite_rates_and_widths_of_rules_are_parameters():
     @dataclasses.dataclass(frozen=True)
     class Ahead:
+        interaction: SharedVelocity = SharedVelocity()
         rate: float = 0.4
         path_scale: float = 2.0
         gap_scale: float = math.inf

@@ -207,33 +207,49 @@ def test_the_queue_brakes_through_following():
     assert not any(name == "Stopping" and t in (1, 2) for name, t, _ in ends)
 
 
-def test_the_way_to_a_line_is_along_the_lane():
-    """A line round the bend: straight on, the vehicle would miss it."""
-    nodes = bent_lane()
+def line_round_the_bend(*others):
+    """Vehicles `others`, one in a bent lane, the lane, and a stop line that it would miss straight on."""
+    nodes, n = bent_lane(), len(others)
     lane = nodes.outline[1]
     end, before = lane[-1], lane[-2]
     t = (end - before) / np.linalg.norm(end - before)
     across = np.array([-t[1], t[0]])
-    rows = [("car", *nodes.position[0], 8.0, 0.2, 4), ("lane", *nodes.position[1], 0, 0, 0)]
+    rows = [*others, ("car", *nodes.position[0], 8.0, 0.2, 4), ("lane", *nodes.position[1], 0, 0, 0)]
     rows.append(("stop_line", *(end - t), 0, math.atan2(t[1], t[0]), 0))
     with_line = table(
         rows,
-        np.array([0, 0, 1.0]),
-        {1: lane, 2: np.stack([end - t + 1.75 * across, end - t - 1.75 * across])},
-        {1: 3.5},
+        np.append(np.zeros(n + 2), 1.0),
+        {n + 1: lane, n + 2: np.stack([end - t + 1.75 * across, end - t - 1.75 * across])},
+        {n + 1: 3.5},
     )
-    left, right = (tuple(point) for point in with_line.outline[2].tolist())
+    left, right = (tuple(point) for point in with_line.outline[n + 2].tolist())
     mapped = Lane("lane", tuple(map(tuple, lane.tolist()))), StopLine("line", left, right, "light")
-    crossing = LanesAcross.of(mapped[:1], mapped[1:]).placed(np.zeros(2), np.zeros((1, 2)), np.array([2]))
-    assert crossing.line.tolist() == [2]
-    assert len(RedLight().pairs(with_line).target) == 0  # straight on it would miss the line
-    with_line = replace(with_line, lanes=crossing)
+    crossing = LanesAcross.of(mapped[:1], mapped[1:]).placed(np.zeros(2), np.zeros((1, 2)), np.array([n + 2]))
+    return lane, replace(with_line, lanes=crossing)
+
+
+def test_the_way_to_a_line_is_along_the_lane():
+    lane, with_line = line_round_the_bend()
+    assert with_line.lanes.line.tolist() == [2]
+    assert len(RedLight().pairs(replace(with_line, lanes=None)).target) == 0  # straight on it would miss the line
     assert RedLight().pairs(with_line).target.tolist() == [0]
-    at = feet(lane, nodes.position[:1])
+    at = feet(lane, with_line.position[:1])
     arc, speed = 50 * 1.2 - 1 - at.s[0], 8.0 * (at.direction[0] @ (np.cos(0.2), np.sin(0.2)))
     rule = RedLight(full_deceleration=0.3)
     expected = -(speed**2) / (2 * (arc - 2 - rule.interaction.margin))
     assert pull(with_line, rule)[0] @ at.direction[0] == pytest.approx(expected, rel=1e-3)  # an arc of chords
+
+
+def test_who_takes_no_part_changes_nothing_for_others():
+    """Lanes keep their lines where a node before them takes no part."""
+    _, alone = line_round_the_bend()
+    _, with_weak = line_round_the_bend(("car", 500.0, 500.0, 8.0, 0.0, 4))
+    expected = build_graph(alone, [RedLight()]).edges
+    found = build_graph(with_weak, [RedLight()], interacting=np.arange(4) > 0).edges
+    assert len(found) == len(expected) == 1
+    assert (found[0].target - 1, found[0].source - 1) == (expected[0].target, expected[0].source) == (0, 2)
+    assert found[0].b == pytest.approx(expected[0].b)
+    assert len(with_weak.select(np.array([0, 1])).lanes.line) == 0
 
 
 # lanes

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
+from saga_fg.tracking.known_courses import typical_speed
 from saga_fg.tracking.trails import STEP, TrailPoints, Trails, TrailSettings
 from tests.saga_fg.traffic_frames import frame
 
@@ -29,7 +30,7 @@ def along(place, heading, ids=0, settings=SETTINGS):
     """The trail of one track by its places (k, 2) and headings (k,)."""
     trails = Trails(settings)
     for k, (p, h) in enumerate(zip(place, heading, strict=True)):
-        trails.update(passing([p], h, 0.1 * k, [ids]))
+        trails.update(passing([p], h, 0.1 * k, [ids]), 0.1 * k)
     return trails
 
 
@@ -53,8 +54,15 @@ def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
 
 def test_points_are_forgotten():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
-    trails.update(passing([(100.0, 0.0)], 0.0, 60.5, [3]))
+    trails.update(passing([(100.0, 0.0)], 0.0, 60.5, [3]), 60.5)
     assert trails.points.time.min() >= 0.5
+
+
+def test_points_are_forgotten_while_nobody_moves():
+    trails = along(*arc(np.arange(-20, 0, 2.0)))
+    trails.update(passing(np.empty((0, 2)), 0.0), 1000.0)
+    assert len(trails.points) == len(trails.latest) == 0
+    assert path(trails).weight.max() == 0.0
 
 
 def test_without_a_memory_nothing_is_remembered():
@@ -100,7 +108,7 @@ def test_ones_own_trail_leads_one_nowhere():
 def test_a_path_knows_the_speed_of_earlier_traffic():
     trails = Trails(SETTINGS)
     for x in np.arange(-20.0, 40.0, 2.0):
-        trails.update(passing([(x, 0.0)], 0.0, 0.1 * (x + 20.0), [1], speed=10.0 - 0.1 * x))
+        trails.update(passing([(x, 0.0)], 0.0, 0.1 * (x + 20.0), [1], speed=10.0 - 0.1 * x), 0.1 * (x + 20.0))
     found = path(trails)
     assert found.speed[0] == pytest.approx(10.0 - 0.1 * found.position[0, :, 0], abs=0.2)
     assert path(Trails(SETTINGS)).weight.max() == 0.0
@@ -177,12 +185,20 @@ def test_where_trails_part_the_place_is_less_certain():
     trails = along(*arc(np.arange(-20, 40, 1.0)))
     before = path(trails)
     for p in np.arange(-20, 40, 1.0):
-        trails.update(passing([(p, 0.0)], 0.0, 10.0, [1]))
+        trails.update(passing([(p, 0.0)], 0.0, 10.0, [1]), 10.0)
     at_the_fork = path(trails, *(each[0] for each in arc(np.array([6.0]))))
     assert before.certainty[0] > 0.7 > 0.0 == path(Trails(SETTINGS)).certainty[0]
     assert before.disagreement == pytest.approx(0.0, abs=1e-9)
     assert at_the_fork.disagreement > 0.01
     assert at_the_fork.certainty < 0.9 * before.certainty
+
+
+def test_where_nothing_is_known_of_earlier_traffic_its_speed_is_not_zero():
+    """A trail of 8 m/s begins 13 m ahead: nothing is known before it, and 8 m/s wherever there is any weight."""
+    trails = along(*arc(np.arange(3, 40, 1.0)))
+    for way in np.arange(0.0, 30.0, 0.5):
+        speed, weight = typical_speed(path(trails, heading=0.05), np.array([way]))
+        assert weight[0] < 1e-6 or speed[0] == pytest.approx(8.0)
 
 
 def test_a_hidden_car_takes_on_the_speed_of_earlier_traffic():
