@@ -45,6 +45,7 @@ class DetectionFileSource(DatasetSource):
 
     name = "file"
     has_truth = False
+    truth_option = "--truth"
     summarised = True
     example = "detections.csv"
     detections: list[str] | None = option(

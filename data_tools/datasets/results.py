@@ -152,7 +152,7 @@ def _scene(rows: TrackRows, name: str) -> Scene:
 
 
 def scene_result(scene: Scene, rows: TrackRows, path: str | Path) -> SceneResult:
-    """The rows of a scene at its moments. Raises `InputError` for times that are none; `path` is named."""
+    """The rows of a scene at its moments. Raises `InputError` for other times; `path` is named."""
     mine: IntArray = np.flatnonzero(rows.scene == scene.name)
     moment = np.searchsorted(scene.timestamps, rows.timestamp[mine] - _SAME_TIME)
     at = np.minimum(moment, len(scene) - 1)

@@ -127,6 +127,7 @@ class DatasetSource(ABC):
     name            of the dataset, in `saga-fg VERB NAME`
     family          the shipped settings that fit; or the path of a YAML file, over those of "file"
     has_truth       whether there is ground truth
+    truth_option    option that names a table of ground truth where there is none otherwise; "" for none
     example         options of the examples in the help
     tracks          what `track` writes, for the help; tracks_example: such a name
     merged          result of all parts in parallel, "" for none: of tracks, of labels
@@ -137,6 +138,7 @@ class DatasetSource(ABC):
     name: ClassVar[str]
     family: ClassVar[str | Path] = "file"
     has_truth: ClassVar[bool] = True
+    truth_option: ClassVar[str] = ""
     example: ClassVar[str] = ""
     tracks: ClassVar[str] = "Table of tracks to write: .csv, .ndjson or .jsonl."
     tracks_example: ClassVar[str] = "tracks.csv"

@@ -1,4 +1,4 @@
-"""`saga-fg benchmark`: the official figures of a dataset by one command that can be stopped and started again."""
+"""`saga-fg benchmark`: the figures of a whole dataset by one command that can be stopped and started again."""
 
 from __future__ import annotations
 
@@ -37,10 +37,11 @@ def _benchmark(
     config: options.Config = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Track all scenes in parallel, score them by the official metrics, and write figures, a page and a submission.
+    """Track all scenes in parallel, score them, and write figures and a page; for nuScenes and KITTI a submission.
 
-    The folder gets tracks/ with a result for each scene, all of them in one, figures.json, report.html, and
-    submission.zip for the official server. A scene that is done is not done again, unless its input, the settings or
+    The figures are the official ones of nuScenes and KITTI, and CLEAR of other datasets. The folder gets tracks/ with a
+    result for each scene, all of them in one, figures.json, report.html, and for nuScenes and KITTI submission.zip for
+    the official server. A scene that is done is not done again, unless its input, the settings or
     saga-fg have changed.
     """
     from pipelines.benchmark import judge_run
@@ -79,4 +80,4 @@ benchmark_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mod
 
 @benchmark_app.callback()
 def benchmark() -> None:
-    """Get the official figures of a dataset: tracks, figures, a page and a submission, in one run that can resume."""
+    """Get the figures of a whole dataset, with tracks, a page and, where there is one, the official submission."""

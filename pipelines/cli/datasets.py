@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
@@ -51,6 +52,8 @@ def dataset_commands(
             own = super().get_command(ctx, cmd_name)
             if own is not None:
                 return own
+            if cmd_name not in dataset_names() and Path(cmd_name).exists():
+                raise InputError(_without_dataset(verb, cmd_name))
             try:
                 return _command(verb, run, dataset_source(cmd_name), examples, texts)
             except InputError as error:
@@ -59,6 +62,15 @@ def dataset_commands(
                 return _broken(cmd_name, error)  # so that the list of all datasets can be shown
 
     return DatasetGroup
+
+
+def _without_dataset(verb: str, place: str) -> str:
+    """What to say where a file, or the folder of a bag, stands in the place of a dataset."""
+    path = Path(place)
+    bag = path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file()
+    if path.is_dir() and not bag:
+        return f"{place}: expected the name of a dataset before a folder: saga-fg {verb} --help lists them"
+    return f"{place}: expected a dataset before the file: saga-fg {verb} {'mcap' if bag else 'file'} {quote(place)} ..."
 
 
 def _is_listed(name: str, listed: Callable[[Source], bool]) -> bool:
@@ -181,9 +193,9 @@ def _examples(verb: Verb, source: Source, examples: tuple[str, ...]) -> str:
     recordings = f"{source.name} {options}"
     result = "labels" if verb == "evaluate labels" else source.tracks_example
     beside = f"{source.name} {result} {''.join(arguments)}{options}"
-    if verb == "evaluate" and any(each.name == "truth" for each in fields(source)):  # there is none but by this option
-        recordings = f"{source.name} {''.join(arguments)}{options} --truth truth.csv"
-        beside = f"{source.name} {result} --truth truth.csv"
+    if verb == "evaluate" and source.truth_option:
+        recordings = f"{source.name} {''.join(arguments)}{options} {source.truth_option} truth.csv"
+        beside = f"{source.name} {result} {source.truth_option} truth.csv"
     lines = []
     for example in examples:
         line = "  saga-fg " + example.format(recordings=recordings, result=beside, name=source.name, tracks=result)

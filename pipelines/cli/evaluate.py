@@ -60,7 +60,8 @@ def _evaluate(
     from pipelines.explaining import journal_innovations, journal_of
 
     if not source.has_truth:
-        mend = "name it: --truth TABLE" if hasattr(source, "truth") else "see evaluate labels"
+        own = f"name it: {source.truth_option} TABLE"
+        mend = own if source.truth_option else "score a table: saga-fg evaluate file tracks.csv --truth TABLE"
         raise InputError(f"evaluate {source.name}: expected ground truth, there is none; {mend}")
     if result is None:
         settings = how.configured(source.family, config, method or "saga", estimator, lag, association)
@@ -151,6 +152,7 @@ _commands = dataset_commands(
         "evaluate {recordings} --method kf",
     ),
     _texts,
+    listed=lambda source: source.has_truth or bool(source.truth_option),
 )
 evaluate_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
 _label_commands = dataset_commands("evaluate labels", _evaluate_labels, ("evaluate labels {result}",))

@@ -42,7 +42,7 @@ def result_report(source: DatasetSource, result: Path, beside: Path | None = Non
     """
     results = [_read(source, result)]
     if beside is not None:
-        results = _told_apart(results[0], _read(source, beside))
+        results = _with_distinct_names(results[0], _read(source, beside))
     scenes = _scenes(source, results[0])
     for other in results[1:]:
         scenes = [_joined(scene, other, added) for scene, added in _pairs(scenes, _scenes(source, other))]
@@ -90,7 +90,7 @@ def _read(source: DatasetSource, path: Path) -> _Result:
     return _Result(record.method if record is not None else path.stem, path, source.read_results(path), record)
 
 
-def _told_apart(one: _Result, other: _Result) -> list[_Result]:
+def _with_distinct_names(one: _Result, other: _Result) -> list[_Result]:
     """Give two results different names."""
     if one.method != other.method:
         return [one, other]

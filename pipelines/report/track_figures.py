@@ -25,7 +25,7 @@ TITLE = (
 
 
 @dataclass(frozen=True, eq=False)
-class _Lives:
+class _TrackSpans:
     """T tracks as wholes: their class, s from first to last box, boxes, and gaps, (T,)."""
 
     label: StrArray
@@ -33,9 +33,9 @@ class _Lives:
     boxes: FloatArray
     gaps: FloatArray
 
-    def of(self, label: str) -> _Lives:
+    def of(self, label: str) -> _TrackSpans:
         rows = np.flatnonzero((self.label == label) | (label == "all"))
-        return _Lives(self.label[rows], self.seconds[rows], self.boxes[rows], self.gaps[rows])
+        return _TrackSpans(self.label[rows], self.seconds[rows], self.boxes[rows], self.gaps[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class _Boxes:
 
 def track_figures(results: Sequence[SceneResult]) -> FigureTable:
     """Return a table with a row for each class."""
-    lives, boxes = _lives(results), _boxes(results)
+    lives, boxes = _track_spans(results), _boxes(results)
     classes = np.unique(lives.label).tolist()
     rows = [_row(name, lives.of(name), boxes.of(name)) for name in (["all"] if len(classes) > 1 else []) + classes]
     return FigureTable(TITLE, COLUMNS, tuple(rows))
@@ -63,7 +63,7 @@ def track_figures(results: Sequence[SceneResult]) -> FigureTable:
 
 def track_charts(results: Sequence[SceneResult]) -> list[Chart]:
     """Return the number of tracks over time, and distributions of lives, speeds and scores by class."""
-    lives, boxes = _lives(results), _boxes(results)
+    lives, boxes = _track_spans(results), _boxes(results)
     classes = np.unique(lives.label).tolist()
     charts = [
         distribution("Life of tracks", "s", "share of tracks below", [(c, lives.of(c).seconds) for c in classes]),
@@ -82,7 +82,7 @@ def _counts(results: Sequence[SceneResult]) -> Chart:
     return Chart("Tracks at a time", "s", "tracks", series)
 
 
-def _row(name: str, lives: _Lives, boxes: _Boxes) -> tuple[str, ...]:
+def _row(name: str, lives: _TrackSpans, boxes: _Boxes) -> tuple[str, ...]:
     known = np.isfinite(boxes.unseen)
     return (
         name,
@@ -125,7 +125,7 @@ def _boxes(results: Sequence[SceneResult]) -> _Boxes:
     return _Boxes(label, *(np.concatenate([np.empty(0), *parts]) for parts in columns))
 
 
-def _lives(results: Sequence[SceneResult]) -> _Lives:
+def _track_spans(results: Sequence[SceneResult]) -> _TrackSpans:
     parts: list[tuple[StrArray, FloatArray, FloatArray, FloatArray]] = []
     for each in results:
         table, unseen = each.found, np.nan_to_num(_unseen(each))
@@ -138,4 +138,4 @@ def _lives(results: Sequence[SceneResult]) -> _Lives:
         gaps = np.bincount(number[order][1:][again], minlength=len(ids))
         parts.append((table.boxes.label[first], seconds, count.astype(np.float64), gaps.astype(np.float64)))
     label = np.concatenate([np.empty(0, dtype="<U1"), *(part[0] for part in parts)])
-    return _Lives(label, *(np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in (1, 2, 3)))
+    return _TrackSpans(label, *(np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in (1, 2, 3)))

@@ -159,6 +159,12 @@ def test_a_name_belongs_to_one_package(packages: Path) -> None:
         registry.dataset_source("kity")
 
 
+def test_help_lists_what_can_be_evaluated() -> None:
+    listed = re.findall(r"^  (\w+) ", saga_fg("evaluate", "--help").stdout, re.M)
+    assert {"nuscenes", "file", "simulated", "labels"} <= set(listed)
+    assert "mcap" not in listed
+
+
 @pytest.mark.parametrize("name", registry.BUILT_IN)
 def test_those_that_come_along_are_sources(name: str) -> None:
     source = registry.dataset_source(name)
@@ -171,6 +177,13 @@ def test_those_that_come_along_are_sources(name: str) -> None:
     [
         (("evaluate", "file", "tracks.csv"), "error: evaluate file: expected ground truth, there is none"),
         (("track", "nothing"), "error: unknown dataset 'nothing'"),
+        (
+            ("evaluate", "mcap", "tracks.csv"),
+            "error: evaluate mcap: expected ground truth, there is none; score a table: saga-fg evaluate file",
+        ),
+        (("track", "own.csv"), "error: own.csv: expected a dataset before the file: saga-fg track file own.csv ..."),
+        (("view", "a bag"), "error: a bag: expected a dataset before the file: saga-fg view mcap 'a bag' ..."),
+        (("smooth", "folder"), "error: folder: expected the name of a dataset before a folder: saga-fg smooth --help"),
         (("evaluate", "simulated", "tracks.csv", "--method", "kf"), "error: --method kf: goes without a result"),
         (
             ("learn", "interactions", "kitti", "--dataroot", "kitti", "-o", "out"),
@@ -183,6 +196,10 @@ def test_what_cannot_be_done_is_one_line(
     arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("own.csv").write_text("timestamp,x,y\n")
+    for folder in ("a bag", "folder"):
+        Path(folder).mkdir()
+    Path("a bag/metadata.yaml").touch()
     result = saga_fg(*arguments)
     assert result.exit_code == 2
     assert result.stderr.startswith(message)

@@ -62,7 +62,7 @@ class AnnotatedLogs:
 class DetectedLogs:
     """Logs with the boxes of a Feather file of detections; the scenes are the logs of the file.
 
-    Raises `InputError` for a file that is none, a missing column, a score or box that is no number, and for a log that
+    Raises `InputError` for an invalid file, a missing column, a score or box that is no number, and for a log that
     is not there.
     """
 
@@ -73,7 +73,8 @@ class DetectedLogs:
         names = tuple(dict.fromkeys(self._log.tolist()))
         self.scenes = tuple(name for name in logs.scenes if name in set(names))
         if not self.scenes:
-            there = f"{names[0]} and {len(names) - 1} more" if names else "none"
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            there = f"{names[0]}{more}" if names else "none"
             raise InputError(f"{path}: log_id: expected one of the logs, such as {logs.scenes[0]}, got {there}")
 
     def scene(self, name: str) -> ArgoverseScene:

@@ -72,6 +72,12 @@ class ArgoverseLogs:
         files = [path for name in FILES for path in self._root.glob(f"*/{name}")]
         self._scenes = tuple(sorted({path.parent.name for path in files}))
         if not self._scenes:
+            if not self._root.is_dir():
+                raise InputError(f"{self._root}: expected the folder of the logs, there is no such folder")
+            if any((self._root / name).is_file() for name in FILES):
+                raise InputError(
+                    f"{self._root}: expected the folder of the logs, this is one log: give {self._root.parent}"
+                )
             raise InputError(f"{self._root}: expected LOG/annotations.feather, there is none")
 
     @property

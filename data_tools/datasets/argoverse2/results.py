@@ -147,8 +147,8 @@ def track_categories(scene: Scene, moments: Sequence[Tracks]) -> dict[int, str]:
         for row in np.flatnonzero(distance.min(axis=1) < _NEAR).tolist():
             column = int(nearest[row])
             votes[int(tracks.id[row])][str(category[column])] += max(float(found.score[column]), 1e-9)
-    told = {id_: max(of, key=lambda name: of[name]) for id_, of in votes.items()}
-    names = {id_: told.get(id_, label) for id_, label in labels.items()}
+    voted = {id_: max(of, key=lambda name: of[name]) for id_, of in votes.items()}
+    names = {id_: voted.get(id_, label) for id_, label in labels.items()}
     return {id_: name if name.isupper() else _CATEGORY.get(name, name.upper()) for id_, name in names.items()}
 
 

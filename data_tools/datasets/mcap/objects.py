@@ -131,7 +131,7 @@ def _numbers(
 
 
 def _covariances(rows: ObjectRows, name: str, values: list[Any]) -> FloatArray:
-    """The horizontal part (N, 2, 2) of 6 x 6 covariances, NaN where zero. Raises `InputError` for one that is none."""
+    """The horizontal part (N, 2, 2) of 6 x 6 covariances, NaN where zero. Raises `InputError` for an invalid one."""
     P = np.array([(v[0], v[1], v[6], v[7]) for v in values], dtype=np.float64).reshape(-1, 2, 2)
     P = np.where((P == 0).all(axis=(1, 2), keepdims=True), np.nan, P)
     P = (P + np.swapaxes(P, 1, 2)) / 2
@@ -149,7 +149,7 @@ def _covariances(rows: ObjectRows, name: str, values: list[Any]) -> FloatArray:
 
 
 def transform_matrix(transform: Any) -> FloatArray:
-    """The matrix (4, 4) of a geometry_msgs/Transform. Raises `InputError` for a rotation that is none."""
+    """The matrix (4, 4) of a geometry_msgs/Transform. Raises `InputError` for an invalid rotation."""
     T = np.eye(4)
     T[:3, :3] = quaternion_rotation(checked_quaternions("rotation", [wxyz(transform.rotation)]))[0]
     T[:3, 3] = xyz(transform.translation)

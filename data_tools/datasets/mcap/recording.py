@@ -12,7 +12,7 @@ import sqlite3
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing, contextmanager, redirect_stderr
 from dataclasses import dataclass
-from io import StringIO
+from io import SEEK_END, StringIO
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from data_tools.files.input_files import open_bytes
 from saga_fg.errors import InputError, MissingExtraError
 
 SUFFIXES = (".mcap", ".db3")
+_MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of a file
 Decode = Callable[[bytes], Any]
 
 
@@ -77,7 +78,7 @@ class Recording:
         for file in self.files:
             for topic, time, decode, data in _reader(file).messages(topics):
                 counts[topic] += 1
-                with _somebody_elses(f"{file}: {topic}: message {counts[topic]}"):
+                with _library_errors(f"{file}: {topic}: message {counts[topic]}"):
                     message = decode(data)
                 yield LoggedMessage(self.topics[topic], counts[topic], time, message)
 
@@ -89,7 +90,7 @@ class _McapFile:
     def topics(self) -> list[Topic]:
         from mcap.reader import make_reader
 
-        with open_bytes(self.path) as file, _somebody_elses(str(self.path)):
+        with open_bytes(self.path) as file, _library_errors(str(self.path), self.path):
             summary = make_reader(file).get_summary()
             if summary is not None and summary.statistics is not None:
                 counts = summary.statistics.channel_message_counts
@@ -101,7 +102,7 @@ class _McapFile:
                     if each.schema_id in schemas
                 ]
         found: dict[str, Topic] = {}  # a file without a summary is read from end to end
-        with open_bytes(self.path) as file, _somebody_elses(str(self.path)):
+        with open_bytes(self.path) as file, _library_errors(str(self.path), self.path):
             for schema, channel, _ in make_reader(file).iter_messages(log_time_order=False):
                 if schema is not None:
                     count = found[channel.topic].count if channel.topic in found else 0
@@ -115,14 +116,14 @@ class _McapFile:
         with open_bytes(self.path) as file:
             found = iter(make_reader(file, validate_crcs=True).iter_messages(topics=list(topics), log_time_order=False))
             while True:
-                with _somebody_elses(str(self.path)):
+                with _library_errors(str(self.path), self.path):
                     record = next(found, None)
                 if record is None:
                     return
                 schema, channel, message = record
                 decode = decoders.get(channel.id)
                 if decode is None:
-                    with _somebody_elses(f"{self.path}: {channel.topic}"):
+                    with _library_errors(f"{self.path}: {channel.topic}"):
                         decode = _decoder(schema, channel.message_encoding)
                     decoders[channel.id] = decode
                 yield channel.topic, message.log_time, decode, message.data
@@ -150,7 +151,7 @@ class _SqliteFile:
             definitions = self._definitions(rows)
             for topic, type_, encoding, time, data in rows(query, *topics):
                 if topic not in decoders:
-                    with _somebody_elses(f"{self.path}: {topic}"):
+                    with _library_errors(f"{self.path}: {topic}"):
                         text = definitions.get(type_, "")
                         schema = Schema(id=1, name=type_, encoding="ros2msg" if text else "", data=text.encode())
                         decoders[topic] = _decoder(schema, encoding)
@@ -225,15 +226,25 @@ def _decoder(schema: Any, encoding: str) -> Decode:
 
 
 @contextmanager
-def _somebody_elses(where: str) -> Iterator[None]:
-    """An `InputError` that names the place for whatever a library raises about broken bytes."""
+def _library_errors(where: str, mcap: Path | None = None) -> Iterator[None]:
+    """An `InputError` that names the place for whatever a library raises about broken bytes, as of a file of MCAP."""
     try:
         yield
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     except Exception as error:  # the libraries trust what they read: any exception may come
         reason = str(error).strip().splitlines()
-        raise InputError(f"{where}: not readable: {reason[0] if reason else type(error).__name__}") from error
+        text = f"{where}: not readable: {reason[0] if reason else type(error).__name__}"
+        hint = "; the file may be cut off: mcap recover" if mcap is not None and _cut_off(mcap) else ""
+        raise InputError(text + hint) from error
+
+
+def _cut_off(path: Path) -> bool:
+    """True for a file that begins as MCAP and does not end so."""
+    with open_bytes(path) as file:
+        start = file.read(len(_MAGIC))
+        file.seek(-len(start), SEEK_END)
+        return start == _MAGIC != file.read()
 
 
 def load_mcap() -> None:

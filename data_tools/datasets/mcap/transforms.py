@@ -67,7 +67,7 @@ class _Edge:
 
 
 class TransformTree:
-    """All transforms of a recording. Raises `InputError` for one that is none, naming its place.
+    """All transforms of a recording. Raises `InputError` for an invalid one, naming its place.
 
     The parent of a frame is the one that most of its transforms name.
     """

@@ -108,8 +108,12 @@ def test_a_missing_column_a_missing_pose_and_a_broken_file_are_named(tmp_path):
 def test_a_root_without_logs_and_an_unknown_log_are_errors(tmp_path):
     with pytest.raises(InputError, match=r"expected LOG/annotations.feather"):
         ArgoverseLogs(tmp_path)
+    with pytest.raises(InputError, match=r"nowhere: expected the folder of the logs, there is no such folder"):
+        ArgoverseLogs(tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"unknown log 'other'"):
         write(tmp_path, boxes(), poses()).scene("other")
+    with pytest.raises(InputError, match=rf"this is one log: give {tmp_path}$"):
+        ArgoverseLogs(tmp_path / "log")
 
 
 LOG = "log"
@@ -169,6 +173,7 @@ def test_a_log_without_annotations_has_the_times_of_its_boxes(tmp_path):
     ("changes", "message"),
     [
         ({"log_id": ["a", "b", "c"]}, "log_id: expected one of the logs, such as log, got a and 2 more"),
+        ({"log_id": ["zzz"] * 3}, "log_id: expected one of the logs, such as log, got zzz$"),
         ({"score": [np.nan, 0.4, 0.5]}, "log log: score: expected finite numbers"),
         ({"timestamp_ns": [3, 3, 3]}, "timestamp_ns: expected a pose at every time of boxes, 3 has none"),
         ({"qw": [2.0, 1.0, 1.0]}, "expected a unit quaternion"),
