@@ -26,8 +26,8 @@ _ITERATIONS, _STEP = 20, 1e-4
 
 
 class Fit(NamedTuple):
-    """pose (3,); information (3, 3) of the points alone, in the map's axes; share: of the points that lie within `near`
-    of a line or point of the map.
+    """pose (3,); information (3, 3) of the points alone, in the map's axes; share: of the points that lie
+    within `near` of a point of the map, there.
     """
 
     pose: FloatArray
@@ -69,11 +69,10 @@ class LineMap:
         reach: largest distance of a pair at the start, m; it shrinks to `near`
         """
         start, x = pose, pose.copy()
-        H, paired = np.zeros((3, 3)), np.zeros(0, dtype=bool)
+        H = np.zeros((3, 3))
         for iteration in range(_ITERATIONS):
             farthest = max(near, reach * 0.7**iteration)
-            c, s = np.cos(x[2]), np.sin(x[2])
-            arm = scan @ np.array([[c, s], [-s, c]])
+            arm = _turned(scan, x[2])
             at = arm + x[:2]
             distance, rows = self.tree.query(at, distance_upper_bound=farthest)
             paired = np.isfinite(distance)
@@ -92,7 +91,13 @@ class LineMap:
             x = x + step
             if farthest == near and np.abs(step).max() < _STEP:
                 break
-        return Fit(x, H, float(paired.mean()) if len(scan) else 0.0)
+        distance, _ = self.tree.query(_turned(scan, x[2]) + x[:2], distance_upper_bound=near)
+        return Fit(x, H, float(np.isfinite(distance).mean()) if len(scan) else 0.0)
+
+
+def _turned(points: FloatArray, angle: float) -> FloatArray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.asarray(points @ np.array([[c, s], [-s, c]]))
 
 
 def difference(x: FloatArray, other: FloatArray) -> FloatArray:

@@ -75,13 +75,15 @@ class ScoreGrid:
         best = least
         for level in range(top, 0, -1):
             lead = int(np.argmax(bound))  # a way straight down tells a score that is really reached
-            best = max(best, self._descended(level, cells, angle[lead], dx[lead], dy[lead]))
+            best = max(best, self._descended(level, n, cells, angle[lead], dx[lead], dy[lead]))
             keep = bound >= max(least, _RIVAL * best)
             if not keep.any():
                 return None
             half = 2 ** (level - 1)
             angle, dx, dy = (np.repeat(a[keep], 4) for a in (angle, dx, dy))
             dx, dy = dx + half * np.tile([0, 0, 1, 1], len(dx) // 4), dy + half * np.tile([0, 1, 0, 1], len(dy) // 4)
+            inside = (dx <= n) & (dy <= n)  # the last squares of the coarsest level reach beyond the window
+            angle, dx, dy = angle[inside], dx[inside], dy[inside]
             bound = self._scores(level - 1, cells, angle, dx, dy)
         lead = int(np.argmax(bound))
         if bound[lead] < least:
@@ -92,11 +94,14 @@ class ScoreGrid:
         found = np.array([pose[0] + dx[lead] * CELL, pose[1] + dy[lead] * CELL, angles[angle[lead]]])
         return Found(found, float(bound[lead]), rival)
 
-    def _descended(self, level: int, cells: IntArray, angle: int, dx: int, dy: int) -> float:
+    def _descended(self, level: int, n: int, cells: IntArray, angle: int, dx: int, dy: int) -> float:
+        """A score that is reached inside the square, within shifts of n cells."""
         score = 0.0
         for down in range(level - 1, -1, -1):
             xs, ys = dx + 2**down * np.array([0, 0, 1, 1]), dy + 2**down * np.array([0, 1, 0, 1])
-            scores = self._scores(down, cells, np.full(4, angle), xs, ys)
+            inside = (xs <= n) & (ys <= n)
+            xs, ys = xs[inside], ys[inside]
+            scores = self._scores(down, cells, np.full(len(xs), angle), xs, ys)
             lead = int(np.argmax(scores))
             dx, dy, score = xs[lead], ys[lead], float(scores[lead])
         return score

@@ -11,6 +11,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import PoseGraph, trusted
 
+_LEAST = 4  # poses, of which two are no neighbours, whichever is first
 _REACH = 10.0  # m, largest coordinate of a false measurement
 
 
@@ -20,8 +21,12 @@ def with_false_loops(graph: PoseGraph, share: float, seed: int) -> PoseGraph:
     Both poses, the position within 10 m by axis, and the rotation are uniformly distributed. Raises `InputError`.
     """
     loops = np.flatnonzero(~trusted(graph))
-    if not len(loops) or not 0 <= share < np.inf:
-        raise InputError(f"expected a graph with loops and a share >= 0, got {len(loops)} loops and {share:g}")
+    if not graph.poses_alone:
+        raise InputError("expected a graph of poses alone, without landmarks and priors")
+    if not len(loops) or len(graph) < _LEAST:
+        raise InputError(f"expected {_LEAST} poses and a loop or more, got {len(graph)} and {len(loops)}")
+    if not 0 <= share < np.inf:
+        raise InputError(f"share: expected a number >= 0, got {share:g}")
     rng = np.random.default_rng(seed)
     count, n = round(share * len(loops)), len(graph)
     first = rng.integers(0, n, count)

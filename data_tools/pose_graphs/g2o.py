@@ -3,13 +3,15 @@
 The records are those of `data_tools.pose_graphs.g2o_records`. A measurement is first_T_second; landmarks are measured
 in the frame of the pose, and ids of poses and landmarks are of one numbering. g2o means the vector part of a quaternion
 by a rotation in space; like GTSAM, which everybody compares with, we read the matrix as that of a rotation vector.
-Offsets of sensors (PARAMS_SE3OFFSET) are taken into the measurements. FIX names a pose to hold; as the first pose is
-always held unless there are priors, it has no effect. Empty lines and those that begin with # are left out.
+Offsets of sensors (PARAMS_SE3OFFSET) are taken into the measurements. FIX names poses to hold; the first pose is
+always held unless there are priors, and others are not: reading warns of them. Empty lines and those that begin with #
+are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import gtsam
@@ -36,6 +38,7 @@ _OBSERVED: dict[str, ObservationKind] = {
 }
 _TANGENT = {2: [0, 1, 2], 3: [3, 4, 5, 0, 1, 2]}  # where each entry of our tangent is found in the file's
 _OFFSET, _LARGEST_ID = "PARAMS_SE3OFFSET", 2**62
+log = logging.getLogger(__name__)
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
@@ -48,7 +51,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
     that is clearly negative.
     """
     file = Path(path)
-    tables = read_records(file)
+    tables, fixed = read_records(file)
     dims = {RECORDS[tag].dim for tag in tables}
     if len(dims) != 1:
         raise InputError(f"{file}: expected poses and edges, all in the plane (SE2) or all in space (SE3:QUAT)")
@@ -64,12 +67,21 @@ def read_g2o(path: str | Path) -> PoseGraph:
     if (first == second).any():
         raise edges.fault(int(np.argmax(first == second)), "second: expected another pose than the first")
     priors = _priors(tables, d, ids)
+    _warn_of_fixed(file, fixed, ids, priors)
     if whole:
         poses = transforms(tables[_POSE[d]], RECORDS[_POSE[d]])[order]
         graph = PoseGraph(ids, poses, first, second, between, weights, priors=priors)
     else:
         graph = PoseGraph.of_measurements(ids, first, second, between, weights, priors)
     return graph.with_landmarks(_landmarks(tables, graph, whole))
+
+
+def _warn_of_fixed(file: Path, fixed: Sequence[int], ids: IntArray, priors: PosePriors | None) -> None:
+    """Warn once of poses that the file holds and we do not."""
+    held = [int(ids[0])] if priors is None else []
+    if others := [named for named in fixed if named not in held]:
+        holds = "the priors hold the graph" if priors is not None else f"pose {held[0]}, the first, is held"
+        log.warning("%s: FIX %d has no effect, as %s (%d poses so)", file, others[0], holds, len(others))
 
 
 def _priors(tables: Tables, d: int, ids: IntArray) -> PosePriors | None:
@@ -168,6 +180,11 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
 def _observation_lines(seen: LandmarkObservations, poses: IntArray, landmarks: IntArray, d: int) -> list[str]:
     ends = np.stack([poses[seen.pose], landmarks[seen.landmark]], axis=1)
     if seen.kind == "range bearing":
+        correlated = np.flatnonzero(seen.information[:, 0, 1] != 0)
+        if len(correlated):
+            row = int(correlated[0])
+            named = f"pose {poses[seen.pose[row]]}, landmark {landmarks[seen.landmark[row]]}"
+            raise InputError(f"{named}: expected range and bearing of independent errors, BR has no room for others")
         sigma = 1 / np.sqrt(np.diagonal(seen.information, axis1=1, axis2=2))
         return _lines("BR", ends, seen.z[:, ::-1], sigma[:, ::-1])
     tag = "EDGE_BEARING_SE2_XY" if seen.kind == "bearing" else "EDGE_SE2_XY" if d == 2 else "EDGE_SE3_TRACKXYZ"

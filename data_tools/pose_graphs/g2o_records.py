@@ -74,12 +74,18 @@ RECORDS = {
 _SPELLED = {"EDGE_SE2_PRIOR": "EDGE_PRIOR_SE2"}
 
 
-def read_records(file: Path) -> dict[str, TextTable]:
-    """The lines of a file by their tag. Raises `InputError` naming the line of an unknown or a short one."""
+def read_records(file: Path) -> tuple[dict[str, TextTable], list[int]]:
+    """The lines of a file by their tag, and the ids of FIX. Raises `InputError` naming the line of a wrong one."""
+    fixed: list[int] = []
     found: dict[str, tuple[list[list[str]], list[int]]] = {}
     for number, line in enumerate(read_lines(file), start=1):
         tag, *row = line.split() or [""]
-        if not tag or tag.startswith("#") or tag == "FIX":
+        if not tag or tag.startswith("#"):
+            continue
+        if tag == "FIX":
+            if not row or not all(name.isdecimal() and len(name) < 20 for name in row):
+                raise InputError(f"{file}: line {number}: expected ids of poses after FIX, got {' '.join(row)!r:.40}")
+            fixed += [int(name) for name in row]
             continue
         tag = _SPELLED.get(tag, tag)
         record = RECORDS.get(tag)
@@ -90,7 +96,7 @@ def read_records(file: Path) -> dict[str, TextTable]:
         rows, lines = found.setdefault(tag, ([], []))
         rows.append(row)
         lines.append(number)
-    return {tag: TextTable.of(file, rows, lines) for tag, (rows, lines) in found.items()}
+    return {tag: TextTable.of(file, rows, lines) for tag, (rows, lines) in found.items()}, fixed
 
 
 def record_values(table: TextTable, record: Record) -> FloatArray:

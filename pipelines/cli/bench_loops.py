@@ -29,7 +29,8 @@ def loops(
     import numpy as np
 
     from data_tools.figures import FigureTable, cell
-    from data_tools.pose_graphs import read_g2o
+    from data_tools.files.error_messages import error_context
+    from data_tools.pose_graphs import read_g2o, with_false_loops
     from pipelines.bench.loops import LoopsRow, bench_loops
     from saga_fg.errors import InputError
 
@@ -37,10 +38,17 @@ def loops(
         wanted = [float(share) for share in shares.split(",")]
     except ValueError as error:
         raise InputError(f"--shares: expected numbers with commas, got {shares!r:.40}") from error
+    if not all(0 <= share < np.inf for share in wanted):
+        raise InputError(f"--shares: expected numbers >= 0 with commas, got {shares!r:.40}")
+    graphs = [read_g2o(file) for file in files]
+    for file, graph in zip(files, graphs, strict=True):
+        with error_context(str(file)):
+            with_false_loops(graph, 0.0, seed=0)  # refuses what cannot have any, before hours of others
     rows: list[LoopsRow] = []
     with progress_bar() as progress:
-        for file in files:
-            rows += bench_loops(file.stem, read_g2o(file), wanted, seeds, gnc, progress)
+        for file, graph in zip(files, graphs, strict=True):
+            with error_context(str(file)):
+                rows += bench_loops(file.stem, graph, wanted, seeds, gnc, progress)
     shown = []
     for key in dict.fromkeys((row.graph, row.share, row.contender) for row in rows):
         group = [row for row in rows if (row.graph, row.share, row.contender) == key]

@@ -83,7 +83,7 @@ def g2o(
     if compare and not graph.poses_alone:
         raise InputError(f"--compare: expected a graph of poses alone, {file} has landmarks or priors")
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
-        rows = _rows(covariances, graph.ids)
+        rows, guess = _rows(covariances, graph.ids), graph_error(graph, loss)
         if robust == "consensus":
             agreed = consensus(graph)
             rejected = [
@@ -92,7 +92,6 @@ def g2o(
             graph = agreed.graph
         optimised = optimise_poses(graph, loss, certify)
         blocks = optimised.covariances(rows)
-    guess = graph_error(graph, loss)
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
         with working("GTSAM's optimisers"):

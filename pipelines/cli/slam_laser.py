@@ -32,12 +32,12 @@ def laser(
 
     from data_tools.files.atomic_files import check_writable_folder
     from data_tools.laser import read_carmen
-    from pipelines.slam.configuration import load_slam_config
+    from pipelines.slam.configuration import load_laser_settings
     from pipelines.slam.laser_results import write_laser_slam
     from pipelines.slam.laser_slam import laser_slam
 
     check_writable_folder(output)
-    settings = load_slam_config("kitti", config).slam.laser
+    settings = load_laser_settings(config)
     log = read_carmen(file)
     if scans is not None:
         log = log.first(scans)

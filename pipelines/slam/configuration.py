@@ -50,6 +50,12 @@ class SlamConfig(TrackConfig):
             raise InputError("tracker.providers: expected under slam, for a graph of vehicle and objects")
 
 
+def load_laser_settings(path: Path | None = None) -> LaserSettings:
+    """Settings of planar laser SLAM, with the overrides of a YAML file. Raises `InputError` naming file and key."""
+    start = SlamConfig()
+    return (start if path is None else load_settings(SlamConfig, path, start)).slam.laser
+
+
 def load_slam_config(family: str | Path, path: Path | None = None) -> SlamConfig:
     """Return the defaults shipped for a kind of data, with the overrides of a YAML file.
 

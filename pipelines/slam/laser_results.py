@@ -34,6 +34,7 @@ def write_laser_slam(
         "keyframes": len(path.keyframes),
         "loops": path.loops,
         "false_loops": path.rejected,
+        "jumps_of_the_wheels": path.jumps,
         "entropy": grid.entropy,
         "entropy_scan_matching": _grid(log, path, path.matched, largest_range).entropy,
         "seconds": seconds,

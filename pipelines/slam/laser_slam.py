@@ -5,14 +5,15 @@
 3. Loops: each second keyframe, with those just before it, is searched for in older submaps by branch and bound, inside
    the window that the graph leaves open: it grows with the way along measurements between them, so that what has been
    closed before is searched closely and what has drifted widely. A place that has a rival is no loop; one found in a
-   wide window waits for another that agrees with it. A bare corridor says nothing along itself.
+   wide window waits for another that agrees with it. Along a bare corridor a scan tells no place.
 4. At the end false loops are found by consensus, and all keyframes are registered anew with every other pass of the
    same place, twice.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import logging
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -22,6 +23,7 @@ from data_tools.laser.line_map import Fit, LineMap, thinned
 from data_tools.laser.score_grid import ScoreGrid
 from pipelines.slam.planar_poses import heading, moved, transform, transforms, vector, vectors
 from pipelines.tracking import Progress
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
@@ -34,7 +36,9 @@ _KNOWN = 0.8  # m, half width of a window up to which a corridor may be recognis
 _UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
 _AGREED = np.array([0.3, 0.06])  # m and rad that two such may differ by, and 0.03 of the way between them
 _WAITING = 15.0  # m of way that a loop waits
-_LEAST_POINTS = 20
+_LEAST_POINTS = 20  # of a scan that is registered
+_WIDEST = 3.0  # m, half width of the search where wheels slipped: its time and memory grow with the square
+_SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
 _POOR = 0.8  # share of a scan that lies on the local map, below which the pose is searched
 _REACHES = (0.6, 0.3)  # m, of registrations with other passes, in turn
 _LONGEST = 60.0  # m of way from which the search of headings does not grow
@@ -43,18 +47,26 @@ _DOUBT = 0.2  # share of a difference between wheels and registration that count
 _TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
 
 
+_log = logging.getLogger(__name__)
+
+
 @dataclass(frozen=True)
 class LaserSettings(Settings):
     """Settings of SLAM with a planar laser."""
 
     largest_range: Positive = setting(30.0, "m: readings beyond are left out; raise for halls and yards")
+    largest_speed: Positive = setting(
+        3.0, "m/s: steps of the wheels that are faster, and 1 m longer, count as standing still; raise for vehicles"
+    )
     scan_step: Positive = setting(0.1, "m: scans that moved less, and turned less than 3 degrees, are not registered")
     keyframe_step: Positive = setting(0.5, "m between keyframes, 0.2 to 2; smaller costs time")
     keyframe_turn: Positive = setting(0.5, "rad between keyframes")
     local_map: Positive = setting(10.0, "m of way whose keyframes scans are registered with")
     submap: Positive = setting(10.0, "m of way in a submap in which loops are searched")
     odometry_drift: Positive = setting(0.15, "error of the wheels, share of the way: standard deviation")
-    odometry_turn: Positive = setting(0.1, "error of the wheels, rad per rad and per 2 m: standard deviation")
+    odometry_turn: Positive = setting(
+        0.1, "error of the wheels' heading, rad for each rad turned and for each 2 m driven: standard deviation"
+    )
     loop_score: Annotated[float, Range(0, 1)] = setting(0.6, "least mean score of a loop; raised: fewer, surer loops")
     loop_drift: Positive = setting(0.04, "half width of the search, share of the way since; raised: slower, finds more")
 
@@ -83,7 +95,7 @@ class _Submap:
 @dataclass(frozen=True, eq=False)
 class LaserPath:
     """poses (n, 3, 3) of the robot at each scan, matched: by scan matching alone; loops taken, rejected as false;
-    keyframes: their rows; graph: of these, with the measurements kept.
+    keyframes: their rows; graph: of these, with the measurements kept; jumps: steps of the wheels too fast to believe.
     """
 
     poses: FloatArray
@@ -92,6 +104,7 @@ class LaserPath:
     rejected: int
     keyframes: IntArray
     graph: PoseGraph
+    jumps: int = 0
 
 
 @dataclass(eq=False)
@@ -116,12 +129,13 @@ class LaserSlam:
         """Take a scan, points (n, 2) in the laser's frame, and the wheels' pose (3,); returns the pose (3, 3) now."""
         points = points @ self.robot_T_laser[:2, :2].T + self.robot_T_laser[:2, 2]
         wheels = transform(odometry)
-        if self._odometry is None:
-            self._odometry = wheels
+        step = np.eye(3) if self._odometry is None else np.linalg.inv(self._odometry) @ wheels
+        if self._graph is None:  # by the wheels until a scan tells where it is
+            self._at, self._odometry = self._at @ step, wheels
             self._matched.append(self._at)
-            self._add_keyframe(points, self._at, np.eye(3))
+            if len(points) >= _LEAST_POINTS:
+                self._add_keyframe(points, self._at, np.eye(3))
             return self._at
-        step = np.linalg.inv(self._odometry) @ wheels
         way, turn = np.hypot(step[0, 2], step[1, 2]), abs(heading(step))
         predicted = self._at @ step
         if (way < self.settings.scan_step and turn < np.deg2rad(3)) or len(points) < _LEAST_POINTS:
@@ -138,8 +152,13 @@ class LaserSlam:
         return self._now(self._at)
 
     def finish(self, progress: Progress | None = None) -> LaserPath:
-        """All poses, after false loops are left out and passes of one place are registered with each other."""
-        assert self._graph is not None
+        """All poses, after false loops are left out and passes of one place are registered with each other.
+
+        Raises `InputError` where no scan had enough points.
+        """
+        if self._graph is None:
+            seen = f"{_LEAST_POINTS} readings within largest_range, {self.settings.largest_range:g} m"
+            raise InputError(f"expected a scan with {seen}, there is none among {len(self._matched)}")
         agreed = self._graph.settled()
         loops = int((np.abs(agreed.graph.second - agreed.graph.first) > 1).sum())
         rejected = int((~agreed.kept).sum())
@@ -170,7 +189,7 @@ class LaserSlam:
         if fit.share < _POOR:  # a fast turn, wheels that slipped, or much of what is seen is new
             local = scan if len(scan) <= 200 else scan[:: len(scan) // 200 + 1]
             self._grid = self._grid or ScoreGrid.of(self._map.points)
-            found = self._grid.search(local, vector(predicted), 0.2 + way / 2, 0.1 + turn / 2, 0.4)
+            found = self._grid.search(local, vector(predicted), min(0.2 + way / 2, _WIDEST), 0.1 + turn / 2, 0.4)
             if found is not None:
                 other = self._map.fit(scan, found.pose, 0.01 * prior, reach=0.3)
                 fit = max(fit, other, key=lambda each: each.share)
@@ -299,6 +318,7 @@ class LaserSlam:
         after = np.minimum(key + 1, len(rows) - 1)
         length = way[rows[after]] - way[rows[key]]
         share = np.where(length > 0, (way - way[rows[key]]) / np.where(length > 0, length, 1), 0.0)
+        share = np.clip(share, 0, 1)  # scans before the first keyframe
         from_before = poses[key] @ np.linalg.inv(matched[rows[key]]) @ matched
         from_after = poses[after] @ np.linalg.inv(matched[rows[after]]) @ matched
         one, other = vectors(from_before), vectors(from_after)
@@ -310,11 +330,34 @@ class LaserSlam:
 def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: Progress | None = None) -> LaserPath:
     """The path of a log."""
     slam = LaserSlam(settings or LaserSettings(), transform(log.robot_T_laser))
+    odometry, jumps = without_jumps(log, slam.settings.largest_speed)
     for row in range(len(log)):
-        slam.step(log.points(row, slam.settings.largest_range), log.odometry[row])
+        slam.step(log.points(row, slam.settings.largest_range), odometry[row])
         if progress is not None:
             progress("scans", row + 1, len(log))
-    return slam.finish(progress)
+    return replace(slam.finish(progress), jumps=jumps)
+
+
+def without_jumps(log: LaserLog, largest_speed: float) -> tuple[FloatArray, int]:
+    """Poses (n, 3) of the wheels, where steps faster than `largest_speed` (m/s) count as standing still; their number.
+
+    Steps may be 1 m longer than that speed allows. Warns of the first one.
+    """
+    wheels = transforms(log.odometry)
+    step = np.linalg.inv(wheels[:-1]) @ wheels[1:]
+    way, seconds = np.hypot(step[:, 0, 2], step[:, 1, 2]), np.maximum(np.diff(log.time), 0.0)
+    jumps = np.flatnonzero(way > largest_speed * seconds + _SLACK)
+    if not len(jumps):
+        return log.odometry, 0
+    first = int(jumps[0])
+    _log.warning(
+        "scan %d: the wheels moved %.3g m in %.3g s, more than largest_speed, %g m/s, allows; "
+        "so in %d steps, which count as standing still",
+        first + 2, way[first], seconds[first], largest_speed, len(jumps),
+    )  # fmt: skip
+    for row in jumps.tolist():  # what follows moves by what the jump did
+        wheels[row + 1 :] = wheels[row] @ np.linalg.inv(wheels[row + 1]) @ wheels[row + 1 :]
+    return vectors(wheels), len(jumps)
 
 
 def _between(frames: list[_Keyframe], one: int, other: int) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,3 +126,13 @@ def test_a_single_bearing_does_not_determine_a_landmark(tmp_path: Path) -> None:
     lines = [line for line in PLANAR.splitlines() if not line.startswith(("EDGE_BEARING_SE2_XY 2", "VERTEX_XY"))]
     with pytest.raises(InputError, match="landmark 11: expected bearings that cross"):
         read_g2o(written(tmp_path, "\n".join(lines) + "\n"))
+
+
+def test_correlated_range_and_bearing_are_not_written_as_if_independent(tmp_path: Path) -> None:
+    graph = read_g2o(written(tmp_path, PLANAR))
+    assert graph.landmarks is not None
+    seen = list(graph.landmarks.observations)
+    seen[2] = replace(seen[2], information=np.array([[[4, 1.5], [1.5, 2]]]))
+    with pytest.raises(InputError, match="pose 3, landmark 10: expected range and bearing of independent errors"):
+        write_g2o(tmp_path / "again.g2o", replace(graph, landmarks=replace(graph.landmarks, observations=tuple(seen))))
+    assert not (tmp_path / "again.g2o").exists()

@@ -82,6 +82,7 @@ def test_writing_and_reading_gives_the_same_graph(tmp_path: Path, text: str) -> 
         (PLANAR, "4 1 0.5 5", "1e300 1 0.5 1e300", r"line 6: I11: expected a number within 1e\+15, got 1e\+300"),
         (PLANAR, "VERTEX_SE2 3", "VERTEX_SE2 7", "line 2: id: 7 is given twice"),
         (PLANAR, "VERTEX_SE2 3", "VERTEX_SE2 3.5", "line 2: id: expected a whole number"),
+        (PLANAR, "FIX 3", "FIX it", "line 5: expected ids of poses after FIX, got 'it'"),
         (PLANAR, "EDGE_SE2 3 7", "EDGE_SE2 3 8", "line 6: second: there is no pose 8"),
         (PLANAR, "EDGE_SE2 3 7", "EDGE_SE2 7 7", "line 6: second: expected another pose"),
         (PLANAR, "4 1 0.5 5", "4 9 0.5 5", r"line 6: I11 ... I33: expected a positive definite matrix"),
@@ -128,3 +129,11 @@ def test_slightly_indefinite_information_is_projected_with_a_warning(
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.g2o: cannot be read"):
         read_g2o(tmp_path / "none.g2o")
+
+
+@pytest.mark.parametrize(("fixed", "warned"), [("FIX 3", False), ("FIX 7", True), ("FIX 3 7", True)])
+def test_poses_that_are_not_held_as_the_file_says_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, fixed: str, warned: bool
+) -> None:
+    read_g2o(written(tmp_path, PLANAR.replace("FIX 3", fixed)))
+    assert ("FIX 7 has no effect, as pose 3, the first, is held" in caplog.text) == warned

@@ -109,6 +109,8 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
         off[name] = np.abs((found - np.linalg.inv(truth[0]) @ truth)[:, :2, 2]).max()
     assert off["robust"] < 0.3 * off["plain"]
     assert off["consensus"] < 0.3 * off["plain"]
+    errors = {name: json.loads((tmp_path / name / "errors.json").read_text()) for name in ("plain", "consensus")}
+    assert errors["consensus"]["guess itself"] == pytest.approx(errors["plain"]["guess itself"], rel=1e-12)
     named = [f"{graph.ids[graph.first[k]]} {graph.ids[graph.second[k]]}" for k in false]
     rejected = json.loads((tmp_path / "consensus" / "errors.json").read_text())["rejected"]
     assert set(named) <= set(rejected)

@@ -6,13 +6,15 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
 from data_tools.laser import LaserLog
 from data_tools.simulator.laser_drive import laser_drive, write_carmen
 from data_tools.trajectories import read_tum_poses
 from pipelines.cli import app
-from pipelines.slam.laser_slam import LaserSettings, laser_slam
+from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam
+from saga_fg import InputError
 
 
 def test_loops_are_closed_and_the_path_is_right(tmp_path: Path) -> None:
@@ -61,3 +63,37 @@ def test_a_broken_log_is_one_line(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert "line 1: expected a number of readings from 10" in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_the_path_starts_at_the_wheels_until_a_scan_hits_something() -> None:
+    log, true = laser_drive(2, rounds=0.1)
+    log.ranges[:8] = np.nan
+    path = laser_slam(log)
+    assert path.keyframes[0] == 8
+    assert np.linalg.norm(path.poses[:, :2, 2] - true[:, :2, 2], axis=1).max() < 0.15
+
+
+def test_scans_that_never_hit_are_one_error() -> None:
+    log, _ = laser_drive(2, rounds=0.02)
+    with pytest.raises(InputError, match=r"20 readings within largest_range, 0\.1 m, there is none among"):
+        laser_slam(log, LaserSettings(largest_range=0.1))
+    with pytest.raises(InputError, match="none among 0"):
+        LaserSlam().finish()
+
+
+def test_a_robot_that_stands_still_has_a_map(tmp_path: Path) -> None:
+    log, _ = laser_drive(2, rounds=0.1)
+    write_carmen(tmp_path / "drive.log", log)
+    arguments = ["slam", "laser", str(tmp_path / "drive.log"), "--output", str(tmp_path / "out"), "--scans", "2"]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert "2 scans, 1 keyframe, 0 loops" in result.stdout
+
+
+def test_jumps_of_the_wheels_are_counted_and_not_believed(caplog: pytest.LogCaptureFixture) -> None:
+    log, true = laser_drive(2, rounds=0.12)
+    log.odometry[20:, 0] += 100.0
+    path = laser_slam(log)
+    assert path.jumps == 1
+    assert "scan 21: the wheels moved 100 m in 0.2 s" in caplog.text
+    assert np.linalg.norm(path.poses[:, :2, 2] - true[:, :2, 2], axis=1).max() < 0.2

@@ -55,7 +55,8 @@ class OptimisedPoses:
     landmarks: FloatArray | None = None
 
     def covariances(self, rows: IntArray | None = None) -> FloatArray:
-        """Covariance (n, k, k) of poses `rows` (n,), or all, each in its tangent, relative to the first one.
+        """Covariance (n, k, k) of poses `rows` (n,), or all, each in its tangent: relative to the
+        first one, or, where there are priors, in the frame that these are given in.
 
         Raises `InputError` where the measurements are too unlike in size to say.
         """

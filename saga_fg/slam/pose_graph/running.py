@@ -19,6 +19,7 @@ from saga_fg.slam.pose_graph.graph import PoseGraph
 _LOSS = Robust("cauchy", 3.0)
 _ANCHOR = 1e-8  # variance of the first pose
 _TURN = 1.0  # m of path that a radian of turning counts as
+_SHORTEST = 1e-6  # m: a sparse matrix takes 0 for no measurement
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +45,6 @@ class RunningPoseGraph:
         self._new, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._new.add(pose_prior_factor(0, world_T_first, _ANCHOR * np.eye(3)))
         self._start.insert(0, _pose2(world_T_first))
-
-    def __len__(self) -> int:
-        return len(self._poses)
-
-    @property
-    def edges(self) -> list[Measured]:
-        """The measurements: odometry and loops, in the order they came."""
-        return self._edges
 
     def append(self, last_T_new: FloatArray, covariance: FloatArray) -> int:
         """Add a pose by odometry from the last one; returns its number."""
@@ -84,14 +77,20 @@ class RunningPoseGraph:
 
     def distances(self, row: int) -> FloatArray:
         """Length (N,) of the shortest way from a pose to each along measurements, m: what relative errors grow with."""
-        from scipy.sparse import coo_array
+        from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 
-        first, second = (np.array([getattr(edge, end) for edge in self._edges]) for end in ("first", "second"))
+        first, second = (
+            np.array([getattr(edge, end) for edge in self._edges], dtype=np.int64) for end in ("first", "second")
+        )
         T = np.array([edge.first_T_second for edge in self._edges]).reshape(-1, 3, 3)
         length = np.hypot(T[:, 0, 2], T[:, 1, 2]) + _TURN * np.abs(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
         n = len(self._poses)
-        joined = coo_array((np.maximum(length, 1e-6), (first, second)), shape=(n, n)).tocsr()
+        low, high = np.minimum(first, second), np.maximum(first, second)
+        order = np.lexsort((length, high, low))  # the shortest of several between the same two
+        _, once = np.unique(low[order] * n + high[order], return_index=True)
+        kept = order[once]
+        joined = csr_array((np.maximum(length[kept], _SHORTEST), (low[kept], high[kept])), shape=(n, n))
         return np.asarray(dijkstra(joined, directed=False, indices=row))
 
     def graph(self, loops: list[Measured] | None = None) -> PoseGraph:

@@ -76,3 +76,26 @@ def test_a_map_that_is_drawn_twice_has_the_larger_entropy() -> None:
     apart = poses.copy()
     apart[3:, :2, 2] = 0.3
     assert OccupancyGrid.of(scans, apart).entropy > 1.1 * OccupancyGrid.of(scans, poses).entropy
+
+
+@pytest.mark.parametrize("edge", [-0.4, 0.4])
+def test_the_window_ends_at_its_reach_on_both_sides(edge: float) -> None:
+    rng = np.random.default_rng(2)
+    true = np.array([2.0, 2.0, 0.0])
+    grid = ScoreGrid.of(room(rng))
+    scan = seen_from(room(rng, 150), true)
+    at_the_edge = grid.search(scan, true - np.array([edge, edge, 0.0]), 0.4, 0.02, 0.5)
+    assert at_the_edge is not None
+    assert (np.abs(at_the_edge.pose[:2] - true[:2]) < 0.06).all()
+    start = true - np.array([2 * edge, 2 * edge, 0.0])
+    beyond = grid.search(scan, start, 0.4, 0.02, 0.01)
+    assert beyond is not None
+    assert (np.abs(beyond.pose[:2] - start[:2]) < 0.41).all()
+
+
+def test_the_share_is_of_points_near_the_map_even_where_too_few_pair() -> None:
+    lines = LineMap.of(room(np.random.default_rng(0)))
+    scan = np.array([[0.5, 0.1], [1.0, 0.1], [1.5, 0.4], [2.0, 0.4]])
+    fit = lines.fit(scan, np.zeros(3), np.eye(3), reach=0.5)
+    assert fit.share == 0.5
+    assert not fit.information.any()

@@ -45,3 +45,11 @@ def test_a_graph_in_pieces_is_refused() -> None:
     graph = graph_of(2)
     with pytest.raises(InputError, match="expected measurements that connect it with the first pose"):
         consensus(chosen_edges(graph, graph.first < 10))
+
+
+def test_a_graph_without_measurements_is_kept() -> None:
+    none = np.zeros(0, dtype=np.int64)
+    alone = PoseGraph(np.arange(1), np.eye(3)[None], none, none, np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
+    agreed = consensus(alone)
+    assert agreed.kept.shape == (0,)
+    assert len(agreed.graph) == 1
