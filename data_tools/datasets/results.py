@@ -12,6 +12,7 @@ import numpy as np
 from data_tools.datasets.detection_files import TableImport, TrackRows, read_tracks
 from data_tools.files.error_messages import unknown_name
 from data_tools.metrics import SceneBoxes
+from data_tools.plausibility import Mend, usual_class
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Dataset, Scene
@@ -88,7 +89,7 @@ def read_judged_results(
     for name in chosen:
         scene = truth.scene(name)
         results[name] = scene_result(scene, _at_moments(rows, scene, path), path)
-    _warn_of_classes(results, path)
+    _warn_of_classes(results, path, how or TableImport())
     return results
 
 
@@ -124,16 +125,22 @@ def _nearest(times: FloatArray, moments: FloatArray) -> FloatArray:
     return np.where(np.abs(moments - times[before]) <= np.abs(times[after] - moments), times[before], times[after])
 
 
-def _warn_of_classes(results: Mapping[str, SceneResult], path: Path) -> None:
-    """Warn where tracks and true objects have no class in common: nothing can match."""
+def _warn_of_classes(results: Mapping[str, SceneResult], path: Path, how: TableImport) -> None:
+    """Warn of classes that tracks or true objects alone have: nothing of them can match."""
     found = {label for each in results.values() for label in each.found.boxes.label.tolist()}
     true = {
         label for each in results.values() for t in each.scene.ground_truth or () for label in t.boxes.label.tolist()
     }
-    if found and true and not found & true:
-        pair = f"{min(found)}={min(true)}"
-        text = "%s: tracks are of %s, true objects of %s: nothing can match; name them alike: --classes %s"
-        log.warning(text, path, ", ".join(sorted(found)), ", ".join(sorted(true)), pair)
+    tracked, missed = sorted(found - true), sorted(true - found)
+    if not found or not true or not (tracked or missed):
+        return
+    whose = {"tracks": tracked, "true objects": missed}
+    alone = " and ".join(f"{who} of {', '.join(names)}" for who, names in whose.items() if names)
+    alike = {name: each for name in missed for each in tracked if usual_class(name) == usual_class(each) is not None}
+    if len(tracked) == len(missed) == 1:
+        alike = {missed[0]: tracked[0]}
+    hint = f"; name them alike: {how.mended(Mend(classes=alike), {}).options().strip()}" if alike else ""
+    log.warning("%s: %s have no counterpart of their class, nothing of them can match%s", path, alone, hint)
 
 
 def _scene(rows: TrackRows, name: str) -> Scene:

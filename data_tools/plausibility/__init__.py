@@ -11,7 +11,7 @@ from data_tools.plausibility.checks import (
     unlikely_sizes,
     within_a_metre,
 )
-from data_tools.plausibility.class_names import idle_rules, settings_without_data, usual_classes
+from data_tools.plausibility.class_names import idle_rules, settings_without_data, usual_class, usual_classes
 from data_tools.plausibility.doubt import FILL_IN, Doubt, Mend
 from data_tools.plausibility.sample import Sample, doubts_of
 
@@ -31,6 +31,7 @@ __all__ = [
     "settings_without_data",
     "strange_time_steps",
     "unlikely_sizes",
+    "usual_class",
     "usual_classes",
     "within_a_metre",
 ]

@@ -158,12 +158,44 @@ def test_tracks_that_do_not_fit_the_truth(tmp_path: Path, change: dict[str, Any]
     assert message is None or message in result.stderr
 
 
-def test_classes_that_have_nothing_in_common_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    _, true = rows()
-    gt, other = write(tmp_path / "gt.csv", true), write(tmp_path / "t.csv", [{**row, "category": "X"} for row in true])
-    result = saga_fg("evaluate", "file", other, "--truth", gt, "--units", "angle=deg")
-    assert result.exit_code == 0, result.output
-    assert "nothing can match; name them alike: --classes X=VEHICLE" in caplog.text
+@pytest.mark.parametrize(
+    ("theirs", "alone", "classes"),
+    [
+        ({"v0": "X"}, "tracks of X and true objects of BUS", "BUS=X"),
+        ({"v0": "coach", "v1": "VEHICLE"}, "tracks of coach and true objects of BUS", "BUS=coach"),
+        ({"v0": "VEHICLE"}, "true objects of BUS", None),
+        ({"v0": "coach", "v2": "Y"}, "tracks of Y, coach and true objects of BUS", "BUS=coach"),
+    ],
+)
+def test_each_class_without_a_counterpart_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, theirs: dict[str, str], alone: str, classes: str | None
+) -> None:
+    true = [row | ({"category": "BUS"} if row["object_id"] == "v0" else {}) for row in rows()[1]]
+    gt = write(tmp_path / "gt.csv", true)
+    other = write(tmp_path / "t.csv", [row | {"category": theirs.get(row["object_id"], "VEHICLE")} for row in true])
+    judge = ["evaluate", "file", other, "--truth", gt]
+    assert saga_fg(*judge, "--units", "angle=deg").exit_code == 0
+    assert f"{alone} have no counterpart of their class" in caplog.text
+    assert ("name them alike" in caplog.text) == (classes is not None)
+    if classes is not None:
+        mend = caplog.records[-1].getMessage().rpartition("name them alike: ")[2]
+        assert mend == f"--classes {classes} --units angle=deg"
+        caplog.clear()
+        assert saga_fg(*judge, *shlex.split(mend)).exit_code == 0
+        assert "BUS" not in caplog.text
+
+
+def test_decimal_commas_and_other_encodings_are_told_in_one_line(tmp_path: Path) -> None:
+    table = tmp_path / "d.csv"
+    table.write_text("time;x;y;length;label\n0,0;1,5;2,5;4,5;car\n0,1;1,6;2,5;4,5;car\n")
+    tracked = saga_fg("track", "file", table, "-o", tmp_path / "t.csv")
+    text = "line 2: timestamp, x, y, length: expected decimal points, got '0,0'; replace the decimal commas"
+    assert tracked.stderr.strip() == f"error: {table}: {text}"
+    assert saga_fg("inspect", table).stdout.count(text) == 1
+    table.write_bytes("time,x,y,label\n0,1,2,car\n1,1,2,Fußgänger\n".encode("latin-1"))
+    tracked = saga_fg("track", "file", table, "-o", tmp_path / "t.csv")
+    assert f"{table}: expected text in UTF-8, line 3 is in another encoding, such as Latin-1" in tracked.stderr
+    assert f"iconv -f latin1 -t utf-8 {table}" in tracked.stderr
 
 
 def test_without_truth_it_is_asked_for(tmp_path: Path) -> None:

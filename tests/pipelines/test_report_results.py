@@ -13,6 +13,7 @@ from data_tools.metrics import SceneBoxes
 from pipelines.cli import app
 from pipelines.report.track_figures import COLUMNS, track_charts, track_figures
 from saga_fg import Boxes, Scene
+from tests.pipelines.page_in_browser import tried_in_browser
 from tests.pipelines.test_report import data_of
 
 
@@ -46,6 +47,13 @@ def test_the_title_says_method_and_data_and_the_figures_what_is_known(folder: Pa
     titles = [chart["title"] for chart in data_of(page)["charts"]]
     assert titles[0] == "Tracks at a time"
     assert titles[-1].startswith("Time in the tracker")
+
+
+def test_tracks_of_own_data_are_drawn_when_the_page_opens(folder: Path, tmp_path: Path) -> None:
+    assert report(folder).exit_code == 0
+    page = (folder / "page.html").read_text(encoding="utf-8")
+    found = tried_in_browser(page, 'found.tracks = document.getElementById("view").dataset.tracks;', tmp_path)
+    assert found == {"faults": [], "tracks": "2"}
 
 
 def test_two_results_stand_side_by_side(folder: Path) -> None:

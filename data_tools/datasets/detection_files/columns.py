@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -31,6 +32,7 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 ROTATIONS = {"yaw": QUATERNION, "ego_yaw": tuple(f"ego_{name}" for name in QUATERNION)}
 COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, *ODOMETRY, *GPS, *QUATERNION, *ROTATIONS["ego_yaw"], "empty")
 _ARGOVERSE = {"log_id", "timestamp_ns", "category", "length_m", "qw", "qz", "tx_m", "ty_m", "tz_m"}
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 LONGEST_NAME = 256  # characters; NumPy stores all texts of an array as wide as the widest
 
 Values = Sequence[Any] | np.ndarray[Any, Any]
@@ -91,14 +93,29 @@ class RawTable:
 
     def check_numbers(self, names: Sequence[str]) -> None:
         """Raise one `InputError` for all of these columns that hold anything but finite numbers."""
-        faults = []
+        faults = self.faults_of_numbers(names)
+        if faults:
+            raise InputError(f"{self.path}: {'; '.join(faults.values())}")
+
+    def faults_of_numbers(self, names: Sequence[str]) -> dict[tuple[str, ...], str]:
+        """Why columns hold anything but finite numbers, by those that share a reason, such as decimal commas."""
+        faults: dict[tuple[str, ...], str] = {}
+        commas: dict[str, int] = {}
         for name in names:
             try:
                 self.numbers(name)
             except InputError as error:
-                faults.append(str(error).removeprefix(f"{self.path}: "))
-        if faults:
-            raise InputError(f"{self.path}: {'; '.join(faults)}")
+                texts = enumerate(self.columns.get(name, ()))
+                row = next((row for row, text in texts if _DECIMAL_COMMA.fullmatch(str(text))), None)
+                if row is None:
+                    faults[name,] = str(error).removeprefix(f"{self.path}: ")
+                else:
+                    commas[name] = row
+        if commas:
+            name, row = next(iter(commas.items()))
+            got = f"expected decimal points, got {str(self.columns[name][row])[:40]!r}; replace the decimal commas"
+            faults[tuple(commas)] = f"{self.where(row)}: {', '.join(commas)}: {got}"
+        return faults
 
     def doubts(self) -> list[Doubt]:
         """What is doubtful about columns as they are given, which cannot be seen in frames."""

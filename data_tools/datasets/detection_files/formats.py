@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import logging
+import shlex
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -129,7 +130,19 @@ def _tables(reading: _Reading) -> Iterator[RawTable]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected text in UTF-8: {error}") from error
+        raise InputError(f"{path}: expected text in UTF-8{_foreign_line(path)}") from error
+
+
+def _foreign_line(path: Path) -> str:
+    """Where a file is no text in UTF-8, and what to do."""
+    with open_bytes(path) as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                line.decode()
+            except UnicodeDecodeError:
+                convert = f"iconv -f latin1 -t utf-8 {shlex.quote(str(path))}"
+                return f", line {number} is in another encoding, such as Latin-1; convert the file: {convert}"
+    return ""
 
 
 def column_names(path: Path, how: TableImport | None = None) -> Mapping[str, str]:

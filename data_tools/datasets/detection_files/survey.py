@@ -82,7 +82,7 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
             for name in table.scenes[:3]:
                 doubts += doubts_of(Sample.of(table.scene(name).frames))
         except InputError as error:
-            faults.append(_of_file(error, raw))
+            faults.append(str(error).removeprefix(f"{path}: "))
     known = {doubt.kind: doubt for doubt in reversed(doubts)}
     labels = raw.texts("label", "object")
     detected = raw.present("x") if "x" in raw.columns else np.ones(raw.length, dtype=np.bool_)
@@ -101,18 +101,10 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
 
 def _without_faults(raw: RawTable) -> tuple[RawTable, list[str]]:
     """The table without the columns that hold anything but finite numbers, and what is wrong with it."""
-    faults, broken = list(raw.found.faults), set()
-    for name in (*SHOWN, *QUATERNION):
-        try:
-            raw.numbers(name)
-        except InputError as error:
-            faults.append(_of_file(error, raw))
-            broken |= {name, *ROTATIONS.get(name, ())}
-    return replace(raw, columns={name: values for name, values in raw.columns.items() if name not in broken}), faults
-
-
-def _of_file(error: InputError, raw: RawTable) -> str:
-    return str(error).removeprefix(f"{raw.path}: ")
+    numbers = raw.faults_of_numbers((*SHOWN, *QUATERNION))
+    broken = {name for names in numbers for each in names for name in (each, *ROTATIONS.get(each, ()))}
+    columns = {name: values for name, values in raw.columns.items() if name not in broken}
+    return replace(raw, columns=columns), [*raw.found.faults, *numbers.values()]
 
 
 def _rotated(raw: RawTable, name: str) -> bool:
