@@ -6,6 +6,7 @@ import numpy as np
 
 from pipelines.slam.planar_poses import transforms, vectors
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.slam.pose_graph.running import way_along
 
 
 def between_keyframes(matched: FloatArray, poses: FloatArray, rows: IntArray) -> FloatArray:
@@ -13,8 +14,8 @@ def between_keyframes(matched: FloatArray, poses: FloatArray, rows: IntArray) ->
 
     matched: (n, 3, 3) by scan matching alone; poses: (k, 3, 3) of the keyframes, the scans `rows` (k,).
     """
-    step = np.diff(vectors(matched), axis=0)
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]) + np.abs(np.sin(step[:, 2])))])
+    step = np.linalg.inv(matched[:-1]) @ matched[1:]
+    way = np.concatenate([[0.0], np.cumsum(way_along(step))])
     key = np.clip(np.searchsorted(rows, np.arange(len(matched)), side="right") - 1, 0, len(rows) - 1)
     after = np.minimum(key + 1, len(rows) - 1)
     length = way[rows[after]] - way[rows[key]]

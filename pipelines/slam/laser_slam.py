@@ -30,7 +30,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
-from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
+from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph, way_along
 
 _KNOWN = 0.8  # m, half width of a window up to which a corridor may be recognised: it then says nothing along it
 _UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
@@ -43,7 +43,6 @@ _REACHES = (0.6, 0.3)  # m, of registrations with other passes, in turn
 _ACROSS = 5.0  # m from the centre of a submap that it is searched from, besides the window
 _UNIQUE = 0.92  # share of the best score that a rival may have
 _LONGEST = 60.0  # m of way from which the search of headings does not grow
-_RADIAN = 0.5  # m of way that a radian of turning counts as
 _DOUBT = 0.2  # share of a difference between wheels and registration that counts as standard deviation: one errs
 _TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
 
@@ -189,7 +188,7 @@ class LaserSlam:
     def _add_keyframe(self, points: FloatArray, matched: FloatArray, since: FloatArray) -> None:
         frames, s, turn = self._keyframes, self.settings, abs(heading(since))
         assert self._odometry is not None
-        way = frames[-1].way + float(np.hypot(since[0, 2], since[1, 2])) + _RADIAN * turn if frames else 0.0
+        way = frames[-1].way + float(way_along(since[None])[0]) if frames else 0.0
         frames.append(Keyframe(thinned(points, 0.03), matched, len(self._matched) - 1, way))
         if self._graph is None:
             self._graph = RunningPoseGraph(matched)

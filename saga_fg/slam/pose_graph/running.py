@@ -18,7 +18,7 @@ from saga_fg.slam.pose_graph.graph import PoseGraph
 
 _LOSS = Robust("cauchy", 3.0)
 _ANCHOR = 1e-8  # variance of the first pose
-_TURN = 1.0  # m of path that a radian of turning counts as
+_RADIAN = 1.0  # m of way that a radian of turning counts as
 _SHORTEST = 1e-6  # m: a sparse matrix takes 0 for no measurement
 
 
@@ -30,6 +30,12 @@ class Measured:
     second: int
     first_T_second: FloatArray
     covariance: FloatArray
+
+
+def way_along(steps: FloatArray) -> FloatArray:
+    """Way (n,) of steps (n, 3, 3), m: their length, and a metre for each radian turned."""
+    turn = np.abs(np.arctan2(steps[:, 1, 0], steps[:, 0, 0]))
+    return np.asarray(np.hypot(steps[:, 0, 2], steps[:, 1, 2]) + _RADIAN * turn)
 
 
 class RunningPoseGraph:
@@ -84,7 +90,7 @@ class RunningPoseGraph:
             np.array([getattr(edge, end) for edge in self._edges], dtype=np.int64) for end in ("first", "second")
         )
         T = np.array([edge.first_T_second for edge in self._edges]).reshape(-1, 3, 3)
-        length = np.hypot(T[:, 0, 2], T[:, 1, 2]) + _TURN * np.abs(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
+        length = way_along(T)
         n = len(self._poses)
         low, high = np.minimum(first, second), np.maximum(first, second)
         order = np.lexsort((length, high, low))  # the shortest of several between the same two
