@@ -12,16 +12,19 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
 
 from data_tools.laser.carmen import LaserLog
-from data_tools.laser.line_map import Fit, LineMap, thinned
+from data_tools.laser.line_map import LineMap, thinned
 from data_tools.laser.score_grid import ScoreGrid
-from pipelines.slam.planar_poses import heading, moved, transform, transforms, vector, vectors
+from pipelines.slam.laser_interpolation import between_keyframes
+from pipelines.slam.laser_keyframes import SMEAR, Keyframe, covariance_of, determined, joined, measured_by
+from pipelines.slam.laser_odometry import without_jumps
+from pipelines.slam.laser_passes import registered_passes
+from pipelines.slam.planar_poses import heading, moved, transform, vector
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -29,25 +32,20 @@ from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
 from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
 
-_SMEAR = 4.0  # how often the points of a wall say the same: information of a registration is divided by this
-_FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any number of points, m^2 and rad^2
-_DETERMINED = 0.05  # ratio of information along and across below which a place is a bare corridor
 _KNOWN = 0.8  # m, half width of a window up to which a corridor may be recognised: it then says nothing along it
 _UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
 _AGREED = np.array([0.3, 0.06])  # m and rad that two such may differ by, and 0.03 of the way between them
 _WAITING = 15.0  # m of way that a loop waits
 _LEAST_POINTS = 20  # of a scan that is registered
 _WIDEST = 3.0  # m, half width of the search where wheels slipped: its time and memory grow with the square
-_SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
 _POOR = 0.8  # share of a scan that lies on the local map, below which the pose is searched
 _REACHES = (0.6, 0.3)  # m, of registrations with other passes, in turn
+_ACROSS = 5.0  # m from the centre of a submap that it is searched from, besides the window
+_UNIQUE = 0.92  # share of the best score that a rival may have
 _LONGEST = 60.0  # m of way from which the search of headings does not grow
 _RADIAN = 0.5  # m of way that a radian of turning counts as
 _DOUBT = 0.2  # share of a difference between wheels and registration that counts as standard deviation: one errs
 _TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
-
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -69,16 +67,6 @@ class LaserSettings(Settings):
     )
     loop_score: Annotated[float, Range(0, 1)] = setting(0.6, "least mean score of a loop; raised: fewer, surer loops")
     loop_drift: Positive = setting(0.04, "half width of the search, share of the way since; raised: slower, finds more")
-
-
-@dataclass(eq=False)
-class _Keyframe:
-    """A scan (n, 2) of the graph, its pose by scan matching alone, the row of the scan, and the way until there, m."""
-
-    points: FloatArray
-    matched: FloatArray
-    row: int
-    way: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +101,7 @@ class LaserSlam:
 
     settings: LaserSettings = field(default_factory=LaserSettings)
     robot_T_laser: FloatArray = field(default_factory=lambda: np.eye(3))
-    _keyframes: list[_Keyframe] = field(default_factory=list)
+    _keyframes: list[Keyframe] = field(default_factory=list)
     _matched: list[FloatArray] = field(default_factory=list)
     _graph: RunningPoseGraph | None = None
     _map: LineMap | None = None
@@ -164,13 +152,15 @@ class LaserSlam:
         rejected = int((~agreed.kept).sum())
         graph = agreed.graph
         for turn, reach in enumerate(_REACHES):
-            again = self._passes(graph.world_T_pose, reach)
+            again = registered_passes(
+                self._keyframes, graph.world_T_pose, reach, self.settings.local_map, self.settings.loop_score
+            )
             if progress is not None:
                 progress("registering passes", turn + 1, len(_REACHES))
             if again:
                 graph = self._graph.settled(again).graph
         rows = np.array([frame.row for frame in self._keyframes])
-        poses = self._all_poses(graph.world_T_pose, rows)
+        poses = between_keyframes(np.stack(self._matched), graph.world_T_pose, rows)
         return LaserPath(poses, np.stack(self._matched), loops, rejected, rows, graph)
 
     def _now(self, matched: FloatArray) -> FloatArray:
@@ -193,20 +183,20 @@ class LaserSlam:
             if found is not None:
                 other = self._map.fit(scan, found.pose, 0.01 * prior, reach=0.3)
                 fit = max(fit, other, key=lambda each: each.share)
-        self._information = fit.information / _SMEAR + prior
+        self._information = fit.information / SMEAR + prior
         return transform(fit.pose)
 
     def _add_keyframe(self, points: FloatArray, matched: FloatArray, since: FloatArray) -> None:
         frames, s, turn = self._keyframes, self.settings, abs(heading(since))
         assert self._odometry is not None
         way = frames[-1].way + float(np.hypot(since[0, 2], since[1, 2])) + _RADIAN * turn if frames else 0.0
-        frames.append(_Keyframe(thinned(points, 0.03), matched, len(self._matched) - 1, way))
+        frames.append(Keyframe(thinned(points, 0.03), matched, len(self._matched) - 1, way))
         if self._graph is None:
             self._graph = RunningPoseGraph(matched)
         else:
             off = vector(np.linalg.inv(since) @ np.linalg.inv(self._wheels) @ self._odometry)
             doubt = _DOUBT * np.array([np.hypot(off[0], off[1])] * 2 + [abs(off[2])]) + [0.0, 0.0, _TURNING * turn]
-            self._graph.append(since, _covariance(self._information, matched) + np.diag(doubt**2))
+            self._graph.append(since, covariance_of(self._information, matched) + np.diag(doubt**2))
         self._wheels = self._odometry
         recent = [frame for frame in frames if frame.way > way - s.local_map]
         self._map = LineMap.of(np.concatenate([moved(frame.points, frame.matched) for frame in recent]))
@@ -214,8 +204,8 @@ class LaserSlam:
         first = self._submaps[-1].end if self._submaps else 0
         if way - frames[first].way > s.submap:
             centre = (first + len(frames)) // 2
-            joined = self._joined(frames[first:], frames[centre])
-            self._submaps.append(_Submap(first, len(frames), centre, ScoreGrid.of(joined), LineMap.of(joined)))
+            points = joined(frames[first:], frames[centre])
+            self._submaps.append(_Submap(first, len(frames), centre, ScoreGrid.of(points), LineMap.of(points)))
         if len(frames) % 2 == 0:
             loops = self._loops(len(frames) - 1)
             if loops or len(frames) % 20 == 0:
@@ -233,7 +223,7 @@ class LaserSlam:
         poses = self._graph.poses
         window = 0.5 + self.settings.loop_drift * way
         apart = np.linalg.norm(poses[centres, :2, 2] - poses[row, :2, 2], axis=1)
-        near = np.flatnonzero(apart < 5.0 + window)
+        near = np.flatnonzero(apart < _ACROSS + window)
         near = near[np.argsort(apart[near])]
         source = self._source(row)
         found: list[Measured] = []
@@ -270,61 +260,17 @@ class LaserSlam:
         self, submap: _Submap, row: int, source: FloatArray, guess: FloatArray, window: float, turn: float
     ) -> Measured | None:
         found = submap.grid.search(source, vector(guess), window, turn, self.settings.loop_score)
-        if found is None or found.rival > 0.92 * found.score:
+        if found is None or found.rival > _UNIQUE * found.score:
             return None
         fit = submap.lines.fit(self._keyframes[row].points, found.pose, np.diag([1.0, 1.0, 10.0]), reach=0.4)
-        if fit.share < self.settings.loop_score or (window > _KNOWN and not _determined(fit.information)):
+        if fit.share < self.settings.loop_score or (window > _KNOWN and not determined(fit.information)):
             return None
-        return _measured(submap.centre, row, fit)
+        return measured_by(submap.centre, row, fit)
 
     def _source(self, row: int) -> FloatArray:
         """Points of a keyframe and of the four before it, in its frame."""
         frames = self._keyframes[max(0, row - 4) : row + 1]
-        return thinned(self._joined(frames, frames[-1]), 0.2)
-
-    def _joined(self, frames: list[_Keyframe], centre: _Keyframe) -> FloatArray:
-        back = np.linalg.inv(centre.matched)
-        return np.concatenate([moved(frame.points, back @ frame.matched) for frame in frames])
-
-    def _passes(self, poses: FloatArray, reach: float) -> list[Measured]:
-        """Registrations of each keyframe with the map of every other pass nearby."""
-        found: list[Measured] = []
-        maps: dict[int, LineMap] = {}
-        places, frames = poses[:, :2, 2], self._keyframes
-        way = np.array([frame.way for frame in frames])
-        for row in range(len(poses)):
-            apart = np.linalg.norm(places[:row] - places[row], axis=1)
-            others = np.flatnonzero((apart < 3.0) & (way[:row] < way[row] - 2 * self.settings.local_map))
-            if not len(others):
-                continue
-            runs = np.split(others, np.flatnonzero(np.diff(way[others]) > 5.0) + 1)
-            nearest = sorted((int(run[np.argmin(apart[run])]) for run in runs), key=lambda k: apart[k])
-            for other in dict.fromkeys(near // 3 * 3 for near in nearest[:4]):
-                if other not in maps:
-                    around = [frame for frame in frames if abs(frame.way - way[other]) < self.settings.local_map / 3]
-                    maps[other] = LineMap.of(self._joined(around, frames[other]))
-                guess = np.linalg.inv(poses[other]) @ poses[row]
-                fit = maps[other].fit(frames[row].points, vector(guess), np.diag([100.0, 100.0, 1000.0]), reach)
-                if fit.share > self.settings.loop_score:
-                    found.append(_measured(other, row, fit))
-        return found
-
-    def _all_poses(self, poses: FloatArray, rows: IntArray) -> FloatArray:
-        """Poses of all scans: the correction of the keyframes before and after, by the way between them."""
-        matched = np.stack(self._matched)
-        step = np.diff(vectors(matched), axis=0)
-        way = np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]) + np.abs(np.sin(step[:, 2])))])
-        key = np.clip(np.searchsorted(rows, np.arange(len(matched)), side="right") - 1, 0, len(rows) - 1)
-        after = np.minimum(key + 1, len(rows) - 1)
-        length = way[rows[after]] - way[rows[key]]
-        share = np.where(length > 0, (way - way[rows[key]]) / np.where(length > 0, length, 1), 0.0)
-        share = np.clip(share, 0, 1)  # scans before the first keyframe
-        from_before = poses[key] @ np.linalg.inv(matched[rows[key]]) @ matched
-        from_after = poses[after] @ np.linalg.inv(matched[rows[after]]) @ matched
-        one, other = vectors(from_before), vectors(from_after)
-        off = other - one
-        off[:, 2] = np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2]))
-        return transforms(one + share[:, None] * off)
+        return thinned(joined(frames, frames[-1]), 0.2)
 
 
 def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: Progress | None = None) -> LaserPath:
@@ -338,56 +284,5 @@ def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: P
     return replace(slam.finish(progress), jumps=jumps)
 
 
-def without_jumps(log: LaserLog, largest_speed: float) -> tuple[FloatArray, int]:
-    """Poses (n, 3) of the wheels, where steps faster than `largest_speed` (m/s) count as standing still; their number.
-
-    Steps may be 1 m longer than that speed allows. Warns of the first one.
-    """
-    wheels = transforms(log.odometry)
-    step = np.linalg.inv(wheels[:-1]) @ wheels[1:]
-    way, seconds = np.hypot(step[:, 0, 2], step[:, 1, 2]), np.maximum(np.diff(log.time), 0.0)
-    jumps = np.flatnonzero(way > largest_speed * seconds + _SLACK)
-    if not len(jumps):
-        return log.odometry, 0
-    first = int(jumps[0])
-    _log.warning(
-        "scan %d: the wheels moved %.3g m in %.3g s, more than largest_speed, %g m/s, allows; "
-        "so in %d steps, which count as standing still",
-        first + 2, way[first], seconds[first], largest_speed, len(jumps),
-    )  # fmt: skip
-    for row in jumps.tolist():  # what follows moves by what the jump did
-        wheels[row + 1 :] = wheels[row] @ np.linalg.inv(wheels[row + 1]) @ wheels[row + 1 :]
-    return vectors(wheels), len(jumps)
-
-
-def _between(frames: list[_Keyframe], one: int, other: int) -> FloatArray:
+def _between(frames: list[Keyframe], one: int, other: int) -> FloatArray:
     return np.asarray(np.linalg.inv(frames[one].matched) @ frames[other].matched)
-
-
-def _measured(first: int, second: int, fit: Fit) -> Measured:
-    measured = transform(fit.pose)
-    return Measured(first, second, measured, _covariance(_firm(fit.information) / _SMEAR, measured))
-
-
-def _determined(information: FloatArray) -> bool:
-    values = np.linalg.eigvalsh(information[:2, :2])
-    return bool(values[0] > _DETERMINED * values[1])
-
-
-def _firm(information: FloatArray) -> FloatArray:
-    """Information without what scatter seems to say along a bare corridor."""
-    values, vectors = np.linalg.eigh(information[:2, :2])
-    ratio = values[0] / max(values[1], 1e-9)
-    if ratio >= _DETERMINED:
-        return information
-    S = np.eye(3)
-    S[:2, :2] -= (1 - max(ratio, 0.0) / _DETERMINED) * np.outer(vectors[:, 0], vectors[:, 0])
-    return np.asarray(S @ information @ S)
-
-
-def _covariance(information: FloatArray, pose: FloatArray) -> FloatArray:
-    """Covariance in the pose's own frame of what is known in the axes of the map."""
-    R = np.eye(3)
-    R[:2, :2] = pose[:2, :2]
-    own = R.T @ np.linalg.inv(information + np.diag([1e-3, 1e-3, 1e-3])) @ R
-    return np.asarray((own + own.T) / 2 + np.diag(_FLOOR))
