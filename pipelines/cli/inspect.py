@@ -126,9 +126,9 @@ def _show_classes(survey: TableSurvey) -> list[Doubt]:
     """List the classes; return what is doubtful about those that no edge rule acts on."""
     from data_tools.plausibility import Doubt, Mend, idle_rules, usual_classes
     from pipelines.config import load_config
+    from pipelines.doubts import acting_classes
 
-    rules = load_config("file").tracker.edges
-    acting = {label for rule in rules for label in getattr(rule, "classes", getattr(rule, "attached", ()))}
+    acting = acting_classes(load_config("file"))
     mapped = {name: survey.how.classes.get(name, name) for name in survey.classes}
     typer.echo("\nClasses, with rows and median length, width, height:")
     for name in sorted(survey.classes, key=lambda name: -survey.classes[name])[:MOST]:

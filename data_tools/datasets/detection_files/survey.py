@@ -38,7 +38,7 @@ class SensorTimes:
 
 @dataclass(frozen=True, eq=False)
 class TableSurvey:
-    """What a table holds.
+    """The content of a table.
 
     raw       its columns; how: what it takes to read it; sorted: its rows are in order, or `how` sorts them
     ranges    least, median and largest number of each column, in our units
