@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport, TruthFile
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.formats import column_names
@@ -63,28 +64,23 @@ class DetectionFileSource(DatasetSource):
         verbs=JUDGED,
     )
     columns: str | None = option(
-        "Names of columns in the file, where they are not found: time=ts_ns,x=pos_x,yaw=hdg. `length=` leaves one out.",
+        import_options.COLUMNS,
         None,
         metavar="OURS=THEIRS,...",
     )
     classes: str | None = option(
-        "Names of classes: REGULAR_VEHICLE=car,PERSON=pedestrian. `SIGN=` leaves a class out.",
+        import_options.CLASSES,
         None,
         metavar="THEIRS=OURS,...",
     )
     units: str | None = option(
-        "Units: time=ns (s, ms, us, ns, iso8601, 10Hz), length=ft (m, cm, mm, km, ft), speed=km/h (m/s, km/h, mph, "
-        "ft/s), angle=deg (rad, deg), score=percent (share, percent).",
+        import_options.UNITS,
         None,
         metavar="KIND=UNIT,...",
     )
-    coordinates: Literal["world", "ego", "sensor"] | None = option(
-        "Coordinates of rows that say none; ego and sensor need the pose of the vehicle.  [default: world]", None
-    )
-    sort: bool = option("Sort the rows by time, in memory.", False)
-    table_import: TableImport | None = option(
-        "YAML file with the same: columns, classes, units, coordinates, sort.", None, flag="--import", metavar="FILE"
-    )
+    coordinates: Literal["world", "ego", "sensor"] | None = option(import_options.COORDINATES, None)
+    sort: bool = option(import_options.SORT, False)
+    table_import: TableImport | None = option(import_options.IMPORT, None, flag="--import", metavar="FILE")
     truth_import: TableImport | None = option(
         "YAML file with the same, for --truth alone.", None, flag="--truth-import", metavar="FILE", verbs=JUDGED
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from data_tools.datasets import import_options
 from pipelines.cli import options
 from pipelines.cli.summary import counted
 
@@ -30,23 +31,22 @@ def inspect_table(
     ],
     columns: Annotated[
         str | None,
-        typer.Option("--columns", help="Names of columns in the file: time=ts_ns,x=pos_x.", metavar="OURS=THEIRS,..."),
+        typer.Option("--columns", help=import_options.COLUMNS, metavar="OURS=THEIRS,..."),
     ] = None,
     classes: Annotated[
         str | None,
-        typer.Option("--classes", help="Names of classes: REGULAR_VEHICLE=car.", metavar="THEIRS=OURS,..."),
+        typer.Option("--classes", help=import_options.CLASSES, metavar="THEIRS=OURS,..."),
     ] = None,
     units: Annotated[
         str | None,
-        typer.Option("--units", help="Units: time=ns,length=ft,angle=deg,score=percent.", metavar="KIND=UNIT,..."),
+        typer.Option("--units", help=import_options.UNITS, metavar="KIND=UNIT,..."),
     ] = None,
     coordinates: Annotated[
         Literal["world", "ego", "sensor"] | None,
-        typer.Option("--coordinates", help="Coordinates of rows that say none.  [default: world]"),
+        typer.Option("--coordinates", help=import_options.COORDINATES),
     ] = None,
-    import_file: Annotated[
-        Path | None, typer.Option("--import", help="YAML file with the same.", metavar="FILE")
-    ] = None,
+    sort: Annotated[bool, typer.Option("--sort", help=import_options.SORT)] = False,
+    import_file: Annotated[Path | None, typer.Option("--import", help=import_options.IMPORT, metavar="FILE")] = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Look at a table: its columns, units, classes, times, what looks wrong, and the command to run next.
@@ -65,7 +65,7 @@ def inspect_table(
     from pipelines.configuration import load_settings
 
     given = TableImport(
-        pairs("--columns", columns), pairs("--classes", classes), pairs("--units", units), coordinates or ""
+        pairs("--columns", columns), pairs("--classes", classes), pairs("--units", units), coordinates or "", sort
     )
     base = TableImport() if import_file is None else load_settings(TableImport, import_file)
     survey = survey_table(table, given.over(base))
@@ -126,9 +126,9 @@ def _show_classes(survey: TableSurvey) -> list[Doubt]:
     """List the classes; return what is doubtful about those that no edge rule acts on."""
     from data_tools.plausibility import Doubt, Mend, idle_rules, usual_classes
     from pipelines.config import load_config
+    from pipelines.doubts import acting_classes
 
-    rules = load_config("file").tracker.edges
-    acting = {label for rule in rules for label in getattr(rule, "classes", getattr(rule, "attached", ()))}
+    acting = acting_classes(load_config("file"))
     mapped = {name: survey.how.classes.get(name, name) for name in survey.classes}
     typer.echo("\nClasses, with rows and median length, width, height:")
     for name in sorted(survey.classes, key=lambda name: -survey.classes[name])[:MOST]:

@@ -338,6 +338,17 @@ def test_a_look_at_a_table_with_faults_shows_what_is_understood(tmp_path: Path) 
     assert "Nothing looks wrong." in told.stdout
 
 
+def test_a_look_takes_the_options_that_it_prints(tmp_path: Path) -> None:
+    table = write(tmp_path / "d.csv", rows()[0])
+    look = saga_fg("inspect", table).stdout
+    assert "rows are not in order of time; add --sort" in look
+    (options,) = re.findall(r"track file \S+ (.*) --output tracks.csv", look)
+    again = saga_fg("inspect", table, *shlex.split(options))
+    assert again.exit_code == 0, again.output
+    assert "Nothing looks wrong." in again.stdout
+    assert f" {options} --output tracks.csv" in again.stdout
+
+
 def test_numbers_of_frames_taken_for_seconds(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     found = [{"frame": k // 2, "x": k // 2 + 20 * (k % 2), "y": 2, "label": "car"} for k in range(40)]
     table = write(tmp_path / "d.csv", found)

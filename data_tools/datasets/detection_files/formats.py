@@ -49,7 +49,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class _Reading:
-    """What is to be read: a file, of which columns, how, in parts of so many rows."""
+    """A file to be read: of which columns, how, in parts of so many rows."""
 
     path: Path
     layout: Layout

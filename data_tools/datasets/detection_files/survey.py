@@ -38,9 +38,9 @@ class SensorTimes:
 
 @dataclass(frozen=True, eq=False)
 class TableSurvey:
-    """What a table holds.
+    """The content of a table.
 
-    raw       its columns; how: what it takes to read it, with what mends the doubts; sorted: its rows are in order
+    raw       its columns; how: what it takes to read it; sorted: its rows are in order, or `how` sorts them
     ranges    least, median and largest number of each column, in our units
     classes   rows of each class, by the name in the file
     sizes     median length, width and height of each class, m
@@ -89,7 +89,7 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
     return TableSurvey(
         raw,
         replace(how, sort=how.sort or not in_order),
-        in_order,
+        in_order or how.sort,
         {name: _range(raw.numbers(name)) for name in SHOWN if name in raw.columns or _rotated(raw, name)},
         {name: int((detected & (labels == name)).sum()) for name in np.unique(labels[detected]).tolist()},
         _sizes(raw, labels, detected),

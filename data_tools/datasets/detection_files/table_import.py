@@ -104,12 +104,12 @@ class TableImport(Settings):
         return text + (f" --coordinates {self.coordinates}" if self.coordinates else "") + " --sort" * self.sort
 
     def values(self) -> dict[str, Any]:
-        """What is not as by default, for a record."""
+        """The values that differ from the default, for a record."""
         return {name: value for name, value in asdict(self).items() if value}
 
 
 def pairs(option: str, text: str | None) -> dict[str, str]:
-    """The entries of an option `a=b,c=d`. Raises `InputError` for one that is none, or occurs twice."""
+    """The entries of an option `a=b,c=d`. Raises `InputError` for an invalid entry, and one that occurs twice."""
     found: dict[str, str] = {}
     for entry in (text or "").split(","):
         name, equals, value = (part.strip() for part in entry.partition("="))

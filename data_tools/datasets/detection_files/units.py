@@ -44,7 +44,7 @@ _KINDS: dict[str, Kind] = {
     "score": "score",
 }
 kind_of: Mapping[str, Kind] = MappingProxyType(_KINDS)
-"""What the numbers of a column measure, by our name."""
+"""The quantity that the numbers of a column measure, by our name."""
 
 _PER_SECOND = {"m": "m/s", "km": "km/h", "ft": "ft/s"}
 _LARGEST_SECONDS = 1e11  # beyond, numbers are no seconds
