@@ -46,15 +46,12 @@ def hota(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], thresholds: Mapping[st
 
 
 def _similarities(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]]) -> dict[str, Similarity]:
-    """The overlaps that boxes have; where truth or tracks are points, the nearness of centres, 0 from 4 m on."""
-    known = []
-    for one in zip(*scenes, strict=True):
-        size = np.concatenate([table.boxes.size for table in one])
-        known.append(np.isfinite(size).any(axis=0) if len(size) else np.ones(3, dtype=np.bool_))
-    length, width, height = np.all(known, axis=0).tolist() if known else (True, True, True)
-    if not (length and width):
+    """The overlaps that all boxes have; where sizes or headings are missing, the nearness of centres, 0 from 4 m on."""
+    tables = [table.boxes for one in scenes for table in one]
+    plane = all(np.isfinite(boxes.size[:, :2]).all() and np.isfinite(boxes.yaw).all() for boxes in tables)
+    if not plane:
         return {"centre": "centre"}
-    if not height:
+    if not all(np.isfinite(boxes.size[:, 2]).all() for boxes in tables):
         return {"2D": "bev_iou"}
     return SIMILARITIES
 

@@ -38,7 +38,7 @@ def scores_beyond_one(score: FloatArray) -> Doubt | None:
     if len(score) < FEWEST or share < 0.01:
         return None
     low, high = float(score.min()), float(score.max())
-    what = f"scores are no shares: {share:.0%} of them are outside 0 to 1, from {low:.3g} to {high:.3g}; "
+    what = f"scores are not from 0 to 1: {share:.0%} of them are outside, from {low:.3g} to {high:.3g}; "
     if low >= 0 and 5 < high <= 100.5:
         return Doubt("scores", what + "they look like percent", "expected 0 to 1", Mend(units={"score": "percent"}))
     setting = "put `sensors: {default: {score: logit}}` into a file for --config"
