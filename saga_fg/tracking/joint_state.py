@@ -261,7 +261,8 @@ class JointTrackState:
             R = np.broadcast_to(np.eye(node_type.dim), H.shape)
         if delay > 0 and isinstance(estimator, FixedLagSmoother):
             then = estimator.time - delay
-            there = np.array([self._initiated[track] <= then for track in ids.tolist()]) & (then >= estimator.start)
+            known = [self._initiated[track] <= then for track in ids.tolist()]
+            there = np.array(known, dtype=np.bool_) & (then >= estimator.start)
             if there.any():
                 estimator.update(Measurements(ids[there], z[there], H[there], R[there]), time=then)
             ids, z, H, R = ids[~there], z[~there], H[~there], R[~there]

@@ -222,7 +222,7 @@ def test_edge_rules_that_meet_no_class_are_told_once_however_it_runs(
             assert result.exit_code == 0, result.output
             warnings.append([record.getMessage() for record in caplog.records])
     what = "no edges: tracker.edges act on truck, and the tracks are of car; objects are tracked one by one"
-    told = [f"{what}; add --classes car=truck"]
+    told = [f"{what}; fill in and add --classes car=..."]
     assert warnings == [told, told, [], [], [], []]  # also where the results are there already
 
 

@@ -78,6 +78,7 @@ def written(timestamp, places, corruption):
     max_step=st.sampled_from([np.inf, 0.05]),
 )
 @example(corruptions=[("timestamp", [0.75, 0.0, 0.0])], epoch=0.0, max_step=np.inf)
+@example(corruptions=[("timestamp", [0.5, 0.0, 0.0]), ("range_rate", [4.0, 0.0, 0.0])], epoch=0.0, max_step=np.inf)
 def test_a_valid_frame_is_tracked_after_whatever_came_before(estimator, corruptions, epoch, max_step):
     logging.disable(logging.WARNING)
     if estimator == "centerpoint":
