@@ -20,7 +20,7 @@ from data_tools.plausibility import (
 )
 from pipelines.config import TrackConfig
 from saga_fg.errors import InputError
-from saga_fg.model.rigid_coupling import Attached
+from saga_fg.model.edge_rules import acting_classes
 from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
@@ -32,15 +32,6 @@ log = logging.getLogger(__name__)
 
 FRAMES = 100  # with tracks, after which a live stream is judged
 SCENES = 3  # of a dataset, whose first frames are judged
-
-
-def acting_classes(settings: TrackConfig) -> set[str]:
-    """The classes that some edge rule acts on."""
-    return {
-        label
-        for rule in settings.tracker.edges
-        for label in (rule.attached if isinstance(rule, Attached) else getattr(rule, "classes", ()))
-    }
 
 
 class Doubts:
@@ -58,7 +49,7 @@ class Doubts:
         option_for: Callable[[Mend], str] = lambda mend: "",
     ) -> None:
         self._settings, self._option_for = settings, option_for
-        self._acting = acting_classes(settings)
+        self._acting = acting_classes(settings.tracker.edges)
         usual = usual or settings
         self._own_classes = set(settings.tracker.classes) - set(usual.tracker.classes) - {DEFAULT}
         self._own_sensors = set(settings.sensors) - set(usual.sensors) - {DEFAULT}

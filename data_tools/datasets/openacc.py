@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.recorded_traffic import PERIOD, RecordedTraffic, StateRows
-from data_tools.files.arrow_tables import all_of, read_arrow_table
+from data_tools.files.arrow_tables import NUMBERS, WHOLE, all_of, numpy_columns, read_arrow_table
 from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -34,7 +34,14 @@ FILE = "platoons.parquet"
 JUMP = 5.0  # m/s, between a step and the speed
 SIZE = (4.6, 1.85)  # m, of a car of which nothing is known
 LENGTHS = (2.5, 7.0)  # m, within which a car is
-_COLUMNS = {"setting": "OUT", "run": "OUT", "t": "iuf", "veh": "iu", "speed": "iuf", "east": "iuf", "north": "iuf"}
+_TEXT = "OUT"  # kinds of NumPy's types
+_COLUMNS = {
+    "setting": _TEXT,
+    "run": _TEXT,
+    "t": NUMBERS,
+    "veh": WHOLE,
+    **dict.fromkeys(("speed", "east", "north"), NUMBERS),
+}
 _GAP = "gap_to_next"
 _TRAVELLED = 0.5  # m, from which a way has a direction
 _LATEST = 1e6  # s
@@ -149,14 +156,6 @@ def _courses(vehicle: IntArray, position: FloatArray) -> FloatArray:
 def _columns(path: Path) -> dict[str, Any]:
     """The columns of the file as arrays; numbers may be NaN where the file has nothing."""
     table = read_arrow_table(path, all_of(path, (*_COLUMNS, _GAP)))
-    empty = [name for name in ("setting", "run", "t", "veh") if table[name].null_count]
-    if empty:
-        raise InputError(f"{path}: {empty[0]}: expected a value in every row")
-    columns = {name: table[name].to_numpy() for name in table.column_names}
-    for name, column in columns.items():
-        kinds = _COLUMNS.get(name, "iuf")
-        if column.dtype.kind not in kinds:
-            expected = "text" if kinds == "OUT" else "whole numbers" if kinds == "iu" else "numbers"
-            raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
-        columns[name] = column.astype(np.str_ if kinds == "OUT" else np.int64 if kinds == "iu" else np.float64)
-    return columns
+    columns = numpy_columns(path, table, _COLUMNS, ("setting", "run", "t", "veh"))
+    types = {_TEXT: np.str_, WHOLE: np.int64, NUMBERS: np.float64}
+    return {name: column.astype(types[_COLUMNS.get(name, NUMBERS)]) for name, column in columns.items()}

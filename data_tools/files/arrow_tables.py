@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from data_tools.files.input_files import open_bytes
 from saga_fg.errors import InputError, MissingExtraError
 
 SUFFIXES = (".parquet", ".feather", ".arrow")
+NUMBERS, WHOLE = "iuf", "iu"  # kinds of NumPy's types
 
 
 def read_arrow_table(path: Path, choose: Callable[[list[str]], Sequence[str]]) -> Any:
@@ -42,6 +43,26 @@ def all_of(path: Path, columns: Sequence[str]) -> Callable[[list[str]], Sequence
         return columns
 
     return choose
+
+
+def numpy_columns(path: Path, table: Any, kinds: Mapping[str, str], filled: Sequence[str]) -> dict[str, Any]:
+    """The columns of a `pyarrow.Table` as arrays.
+
+    kinds   kinds of NumPy's types that a column may have, `NUMBERS` for those not named
+    filled  columns that have a value in every row
+
+    Raises `InputError` naming the file and the column.
+    """
+    empty = [name for name in filled if table[name].null_count]
+    if empty:
+        raise InputError(f"{path}: {empty[0]}: expected a value in every row")
+    columns = {name: table[name].to_numpy() for name in table.column_names}
+    for name, column in columns.items():
+        allowed = kinds.get(name, NUMBERS)
+        if column.dtype.kind not in allowed:
+            expected = {NUMBERS: "numbers", WHOLE: "whole numbers"}.get(allowed, "text")
+            raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
+    return columns
 
 
 @contextmanager

@@ -22,6 +22,7 @@ import numpy as np
 
 from data_tools.files.text_tables import LARGEST, TextTable, read_lines
 from saga_fg.errors import InputError
+from saga_fg.numerics import planar_poses
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import quaternion_norms, quaternion_rotation
 from saga_fg.types.boxes import MAX_POSITION
@@ -110,11 +111,7 @@ def transforms(table: TextTable, record: Record) -> FloatArray:
     """Poses (n, d + 1, d + 1) of a record. Raises `InputError` naming the line of a quaternion off the unit sphere."""
     values = record_values(table, record)
     if record.dim == 2:
-        c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
-        T = np.tile(np.eye(3), (len(values), 1, 1))
-        T[:, :2, :2] = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
-        T[:, :2, 2] = values[:, :2]
-        return T
+        return planar_poses.transforms(values)
     quaternion = values[:, [6, 3, 4, 5]]
     norm = quaternion_norms(quaternion)
     bad = np.abs(norm - 1) > _UNIT

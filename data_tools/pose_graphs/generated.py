@@ -19,6 +19,7 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.planar_poses import transforms
 from saga_fg.slam.pose_graph import PoseGraph
 
 _NEAR = 1.5  # m, between poses of a city that see the same place
@@ -35,10 +36,7 @@ def city(poses: int, seed: int, block: int = 5, noise: float = 0.05) -> tuple[Po
     heading = np.concatenate([[0.0], np.cumsum(turns)])
     steps = np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], axis=1)
     place = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    true = np.tile(np.eye(3), (poses, 1, 1))
-    c, s = np.cos(heading), np.sin(heading)
-    true[:, :2, :2] = np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
-    true[:, :2, 2] = place
+    true = transforms(np.column_stack([place, heading]))
     sigma = noise * np.array([1.0, 1.0, 0.2])
     return _measured(true, _revisits(place, rng), sigma, rng, gtsam.Pose2.Expmap), true
 

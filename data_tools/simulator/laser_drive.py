@@ -13,6 +13,7 @@ import numpy as np
 from data_tools.files.atomic_files import write_text
 from data_tools.laser import LaserLog
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.planar_poses import transforms
 
 _OUTER, _WIDTH = (30.0, 20.0), 3.0  # m: the building, its corridor
 _STEP, _PERIOD = 0.15, 0.2  # m and s between scans
@@ -31,10 +32,7 @@ def laser_drive(seed: int, rounds: float = 1.5) -> tuple[LaserLog, FloatArray]:
     ranges = np.stack([_rays(walls, pose, angles) for pose in x])
     ranges = ranges + _NOISE * rng.normal(size=ranges.shape)
     ranges[ranges > _REACH] = np.nan
-    c, s = np.cos(x[:, 2]), np.sin(x[:, 2])
-    true: FloatArray = np.tile(np.eye(3), (n, 1, 1))
-    true[:, 0, 0], true[:, 0, 1], true[:, 1, 0], true[:, 1, 1] = c, -s, s, c
-    true[:, :2, 2] = x[:, :2]
+    true = transforms(x)
     steps = np.linalg.inv(true[:-1]) @ true[1:]
     way = np.hypot(steps[:, 0, 2], steps[:, 1, 2])
     turn = np.arctan2(steps[:, 1, 0], steps[:, 0, 0]) + _BIAS * way + _SPREAD * np.sqrt(way) * rng.normal(size=n - 1)

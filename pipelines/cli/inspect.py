@@ -126,9 +126,9 @@ def _show_classes(survey: TableSurvey) -> list[Doubt]:
     """List the classes; return what is doubtful about those that no edge rule acts on."""
     from data_tools.plausibility import Doubt, Mend, idle_rules, usual_classes
     from pipelines.config import load_config
-    from pipelines.doubts import acting_classes
+    from saga_fg.model.edge_rules import acting_classes
 
-    acting = acting_classes(load_config("file"))
+    acting = acting_classes(load_config("file").tracker.edges)
     mapped = {name: survey.how.classes.get(name, name) for name in survey.classes}
     typer.echo("\nClasses, with rows and median length, width, height:")
     for name in sorted(survey.classes, key=lambda name: -survey.classes[name])[:MOST]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.slam.planar_poses import transforms, vectors
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.planar_poses import transforms, vectors
 from saga_fg.slam.pose_graph.running import way_along
 
 

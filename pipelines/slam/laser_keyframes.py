@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.laser.line_map import Fit
-from pipelines.slam.planar_poses import moved, transform
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.planar_poses import moved, transform
 from saga_fg.slam.pose_graph.running import Measured
 
 SMEAR = 4.0  # how often the points of a wall say the same: information of a registration is divided by this

@@ -7,8 +7,8 @@ import logging
 import numpy as np
 
 from data_tools.laser import LaserLog
-from pipelines.slam.planar_poses import transforms, vectors
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.planar_poses import transforms, vectors
 
 _SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
 _log = logging.getLogger(__name__)

@@ -6,8 +6,8 @@ import numpy as np
 
 from data_tools.laser.line_map import LineMap
 from pipelines.slam.laser_keyframes import Keyframe, joined, measured_by
-from pipelines.slam.planar_poses import vector
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.planar_poses import vector
 from saga_fg.slam.pose_graph.running import Measured
 
 _NEARBY = 3.0  # m between keyframes that see the same walls

@@ -18,9 +18,9 @@ from data_tools.plots import occupancy_picture, png
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import write_tum_poses
 from pipelines.slam.laser_slam import LaserPath
-from pipelines.slam.planar_poses import transforms
 from pipelines.slam.results import planar_trajectory
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.planar_poses import transforms
 
 
 def write_laser_slam(

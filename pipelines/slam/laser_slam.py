@@ -24,10 +24,10 @@ from pipelines.slam.laser_interpolation import between_keyframes
 from pipelines.slam.laser_keyframes import SMEAR, Keyframe, covariance_of, determined, joined, measured_by
 from pipelines.slam.laser_odometry import without_jumps
 from pipelines.slam.laser_passes import registered_passes
-from pipelines.slam.planar_poses import heading, moved, transform, vector
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.planar_poses import heading, moved, transform, vector
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
 from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph, way_along

@@ -28,6 +28,7 @@ from saga_fg.estimators import BatchSolver
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.numerics.planar_poses import transforms
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import MeasuredMotion, landmark_key, pose_key
 
@@ -170,7 +171,4 @@ def trilateration(places: FloatArray, ranges: FloatArray) -> FloatArray:
 
 def _steps(distance: FloatArray, turn: FloatArray) -> FloatArray:
     """Return the increment (N, 3, 3) of each row of odometry: half the turn, the distance, the other half."""
-    T = np.tile(np.eye(3), (len(turn), 1, 1))
-    T[:, :2, :2] = np.stack([np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)], axis=1).reshape(-1, 2, 2)
-    T[:, :2, 2] = distance[:, None] * np.stack([np.cos(turn / 2), np.sin(turn / 2)], axis=1)
-    return T
+    return transforms(np.column_stack([distance * np.cos(turn / 2), distance * np.sin(turn / 2), turn]))

@@ -12,6 +12,7 @@ A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
@@ -58,6 +59,11 @@ class EdgeRule(Protocol):
     def interaction(self) -> Interaction | AccelerationLaw: ...
 
     def pairs(self, nodes: NodeTable) -> Pairs: ...
+
+
+def acting_classes(rules: Iterable[EdgeRule]) -> set[str]:
+    """The classes of objects that some of the rules act on."""
+    return {label for rule in rules for label in getattr(rule, "classes", getattr(rule, "attached", ()))}
 
 
 @dataclass(frozen=True)

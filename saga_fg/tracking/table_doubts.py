@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from saga_fg.model.edge_rules import acting_classes
 from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.types.pandas_tables import UNNAMED, Table, checked_table, numbers, texts
@@ -27,7 +28,7 @@ def table_doubts(table: Table, settings: TrackerSettings, sensors: Mapping[str, 
     yaw = np.abs(yaw[np.isfinite(yaw)])
     if len(yaw) and np.mean(yaw > 2 * np.pi + 0.1) > MANY:
         yield f"yaw: expected rad, got up to {yaw.max():.4g}, which looks like degrees; numpy.deg2rad converts them"
-    acting = {name for rule in settings.edges for name in getattr(rule, "classes", getattr(rule, "attached", ()))}
+    acting = acting_classes(settings.edges)
     classes = set(texts(table, "label", UNNAMED).tolist()) - {UNNAMED}
     if acting and classes and not acting & classes:
         yield (

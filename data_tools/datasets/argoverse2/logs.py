@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
-from data_tools.files.arrow_tables import all_of, read_arrow_table
+from data_tools.files.arrow_tables import WHOLE, all_of, numpy_columns, read_arrow_table
 from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
@@ -47,7 +47,7 @@ SIZE = ("length_m", "width_m", "height_m")
 _ANNOTATIONS = ("timestamp_ns", "track_uuid", "category", *SIZE, *POSE, "num_interior_pts")
 FILES = ("annotations.feather", "city_SE3_egovehicle.feather")
 KINDS = {
-    **dict.fromkeys(("timestamp_ns", "track_id"), "iu"),
+    **dict.fromkeys(("timestamp_ns", "track_id"), WHOLE),
     **dict.fromkeys(("track_uuid", "category", "log_id"), "OU"),
 }  # of NumPy, of columns that are no numbers
 _LONGEST_GAP = 0.5  # s between boxes of an object, for a velocity
@@ -154,14 +154,4 @@ def columns_of(path: Path, names: tuple[str, ...], may_lack: tuple[str, ...] = (
     def choose(there: list[str]) -> list[str]:
         return [*all_of(path, names)(there), *(name for name in may_lack if name in there)]
 
-    table = read_arrow_table(path, choose)
-    empty = [name for name in names if table[name].null_count]
-    if empty:
-        raise InputError(f"{path}: {empty[0]}: expected a value in every row")
-    columns = {name: table[name].to_numpy() for name in table.column_names}
-    for name, column in columns.items():
-        kinds = KINDS.get(name, "iuf")
-        if column.dtype.kind not in kinds:
-            expected = "text" if kinds == "OU" else "whole numbers" if kinds == "iu" else "numbers"
-            raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
-    return columns
+    return numpy_columns(path, read_arrow_table(path, choose), KINDS, names)
