@@ -1,13 +1,14 @@
 """Simulated LiDAR drives through a town, on a closed course that passes places again, in both directions.
 
-The vehicle keeps to the right, turns at crossings in arcs and slows down for them. A lap has 1.6 to 2.1 km and passes two
-stretches again, one of them at least in the opposite direction; driving on into the next lap, it passes the first
-streets a third time. A scan is made when it is read, always the same for its row, so that a drive takes no memory.
+The vehicle keeps to the right, turns at crossings in arcs and slows down for them. A lap of 1.6 to 2.1 km
+passes two stretches again, one of them at least in the opposite direction; driving on into the next lap, it passes the
+first streets again. A scan is made when it is read, always the same for its row, so that a drive takes no memory.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -133,8 +134,8 @@ def revisits(
 def _walk(rng: np.random.Generator) -> IntArray:
     """Crossings (n, 2) of a closed walk without turning round, that passes two stretches twice."""
     while True:
-        at, heading = rng.integers(NODES, size=2), int(rng.integers(4))
-        nodes, headings = [at], []
+        heading, headings = int(rng.integers(4)), list[int]()
+        nodes = [rng.integers(NODES, size=2)]
         for _ in range(_STREETS):
             choices = [heading] if not headings else [(heading + turn) % 4 for turn in (-1, 0, 1)]
             choices = [h for h in choices if ((nodes[-1] + _STEPS[h] >= 0) & (nodes[-1] + _STEPS[h] < NODES)).all()]
@@ -160,7 +161,7 @@ def _is_varied(nodes: IntArray, headings: list[int]) -> bool:
     once = len({old for _, old in again}) == len(again)
     if not once or not 2 <= len(again) <= 5:
         return False
-    runs = 1 + sum(k != before + 1 for (before, _), (k, _) in zip(again[:-1], again[1:], strict=True))
+    runs = 1 + sum(k != before + 1 for (before, _), (k, _) in pairwise(again))
     opposite = [headings[k] != headings[old] for k, old in again]
     return runs == 2 and any(opposite) and again[-1][0] < len(headings) - 2
 

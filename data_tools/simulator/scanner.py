@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan
-from saga_fg.numerics.arrays import BoolArray, FloatArray, checked
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.settings import Positive, PositiveInt, Settings, setting
 from saga_fg.types.boxes import Boxes
@@ -92,22 +92,25 @@ def simulate_scan(
 
 
 def ranges(world: StaticWorld, origin: FloatArray, direction: FloatArray) -> FloatArray:
-    """Ranges (C, R), m, of R rays in unit `direction` (C, R, 3) from each `origin` (C, 3); infinite where nothing is."""
+    """Ranges (C, R), m, of R rays, unit `direction` (C, R, 3), from each `origin` (C, 3); infinite without a hit."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ground = np.where(direction[..., 2] < 0, -origin[:, None, 2] / direction[..., 2], np.inf)
         nearest = np.where(ground > 0, ground, np.inf)
         boxes, poles = world.boxes, world.poles
         half = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2
-        for centre, radius, distances in (
-            (boxes.position[:, :2], half, lambda k, c: _to_boxes(boxes.select(k), origin[c], direction[c])),
-            (poles[:, :2], poles[:, 2], lambda k, c: _to_poles(poles[k], origin[c], direction[c])),
-        ):
-            column, row = np.nonzero(_in_sight(centre, radius, origin, direction))
-            if len(column):
-                first = np.flatnonzero(np.diff(column, prepend=-1))
-                least = np.minimum.reduceat(distances(row, column), first)
-                nearest[column[first]] = np.minimum(nearest[column[first]], least)
+        column, row = np.nonzero(_in_sight(boxes.position[:, :2], half, origin, direction))
+        _shorten(nearest, column, _to_boxes(boxes.select(row), origin[column], direction[column]))
+        column, row = np.nonzero(_in_sight(poles[:, :2], poles[:, 2], origin, direction))
+        _shorten(nearest, column, _to_poles(poles[row], origin[column], direction[column]))
     return nearest
+
+
+def _shorten(nearest: FloatArray, column: IntArray, distance: FloatArray) -> None:
+    """Take the least of ranges (P, R) of each column, in ascending order (P,), into `nearest` (C, R)."""
+    if len(column):
+        first = np.flatnonzero(np.diff(column, prepend=-1))
+        at = column[first]
+        nearest[at] = np.minimum(nearest[at], np.minimum.reduceat(distance, first))
 
 
 def _in_sight(centre: FloatArray, radius: FloatArray, origin: FloatArray, direction: FloatArray) -> BoolArray:
