@@ -8,6 +8,7 @@ from .registration import Registration, RegistrationError, RegistrationSettings,
 from .scan import Scan
 from .scan_files import read_scan, write_ply
 from .sharpness import scan_to_map_residual
+from .submap import Submap, upright
 from .surfels import SurfelMap, Surfels, surfels_of
 from .voxels import voxel_downsample, voxel_keys
 
@@ -27,6 +28,7 @@ __all__ = [
     "RegistrationError",
     "RegistrationSettings",
     "Scan",
+    "Submap",
     "SurfelMap",
     "Surfels",
     "azimuth_times",
@@ -44,6 +46,7 @@ __all__ = [
     "segment_ground",
     "straight_lines",
     "surfels_of",
+    "upright",
     "voxel_downsample",
     "voxel_keys",
     "write_ply",
