@@ -1,5 +1,6 @@
 from .clusters import ClusterSettings, ObjectSize, detect_clusters
 from .curbs import CurbSettings, Line, LineSettings, extract_curbs, straight_lines
+from .degeneracy import Observability, observability
 from .deskew import azimuth_times, constant_velocity, deskewed
 from .ground import Ground, GroundSettings, segment_ground
 from .planes import Plane, PlaneSettings, extract_walls, fit_ground, fit_plane
@@ -20,6 +21,7 @@ __all__ = [
     "Line",
     "LineSettings",
     "ObjectSize",
+    "Observability",
     "Plane",
     "PlaneSettings",
     "Pole",
@@ -40,6 +42,7 @@ __all__ = [
     "extract_walls",
     "fit_ground",
     "fit_plane",
+    "observability",
     "read_scan",
     "register",
     "scan_to_map_residual",
