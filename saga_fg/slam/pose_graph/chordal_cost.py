@@ -89,7 +89,7 @@ class ChordalCost:
     def rotations(self) -> IntArray:
         """Rows of Y_R."""
         rows = np.arange(self.poses * (self.dim + 1))
-        return rows[rows % (self.dim + 1) != self.dim]
+        return np.asarray(rows[rows % (self.dim + 1) != self.dim])
 
     @cached_property
     def positions(self) -> IntArray:
@@ -136,9 +136,9 @@ def _point_matrix(landmarks: PointLandmarks, poses: int, d: int) -> tuple[csc_ar
     """Rows (S, N (d + 1) + L) of S observations, and their weights (S,)."""
     for seen in landmarks.observations:
         if seen.kind != "point":
-            point = int(landmarks.ids[seen.landmark[0]])
+            name = int(landmarks.ids[seen.landmark[0]])
             raise InputError(
-                f"landmark {point}: expected a point, seen by coordinates; the chordal cost knows no {seen.kind}"
+                f"landmark {name}: expected a point, seen by coordinates; the chordal cost knows no {seen.kind}"
             )
     pose, point = (
         np.concatenate([getattr(seen, end) for seen in landmarks.observations]) for end in ("pose", "landmark")
@@ -146,10 +146,10 @@ def _point_matrix(landmarks: PointLandmarks, poses: int, d: int) -> tuple[csc_ar
     z, information = (
         np.concatenate([getattr(seen, name) for seen in landmarks.observations]) for name in ("z", "information")
     )
-    S, ones = len(z), np.ones((len(z), 1))
+    ones = np.ones((len(z), 1))
     columns = np.column_stack([pose[:, None] * (d + 1) + np.arange(d + 1), poses * (d + 1) + point])
-    entries = (np.hstack([-z, -ones, ones]).ravel(), columns.ravel(), (d + 2) * np.arange(S + 1))
-    A = csr_array(entries, shape=(S, poses * (d + 1) + len(landmarks.ids))).tocsc()
+    entries = (np.hstack([-z, -ones, ones]).ravel(), columns.ravel(), (d + 2) * np.arange(len(z) + 1))
+    A = csr_array(entries, shape=(len(z), poses * (d + 1) + len(landmarks.ids))).tocsc()
     return A, d / np.trace(np.linalg.inv(information), axis1=1, axis2=2)
 
 
