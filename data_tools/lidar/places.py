@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import numpy.typing as npt
 from scipy import fft
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
@@ -116,9 +117,9 @@ class PlaceIndex:
 
     def aligned(self, image: PlaceImage, numbers: Sequence[int]) -> list[PlaceMatch]:
         """Align the image with these places, the best match first."""
-        angles = 2 * np.pi / _TURNS * np.arange(_TURNS)
+        angles: FloatArray = np.linspace(0.0, 2 * np.pi, _TURNS, endpoint=False)
         turned = _images(image.cells, image.weight, angles)
-        size = np.sqrt((turned**2).sum(axis=(1, 2)))
+        size: FloatArray = np.sqrt((turned.astype(np.float64) ** 2).sum(axis=(1, 2)))
         spectra = np.conj(fft.rfft2(turned, s=(_PADDED, _PADDED)))
         found = [_aligned(number, self._images[number], image, angles, spectra, size) for number in numbers]
         return sorted(found, key=lambda match: -match.score)
@@ -141,8 +142,8 @@ def heights_above_ground(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return points[:, 2] - low[at[:, 0], at[:, 1]], ground
 
 
-def _images(cells: FloatArray, weight: FloatArray, angles: FloatArray) -> FloatArray:
-    """The image turned by each angle (A, n, n), float32."""
+def _images(cells: FloatArray, weight: FloatArray, angles: FloatArray) -> npt.NDArray[np.float32]:
+    """The image turned by each angle (A, n, n)."""
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
     x = np.floor((c * cells[:, 0] - s * cells[:, 1]) / CELL).astype(np.int64) + _CELLS // 2
     y = np.floor((s * cells[:, 0] + c * cells[:, 1]) / CELL).astype(np.int64) + _CELLS // 2
@@ -155,7 +156,12 @@ def _images(cells: FloatArray, weight: FloatArray, angles: FloatArray) -> FloatA
 
 
 def _aligned(
-    number: int, old: PlaceImage, new: PlaceImage, angles: FloatArray, spectra: FloatArray, size: FloatArray
+    number: int,
+    old: PlaceImage,
+    new: PlaceImage,
+    angles: FloatArray,
+    spectra: npt.NDArray[np.complex64],
+    size: FloatArray,
 ) -> PlaceMatch:
     (image,) = _images(old.cells, old.weight, np.zeros(1))
     norm = size * np.sqrt((image**2).sum())
@@ -181,7 +187,7 @@ def _lift(old: FloatArray, new: FloatArray) -> float:
     return float(np.median(old[row[known], 2] - new[known, 2])) if known.any() else 0.0
 
 
-def _key(image: FloatArray) -> FloatArray:
+def _key(image: npt.NDArray[np.float32]) -> FloatArray:
     """Magnitudes (K,) of the spectrum's Fourier series over the bearing, on rings of the spectrum."""
     norm = float(np.sqrt((image**2).sum())) or 1.0
     spectrum = np.abs(fft.fftshift(fft.fft2(image, s=(_PADDED, _PADDED)))) / norm

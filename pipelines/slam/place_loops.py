@@ -91,7 +91,7 @@ class PlaceLoops:
         self._submaps.append(submap)
         if len(submap.points) < _FEWEST:
             return []
-        image = PlaceImage.of(submap.points)
+        image = PlaceImage.of(submap.points.astype(np.float64))
         proved = self._proved(number, image, world_T_submap)
         self._index.add(number, image)
         taken: list[LoopClosure] = []
@@ -167,7 +167,7 @@ class PlaceLoops:
     def _trusted(self, one: _Proved) -> bool:
         """Whether the drift of odometry explains the loop."""
         way = self._ways(one.loop.second)[one.loop.first]
-        return one.off < 1.0 + self.settings.drift * way
+        return one.off < 1.0 + self.settings.drift * float(way)
 
     def _older(self, number: int) -> IntArray:
         """Submaps that ended `min_path` before this one began."""
