@@ -91,7 +91,7 @@ def _tables(result: SpeedBench) -> list[FigureTable]:
     ]
     if (live := result.service) is not None:
         times = (cell(live.p50, 1), cell(live.p90, 1), cell(live.p99, 1), cell(live.cpu, 1), cell(live.memory, 0))
-        columns = ("objects", "frames", "p50, ms", "p90", "p99", "CPU ms a frame", "MB")
+        named = ("objects", "frames", "p50, ms", "p90", "p99", "CPU ms a frame", "MB")
         title = "live service at 10 Hz: round trip on the wall's clock"
-        tables.append(FigureTable(title, columns, ((str(live.objects), str(live.frames), *times),)))
+        tables.append(FigureTable(title, named, ((str(live.objects), str(live.frames), *times),)))
     return tables
