@@ -74,9 +74,11 @@ def _beside(traffic: Traffic, ids: IntArray, position: FloatArray, heading: Floa
         return _Beside(*np.zeros((5, len(heading))))
     points, tree = found
     apart, at = tree.query(position, k=NEAREST, distance_upper_bound=2 * reach)
-    at = np.minimum(at, len(points) - 1)
+    most = int(np.isfinite(apart).sum(axis=1).max(initial=0))
+    apart, at = apart[:, :most], np.minimum(at[:, :most], len(points) - 1)
     of = points.id[at]
-    other = np.isfinite(apart) & (of != ids[:, None]) & ~((of[:, :, None] == of[:, None]) & _NEARER).any(axis=2)
+    again = ((of[:, :, None] == of[:, None]) & _NEARER[:most, :most]).any(axis=2)
+    other = np.isfinite(apart) & (of != ids[:, None]) & ~again
     turn = wrap_angle(points.heading[at] - heading[:, None])
     aside = np.where(other, apart, 0.0)
     k = np.exp(-((aside / reach) ** 2 + (turn / TURN) ** 2) / 2) * other
