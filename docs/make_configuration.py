@@ -9,7 +9,7 @@ from pipelines.config import TrackConfig
 from pipelines.configuration import settings_reference
 from pipelines.serving import StreamSettings
 from pipelines.slam.configuration import SlamSettings
-from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StationaryObjects
+from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StationaryObjects, Wheels
 from saga_fg.smoothing import SmoothingSettings
 
 INTRODUCTION = """\
