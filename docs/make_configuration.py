@@ -51,7 +51,7 @@ def configuration_page() -> str:
                        ("Limits of the service (`saga-fg serve --limits`)", StreamSettings),
                        ("The simulator (`saga-fg simulate`)", SimulatorSettings)):  # fmt: skip
         parts += [f"# {title}\n", settings_reference(cls, documented)]
-    for cls in (Odometry, Gps, Imu, Landmarks, LaneKeeping, StationaryObjects):
+    for cls in (Odometry, Gps, Imu, Wheels, Landmarks, LaneKeeping, StationaryObjects):
         parts += [f"# Factor provider `saga_fg.providers:{cls.__name__}`\n", settings_reference(cls, documented)]
     return "\n".join(parts)
 
