@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -168,7 +169,7 @@ def test_sensors_anywhere_on_the_vehicle_and_poses_of_another_sensor() -> None:
     found = run(sensors, placed, blind=(3.0, 6.5), pose_T_vehicle=lidar_T_vehicle, batch=True)
     assert found.errors.max() < 0.6
     assert found.misfits(sensors, placed) == {}
-    bias = found.smoother.state(found.smoother.graph().of(EGO_BIAS, found.smoother.graph().epoch)[0].key)
+    bias: Any = found.smoother.state(found.smoother.graph().of(EGO_BIAS, found.smoother.graph().epoch)[0].key)
     assert np.abs(bias.vector()[3:]).max() < 0.005
 
 
