@@ -24,7 +24,7 @@ from saga_fg.tracking.trails import STEP, paths
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
 LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
 WIDEST = 0.3  # rad, of a course, however slow the vehicle
-TURNING_TIME = 1.0  # s of the acceleration across a bend that make the velocity across it: how sharply is not known
+TURNING_TIME = 1.0  # s: a path is not known better than by what it turns within this time
 FLOW_TIME = 3.0  # s, in which a vehicle takes on the speed of earlier traffic
 STEPS = 20  # of a path, as far as leaders are looked for
 _ASTRAY = 0.5  # rad between heading and motion, from which the motion is noise
@@ -76,7 +76,7 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
         if len(led):
             own, way = paths.select(path[rows[led]]), speed[led] * dt
             turn = _at(own.heading, way) - own.heading[:, 0]
-            heading[led], across[led] = own.heading[:, 0], _across(own, speed[led], turn / dt)
+            heading[led], across[led] = own.heading[:, 0], _across(own, speed[led])
             typical, weight = typical_speed(own, way)
             pull[led] = weight / (weight + 1) * np.where(speed[led] > MOVING, typical - speed[led], 0.0) / FLOW_TIME
             after[rows[led]] = wrap_angle(heading[led] + turn)
@@ -95,10 +95,11 @@ def typical_speed(paths: Paths, way: FloatArray) -> tuple[FloatArray, FloatArray
     return _at(paths.weight * paths.speed, way) / np.maximum(weight, _LEAST), weight
 
 
-def _across(paths: Paths, speed: FloatArray, rate: FloatArray) -> FloatArray:
-    """Variances (k,) of the velocity across paths, (m/s)^2, on which vehicles turn at some rate (k,), rad/s."""
+def _across(paths: Paths, speed: FloatArray) -> FloatArray:
+    """Variances (k,) of the velocity across paths, (m/s)^2."""
     own = np.minimum(ACROSS**2 + (1 - paths.certainty) * LEAVING**2, (WIDEST * speed) ** 2)
-    return np.asarray(own + paths.disagreement * speed**2 + (TURNING_TIME * rate * speed) ** 2)
+    turn = _at(paths.heading, speed * TURNING_TIME) - paths.heading[:, 0]
+    return np.asarray(own + (paths.disagreement + turn**2) * speed**2)
 
 
 def _at(column: FloatArray, way: FloatArray) -> FloatArray:
