@@ -36,6 +36,7 @@ class ClassGroups:
         self.classes = tuple(label for group in self._groups for label in group)
         self._number = [number for number, group in enumerate(self._groups) for _ in group]
         self._column = {label: k for k, label in enumerate(self.classes)}
+        self._of_label: dict[str, int] = {}  # numbers as `numbers` gives them
 
     def __len__(self) -> int:
         return len(self.classes)
@@ -45,6 +46,16 @@ class ClassGroups:
         (classes, of_row), (their_classes, of_column) = distinct(labels), distinct(others)
         same = [[a == b or self._mated(a, b) for b in their_classes] for a in classes]
         return np.array(same, dtype=bool).reshape(len(classes), len(their_classes))[of_row[:, None], of_column]
+
+    def numbers(self, label: StrArray) -> IntArray:
+        """(n,) equal for classes that equal each other or share a group, also between calls."""
+        classes, of_row = distinct(label)
+        return np.array([self._of_label.get(c) or self._numbered(c) for c in classes], dtype=np.int64)[of_row]
+
+    def _numbered(self, label: str) -> int:
+        column = self._column.get(label)
+        first = label if column is None else self._groups[self._number[column]][0]
+        return self._of_label.setdefault(label, self._of_label.setdefault(first, len(self._of_label) + 1))
 
     def _mated(self, label: str, other: str) -> bool:
         """True if two classes share a group."""
@@ -75,6 +86,8 @@ class ClassGroups:
         had = np.where(of_group, belief[np.arange(len(label)), row], np.inf)
         best = belief.argmax(axis=1)
         likelier = belief.max(axis=1, initial=0.0) > had + 1e-9
+        if not likelier.any():
+            return label
         return np.where(likelier, np.array(self.classes)[best], label)
 
     def certainty(self, belief: FloatArray) -> FloatArray:

@@ -24,11 +24,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.overlap import class_overlaps
 from saga_fg.numerics.arrays import BoolArray, FloatArray, distinct
 from saga_fg.numerics.assignment import Matching
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.overlap import paired_bev_iou, touching_pairs
+from saga_fg.types.overlap import HAIR, paired_bev_iou, touching_pairs
 
 OVERLAP = 0.05  # bird's-eye IoU above which a new track is unresolved
 MOST_OVERLAP = 0.2  # largest one of two objects
@@ -36,6 +38,7 @@ PRECISE = 0.75  # standard deviation of a position, in widths of its box, up to 
 FRAMES = 2.0  # frames at the start: a box clear of the other three times in all is hardly a second one by chance
 ALONE = 2.0  # frames for a miss: an object is missed less often than a second box, so a miss tells more
 MOST_FRAMES = 6.0  # frames at most: who walked off counts after so many, whatever was before
+_ALL = np.empty((0, 0), dtype=bool)
 
 
 def unresolved_frames(
@@ -93,6 +96,11 @@ def over_confirmed(state: TrackerState, predicted: Boxes) -> BoolArray:
 
 def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, surer: BoolArray | None = None) -> FloatArray:
     """(n, m) bird's-eye IoU of boxes (n) with others (m) of their class, `surer` (n, m) ones alone; else 0."""
+    if compiled_kernels():
+        of_box, of_other = (state.class_groups.numbers(x.label) for x in (boxes, others))
+        compared = _ALL if surer is None else surer
+        one = boxes.position, boxes.size, boxes.yaw, of_box
+        return class_overlaps(*one, others.position, others.size, others.yaw, of_other, compared, HAIR)
     result = np.zeros((len(boxes), len(others)))
     row, column = touching_pairs(boxes, others)
     if surer is not None:
