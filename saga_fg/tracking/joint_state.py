@@ -267,7 +267,10 @@ class JointTrackState:
     def measure(
         self, node_type: NodeType, ids: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, delay: float
     ) -> None:
-        """Take in linear measurements of tracks of one type: z (k, m), H (k, m, d), R (k, m, m), `delay` s old."""
+        """Take in linear measurements of tracks of one type: z (k, m), H (k, m, d), R (k, m, m), `delay` s old.
+
+        They are not checked: detections and the settings of sensors are, when they are made.
+        """
         estimator = self._estimator_to_change()
         if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
             self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
@@ -277,11 +280,11 @@ class JointTrackState:
             known = [self._initiated[track] <= then for track in ids.tolist()]
             there = np.array(known, dtype=np.bool_) & (then >= estimator.start)
             if there.any():
-                estimator.update(Measurements(ids[there], z[there], H[there], R[there]), time=then)
+                estimator.update(Measurements.unchecked(ids[there], z[there], H[there], R[there]), time=then)
             ids, z, H, R = ids[~there], z[~there], H[~there], R[~there]
         if delay > 0:
             H, R = moved_to_present(node_type, H, R, delay)
-        estimator.update(Measurements(ids, z, H, R))
+        estimator.update(Measurements.unchecked(ids, z, H, R))
 
     def _anchor_modes(self) -> None:
         estimator = self.estimator

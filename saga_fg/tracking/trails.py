@@ -22,6 +22,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.trails import trail_paths
 from saga_fg.model.interactions import unit
 from saga_fg.model.paths import Paths
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -37,6 +39,7 @@ TURN = 0.3  # rad, sigma of the kernel on the difference of headings
 AGREEMENT = 0.2  # rad, deviation of the headings of trails from which they say little
 _BEND = 20.0  # m, along which a curvature of one's own fades
 _LEAST = 1e-9
+_NO_POINTS = (np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
 _NEARER = np.tril(np.ones((NEAREST, NEAREST), dtype=np.bool_), -1)
 
 
@@ -142,6 +145,11 @@ class Trails:
 
         Their steps are `STEP` m long, their rows 0 to n - 1.
         """
+        if compiled_kernels():
+            points, scales = self.points, (self.settings.reach, STEP, _BEND, TURN, PRIOR, AGREEMENT)
+            known = _NO_POINTS if points is None else (points.id, points.position, points.heading, points.speed)
+            tracks = ids, position, heading, curvature
+            return Paths(np.arange(len(ids)), *trail_paths(*known, *tracks, steps, NEAREST, *scales))
         place, beside = position, self._beside(ids, position, heading)
         course = heading + beside.certainty * beside.turn
         certainty, disagreement = beside.certainty, beside.variance
