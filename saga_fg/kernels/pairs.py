@@ -12,6 +12,22 @@ from saga_fg.kernels.compilation import kernel
 Gated = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
+@kernel("f2 f2 f1 f1")
+def compared_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
+    """Rows (k,) of places a (n, 2) and b (m, 2) with |a_i - b_j| <= reach_i + further_j, in order of i, then of j."""
+    k, room = 0, max(64, 2 * (len(a) + len(b)))
+    row, column = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
+    for i in range(len(a)):
+        for j in range(len(b)):
+            x, y, r = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], reach[i] + further[j]
+            if x * x + y * y <= r * r:
+                if k == room:
+                    row, column, room = np.append(row, row), np.append(column, column), 2 * room
+                row[k], column[k] = i, j
+                k += 1
+    return row[:k].copy(), column[:k].copy()
+
+
 @kernel("f2 f3 f1 f1 i1 f2 f2 f3 i1 f2")
 def gated_pairs(
     position: FloatArray,
@@ -40,7 +56,7 @@ def gated_pairs(
             if group[i] != group_z[j]:
                 continue
             x, y = z[j, 0] - position[i, 0], z[j, 1] - position[i, 1]
-            if not x * x + y * y < reach[i] * reach[i]:
+            if not x * x + y * y <= reach[i] * reach[i]:
                 continue
             a, b, c = P[i, 0, 0] + R[j, 0, 0], P[i, 0, 1] + R[j, 0, 1], P[i, 1, 1] + R[j, 1, 1]
             det = a * c - b * b

@@ -43,9 +43,7 @@ class ClassGroups:
 
     def same_group(self, labels: StrArray, others: StrArray) -> BoolArray:
         """(n, m) which classes (n,) equal others (m,) or share a group with them."""
-        (classes, of_row), (their_classes, of_column) = distinct(labels), distinct(others)
-        same = [[a == b or self._mated(a, b) for b in their_classes] for a in classes]
-        return np.array(same, dtype=bool).reshape(len(classes), len(their_classes))[of_row[:, None], of_column]
+        return np.asarray(self.numbers(labels)[:, None] == self.numbers(others))
 
     def numbers(self, label: StrArray) -> IntArray:
         """(n,) equal for classes that equal each other or share a group, also between calls."""
@@ -57,10 +55,14 @@ class ClassGroups:
         first = label if column is None else self._groups[self._number[column]][0]
         return self._of_label.setdefault(label, self._of_label.setdefault(first, len(self._of_label) + 1))
 
-    def _mated(self, label: str, other: str) -> bool:
-        """True if two classes share a group."""
-        a, b = self._column.get(label), self._column.get(other)
-        return a is not None and b is not None and self._number[a] == self._number[b]
+    def pairs_of_group(self, labels: StrArray, others: StrArray, i: IntArray, j: IntArray) -> BoolArray:
+        """(K,) whether the classes of labels[i] and others[j], i and j (K,), are one or share a group."""
+        return np.asarray(self.numbers(labels)[i] == self.numbers(others)[j])
+
+    def number_of_group(self, labels: StrArray) -> IntArray:
+        """(n,) how many of the labels (n,) are of the same class or group as each."""
+        number = self.numbers(labels)
+        return np.bincount(number)[number]
 
     def likelihood(self, label: StrArray, sensor: Sensor) -> FloatArray:
         """L (m, C) of detections of the classes `label` (m,) by a sensor."""

@@ -125,9 +125,11 @@ class Trails:
         if self._tree is None:
             self._tree = cKDTree(points.position, balanced_tree=False, compact_nodes=False)
         apart, at = self._tree.query(position, k=NEAREST, distance_upper_bound=2 * reach)
-        at = np.minimum(at, len(points) - 1)
+        most = int(np.isfinite(apart).sum(axis=1).max(initial=0))
+        apart, at = apart[:, :most], np.minimum(at[:, :most], len(points) - 1)
         of = points.id[at]
-        found = np.isfinite(apart) & (of != ids[:, None]) & ~((of[:, :, None] == of[:, None]) & _NEARER).any(axis=2)
+        again = ((of[:, :, None] == of[:, None]) & _NEARER[:most, :most]).any(axis=2)
+        found = np.isfinite(apart) & (of != ids[:, None]) & ~again
         turn = wrap_angle(points.heading[at] - heading[:, None])
         aside = np.where(found, apart, 0.0)
         k = np.exp(-((aside / reach) ** 2 + (turn / TURN) ** 2) / 2) * found

@@ -7,11 +7,10 @@ from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from saga_fg.kernels.compilation import only_numpy
-from saga_fg.kernels.overlap import class_overlaps
 from saga_fg.numerics.arrays import distinct
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.overlap import HAIR, bev_iou
+from saga_fg.types.overlap import bev_iou, paired_bev_iou
 
 CLASSES = ("car", "truck", "pedestrian", "bicycle", "construction_vehicle")
 
@@ -70,21 +69,18 @@ def test_random_frames_give_the_same_tracks(family, seed):
 @given(st.integers(0, 10_000))
 @settings(max_examples=60, deadline=None)
 def test_overlaps_of_boxes(seed):
-    rng = np.random.default_rng(seed)
+    rng, n = np.random.default_rng(seed), 12
     sets = []
-    for n in rng.integers(0, 8, 2).tolist():
+    for _ in range(2):
         size, yaw = rng.uniform(0.3, 6.0, (n, 3)), rng.choice([0.0, 0.5, np.pi / 2, 3.0, np.nan], n)
         size[rng.random(n) < 0.1] = np.nan
         place = rng.choice([0.0, 1.0, 2.5], (n, 3)) + rng.choice([0.0, 1.0]) * rng.normal(size=(n, 3))
-        sets.append((Boxes.of(rng.choice(["a", "b"], n), place, size, yaw), rng.integers(0, 2, n)))
-    (one, of_one), (other, of_other) = sets
-    compared = rng.random((len(one), len(other))) < 0.8
-    one_of, other_of = (one.position, one.size, one.yaw, of_one), (other.position, other.size, other.yaw, of_other)
-    expected = np.nan_to_num(bev_iou(one, other)) * (of_one[:, None] == of_other)
-    every = np.nan_to_num(class_overlaps(*one_of, *other_of, np.empty((0, 0), dtype=bool), HAIR))
-    np.testing.assert_allclose(every, expected, atol=1e-12)
-    some = np.nan_to_num(class_overlaps(*one_of, *other_of, compared, HAIR))
-    np.testing.assert_allclose(some, expected * compared, atol=1e-12)
+        sets.append(Boxes.of(["car"] * n, place, size, yaw))
+    by_kernel, every = paired_bev_iou(*sets), bev_iou(*sets)
+    with only_numpy():
+        np.testing.assert_allclose(by_kernel, paired_bev_iou(*sets), atol=1e-12)
+        np.testing.assert_allclose(every, bev_iou(*sets), atol=1e-12)
+    assert paired_bev_iou(Boxes.empty(), Boxes.empty()).shape == (0,)
 
 
 @given(st.lists(st.sampled_from(["car", "cart", "ca", "bus", "Fußgänger", "construction_vehicle"])), st.booleans())

@@ -49,8 +49,8 @@ def test_inside_nothing_is_checked_again(monkeypatch):
     tracker = load_config("nuscenes").new_tracker("saga")
     for number in range(5):
         tracker.step(frame(number))
-    made = {Boxes: 0, Measurements: 0}
-    for kind in made:
+    made: dict = {Boxes: 0, Measurements: 0}
+    for kind in (Boxes, Measurements):
         real = kind.__post_init__
 
         def counted(self, kind=kind, real=real):
