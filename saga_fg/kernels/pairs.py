@@ -15,16 +15,41 @@ Gated = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray
 @kernel("f2 f2 f1 f1")
 def compared_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
     """Rows (k,) of places a (n, 2) and b (m, 2) with |a_i - b_j| <= reach_i + further_j, in order of i, then of j."""
-    k, room = 0, max(64, 2 * (len(a) + len(b)))
+    n, m = len(a), len(b)
+    k, room = 0, max(64, 2 * (n + m))
     row, column = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
-    for i in range(len(a)):
-        for j in range(len(b)):
-            x, y, r = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], reach[i] + further[j]
-            if x * x + y * y <= r * r:
-                if k == room:
-                    row, column, room = np.append(row, row), np.append(column, column), 2 * room
-                row[k], column[k] = i, j
-                k += 1
+    low, high, widest = math.inf, -math.inf, -math.inf
+    for j in range(m):
+        low, high = min(low, b[j, 0]), max(high, b[j, 0])
+        if further[j] > widest:
+            widest = further[j]
+    width = max((high - low) / max(m, 1), 1e-9)
+    first, following = np.full(m, -1, dtype=np.int64), np.empty(m, dtype=np.int64)
+    for j in range(m - 1, -1, -1):  # strips of equal width along x
+        strip = min(int((b[j, 0] - low) / width), m - 1)
+        following[j], first[strip] = first[strip], j
+    for i in range(n):
+        span, begin = reach[i] + widest, k
+        if not span >= 0 or m == 0:
+            continue
+        start, end = (a[i, 0] - span - low) / width - 1, (a[i, 0] + span - low) / width + 1
+        if end < 0 or start >= m:
+            continue
+        for strip in range(int(max(start, 0.0)), int(min(end, m - 1.0)) + 1):
+            j = first[strip]
+            while j >= 0:
+                x, y, r = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], reach[i] + further[j]
+                if x * x + y * y <= r * r:
+                    if k == room:
+                        row, column, room = np.append(row, row), np.append(column, column), 2 * room
+                    row[k] = i
+                    at = k
+                    while at > begin and column[at - 1] > j:
+                        column[at] = column[at - 1]
+                        at -= 1
+                    column[at] = j
+                    k += 1
+                j = following[j]
     return row[:k].copy(), column[:k].copy()
 
 
