@@ -7,7 +7,7 @@ import pytest
 
 from data_tools.lidar import Submap, voxel_downsample
 from data_tools.simulator.course import SimulatedCourse
-from pipelines.slam.place_loops import PlaceLoops, PlaceLoopSettings
+from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
@@ -66,4 +66,4 @@ def test_a_submap_without_points_has_no_loops(drive: tuple[list[Submap], FloatAr
 
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(InputError, match="overlap: expected a number from 0 to 1"):
-        PlaceLoopSettings(min_overlap=2.0)
+        LoopSettings(min_overlap=2.0)
