@@ -88,9 +88,9 @@ class BlockGaussian:
                 d if s % d == 0 and (layout.dims[node] == d).all() else 1
             )  # node by node where all are of one size
             chunk = max(1, _IN_CACHE // (s * s))
-            parts = [_tied(P[k : k + chunk], tolerance, of_nodes) for k in range(0, c, chunk)]
+            tied = [_tied(P[first : first + chunk], tolerance, of_nodes) for first in range(0, c, chunk)]
             node = node[:, ::of_nodes]
-            k, i, j = np.nonzero(np.concatenate(parts))
+            k, i, j = np.nonzero(np.concatenate(tied))
             once = i < j
             a.append(node[k[once], i[once]])
             b.append(node[k[once], j[once]])
