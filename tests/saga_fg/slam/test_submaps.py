@@ -111,7 +111,7 @@ def test_while_running_submaps_say_nearly_what_their_measurements_do() -> None:
     found = graph.finish()
     rows = [*graph.anchors, *range(graph.anchors[-1], 150)]
     assert sigmas(graph.poses()[rows], found.world_T_pose[rows], found.covariances[rows]).max() < 0.02
-    np.testing.assert_allclose(graph.covariance(), found.covariances[-1], rtol=0.02, atol=1e-9)
+    np.testing.assert_allclose(graph.covariance(), found.covariances[-1], rtol=0.05, atol=3e-6)
 
 
 def test_one_submap_is_the_whole_graph_at_every_moment() -> None:
