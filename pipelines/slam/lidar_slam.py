@@ -25,7 +25,7 @@ from data_tools.lidar import Scan, Submap, voxel_downsample
 from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory
 from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, motion
-from pipelines.slam.loop_closures import LoopClosure, LoopSettings, NearbySubmaps
+from pipelines.slam.loop_closures import LoopClosure, LoopSettings, PlaceLoops
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmarks
 from pipelines.slam.submap_loops import SubmapLoops
@@ -66,7 +66,7 @@ class LidarSlamSettings(Settings):
     odometry: OdometrySettings = settings_group(OdometrySettings, "LiDAR odometry")
     observations: ScanLandmarkSettings = settings_group(ScanLandmarkSettings, "detection of landmarks in a scan")
     submaps: SubmapSettings = settings_group(SubmapSettings, "submaps and their landmarks")
-    loops: LoopSettings = settings_group(LoopSettings, "loop closures")
+    loops: LoopSettings = settings_group(LoopSettings, "loop closures by place")
     landmarks: bool = setting(True, "use landmarks as nodes of the graph")
     loop_closures: bool = setting(True, "search for loop closures")
     map_spacing: Positive = setting(0.25, "spacing of the points of the map, m; higher: less memory, smaller files")
@@ -143,7 +143,7 @@ class LidarSlam:
     start       (4, 4) the sensor's first pose in the world, z up
     providers   of other factors, asked at every keyframe: of IMU and GPS as in `saga_fg.providers`
     detectors   of other landmarks in the points of keyframes
-    loops       search for loops, by default among nearby submaps as the settings say
+    loops       search for loops, by default by place as the settings say
     odometry    by default that of the LiDAR
     ego_T_lidar (4, 4) pose of the sensor on the vehicle, whose path the result has
 
@@ -167,7 +167,7 @@ class LidarSlam:
         self._odometry = LidarOdometry(s.odometry) if odometry is None else odometry
         self._graph = SubmapGraph(self._start, _START, s.submaps, providers)
         self._detectors = tuple(detectors)
-        self._loops: SubmapLoops | None = NearbySubmaps(s.loops) if loops is None and s.loop_closures else loops
+        self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
         self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
         self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
-MOST_COMPARED = 90_000  # distances that are computed at once, those of 300 places to each other
+MOST_COMPARED = 30_000  # distances that are computed at once: those of 170 places to each other
 _LEAST = 1e-9  # m, so that a reach of 0 has a logarithm
 
 
