@@ -88,13 +88,14 @@ class AnchorLoop:
 class SolvedDrive:
     """Everything solved together: N poses (N, 4, 4), their covariances (N, 6, 6), and the landmarks seen often enough.
 
-    solution: of the whole graph, with all variables
+    solution: of the whole graph, with all variables; graph: that, at its solution
     """
 
     world_T_pose: FloatArray
     covariances: FloatArray
     landmarks: list[Landmark]
     solution: GraphSolution
+    graph: SceneFactorGraph
 
 
 class SubmapGraph:
@@ -243,7 +244,8 @@ class SubmapGraph:
         """Solve all measurements together."""
         if not len(self):
             raise InputError("expected at least one keyframe before the end")
-        solution = BatchSolver(graph=self.measurements(), settings=_SOLVER).solve()
+        solver = BatchSolver(graph=self.measurements(), settings=_SOLVER)
+        solution = solver.solve()
         keys = [pose_key(k) for k in range(len(self))]
         seen = LandmarkObservations(self._confirmed(), {})
         marks = seen.landmarks(solution, self.settings.confirm_after)
@@ -252,6 +254,7 @@ class SubmapGraph:
             np.array([solution.marginal(key) for key in keys]),
             marks,
             solution,
+            solver.graph(),
         )
 
     def _running(self, k: int) -> FloatArray:
