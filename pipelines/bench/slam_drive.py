@@ -11,6 +11,7 @@ import resource
 import sys
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -103,10 +104,10 @@ def bench_drive(keyframes: int, seed: int = 0, progress: Progress | None = None)
     lap = min(course.lap, float(course.way[keyframes - 1]) / 2)
     way = course.way[:keyframes]
     early, late = (float(np.nanmean(cost[rows])) for rows in (way <= lap, way >= way[-1] - lap))
-    parts = [
-        DrivePart(int(a), int(b), 1e3 * float(np.nanmean(cost[a:b])), _mean_of(1e3 * closing[a:b]), int(sizes[a:b].max()))
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    parts = []
+    for a, b in pairwise(edges.tolist()):
+        mean = 1e3 * float(np.nanmean(cost[a:b]))
+        parts.append(DrivePart(a, b, mean, _mean_of(1e3 * closing[a:b]), int(sizes[a:b].max())))
     paths = (solved.world_T_pose, np.array(odometry))
     off = [float(np.sqrt(np.mean(np.sum((p - poses)[:, :3, 3] ** 2, axis=1)))) for p in paths]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
@@ -134,6 +135,7 @@ class _Sights:
         c, s = np.cos(houses.yaw), np.sin(houses.yaw)
         normals = np.stack([np.column_stack([c, s]), np.column_stack([-s, c])])
         half = houses.size.T[:2] / 2
+        self._half = np.concatenate([half[1 - axis] for axis in (0, 1) for _ in (1, -1)])
         self._normal = np.concatenate([sign * normals[axis] for axis in (0, 1) for sign in (1, -1)])
         self._centre = np.concatenate(
             [houses.position[:, :2] + sign * half[axis][:, None] * normals[axis] for axis in (0, 1) for sign in (1, -1)]
@@ -143,19 +145,23 @@ class _Sights:
     def observed(self, pose: FloatArray, rng: np.random.Generator) -> list[Observation]:
         """Observations from a pose (4, 4) of the nearest poles and the nearest fronts that face it."""
         place, lidar_T_world = pose[:2, 3], inverse_transform(pose)
-        rows = [row for row in self._pole_tree.query(place, _POLES)[1] if np.hypot(*(self._poles[row] - place)) < _REACH]
+        distance, rows = self._pole_tree.query(place, _POLES)
         seen = []
-        for row in rows:
+        for row in rows[distance < _REACH]:
             point = lidar_T_world[:3, :3] @ [*self._poles[row], pose[2, 3]] + lidar_T_world[:3, 3]
-            seen.append(Observation(POLE, point + [*rng.normal(0, _POLE, 2), 0.0], _POLE**2 * np.eye(2)))
+            seen.append(Observation(POLE, point + np.append(rng.normal(0, _POLE, 2), 0.0), _POLE**2 * np.eye(2)))
         near = np.array(self._wall_tree.query_ball_point(place, _REACH), dtype=np.int64)
         ahead = ((place - self._centre[near]) * self._normal[near]).sum(axis=1)
         for row in near[np.argsort(np.where(ahead > 1.0, ahead, np.inf))][:_WALLS]:
             if (place - self._centre[row]) @ self._normal[row] <= 1.0:
                 continue
-            plane = gtsam.OrientedPlane3(*self._normal[row], 0.0, -float(self._normal[row] @ self._centre[row]))
+            nx, ny = self._normal[row].tolist()
+            plane = gtsam.OrientedPlane3(nx, ny, 0.0, -float(self._normal[row] @ self._centre[row]))
             noisy = plane.transform(gtsam.Pose3(pose)).retract(_WALL * rng.normal(size=3))
-            seen.append(Observation(WALL, noisy.planeCoefficients(), np.diag(_WALL**2)))
+            along = np.array([-self._normal[row, 1], self._normal[row, 0]]) * self._half[row]
+            ends = np.column_stack([self._centre[row] + np.outer([-1, 1], along), np.full(2, pose[2, 3])])
+            extent = ends @ lidar_T_world[:3, :3].T + lidar_T_world[:3, 3]
+            seen.append(Observation(WALL, noisy.planeCoefficients(), np.diag(_WALL**2), extent))
         return seen
 
 

@@ -153,6 +153,18 @@ def test_far_from_the_start_association_is_the_same(where: float) -> None:
     assert numbers[0] == numbers[1]
 
 
+def test_fronts_in_one_plane_are_walls_of_their_own() -> None:
+    def seen(x: float, d: float) -> Observation:
+        return Observation(WALL, [0, -1, 0, d], np.diag([3e-3, 3e-3, 0.02]) ** 2, [[x - 3, d, 0], [x + 3, d, 2]])
+
+    graph = SubmapGraph(np.eye(4), FIRST)
+    graph.append(0.0, None, [seen(0.0, 8.0), seen(12.0, 8.02)])
+    graph.append(0.1, (yaw_transform(1.0), Q), [seen(4.0, 8.0), seen(11.0, 8.02)])  # on from the first; the second
+    assert [one.landmark for one in graph.observations()] == [0, 1, 0, 1]
+    graph.append(0.2, (yaw_transform(1.0), Q), [seen(22.0, 8.0), Observation(WALL, [0, -1, 0, 8.0], Q[:3, :3])])
+    assert graph.observations()[-2].landmark == 2
+
+
 def test_a_loop_moves_submaps_as_a_whole() -> None:
     drive = Drive(square(330), 0, POOR, landmarks=False)  # once round, and on
     graph = started(drive, SubmapSettings(length=20.0))
