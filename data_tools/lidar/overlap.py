@@ -23,7 +23,7 @@ _FEWEST = 20  # points that tell an overlap
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Points above the ground, thinned (M, 3), with trees of all of them, and of the cells seen from above."""
+    """Points above the ground, thinned (M, 3), with trees of more of them, and of the cells seen from above."""
 
     points: FloatArray
     tree: cKDTree
@@ -34,6 +34,7 @@ class Structure:
         """The structure of points (N, 3), m, z up; N > 0."""
         standing = points[heights_above_ground(points)[0] > _STANDS]
         cells = np.unique(np.floor(points[:, :2] / _CELL), axis=0) * _CELL + _CELL / 2
+        standing = standing[voxel_downsample(standing, _SPACING / 2)]
         return cls(standing[voxel_downsample(standing, _SPACING)], cKDTree(standing), cKDTree(cells))
 
     def shared(self, other: Structure, self_T_other: FloatArray) -> float:

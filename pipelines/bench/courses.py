@@ -16,7 +16,7 @@ import numpy as np
 from data_tools.lidar import Scan
 from data_tools.simulator.course import SimulatedCourse, revisits
 from data_tools.trajectories import Trajectory, degraded_odometry, trajectory_errors
-from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
@@ -80,25 +80,32 @@ class _Drifting:
         return self.course[row]
 
 
-def bench_course(
-    seed: int, drift: float = 0.0, settings: LidarSlamSettings | None = None, progress: Progress | None = None
-) -> CourseRow:
+def drive_course(
+    seed: int, drift: float = 0.0, progress: Progress | None = None
+) -> tuple[SimulatedCourse, LidarSlamResult]:
     """Drive the course of a seed."""
     course = SimulatedCourse(seed, period=_PERIOD, skewed=False)
     scans = _Drifting(course, odometry_of(course, seed, drift))
+    return course, lidar_slam(scans, "oxts", SETTINGS, progress)
+
+
+def bench_course(seed: int, drift: float = 0.0, progress: Progress | None = None) -> CourseRow:
+    """Drive the course of a seed, and compare with the truth."""
     began = time.process_time()
-    result = lidar_slam(scans, "oxts", settings or SETTINGS, progress)
+    course, result = drive_course(seed, drift, progress)
     seconds = time.process_time() - began
     truth = Trajectory(course.timestamps, course.world_T_ego)
     before, after = (trajectory_errors(each, truth).ate for each in (result.odometry, result.trajectory))
-    rows = result.keyframes
-    first, second = (rows[[getattr(loop, end) for loop in result.loops]] for end in ("first", "second"))
+    first, second = (
+        result.keyframes[np.array([getattr(loop, end) for loop in result.loops], dtype=np.int64)]
+        for end in ("first", "second")
+    )
     true = inverse_transform(course.world_T_ego[first]) @ course.world_T_ego[second]
     found = np.array([loop.first_T_second for loop in result.loops]).reshape(-1, 4, 4)
     right = np.linalg.norm((inverse_transform(true) @ found)[:, :3, 3], axis=1) < _FALSE
     ends = course.way[second[right]]
     stretches = [(course.way[a], course.way[b]) for a, b in revisits(course.world_T_ego)]
-    reach = (settings or SETTINGS).submaps.length
+    reach = SETTINGS.submaps.length
     hits = sum(bool(((ends + reach >= a) & (ends <= b)).any()) for a, b in stretches)
     return CourseRow(
         seed,

@@ -41,6 +41,7 @@ _SURFEL, _SPACING = 1.0, 1.5  # m: voxels of the map, and spacing of the points 
 _SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometry
 _FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
 _SAME = 4.0  # m that two loops to one place differ by, besides drift
+_OPEN = 0.5  # m, standard deviation of an alignment of images
 _DISTORTION = np.array([2e-3] * 3 + [0.1] * 3) ** 2  # rad^2 and m^2, of submaps that odometry has bent
 
 
@@ -134,14 +135,16 @@ class PlaceLoops:
         points = new[voxel_downsample(new, _SPACING)]
         criteria = RegistrationSettings()
         try:
-            rough = register(points, surfels, match.place_T_query, 3 * _SURFEL, 1.0, criteria)
-            fine = register(points, surfels, rough.map_T_scan, _SURFEL, 0.1, criteria)
+            rough = register(points, surfels, match.place_T_query, 3 * _SURFEL, 1.0, criteria, "follow")
+            fine = register(points, surfels, rough.map_T_scan, _SURFEL, 0.1, criteria, "follow")
         except RegistrationError:
             return None, 0.0
         if not fine.converged:
             return None, 0.0
         overlap = Structure.of(old).shared(Structure.of(new), fine.map_T_scan)
-        covariance = fine.covariance + np.diag(_DISTORTION)
+        seen = fine.observed
+        free = seen.lost.T / seen.scale[:, None]  # motions that surfaces leave open: by the image
+        covariance = fine.covariance + np.diag(_DISTORTION) + _OPEN**2 * free @ free.T
         return LoopClosure(match.number, number, fine.map_T_scan, covariance), overlap
 
     def _unrivalled(self, found: list[_Proved], frames: FloatArray) -> list[_Proved]:

@@ -6,18 +6,19 @@ import math
 
 import numpy as np
 
-from saga_fg.kernels.array_types import FloatArray, IntArray
+from saga_fg.kernels.array_types import BoolArray, FloatArray, IntArray
 from saga_fg.kernels.compilation import kernel
 
 Paths = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
-@kernel("i1 f2 f1 f1 i1 f2 f1 f1 i i f f f f f f")
+@kernel("i1 f2 f1 f1 b1 i1 f2 f1 f1 i i f f f f f f")
 def trail_paths(
     of: IntArray,
     points: FloatArray,
     headings: FloatArray,
     speeds: FloatArray,
+    timed: BoolArray,
     ids: IntArray,
     position: FloatArray,
     heading: FloatArray,
@@ -33,8 +34,9 @@ def trail_paths(
 ) -> Paths:
     """Places (k, steps + 1, 2), courses, typical speeds and weights (k, steps + 1), certainty and disagreement (k,).
 
-    Of n points of trails: their tracks `of` (n,), places (n, 2), headings and speeds (n,); of k tracks: ids (k,),
-    position (k, 2), heading, curvature (k,); most: points compared; length of a step; the rest are the module's scales
+    Of n points of trails: their tracks `of` (n,), places (n, 2), headings, speeds and whether these are known (n,); of
+    k tracks: ids (k,), position (k, 2), heading, curvature (k,); most: points compared; length of a step; the rest are
+    the module's scales
     """
     n, k, cell = len(of), len(ids), 2 * reach
     buckets = 16
@@ -74,31 +76,33 @@ def trail_paths(
                                 apart[q], near[q] = d, p
                                 found = min(found + 1, most)
                         p = before[p]
-            total, mean, typical = 0.0, 0.0, 0.0
+            total, mean, typical, known = 0.0, 0.0, 0.0, 0.0
             for q in range(found):
                 p = near[q]
                 share[q] = 0.0
                 counts = of[p] != ids[t]
                 for r in range(q):  # of each trail the nearest point
                     counts = counts and of[near[r]] != of[p]
-                turns[q] = (headings[p] - h + math.pi) % (2 * math.pi) - math.pi
+                turns[q] = (headings[p] - h - own + math.pi) % (2 * math.pi) - math.pi
                 if counts:
                     share[q] = math.exp(-((apart[q] / reach) ** 2 + (turns[q] / turning) ** 2) / 2)
                     total += share[q]
+                    if timed[p]:
+                        known += share[q]
+                        typical += share[q] * speeds[p]
             scale = max(total, 1e-9)
             for q in range(found):
                 mean += share[q] / scale * turns[q]
-                typical += share[q] / scale * speeds[near[q]]
             variance = 0.0
             for q in range(found):
                 variance += share[q] / scale * (turns[q] - mean) ** 2
             sure = total / (total + prior) / (1 + variance / agreement**2)
-            after = h + sure * mean + (1 - sure) * own
+            after = h + own + sure * mean
             if step == 0:
                 certainty[t], disagreement[t] = sure, variance
             else:
                 x, y = x + length * math.cos((h + after) / 2), y + length * math.sin((h + after) / 2)
             h = after
             place[t, step, 0], place[t, step, 1], course[t, step] = x, y, h
-            speed[t, step], weight[t, step] = typical, total
+            speed[t, step], weight[t, step] = typical / max(known, 1e-9), known
     return place, course, speed, weight, certainty, disagreement

@@ -16,9 +16,9 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.pose_graph.consensus import Consensus, consensus
 from saga_fg.slam.pose_graph.distances import shortest_ways
 from saga_fg.slam.pose_graph.graph import PoseGraph
+from saga_fg.slam.pose_graph.optimisation import HELD
 
 _LOSS = Robust("cauchy", 3.0)
-_ANCHOR = 1e-8  # variance of the first pose
 _RADIAN = 1.0  # m of way that a radian of turning counts as
 
 
@@ -49,7 +49,7 @@ class RunningPoseGraph:
         self._edges: list[Measured] = []
         self._poses = [world_T_first]
         self._new, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._new.add(pose_prior_factor(0, world_T_first, _ANCHOR * np.eye(3)))
+        self._new.add(pose_prior_factor(0, world_T_first, HELD * np.eye(3)))
         self._start.insert(0, _pose2(world_T_first))
 
     def append(self, last_T_new: FloatArray, covariance: FloatArray) -> int:

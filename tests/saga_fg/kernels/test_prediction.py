@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from saga_fg.kernels.compilation import only_numpy
 from saga_fg.model.discretisation import discretise, linear_motions
-from saga_fg.tracking.trails import TrailPoints, Trails, TrailSettings
+from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings
+from saga_fg.tracking.trails import paths
+from saga_fg.types.road_map import Lane, RoadMap
 from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE, TRAM, VAN, random_graph, random_types
 
 
@@ -51,16 +53,25 @@ def test_long_motions(d, dt):
 @settings(max_examples=50, deadline=None)
 def test_paths_along_trails(seed):
     rng = np.random.default_rng(seed)
-    trails, n, k = Trails(TrailSettings(memory=20.0)), int(rng.integers(1, 30)), int(rng.integers(0, 12))
+    reach = float(rng.choice([0.0, 1.5, 4.0]))
+    traffic, n, k = (
+        Traffic(TrafficSettings(memory=20.0, reach=reach)),
+        int(rng.integers(1, 30)),
+        int(rng.integers(0, 12)),
+    )
     place, heading = rng.uniform(-40, 40, (n, 2)), rng.uniform(-3, 3, n)
+    if rng.random() < 0.5:
+        traffic.add_lanes(RoadMap(lanes=(Lane("main", centre=((-40.3, 0.1), (0.2, 3.7), (40.9, 9.2))),)))
     for number in range(int(rng.integers(0, 25))):
         place = place + 2.2 * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         s = np.flatnonzero(rng.random(n) < 0.8)
-        noisy, time = place[s] + rng.normal(scale=0.1, size=(len(s), 2)), np.full(len(s), 0.5 * number)
-        trails.update(TrailPoints(s, noisy, heading[s], rng.uniform(2, 9, len(s)), time), 0.5 * number)
+        noisy, time, none = place[s] + rng.normal(scale=0.1, size=(len(s), 2)), 0.5 * number, np.zeros(len(s))
+        label, times, moves = np.full(len(s), "car"), np.full(len(s), time), rng.random(len(s)) < 0.9
+        columns = s, label, noisy, heading[s], rng.uniform(2, 9, len(s)), none, none, times, moves
+        traffic.update(Passages(*columns), time)
     start = rng.integers(0, 40, k), rng.uniform(-40, 40, (k, 2)), rng.uniform(-3, 3, k), 0.05 * rng.normal(size=k)
-    by_kernel = trails.paths(*start, steps=20)
+    by_kernel = paths(traffic, *start, steps=20)
     with only_numpy():
-        by_numpy = trails.paths(*start, steps=20)
+        by_numpy = paths(traffic, *start, steps=20)
     for name in vars(by_numpy):
         np.testing.assert_allclose(getattr(by_kernel, name), getattr(by_numpy, name), atol=1e-10)
