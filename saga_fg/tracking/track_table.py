@@ -88,7 +88,7 @@ class TrackTable(Columns):
         )
 
     def snapshot(self) -> Self:
-        """A copy that shares no array with this table."""
+        """A copy that shares no array with this table that can be written."""
         return self.copied()
 
     @property
