@@ -11,6 +11,7 @@ import pytest
 import saga_fg
 from saga_fg.kernels.compilation import compiled_kernels, only_numpy
 
+pytest.importorskip("numba")  # of the extra test
 LABELS = (
     "import numpy as np; from saga_fg.numerics.arrays import distinct; print(distinct(np.array(['a', 'b', 'a']))[1])"
 )
