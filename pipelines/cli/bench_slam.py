@@ -20,6 +20,9 @@ def slam(
     kiss: Annotated[
         bool, typer.Option("--kiss/--no-kiss", help="With KISS-ICP, of the extra bench, or ours alone.")
     ] = True,
+    open3d: Annotated[
+        bool, typer.Option("--open3d", help="Our odometry with Open3D's registration in place of ours, too.")
+    ] = False,
     json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
@@ -34,10 +37,10 @@ def slam(
     """
     from data_tools.datasets.kitti import KittiScans
     from data_tools.figures import FigureTable, cell
-    from pipelines.bench.slam import bench_slam
+    from pipelines.bench.slam import OURS, bench_slam
 
     with progress_bar() as progress:
-        rows = bench_slam(KittiScans(dataroot, sequence, most=scans), kiss, progress=progress)
+        rows = bench_slam(KittiScans(dataroot, sequence, most=scans), kiss, progress=progress, open3d=open3d)
     shown = []
     for row in rows:
         e = row.errors
@@ -46,8 +49,8 @@ def slam(
     columns = ("scans", "method", "RPE, m per 10 m", "RPE, deg per 10 m", "end, m", "residual, mm", "ms a scan")
     table = FigureTable(f"sequence {sequence}: odometry against GPS/IMU", columns, tuple(shown))
     report([table], rows, json_file)
-    for ours, theirs in itertools.pairwise(rows):
-        if ours.case == theirs.case:
+    for ours, theirs in itertools.product(rows, rows):
+        if ours.case == theirs.case and ours.contender == OURS != theirs.contender:
             worse = 100 * (ours.errors.relative_translation - theirs.errors.relative_translation)
             duller = 100 * (ours.residual / theirs.residual - 1)
             share = ours.milliseconds / theirs.milliseconds
