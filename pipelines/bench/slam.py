@@ -33,7 +33,7 @@ from saga_fg.errors import MissingExtraError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 
-OURS, OPEN3D, KISS = "saga-fg", "with open3d's icp", "kiss-icp"
+OURS, OPEN3D, KISS = "saga-fg", "saga-fg, open3d icp", "kiss-icp"
 
 
 @dataclass(frozen=True)

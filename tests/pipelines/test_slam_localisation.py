@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +102,16 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     assert (tmp_path / "second" / "trajectory.tum").is_file()
     with pytest.raises(InputError, match="expected one that shows a place of this drive"):
         localise(SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 4)), slam_map)
+
+
+@pytest.mark.skipif(shutil.which("evo_ape") is None, reason="evo has an environment of its own: put it on the path")
+def test_evo_finds_the_same_error(tmp_path: Path) -> None:
+    scans = SimulatedScans(3, world_T_lidar=drive(0.0, -1.5, 12))
+    figures = write_lidar_slam(tmp_path / "run", lidar_slam(scans, settings=PLAIN), scans)
+    command = ["evo_ape", "tum", "reference.tum", "trajectory.tum", "--align_origin"]
+    said = subprocess.run(command, cwd=tmp_path / "run", capture_output=True, text=True, check=True).stdout
+    rmse = next(float(line.split()[1]) for line in said.splitlines() if line.split()[:1] == ["rmse"])
+    assert rmse == pytest.approx(figures["trajectory"]["ate"], abs=1e-6)
 
 
 def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_path: Path) -> None:
