@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.estimators.partition import BlockDiagonal, Partition, flattened, regrouped
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.components import node_blocks, uncorrelated_labels
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
+_IN_CACHE = 100_000  # entries of components that are compared at once
 _UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
 
 
@@ -30,6 +33,11 @@ class BlockGaussian:
     @property
     def layout(self) -> StateLayout:
         return self.partition.layout
+
+    @property
+    def flat(self) -> FloatArray:
+        """The blocks one after the other, as kernels take them."""
+        return flattened(self.blocks)
 
     def over(self, partition: Partition) -> BlockGaussian:
         """Change the partition; nodes that it separates lose their correlation."""
@@ -59,7 +67,9 @@ class BlockGaussian:
         kept = np.flatnonzero(keep)
         old = self.partition
         partition = old.restricted(self.layout.without(rows), kept)
-        if old.count - partition.count == len(rows):  # nodes without partners go, all others stay as they are
+        if not compiled_kernels() and old.count - partition.count == len(
+            rows
+        ):  # nodes without partners go, all others stay as they are
             leaving = [old.row[rows[old.group[rows] == number]] for number in range(len(self.blocks))]
             left = (np.delete(P, of_group, axis=0) for P, of_group in zip(self.blocks, leaving, strict=True))
             blocks = tuple(P for P in left if len(P))
@@ -76,6 +86,11 @@ class BlockGaussian:
         partition, layout = self.partition, self.layout
         if partition.count == len(layout):
             return partition
+        if compiled_kernels():
+            at = partition.block_places
+            place = at.start, at.size, at.offset
+            parts = Partition(layout, uncorrelated_labels(self.flat, partition.label, *place, layout.dims, tolerance))
+            return partition if parts.count == partition.count else parts
         node_of = np.repeat(np.arange(len(layout)), layout.dims)
         a, b = [], []
         for places, P in zip(partition.groups, self.blocks, strict=True):
@@ -83,12 +98,13 @@ class BlockGaussian:
             d = int(layout.dims[node[0, 0]])
             if s == d and (node == node[:, :1]).all():  # nodes on their own
                 continue
-            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-            tied = np.abs(P) > tolerance * sigma[:, :, None] * sigma[:, None, :]
-            if s % d == 0 and (layout.dims[node] == d).all():  # node by node where all are of one size
-                tied = np.asarray(tied.reshape(c, s // d, d, s // d, d).any(axis=(2, 4)))
-                node = node[:, ::d]
-            k, i, j = np.nonzero(tied)
+            of_nodes = (
+                d if s % d == 0 and (layout.dims[node] == d).all() else 1
+            )  # node by node where all are of one size
+            chunk = max(1, _IN_CACHE // (s * s))
+            tied = [_tied(P[first : first + chunk], tolerance, of_nodes) for first in range(0, c, chunk)]
+            node = node[:, ::of_nodes]
+            k, i, j = np.nonzero(np.concatenate(tied))
             once = i < j
             a.append(node[k[once], i[once]])
             b.append(node[k[once], j[once]])
@@ -131,12 +147,23 @@ class BlockGaussian:
         return variances
 
 
+def _tied(P: FloatArray, tolerance: float, d: int) -> BoolArray:
+    """(c, s / d, s / d) which nodes, of d states each, any correlation above `tolerance` ties; P (c, s, s)."""
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    tied = np.abs(P) > tolerance * sigma[:, :, None] * sigma[:, None, :]
+    columns = np.logical_or.reduce([tied[:, :, k::d] for k in range(d)])
+    return np.asarray(np.logical_or.reduce([columns[:, k::d] for k in range(d)]))
+
+
 def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
     """(k, d, d) blocks of the nodes at `rows`, whose states have equal size d."""
     d = int(partition.layout.dims[rows[0]]) if len(rows) else 0
     result = np.empty((len(rows), d, d))
     if len(rows) == 0:
         return result
+    if compiled_kernels():
+        place = partition.block_places
+        return node_blocks(flattened(blocks), place.start, place.size, place.offset, rows, d)
     if partition.size:
         own = np.empty((len(partition.layout), d, d))
         for (nodes, row, slot), block in zip(partition.nodes_by_group, blocks, strict=True):
