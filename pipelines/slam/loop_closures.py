@@ -36,7 +36,8 @@ from saga_fg.slam.pose_graph.distances import shortest_ways
 _FEWEST = 200  # points of a submap that shows a place
 _COMPARED, _REGISTERED, _TAKEN = 12, 4, 2  # places for each submap
 _ALIKE = 0.3  # correlation of images from which places are registered
-_UNIQUE = 0.92  # share of the best that a rival may have
+_SINGLE = 0.8  # share of the correlation that another alignment of the two may have
+_UNIQUE = 0.92  # share of the shared structure that a loop to elsewhere may have
 _SURFEL, _SPACING = 1.0, 1.5  # m: voxels of the map, and spacing of the points registered
 _SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometry
 _FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
@@ -119,7 +120,7 @@ class PlaceLoops:
         matches = self._index.candidates(image, older.tolist(), _COMPARED)
         found = []
         for match in matches[:_REGISTERED]:
-            if match.score < _ALIKE or match.rival > _UNIQUE * match.score:
+            if match.score < _ALIKE or match.rival > _SINGLE * match.score:
                 continue
             loop, overlap = self._registered(match, number)
             if loop is not None and overlap >= self.settings.min_overlap:
