@@ -9,7 +9,8 @@ landmarks.json              each landmark
 landmarks.ply               points along the poles and on the observed pieces of the walls
 tracks.csv                  objects, where there are any
 above.png                   map, paths, landmarks and the objects' tracks from above
-metrics.json                errors of the trajectories against the recording's own poses, and the map's sharpness
+metrics.json                errors of the trajectories against the recording's own poses, the map's sharpness, scans
+                            that left motions open, and sensors that do not fit
 
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
@@ -53,12 +54,26 @@ def metrics(result: LidarSlamResult, scans: ScanSequence) -> dict[str, Any]:
         "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
         "loops": len(result.loops),
         "submaps": len(result.submaps),
+        "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
+        "misfits": dict(result.misfits),
         "scan_to_map_residual": _residual(result, scans),
         **{
             name: asdict(trajectory_errors(getattr(result, name), truth, "start"))
             for name in ("odometry", "online", "trajectory")
         },
     }
+
+
+def degenerate_spans(times: FloatArray, degenerate: Sequence[tuple[str, ...]]) -> list[dict[str, Any]]:
+    """Runs of scans that leave the same motions open: first and last scan, their times, s, and the motions in words."""
+    spans = list[dict[str, Any]]()
+    for row, motions in enumerate(degenerate):
+        if spans and spans[-1]["motions"] == list(motions) and spans[-1]["last"] == row - 1:
+            spans[-1] |= {"last": row, "until": float(times[row])}
+        elif motions:
+            at = float(times[row])
+            spans.append({"first": row, "last": row, "from": at, "until": at, "motions": list(motions)})
+    return spans
 
 
 def _residual(result: LidarSlamResult, scans: ScanSequence) -> float:
@@ -146,8 +161,9 @@ def _pieces(result: LidarSlamResult, kind: str) -> FloatArray:
         along = np.array([-normal[1], normal[0]])
         foot = (np.array([place["x"], place["y"]]) @ normal) * normal
         spans = []
-        for seen, extent in zip(result.observations, result.extents, strict=True):
-            if seen.landmark == mark.number:
+        for seen in result.observations:
+            extent = seen.observation.extent
+            if seen.landmark == mark.number and extent is not None:
                 u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
                 spans.append((float(u.min()), float(u.max())))
         ends += [np.stack([foot + low * along, foot + high * along]) for low, high in covered_spans(spans)]

@@ -2,11 +2,13 @@
 
     prior         the first pose
     odometry      || log( (T_k^-1 T_(k+1))^-1  D_k ) ||_{P_k}      between successive keyframes
+    sensors       GPS, inertial samples and wheels of the vehicle, where there are any
     landmarks     walls, curbs and poles observed at keyframes, associated within the running submap
     loops         || log( (T_i^-1 T_j)^-1  L_ij ) ||, robust       places that the vehicle came back to
 
 `saga_fg.slam.submaps` keeps the graph small. The points of keyframes are thinned to one cloud a submap and dropped when
 it is closed; then loops are searched for. At the end everything is solved together, and covariances are read off.
+Where the scan leaves a motion open, as along a tunnel, its covariance is wide and the sensors decide.
 Scans between keyframes go along with the keyframe before them, by their odometry.
 
 Odometry is that of the LiDAR, or the recording's own poses, for comparison and for objects alone.
@@ -14,7 +16,8 @@ Odometry is that of the LiDAR, or the recording's own poses, for comparison and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,6 +26,7 @@ import numpy as np
 
 from data_tools.lidar import Scan, Submap, voxel_downsample
 from data_tools.lidar.scan import ScanSequence
+from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, motion
 from pipelines.slam.loop_closures import LoopClosure, LoopSettings, PlaceLoops
@@ -39,11 +43,13 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import AssociatedObservation, MapperSettings
+from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers
 from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
-from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples
+from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 from saga_fg.types.frame import Detections, Frame
 from saga_fg.types.landmark import Landmark
 
+_LOG = logging.getLogger(__name__)
 OdometrySource = Literal["lidar", "oxts"]
 _START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
@@ -68,6 +74,7 @@ class LidarSlamSettings(Settings):
     submaps: SubmapSettings = settings_group(SubmapSettings, "submaps and their landmarks")
     loops: LoopSettings = settings_group(LoopSettings, "loop closures by place")
     landmarks: bool = setting(True, "use landmarks as nodes of the graph")
+    sensors: SensorSettings = settings_group(SensorSettings, "GPS, IMU and wheels of the vehicle")
     loop_closures: bool = setting(True, "search for loop closures")
     map_spacing: Positive = setting(0.25, "spacing of the points of the map, m; higher: less memory, smaller files")
     mapper: MapperSettings = settings_group(
@@ -112,8 +119,9 @@ class LidarSlamResult:
     covariances    (M, 6, 6) of the keyframes' poses, (rotation, translation) in the sensor's frame, rad^2, m^2
     landmarks      of the map, those seen more than once
     observations   of landmarks, with the landmark and the keyframe of each
-    extents        (2, 3) of each observation: ends of the observed piece, m, in the sensor's frame
     loops          that were closed, between keyframes
+    degenerate     (K) motions that each scan left open, in words
+    misfits        what does not fit of the vehicle's sensors, in words, by their names
     submaps        S, and world_T_submap (S, 4, 4) their places
     world_T_lidar  (M, 4, 4) poses of the keyframes
     """
@@ -125,8 +133,9 @@ class LidarSlamResult:
     covariances: FloatArray
     landmarks: Sequence[Landmark]
     observations: Sequence[AssociatedObservation]
-    extents: Sequence[FloatArray]
     loops: Sequence[LoopClosure]
+    degenerate: Sequence[tuple[str, ...]]
+    misfits: Mapping[str, str]
     submaps: Sequence[Submap]
     world_T_submap: FloatArray
     world_T_lidar: FloatArray
@@ -141,11 +150,12 @@ class LidarSlam:
     """LiDAR SLAM of a drive: `step` takes scan by scan, `finish` gives the map.
 
     start       (4, 4) the sensor's first pose in the world, z up
-    providers   of other factors, asked at every keyframe: of IMU and GPS as in `saga_fg.providers`
+    providers   of other factors, asked at every keyframe
+    sensors     of the vehicle whose measurements `step` gets
     detectors   of other landmarks in the points of keyframes
     loops       search for loops, by default by place as the settings say
     odometry    by default that of the LiDAR
-    ego_T_lidar (4, 4) pose of the sensor on the vehicle, whose path the result has
+    ego_T_lidar (4, 4) pose of the sensor on the vehicle, whose path the result has, and on which its sensors are
 
     A scan that `step` refuses is left out, and the next can follow. If a provider or detector raises, the scan is
     placed by odometry and becomes no keyframe.
@@ -160,19 +170,25 @@ class LidarSlam:
         loops: SubmapLoops | None = None,
         odometry: Odometry | None = None,
         ego_T_lidar: FloatArray | None = None,
+        sensors: Collection[SensorName] = (),
     ) -> None:
         self.settings = s = settings or LidarSlamSettings()
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._ego_T_lidar = np.eye(4) if ego_T_lidar is None else checked_transform("ego_T_lidar", ego_T_lidar)
         self._odometry = LidarOdometry(s.odometry) if odometry is None else odometry
-        self._graph = SubmapGraph(self._start, _START, s.submaps, providers)
+        self._sensors = tuple(sensors)
+        lidar_T_ego = inverse_transform(self._ego_T_lidar)
+        of_sensors = sensor_providers(s.sensors, sensors, lidar_T_ego)
+        self._graph = SubmapGraph(self._start, _START, s.submaps, [*of_sensors, *providers])
         self._detectors = tuple(detectors)
         self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
         self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
         self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
-        self._extents, self._closed = list[FloatArray](), list[LoopClosure]()
+        self._closed: list[LoopClosure] = []
+        self._degenerate = list[tuple[str, ...]]()
         self._imu: list[ImuSamples] = []  # since the last keyframe
+        self._wheels: list[WheelSpeed] = []  # likewise
         self._covariance = _START  # of the last keyframe's pose
 
     @property
@@ -187,11 +203,13 @@ class LidarSlam:
         imu: ImuSamples | None = None,
         gps: GpsFix | None = None,
         detections: Detections | None = None,
+        wheels: WheelSpeed | None = None,
     ) -> SlamStep:
         """Place the next scan, taken at `time`, s.
 
-        imu: samples since the scan before; gps: a fix at this scan; detections: of objects, in the sensor's frame. The
-        providers read them from `view.frame`; fixes and detections of scans between keyframes are left out.
+        imu: samples since the scan before; gps: a fix at this scan; detections: of objects, in the sensor's frame;
+        wheels: speed since the scan before, which also predicts the motion. The providers read them from `view.frame`;
+        fixes and detections of scans between keyframes are left out.
         Raises `InputError` for a scan that is not later than the one before, and for a first scan without points. A
         later one without points lies where it was predicted, with the deviation that the settings say.
         """
@@ -201,11 +219,17 @@ class LidarSlam:
             raise InputError(f"time: expected one after {self._times[-1]:.6f} s, got {time:.6f} s")
         if not self._times and not len(scan) and isinstance(self._odometry, LidarOdometry):
             raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
-        placed = self._odometry.step(scan, time)
+        if wheels is not None and isinstance(self._odometry, LidarOdometry):
+            ahead = self._ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]
+            placed = self._odometry.step(scan, time, np.concatenate([np.full(3, np.nan), ahead]))
+        else:
+            placed = self._odometry.step(scan, time)
+        self._degenerate.append(placed.degenerate)
         self._times.append(time)
         self._poses.append(self._start @ placed.map_T_lidar)
         self._covariances.append(placed.covariance + LEAST)
         self._imu += [] if imu is None else [imu]
+        self._wheels += [] if wheels is None else [wheels]
         self._online.append(self._poses[-1])
         row, submap, found = len(self._poses) - 1, None, list[LoopClosure]()
         if placed.keyframe:
@@ -226,6 +250,9 @@ class LidarSlam:
             poses = self._graph.poses()
             self._close(poses)
         solved = self._graph.finish()
+        unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
+        for text in unfit.values():
+            _LOG.warning(text)
         drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
         anchors = solved.world_T_pose[[submap.anchor for submap in self._submaps]]
         times, lidar_T_ego = np.array(self._times), inverse_transform(self._ego_T_lidar)
@@ -237,8 +264,9 @@ class LidarSlam:
             solved.covariances,
             solved.landmarks,
             self._graph.observations(),
-            self._extents,
             self._closed,
+            self._degenerate,
+            unfit,
             self._submaps,
             np.array([world_T_submap(*each) for each in zip(self._submaps, anchors, strict=True)]),
             solved.world_T_pose,
@@ -253,11 +281,10 @@ class LidarSlam:
         if self._keyframes:
             last = self._keyframes[-1]
             moved = motion(self._poses[last:], self._covariances[last + 1 :])
-        frame = _frame(self._times[row], self._imu, gps, detections)
-        closes = self._graph.append(self._times[row], moved, [each.observation for each in seen], frame)
-        self._imu = []
+        frame = _frame(self._times[row], self._imu, self._wheels, gps, detections)
+        closes = self._graph.append(self._times[row], moved, seen, frame)
+        self._imu, self._wheels = [], []
         self._keyframes.append(row)
-        self._extents += [each.extent for each in seen]
         submap, found = None, list[LoopClosure]()
         if closes:
             submap, found = self._close(self._graph.poses()[:-1])
@@ -302,35 +329,49 @@ def lidar_slam(
     progress: Progress | None = None,
     providers: Sequence[FactorProvider] = (),
     detectors: Sequence[LandmarkDetector] = (),
+    log: SensorLog | None = None,
 ) -> LidarSlamResult:
     """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
-    counts is the first, unless the source is "oxts". providers, detectors: as of `LidarSlam`.
+    counts is the first, unless the source is "oxts". providers, detectors: as of `LidarSlam`; log: of the vehicle's
+    sensors, in the recording's world.
     """
     s = settings or LidarSlamSettings()
     recorded = RecordedOdometry(scans, s.oxts_rotation, s.oxts_translation, s.odometry) if source == "oxts" else None
     start = scans.world_T_ego[0] @ scans.ego_T_lidar
-    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar)
+    log, buffer = log or SensorLog({}), SensorBuffer()
+    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar, tuple(log.tables))
     for k, time in enumerate(scans.timestamps.tolist()):
-        slam.step(scans[k], time)
+        log.feed(buffer, time)
+        ego = buffer.take(time)
+        slam.step(scans[k], time, ego.imu, ego.gps, wheels=ego.wheels)
         if progress is not None:
             progress("slam", k + 1, len(scans))
     return slam.finish()
 
 
-def _frame(time: float, imu: Sequence[ImuSamples], gps: GpsFix | None, detections: Detections | None) -> Frame | None:
+def _frame(
+    time: float,
+    imu: Sequence[ImuSamples],
+    wheels: Sequence[WheelSpeed],
+    gps: GpsFix | None,
+    detections: Detections | None,
+) -> Frame | None:
     """What a keyframe brings besides its scan, for providers."""
-    if not imu and gps is None and detections is None:
+    if not imu and not wheels and gps is None and detections is None:
         return None
-    samples = None
+    samples, speed = None, None
     if imu:
         samples = ImuSamples(
             *(np.concatenate([getattr(one, name) for one in imu]) for name in ("dt", "acceleration", "angular_rate"))
         )
+    if wheels:
+        total = sum(one.dt for one in wheels)
+        speed = WheelSpeed(sum(one.speed * one.dt for one in wheels) / total, total)
     return Frame(
         time,
         "lidar",
         Detections.empty() if detections is None else detections,
         None,
         "ego",
-        ego=EgoMeasurements(gps=gps, imu=samples),
+        ego=EgoMeasurements(gps=gps, imu=samples, wheels=speed),
     )

@@ -48,15 +48,18 @@ _WIDE = 64  # dimensions that hang together, from which QR takes many times as l
 
 
 class SceneFactorGraph:
-    """Variables, factors and values. Every method raises `GraphError` and then has changed nothing."""
+    """Variables, factors and values. Every method raises `GraphError` and then has changed nothing.
 
-    def __init__(self) -> None:
+    elimination: of back ends, "qr" or "cholesky", until priors are left that choose
+    """
+
+    def __init__(self, elimination: Elimination = "qr") -> None:
         self._variables: dict[int, GraphVariable] = {}
         self._base, self._values = gtsam.Values(), gtsam.Values()
         self._groups: dict[int, HeldGroup] = {}
         self._touching: dict[int, tuple[int, ...]] = {}  # groups with a factor on a variable, now or before
         self._factor_counts: dict[int, int] = {}  # number of factors on each variable
-        self.elimination: Elimination = "qr"
+        self.elimination: Elimination = elimination
         self._fresh: dict[int, list[gtsam.JacobianFactor]] = {}  # as linearised when they were added
         self._count = 0
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
@@ -168,12 +171,12 @@ class SceneFactorGraph:
             for factor in self.linearised(self._groups[number], np.array(mine), point):
                 touched.push_back(factor)
         involved = set(touched.keyVector())
-        factors = self._eliminated(touched, sorted(leaving.keys() & involved))
         if into is not None:
-            made = into.factors(factors, point)
+            made = into.factors(self._eliminated(touched, sorted(leaving.keys() & involved), "qr"), point)
             self._replace(rows, [], leaving)
             self.add_factors(into.name, made)
             return
+        factors = self._eliminated(touched, sorted(leaving.keys() & involved), self.elimination)
         self._replace(rows, factors, leaving)
         if factors:
             self._choose(max(factor.cols() - 1 for factor in factors))
@@ -318,9 +321,11 @@ class SceneFactorGraph:
             for key in group.rows[row]:
                 self._factor_counts[key] += step
 
-    def _eliminated(self, touched: gtsam.GaussianFactorGraph, keys: list[int]) -> list[gtsam.JacobianFactor]:
+    def _eliminated(
+        self, touched: gtsam.GaussianFactorGraph, keys: list[int], elimination: Elimination
+    ) -> list[gtsam.JacobianFactor]:
         """Factors that are left on the other variables."""
-        if self.elimination == "cholesky":
+        if elimination == "cholesky":
             with contextlib.suppress(FactorError, RuntimeError):  # it has half the digits that QR has
                 return _jacobians(marginal_factors(touched, keys, "cholesky"))
         try:

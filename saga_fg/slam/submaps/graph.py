@@ -38,6 +38,7 @@ from saga_fg.slam.submaps.recording import recorded
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Landmark, Observation
 
+_AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
 _SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
 
 
@@ -54,7 +55,7 @@ class SubmapSettings(Settings):
     )
     confirm_after: Annotated[int, Range(1, 10**9)] = setting(4, "observations that confirm a landmark")
     relinearise_above: Positive = setting(
-        0.3, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
+        0.5, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
     )
     robust_scale: Positive = setting(
         3.0,
@@ -87,13 +88,14 @@ class AnchorLoop:
 class SolvedDrive:
     """Everything solved together: N poses (N, 4, 4), their covariances (N, 6, 6), and the landmarks seen often enough.
 
-    solution: of the whole graph, with all variables
+    solution: of the whole graph, with all variables; graph: that, at its solution
     """
 
     world_T_pose: FloatArray
     covariances: FloatArray
     landmarks: list[Landmark]
     solution: GraphSolution
+    graph: SceneFactorGraph
 
 
 class SubmapGraph:
@@ -119,7 +121,7 @@ class SubmapGraph:
         self.settings = settings or SubmapSettings()
         self._providers = recorded(providers)
         self._smoother = IncrementalSmoother(
-            lag=None, settings=RelinearisationSettings(self.settings.relinearise_above)
+            lag=None, settings=RelinearisationSettings(self.settings.relinearise_above), elimination="cholesky"
         )
         self._motions: list[tuple[FloatArray, FloatArray]] = [(world_T_first, covariance)]
         self._times: list[float] = []
@@ -190,7 +192,7 @@ class SubmapGraph:
                 raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
         if not loops:
             return
-        self._smoother.extend([_Loops(loops, self._anchors, self.settings.robust_loops)])
+        self._smoother.extend([_Loops(loops, self._anchors, self.settings.robust_loops)], _AFTER_LOOPS)
         self._loops += [(len(self) - 1, loop) for loop in loops]
         self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
 
@@ -242,7 +244,8 @@ class SubmapGraph:
         """Solve all measurements together."""
         if not len(self):
             raise InputError("expected at least one keyframe before the end")
-        solution = BatchSolver(graph=self.measurements(), settings=_SOLVER).solve()
+        solver = BatchSolver(graph=self.measurements(), settings=_SOLVER)
+        solution = solver.solve()
         keys = [pose_key(k) for k in range(len(self))]
         seen = LandmarkObservations(self._confirmed(), {})
         marks = seen.landmarks(solution, self.settings.confirm_after)
@@ -251,6 +254,7 @@ class SubmapGraph:
             np.array([solution.marginal(key) for key in keys]),
             marks,
             solution,
+            solver.graph(),
         )
 
     def _running(self, k: int) -> FloatArray:
