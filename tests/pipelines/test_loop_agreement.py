@@ -29,7 +29,7 @@ def test_deviation_is_the_same_in_the_plane_and_in_space() -> None:
     np.testing.assert_allclose(deviation(np.eye(4)), [0.0, 0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize(("off", "later", "believed"), [(0.1, 4, 2), (0.8, 4, 0), (0.1, 1, 0)])
+@pytest.mark.parametrize(("off", "later", "believed"), [(0.1, 4, 2), (0.8, 4, 0), (0.1, 9, 0), (0.1, 1, 0)])
 def test_a_loop_is_believed_when_another_agrees(off: float, later: int, believed: int) -> None:
     """Poses 10 m apart along a line; two loops from 20 on to 0 on, the second off by `off` m, `later` poses on."""
     poses = [yaw_transform(x=10.0 * k) for k in range(40)]
