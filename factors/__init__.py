@@ -41,6 +41,7 @@ from factors.robust import Robust, RobustLoss
 from factors.solver import Solution, SolverSettings, linearised, solve
 from factors.stacked import ResidualFactors
 from factors.variables import ImuBias, PlanarPose, SpatialPose, Variable, Vector
+from factors.wrapping import unwrapped_angles
 
 __all__ = [
     "ERROR_DIM",
@@ -113,4 +114,5 @@ __all__ = [
     "relative_factors",
     "relative_range_bearing_factors",
     "solve",
+    "unwrapped_angles",
 ]
