@@ -52,7 +52,7 @@ def test_loops_are_found_with_drift(drive: tuple[list[Submap], FloatArray], drif
 def test_far_off_a_loop_waits_for_another(drive: tuple[list[Submap], FloatArray]) -> None:
     submaps, true = drive
     estimated = true.copy()
-    estimated[6:, :2, 3] += 80.0
+    estimated[6:, :2, 3] += 95.0
     search = PlaceLoops()
     found = [len(search.add(one, estimated[: k + 1])) for k, one in enumerate(submaps)]
     assert found[:7] == [0] * 7
