@@ -305,7 +305,7 @@ class LidarSlam:
         self._graph.close_loops(found)
         anchors = [submap.anchor for submap in self._submaps]
         closed = [
-            LoopClosure(anchors[one.first], anchors[one.second], one.first_T_second, one.covariance) for one in found
+            LoopClosure(anchors[k.first], anchors[k.second], k.first_T_second, k.covariance, k.confirmed) for k in found
         ]
         self._closed += closed
         return submap, closed
@@ -319,6 +319,7 @@ class LidarSlam:
             loop.second,
             first @ loop.first_T_second @ inverse_transform(second),
             Ad @ loop.covariance @ Ad.T + LEAST,
+            loop.confirmed,
         )
 
 
