@@ -24,6 +24,7 @@ from saga_fg.tracking.trails import STEP, paths
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
 LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
 WIDEST = 0.3  # rad, of a course, however slow the vehicle
+TURNING_TIME = 1.0  # s: a path is not known better than by what it turns within this time
 FLOW_TIME = 3.0  # s, in which a vehicle takes on the speed of earlier traffic
 STEPS = 20  # of a path, as far as leaders are looked for
 _ASTRAY = 0.5  # rad between heading and motion, from which the motion is noise
@@ -97,7 +98,8 @@ def typical_speed(paths: Paths, way: FloatArray) -> tuple[FloatArray, FloatArray
 def _across(paths: Paths, speed: FloatArray) -> FloatArray:
     """Variances (k,) of the velocity across paths, (m/s)^2."""
     own = np.minimum(ACROSS**2 + (1 - paths.certainty) * LEAVING**2, (WIDEST * speed) ** 2)
-    return np.asarray(own + paths.disagreement * speed**2)
+    turn = _at(paths.heading, speed * TURNING_TIME) - paths.heading[:, 0]
+    return np.asarray(own + (paths.disagreement + turn**2) * speed**2)
 
 
 def _at(column: FloatArray, way: FloatArray) -> FloatArray:
