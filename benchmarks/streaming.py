@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import resource
 import time
+import tracemalloc
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -44,6 +45,7 @@ class StreamingBenchSettings(Settings):
     seconds: Positive = setting(300.0, "length of the recording, s")
     rate: Positive = setting(10.0, "frames a second")
     compared: Positive = setting(20.0, "length of the recording that is compared with the batch's labels, s")
+    compared_objects: Annotated[int, Range(PLATOON, 10**6)] = setting(10 * PLATOON, "largest number of objects in it")
     seed: int = setting(0, "seed of the traffic")
 
     @property
@@ -69,6 +71,7 @@ class StreamingBench:
     growth              peak memory over that after a quarter of the recording
     largest_difference  of any position from the labels of the whole recording at once, m, on a short one
     differing           boxes that only one of the two has there, of `compared`
+    at_once             peak of what is allocated while that recording is smoothed at once, MB
     """
 
     rows: tuple[StreamingRow, ...]
@@ -79,6 +82,7 @@ class StreamingBench:
     largest_difference: float
     differing: int
     compared: int
+    at_once: float
 
 
 def bench_streaming(settings: StreamingBenchSettings, progress: Progress | None = None) -> StreamingBench:
@@ -102,11 +106,11 @@ def bench_streaming(settings: StreamingBenchSettings, progress: Progress | None 
             lambda spools: smooth_stream(read_scenes_in_parts(table, rows_read), config, spools, progress=look),
         )
         look("written", settings.frames, settings.frames)
-        difference, differing, compared = _against_batch(Path(folder), settings)
+        against_batch = _against_batch(Path(folder), settings)
     last = rows[-1]
     growth = last.peak / next(row.peak for row in rows if row.recorded >= settings.seconds / 4)
     ratio = last.cpu / settings.seconds
-    return StreamingBench(tuple(rows), last.peak, growth, ratio, done.counts.boxes, difference, differing, compared)
+    return StreamingBench(tuple(rows), last.peak, growth, ratio, done.counts.boxes, *against_batch)
 
 
 def write_traffic(path: Path, settings: StreamingBenchSettings) -> None:
@@ -134,20 +138,23 @@ def write_traffic(path: Path, settings: StreamingBenchSettings) -> None:
                 file.write(f"{k * dt:.6f},car,{x:.4f},{y:.4f},0.8,4.5,1.8,1.6,0.0,{vx:.4f},{vy:.4f},0.9\n")
 
 
-def _against_batch(folder: Path, settings: StreamingBenchSettings) -> tuple[float, int, int]:
-    """Largest difference of positions, m; boxes that only one has; boxes in all."""
-    table = folder / "short.csv"
-    write_traffic(table, replace(settings, seconds=settings.compared, objects=min(settings.objects, 10 * PLATOON)))
+def _against_batch(folder: Path, settings: StreamingBenchSettings) -> tuple[float, int, int, float]:
+    """Largest difference of positions, m; boxes that only one has; boxes in all; peak of smoothing at once, MB."""
+    table, objects = folder / "short.csv", min(settings.objects, settings.compared_objects)
+    write_traffic(table, replace(settings, seconds=settings.compared, objects=objects))
     config = load_smooth_config("file")
     dataset = read_detections(table)
+    tracemalloc.start()
     whole = smooth_scene(dataset.scene(dataset.scenes[0]), config).labels
+    at_once = tracemalloc.get_traced_memory()[1] / 1e6
+    tracemalloc.stop()
     chunks = ChunkSettings(settings.compared / 4, ChunkSettings().margin)
     spools = folder / "spools"
     spools.mkdir()
     (run,) = smooth_stream(read_scenes_in_parts(table, 1000), config, spools, chunks=chunks)
     parts = [moment for _, moments in run.spool.labels() for moment in moments]
     found = [_apart(mine, theirs) for mine, theirs in zip(parts, whole, strict=True)]
-    return max(apart for apart, _ in found), sum(alone for _, alone in found), sum(map(len, whole))
+    return max(apart for apart, _ in found), sum(alone for _, alone in found), sum(map(len, whole)), at_once
 
 
 def _apart(mine: Labels, theirs: Labels) -> tuple[float, int]:
@@ -164,6 +171,9 @@ def streaming(
     compared: Annotated[
         float, typer.Option("--compared", min=1.0, help="Length of a second one, compared with its smoothing at once.")
     ] = 20.0,
+    compared_objects: Annotated[
+        int, typer.Option("--compared-objects", min=PLATOON, help="Objects at any time of that one, at most.")
+    ] = 50,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the traffic.")] = 0,
     json_file: JsonFile = None,
     verbose: Verbose = False,
@@ -175,7 +185,7 @@ def streaming(
       python -m benchmarks streaming --seconds 60
       python -m benchmarks streaming --seconds 3600 --json figures.json
     """
-    settings = StreamingBenchSettings(objects, seconds, rate, compared, seed)
+    settings = StreamingBenchSettings(objects, seconds, rate, compared, compared_objects, seed)
     with progress_bar() as progress:
         result = bench_streaming(settings, progress)
     rows = tuple((cell(r.recorded, 0), cell(r.memory, 0), cell(r.peak, 0), cell(r.cpu, 1)) for r in result.rows)
@@ -187,7 +197,17 @@ def streaming(
         cell(result.ratio),
         f"{result.largest_difference:.1e}",
         f"{result.differing} of {result.compared}",
+        cell(result.at_once, 0),
+        cell(1e3 * result.at_once / result.compared, 2),
     )
-    names = ("peak, MB", "/ first quarter's", "CPU s / s", "off by at most, m", "boxes of one alone")
-    title = f"the whole; the last two: {compared:g} s in chunks against at once"
+    names = (
+        "peak, MB",
+        "/ first quarter's",
+        "CPU s / s",
+        "off by at most, m",
+        "boxes of one alone",
+        "MB at once",
+        "kB a box",
+    )
+    title = f"the whole; the last four: {compared:g} s in chunks against at once"
     report([table, FigureTable(title, names, (figures,))], {"settings": settings, "result": result}, json_file)

@@ -11,6 +11,7 @@ from pathlib import Path
 from concept_pictures import write_concept_pictures
 from heterogeneous_picture import write_heterogeneous_picture
 from running_graph_picture import write_running_graph_pictures
+from slam_loops_picture import write_loops_picture
 
 from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
 from data_tools.simulator import simulate_scene
@@ -45,6 +46,7 @@ def main() -> None:
     write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
     write_heterogeneous_picture(HERE)
     write_running_graph_pictures(HERE)
+    write_loops_picture(HERE)
     if data := os.environ.get("SAGA_FG_DATA"):
         gap = "bench gaps --sets ngsim --test USA_US101-12_1_T-1 --passes 2 --lengths 3,5 --life kept"
         subprocess.run(

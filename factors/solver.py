@@ -114,13 +114,14 @@ def solve(
     `SingularSystemError`, naming the variables, when the factors do not determine the solution.
     """
     settings = settings or SolverSettings()
-    check_variables(graph, factors, start)
+    native = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
+    check_variables(graph, native, factors, start)
     values, error = start, _error(graph, factors, start)
     if not np.isfinite(error):
         raise FactorError(f"the error at the start is {error}: a factor holds a number that is not finite")
     damping = 0.0
     ordering = None
-    custom = custom_factors(graph)
+    custom = _custom(native)
     for iteration in range(1, settings.max_iterations + 1):
         linear = _linearised(graph, custom, factors, values)
         if ordering is None:
@@ -131,9 +132,10 @@ def solve(
         _LOG.debug("iteration %d: error %.9g, step %.3g sigma", iteration, move.error, move.length)
         values, error, damping = move.values, move.error, move.damping
         if damping == 0 and (move.length <= settings.tolerance or move.exact):
-            return Solution(values, _error(graph, factors, values), iteration, True, graph, factors)
+            return Solution(values, _final(graph, factors, values, error), iteration, True, graph, factors)
         damping = damping / 10 if damping > settings.damping else 0.0
-    return Solution(values, _error(graph, factors, values), settings.max_iterations, False, graph, factors)
+    error = _final(graph, factors, values, error)
+    return Solution(values, error, settings.max_iterations, False, graph, factors)
 
 
 def linearised(
@@ -159,7 +161,12 @@ def _linearised(
     return linear
 
 
-def check_variables(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values) -> None:
+def check_variables(
+    graph: gtsam.NonlinearFactorGraph,
+    native: Iterable[gtsam.NonlinearFactor],
+    factors: Iterable[Linearisable],
+    values: gtsam.Values,
+) -> None:
     """Raise `FactorError` unless factors and values speak of the same variables, and wrapped linear ones fit them.
 
     A variable without a single factor is a `SingularSystemError`.
@@ -172,15 +179,17 @@ def check_variables(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Lineari
     free = sorted(dims.keys() - used)
     if free:
         raise SingularSystemError(f"no factor speaks of {format_keys(free)}", tuple(free))
-    factors_of_graph = (graph.at(i) for i in range(graph.size()) if graph.exists(i))
     check_dimensions(  # GTSAM's own factors check their variables themselves, wrapped linear ones do not
-        (factor.factor() for factor in factors_of_graph if isinstance(factor, gtsam.LinearContainerFactor)), dims
+        (factor.factor() for factor in native if isinstance(factor, gtsam.LinearContainerFactor)), dims
     )
 
 
 def custom_factors(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.CustomFactor]:
     """The factors of a graph that call back to Python, ours or not."""
-    factors = (graph.at(i) for i in range(graph.size()) if graph.exists(i))
+    return _custom(graph.at(i) for i in range(graph.size()) if graph.exists(i))
+
+
+def _custom(factors: Iterable[gtsam.NonlinearFactor]) -> list[gtsam.CustomFactor]:
     return [factor for factor in factors if isinstance(factor, gtsam.CustomFactor)]
 
 
@@ -201,8 +210,8 @@ def check_jacobians(factors: Iterable[gtsam.CustomFactor], values: gtsam.Values)
 
 @dataclass(frozen=True)
 class _Move:
-    """values, error: where the step led, length: of the step, in sigmas, damping: that it took, exact: whether the
-    error came out as the linearisation had said, which means that there is nothing nonlinear.
+    """values, error: where the step led (nan: nobody asked), length: of the step, in sigmas, damping: that it took,
+    exact: whether the error came out as the linearisation had said, which means that there is nothing nonlinear.
     """
 
     values: gtsam.Values
@@ -235,7 +244,7 @@ def _move(
             length = _length(linear, step, damping)
             moved = values.retract(step)
             if not careful:
-                return _Move(moved, error, length, 0.0, False)
+                return _Move(moved, float("nan"), length, 0.0, False)
             if undetermined and length <= settings.tolerance and damping <= settings.damping:
                 raise singular_system(linear)  # standing still, but only the damping says where
             moved_error = _error_or_infinity(graph, factors, moved)
@@ -256,6 +265,12 @@ def _error(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], v
     except (RuntimeError, ValueError) as error:
         raise FactorError(f"GTSAM could not evaluate the graph: {error}") from error
     return native + sum(factor.error(values) for factor in factors)
+
+
+def _final(
+    graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values, error: float
+) -> float:
+    return error if np.isfinite(error) else _error(graph, factors, values)
 
 
 def _error_or_infinity(

@@ -42,7 +42,7 @@ class TrackConfig:
     """Configuration of tracking."""
 
     tracker: TrackerSettings = settings_group(
-        TrackerSettings, "the tracker of the methods saga and kf (kf: without edges and trails)"
+        TrackerSettings, "the tracker of the methods saga and kf (kf: without edges, trails and lanes)"
     )
     greedy: GreedySettings = settings_group(GreedySettings, "the tracker of the method centerpoint")
     sensors: Mapping[str, Sensor] = settings_group(
@@ -79,7 +79,7 @@ class TrackConfig:
         return replace(self, tracker=replace(self.tracker, edges=edges, explained_noise=explained))
 
     def new_tracker(self, method: Method, observer: Observer | None = None) -> Tracker | GreedyTracker:
-        """A fresh tracker: `saga`, `kf` (the same without edges and trails) or `centerpoint` (greedy nearest centre).
+        """A fresh tracker: `saga`, `kf` (without edges, trails and lanes) or `centerpoint` (greedy nearest centre).
 
         The `observer` watches the first two; `centerpoint` tells nothing.
         """
@@ -88,10 +88,10 @@ class TrackConfig:
         return Tracker(self.of_method(method).tracker, self.sensors, observer=observer)
 
     def of_method(self, method: Method) -> TrackConfig:
-        """Return a copy for a method: without edges and trails, unless it is `saga`."""
+        """Return a copy for a method: without edges, trails and lanes, unless it is `saga`."""
         if method == "saga":
             return self
-        alone = replace(self.tracker, edges=(), trails=replace(self.tracker.trails, memory=0.0))
+        alone = replace(self.tracker, edges=(), traffic=replace(self.tracker.traffic, reach=0.0))
         return replace(self, tracker=alone)
 
 

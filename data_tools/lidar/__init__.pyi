@@ -1,5 +1,6 @@
 from .clusters import ClusterSettings, ObjectSize, detect_clusters
 from .curbs import CurbSettings, Line, LineSettings, extract_curbs, straight_lines
+from .degeneracy import Observability, observability
 from .deskew import azimuth_times, constant_velocity, deskewed
 from .ground import Ground, GroundSettings, segment_ground
 from .planes import Plane, PlaneSettings, extract_walls, fit_ground, fit_plane
@@ -8,6 +9,7 @@ from .registration import Registration, RegistrationError, RegistrationSettings,
 from .scan import Scan
 from .scan_files import read_scan, write_ply
 from .sharpness import scan_to_map_residual
+from .submap import Submap, upright
 from .surfels import SurfelMap, Surfels, surfels_of
 from .voxels import voxel_downsample, voxel_keys
 
@@ -19,6 +21,7 @@ __all__ = [
     "Line",
     "LineSettings",
     "ObjectSize",
+    "Observability",
     "Plane",
     "PlaneSettings",
     "Pole",
@@ -27,6 +30,7 @@ __all__ = [
     "RegistrationError",
     "RegistrationSettings",
     "Scan",
+    "Submap",
     "SurfelMap",
     "Surfels",
     "azimuth_times",
@@ -38,12 +42,14 @@ __all__ = [
     "extract_walls",
     "fit_ground",
     "fit_plane",
+    "observability",
     "read_scan",
     "register",
     "scan_to_map_residual",
     "segment_ground",
     "straight_lines",
     "surfels_of",
+    "upright",
     "voxel_downsample",
     "voxel_keys",
     "write_ply",

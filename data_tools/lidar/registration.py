@@ -13,17 +13,22 @@ observation c:
 
     P = H^-1 ( sum_c g_c g_c^T ) H^-1,      H = sum_i w J^T J,   g_c = sum_{i in c} w r J^T
 
+Where the surfaces leave motions open (`data_tools.lidar.degeneracy`), steps can be taken among the others alone, C the
+columns that span them: x = C y, (C^T H C) y = - C^T g. The rest of the pose stays as it was given.
+
 Sources: Chen and Medioni, Object modelling by registration of multiple range images, 1992; Huber and Ronchetti, Robust
 Statistics, 2nd ed. 2009, section 6.3; Liang and Zeger, Biometrika 73 (1986).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import gtsam
 import numpy as np
 
+from data_tools.lidar.degeneracy import Observability, observability
 from data_tools.lidar.surfels import SurfelMap, Surfels
 from saga_fg.errors import SagaError
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -32,6 +37,9 @@ from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 LEAST_PAIRS = 12  # twice the unknowns
 UNCONSTRAINED = 1e-3  # least ratio of the smallest to the largest eigenvalue of the information
+
+
+Undetermined = Literal["refuse", "hold", "follow"]
 
 
 class RegistrationError(SagaError):
@@ -57,6 +65,7 @@ class Registration:
     pairs       number of paired points
     iterations  number of iterations
     converged   True if the last step was short enough
+    observed    which motions the map determines; P is 0 along the others if they were held
     """
 
     map_T_scan: FloatArray
@@ -65,6 +74,7 @@ class Registration:
     pairs: int
     iterations: int
     converged: bool
+    observed: Observability
 
 
 def register(
@@ -74,15 +84,54 @@ def register(
     farthest: float,
     scale: float,
     settings: RegistrationSettings,
+    undetermined: Undetermined = "refuse",
 ) -> Registration:
     """Register points (N, 3) of a scan, m, in its sensor's frame, with a map.
 
     map_T_scan  (4, 4) initial pose
     farthest    largest distance of a point from the mean of its surfel, m
     scale       s of the robust loss, m
+    undetermined  along motions that the map leaves open: "refuse" them, "hold" the initial pose, or "follow" what
+                  little the map says of them, which is for an initial pose that knows nothing
 
-    Raises `RegistrationError` for fewer pairs than `LEAST_PAIRS`, and for an unconstrained direction.
+    Raises `RegistrationError` for fewer pairs than `LEAST_PAIRS`, and for an unconstrained motion that is refused.
     """
+
+    def refined(free: FloatArray) -> Registration:
+        return _refined(points, surfels, map_T_scan, farthest, scale, settings, free)
+
+    try:
+        found = refined(np.eye(6))
+        observed = found.observed
+    except _UnconstrainedError as error:
+        observed = error.observed
+        if undetermined == "refuse" or not len(observed.lost):
+            raise
+    else:
+        if not len(observed.lost) or undetermined == "follow":
+            return found
+    if undetermined == "refuse" or len(observed.lost) == 6:
+        raise _UnconstrainedError(observed)
+    free = observed.motions[len(observed.lost) :].T * (1 / observed.scale)[:, None]
+    return replace(refined(free), observed=observed)
+
+
+class _UnconstrainedError(RegistrationError):
+    def __init__(self, observed: Observability) -> None:
+        super().__init__("registration: the visible surfaces leave a direction of motion unconstrained")
+        self.observed = observed
+
+
+def _refined(
+    points: FloatArray,
+    surfels: SurfelMap,
+    map_T_scan: FloatArray,
+    farthest: float,
+    scale: float,
+    settings: RegistrationSettings,
+    free: FloatArray,
+) -> Registration:
+    """The registration among the motions free (6, k)."""
     T = _rigid(map_T_scan)
     span = float(np.sqrt(np.mean(np.square(points)) * 3)) if len(points) else 1.0
     converged, step = False, 0
@@ -90,14 +139,18 @@ def register(
         step += 1
         rows, paired = surfels.nearest(transform_points(T, points), farthest)
         J, r, w = _linearised(points[rows], paired, T, scale)
-        x = _solve(J.T @ (w[:, None] * J), -J.T @ (w * r), span)
+        x = _solve(J.T @ (w[:, None] * J), -J.T @ (w * r), span, free)
+        if x is None:
+            raise _UnconstrainedError(observability(points[rows], paired, J[:, 3:], w))
         T = _rigid(T @ gtsam.Pose3.Expmap(x).matrix())
         converged = bool(
             np.linalg.norm(x[3:]) < settings.translation_tolerance
             and np.linalg.norm(x[:3]) < settings.rotation_tolerance
         )
     J, r, w = _linearised(points[rows], paired, T, scale)
-    return Registration(T, _covariance(J, r, w, paired.voxel), float(np.abs(r).mean()), len(r), step, converged)
+    P = free @ _covariance(J @ free, r, w, paired.voxel) @ free.T
+    seen = observability(points[rows], paired, J[:, 3:], w)
+    return Registration(T, P, float(np.abs(r).mean()), len(r), step, converged, seen)
 
 
 def _linearised(
@@ -111,22 +164,26 @@ def _linearised(
     return np.hstack([np.cross(points, normal), normal]), r, 1 / (1 + (r / scale) ** 2)
 
 
-def _solve(H: FloatArray, g: FloatArray, span: float) -> FloatArray:
-    """The Gauss-Newton step; `span`, a typical distance of the points, m, scales rotations to translations."""
+def _solve(H: FloatArray, g: FloatArray, span: float, free: FloatArray) -> FloatArray | None:
+    """The Gauss-Newton step among the motions free (6, k), None where they are not determined.
+
+    span: a typical distance of the points, m, that scales rotations to translations
+    """
     scale = np.array([span, span, span, 1.0, 1.0, 1.0])
-    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    basis = np.linalg.qr(scale[:, None] * free)[0] / scale[:, None]
+    values, vectors = np.linalg.eigh(basis.T @ H @ basis)
     if values[0] < UNCONSTRAINED * values[-1]:
-        raise RegistrationError("registration: the visible surfaces leave a direction of motion unconstrained")
-    return np.asarray(vectors @ ((vectors.T @ (g / scale)) / values) / scale)
+        return None
+    return np.asarray(basis @ (vectors @ ((vectors.T @ (basis.T @ g)) / values)))
 
 
 def _covariance(J: FloatArray, r: FloatArray, w: FloatArray, group: IntArray) -> FloatArray:
     inverse = np.linalg.inv(J.T @ (w[:, None] * J))
     _, row = np.unique(group, return_inverse=True)
-    scores = np.zeros((row.max() + 1, 6))
+    scores = np.zeros((row.max() + 1, J.shape[1]))
     np.add.at(scores, row, (w * r)[:, None] * J)
     groups = len(scores)
-    P = inverse @ (scores.T @ scores) @ inverse * (groups / max(groups - 6, 1))
+    P = inverse @ (scores.T @ scores) @ inverse * (groups / max(groups - J.shape[1], 1))
     return np.asarray((P + P.T) / 2)
 
 

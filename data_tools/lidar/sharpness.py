@@ -29,18 +29,23 @@ def scan_to_map_residual(
 ) -> float:
     """Mean residual, m, of every fifth scan in the map of the ten before it and the ten after it; NaN for one scan.
 
-    clouds         K scans without skew, points (N, 3) in the sensor's frame
+    clouds         K scans without skew, points (N, 3) in the sensor's frame; asked for when they are needed
     world_T_lidar  (K, 4, 4)
     """
-    thin = [cloud[voxel_downsample(cloud, SPACING)] for cloud in clouds]
-    residuals = [np.empty(0)]
-    for k in range(0, len(thin), every):
-        others = [j for j in range(max(0, k - around), min(len(thin), k + around + 1)) if j != k]
+    residuals, thin = [np.empty(0)], dict[int, FloatArray]()
+    for k in range(0, len(clouds), every):
+        near = range(max(0, k - around), min(len(clouds), k + around + 1))
+        thin = {j: thin[j] if j in thin else _thinned(clouds[j]) for j in near}
+        others = [j for j in near if j != k]
         if others:
             map_points = np.concatenate([transform_points(world_T_lidar[j], thin[j]) for j in others])
             residuals.append(_residuals(thin[k], map_points, world_T_lidar[k]))
     found = np.concatenate(residuals)
     return float(found.mean()) if len(found) else float("nan")
+
+
+def _thinned(cloud: FloatArray) -> FloatArray:
+    return cloud[voxel_downsample(cloud, SPACING)]
 
 
 def _residuals(scan: FloatArray, map_points: FloatArray, world_T_lidar: FloatArray) -> FloatArray:

@@ -18,7 +18,8 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan
-from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.settings import Positive, PositiveInt, Settings, setting
 from saga_fg.types.boxes import Boxes
 
@@ -36,6 +37,13 @@ class StaticWorld:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "poles", checked("poles", self.poles, (None, 4)))
+
+    def within(self, position: FloatArray, reach: float) -> StaticWorld:
+        """What stands within `reach`, m, of a position (3,), seen from above."""
+        boxes, poles = self.boxes, self.poles
+        apart = np.linalg.norm(boxes.position[:, :2] - position[:2], axis=1)
+        near = apart - np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 <= reach
+        return StaticWorld(boxes.select(near), poles[np.linalg.norm(poles[:, :2] - position[:2], axis=1) <= reach])
 
 
 @dataclass(frozen=True)
@@ -76,41 +84,66 @@ def simulate_scan(
     )
     xi = np.zeros(6) if velocity is None else checked("velocity", velocity, (6,))
     poses = world_T_lidar @ np.array([gtsam.Pose3.Expmap(t * xi).matrix() for t in time])
-    direction = np.einsum("cij,crj->cri", poses[:, :3, :3], beam).reshape(-1, 3)
-    origin = np.repeat(poses[:, :3, 3], s.rings, axis=0)
-    distance = ranges(world, origin, direction)
+    direction = np.einsum("cij,crj->cri", poses[:, :3, :3], beam)
+    distance = ranges(world.within(world_T_lidar[:3, 3], s.reach), poses[:, :3, 3], direction).ravel()
     hit = distance <= s.reach
     noisy = distance[hit] + rng.normal(0.0, s.noise, int(hit.sum()))
     return Scan(beam.reshape(-1, 3)[hit] * noisy[:, None], np.full(len(noisy), np.nan), np.repeat(time, s.rings)[hit])
 
 
 def ranges(world: StaticWorld, origin: FloatArray, direction: FloatArray) -> FloatArray:
-    """Ranges (N,), m, of rays from `origin` (N, 3) in unit `direction` (N, 3); infinite for rays that hit nothing."""
+    """Ranges (C, R), m, of R rays, unit `direction` (C, R, 3), from each `origin` (C, 3); infinite without a hit."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ground = np.where(direction[:, 2] < 0, -origin[:, 2] / direction[:, 2], np.inf)
+        ground = np.where(direction[..., 2] < 0, -origin[:, None, 2] / direction[..., 2], np.inf)
         nearest = np.where(ground > 0, ground, np.inf)
-        for pole in world.poles:
-            nearest = np.minimum(nearest, _to_pole(pole, origin, direction))
-        for row in range(len(world.boxes)):
-            nearest = np.minimum(nearest, _to_box(world.boxes.select([row]), origin, direction))
+        boxes, poles = world.boxes, world.poles
+        half = np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2
+        column, row = np.nonzero(_in_sight(boxes.position[:, :2], half, origin, direction))
+        _shorten(nearest, column, _to_boxes(boxes.select(row), origin[column], direction[column]))
+        column, row = np.nonzero(_in_sight(poles[:, :2], poles[:, 2], origin, direction))
+        _shorten(nearest, column, _to_poles(poles[row], origin[column], direction[column]))
     return nearest
 
 
-def _to_pole(pole: FloatArray, origin: FloatArray, direction: FloatArray) -> FloatArray:
-    off, along = origin[:, :2] - pole[:2], direction[:, :2]
-    a, b = (along**2).sum(axis=1), (off * along).sum(axis=1)
-    root = b**2 - a * ((off**2).sum(axis=1) - pole[2] ** 2)
+def _shorten(nearest: FloatArray, column: IntArray, distance: FloatArray) -> None:
+    """Take the least of ranges (P, R) of each column, in ascending order (P,), into `nearest` (C, R)."""
+    if len(column):
+        first = np.flatnonzero(np.diff(column, prepend=-1))
+        at = column[first]
+        nearest[at] = np.minimum(nearest[at], np.minimum.reduceat(distance, first))
+
+
+def _in_sight(centre: FloatArray, radius: FloatArray, origin: FloatArray, direction: FloatArray) -> BoolArray:
+    """Which circles (M, 2) rays of each origin can meet, seen from above (C, M)."""
+    bearing = np.arctan2(direction[..., 1], direction[..., 0])
+    middle = np.arctan2(direction[..., 1].sum(axis=1), direction[..., 0].sum(axis=1))
+    width = np.abs(wrap_angle(bearing - middle[:, None])).max(axis=1)
+    off = centre - origin[:, None, :2]
+    ratio = radius / np.hypot(off[..., 0], off[..., 1])
+    angle = np.where(ratio < 1, np.arcsin(np.minimum(ratio, 1.0)), np.pi)
+    turned = np.abs(wrap_angle(np.arctan2(off[..., 1], off[..., 0]) - middle[:, None]))
+    return np.asarray(turned <= angle + width[:, None] + 1e-9)
+
+
+def _to_poles(pole: FloatArray, origin: FloatArray, direction: FloatArray) -> FloatArray:
+    """Ranges (P, R) of the rays of P origins (P, 3) to a pole each (P, 4)."""
+    off, along = (origin[:, :2] - pole[:, :2])[:, None], direction[..., :2]
+    a, b = (along**2).sum(axis=-1), (off * along).sum(axis=-1)
+    root = b**2 - a * ((off**2).sum(axis=-1) - pole[:, None, 2] ** 2)
     s = (-b - np.sqrt(np.maximum(root, 0.0))) / a
-    z = origin[:, 2] + s * direction[:, 2]
-    return np.where((root >= 0) & (s > 0) & (z >= 0) & (z <= pole[3]), s, np.inf)
+    z = origin[:, None, 2] + s * direction[..., 2]
+    return np.where((root >= 0) & (s > 0) & (z >= 0) & (z <= pole[:, None, 3]), s, np.inf)
 
 
-def _to_box(box: Boxes, origin: FloatArray, direction: FloatArray) -> FloatArray:
-    c, s = np.cos(box.yaw[0]), np.sin(box.yaw[0])
-    box_R_world = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    o, u = (origin - box.position[0]) @ box_R_world.T, direction @ box_R_world.T
-    half = box.size[0] / 2
-    first, second = (-half - o) / u, (half - o) / u
-    near = np.nanmax(np.minimum(first, second), axis=1)
-    far = np.nanmin(np.maximum(first, second), axis=1)
+def _to_boxes(box: Boxes, origin: FloatArray, direction: FloatArray) -> FloatArray:
+    """Ranges (P, R) of the rays of P origins (P, 3) to a box each."""
+    c, s, off = np.cos(box.yaw), np.sin(box.yaw), origin - box.position
+    near, far = np.full(direction.shape[:2], -np.inf), np.full(direction.shape[:2], np.inf)
+    for axis, (x, y, z) in enumerate(((c, s, 0 * c), (-s, c, 0 * c), (0 * c, 0 * c, 0 * c + 1))):
+        o = (x * off[:, 0] + y * off[:, 1] + z * off[:, 2])[:, None]
+        u = direction[..., 2] if axis == 2 else x[:, None] * direction[..., 0] + y[:, None] * direction[..., 1]
+        half = box.size[:, axis, None] / 2
+        first, second = (-half - o) / u, (half - o) / u
+        near = np.fmax(near, np.minimum(first, second))  # a ray in the plane of a side gives NaN, which says nothing
+        far = np.fmin(far, np.maximum(first, second))
     return np.where((near <= far) & (near > 0), near, np.inf)

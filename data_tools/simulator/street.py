@@ -74,6 +74,7 @@ class SimulatedScans:
 
     world_T_lidar  (K, 4, 4), K >= 2, true poses; None for a drive of `count` scans
     curbs          pavements with curbs on both sides
+    world          in place of the street
     """
 
     def __init__(
@@ -83,11 +84,12 @@ class SimulatedScans:
         world_T_lidar: FloatArray | None = None,
         settings: ScannerSettings = SMALL,
         curbs: bool = False,
+        world: StaticWorld | None = None,
     ) -> None:
         self.world_T_ego: FloatArray = drive(count, period=settings.period) if world_T_lidar is None else world_T_lidar
         self.timestamps: FloatArray = settings.period * np.arange(len(self.world_T_ego), dtype=np.float64)
         self.ego_T_lidar: FloatArray = np.eye(4)
-        self.world = street(seed, curbs)
+        self.world = street(seed, curbs) if world is None else world
         self._scans = scans(self.world, self.world_T_ego, seed, settings)
 
     def __len__(self) -> int:

@@ -19,6 +19,7 @@ import numpy as np
 from pipelines.bench.frozen_greedy import FrozenGreedy
 from pipelines.bench.measuring import environment, size_of, timed
 from pipelines.bench.recordings import recording_set
+from pipelines.bench.round_trip import RoundTrip, round_trips
 from pipelines.bench.sampling_profiler import SamplingProfiler
 from pipelines.bench.speed_scenes import Ties, speed_config, speed_frames
 from pipelines.config import Method, TrackConfig, load_config
@@ -38,6 +39,7 @@ TIES: tuple[Ties, ...] = ("loose", "dense")
 WARM_UP = 5  # frames that are not counted: tracks are new
 EVERY = 5  # frames from one reading of the fixed clocks to the next
 GROWTH_FROM = 100  # objects
+SERVED = 200  # objects of the live service
 
 
 @dataclass(frozen=True)
@@ -51,9 +53,10 @@ class SpeedBenchSettings:
         "end a case after this time, s; a method that took a quarter of it is left out of larger cases of the kind",
     )
     seed: int = setting(0, "seed of the simulated objects")
+    round_trips: int = setting(200, "round trips of the live service, at 10 Hz; 0: none")
 
     def __post_init__(self) -> None:
-        if any(size < 1 for size in self.sizes) or self.frames < 1 or self.seconds <= 0:
+        if any(size < 1 for size in self.sizes) or self.frames < 1 or self.seconds <= 0 or self.round_trips < 0:
             raise InputError("sizes, frames, seconds: expected positive numbers")
 
 
@@ -84,10 +87,11 @@ class SpeedRow:
 
 @dataclass(frozen=True)
 class SpeedBench:
-    """All rows; growth: the exponent of time over the number of objects, by case and method."""
+    """All rows; growth: the exponent of time over the number of objects, by case and method; the live service."""
 
     rows: tuple[SpeedRow, ...]
     growth: Mapping[str, float]
+    service: RoundTrip | None
     settings: SpeedBenchSettings
     environment: Mapping[str, str] = field(default_factory=environment)
 
@@ -141,7 +145,9 @@ def bench_speed(settings: SpeedBenchSettings, data: Path | None = None, progress
                 if case.size is not None and case.size >= GROWTH_FROM:
                     growing.setdefault(f"{case.kind}, {row.method}", []).append((case.size, row.median))
     growth = {name: _exponent(points) for name, points in growing.items() if len(points) > 1}
-    return SpeedBench(tuple(rows), growth, settings)
+    trips = settings.round_trips
+    service = round_trips(SERVED, trips, settings.seed, progress) if trips else None
+    return SpeedBench(tuple(rows), growth, service, settings)
 
 
 def write_profile(path: Path, case: SpeedCase, method: Method) -> None:

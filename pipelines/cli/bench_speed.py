@@ -31,6 +31,9 @@ def speed(
         typer.Option("--seconds", min=0.1, help="No more frames of a case after that; no larger case after a quarter."),
     ] = 60.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulated objects.")] = 0,
+    round_trips: Annotated[
+        int, typer.Option("--round-trips", min=0, help="Frames to the live service, at 10 Hz; 0: none.")
+    ] = 200,
     profile: Annotated[
         Path | None,
         typer.Option(
@@ -56,7 +59,7 @@ def speed(
     """
     from pipelines.bench.speed import SpeedBenchSettings, bench_speed, speed_cases, write_profile
 
-    settings = SpeedBenchSettings(counts("--sizes", sizes), frames, seconds, seed)
+    settings = SpeedBenchSettings(counts("--sizes", sizes), frames, seconds, seed, round_trips)
     with progress_bar(unit="frames") as progress:
         result = bench_speed(settings, data, progress)
     report(_tables(result), result, json_file, markdown)
@@ -68,7 +71,7 @@ def speed(
 
 
 def _tables(result: SpeedBench) -> list[FigureTable]:
-    """Cost and ratios, and shares of the stages."""
+    """Cost and ratios, shares of the stages, and the live service."""
     from data_tools.figures import FigureTable, cell
 
     costs, shares = [], []
@@ -82,7 +85,13 @@ def _tables(result: SpeedBench) -> list[FigureTable]:
             parts = (cell(100 * row.stages.get(name, 0.0) / total, 0) for name in names)
             shares.append((row.case, row.method, *parts))
     columns = ("case", "method", "tracks", "ms", "p99", "MB", "/ centerpoint", "/ frozen", "/ 100 filters", "/ SVD")
-    return [
+    tables = [
         FigureTable("CPU time a frame", columns, tuple(costs)),
         FigureTable("shares of the stages, %", ("case", "method", *names), tuple(shares)),
     ]
+    if (live := result.service) is not None:
+        times = (cell(live.p50, 1), cell(live.p90, 1), cell(live.p99, 1), cell(live.cpu, 1), cell(live.memory, 0))
+        named = ("objects", "frames", "p50, ms", "p90", "p99", "CPU ms a frame", "MB")
+        title = "live service at 10 Hz: round trip on the wall's clock"
+        tables.append(FigureTable(title, named, ((str(live.objects), str(live.frames), *times),)))
+    return tables

@@ -36,6 +36,19 @@ def kitti(
             help="Folder of a detector: Car/, Pedestrian/, Cyclist/; DATAROOT/detections/pointrcnn if not given.",
         ),
     ] = None,
+    sensors: Annotated[
+        str,
+        typer.Option(
+            "--sensors",
+            help="Some of gps,imu,wheels, from the GPS/IMU records: fixes and speeds with noise added, as the result "
+            "is compared with them; inertial samples as recorded, at 10 Hz.",
+        ),
+    ] = "",
+    sensor_logs: Annotated[
+        list[str] | None,
+        typer.Option("--sensor-log", help="A table of your own in their place: gps=FILE, imu=FILE or wheels=FILE."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Of the noise of --sensors.")] = 0,
     online: Online = False,
     lag: Lag = None,
     scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
@@ -51,6 +64,7 @@ def kitti(
     \b
     Examples:
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --output slam
+      saga-fg slam kitti --dataroot data/kitti --sequence 0000 --sensors gps,imu,wheels --output slam
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --objects --output slam
       saga-fg slam kitti --dataroot data/kitti --sequence 0004 --objects --odometry oxts --output slam
     """
@@ -61,6 +75,7 @@ def kitti(
     from pipelines.slam.configuration import load_slam_config
     from pipelines.slam.lidar_results import write_lidar_slam
     from pipelines.slam.lidar_slam import lidar_slam
+    from pipelines.slam.sensor_options import sensor_log
     from pipelines.slam.with_objects import with_objects
     from saga_fg.errors import InputError
 
@@ -78,13 +93,14 @@ def kitti(
     training = dataroot / "training" if (dataroot / "training").is_dir() else dataroot
     blind = objects and odometry == "oxts" and not (training / "velodyne" / sequence).is_dir()
     recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans, blind=blind)
+    log = sensor_log(training / "oxts" / f"{sequence}.txt", sensors, sensor_logs or (), seed)
     with progress_bar() as progress:
         lidar = replace(
             slam.lidar,
             landmarks=slam.lidar.landmarks and landmarks and not blind,
             loop_closures=slam.lidar.loop_closures and not blind,
         )
-        result = lidar_slam(recorded, odometry, lidar, progress, slam.new_providers(), slam.new_detectors())
+        result = lidar_slam(recorded, odometry, lidar, progress, slam.new_providers(), slam.new_detectors(), log)
     if objects:
         with working("objects"):
             together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers)
@@ -104,5 +120,7 @@ def kitti(
             turn = 57.29578 * e["relative_rotation"]
             relative = f"RPE {e['relative_translation']:.3f} m and {turn:.3f} deg per {e['relative_distance']:g} m"
         typer.echo(f"{what} against GPS/IMU: ATE {e['ate']:.3f} m, {relative}, end {e['end_error']:.3f} m")
+    for span in figures["degenerate"]:
+        typer.echo(f"scans {span['first']} to {span['last']} leave open: {', '.join(span['motions'])}")
     if not blind:
         typer.echo(f"mean scan-to-map residual: {1e3 * figures['scan_to_map_residual']:.1f} mm")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _METHOD = typer.Option(
     "--method",
-    help="saga: graph-aware Kalman filter; kf: the same without edges and trails; centerpoint: greedy nearest centre.",
+    help="saga: graph-aware Kalman filter; kf: without edges, trails and lanes; centerpoint: greedy nearest centre.",
 )
 MethodOption = Annotated[Literal["saga", "kf", "centerpoint"], _METHOD]
 MethodOrNone = Annotated[Literal["saga", "kf", "centerpoint"] | None, _METHOD]

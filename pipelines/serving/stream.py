@@ -162,6 +162,7 @@ class StreamTracker(Generic[Client]):
             "held": len(self._held),
             "latency_ms": {f"p{percent:g}": ms for percent, ms in zip(percents, latencies, strict=False)},
             "memory_mb": round(resident_memory(), 1),
+            "cpu_seconds": round(time.process_time(), 3),
             "last_seq": dict(self._numbering.last),
             "taken": dict(self._numbering.taken),
             **kept,

@@ -1,18 +1,19 @@
-"""Odometry of a recording: poses of the scans, covariances of the motions, and keyframes."""
+"""Odometry of a drive: poses of the scans, covariances of the motions, and keyframes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
-from data_tools.lidar import constant_velocity, deskewed
+from data_tools.lidar import Scan, constant_velocity, deskewed
 from data_tools.lidar.scan import ScanSequence
-from pipelines.slam.odometry import LidarOdometry, OdometrySettings
-from pipelines.tracking import Progress
+from pipelines.slam.odometry import OdometrySettings, OdometryStep
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 
@@ -27,24 +28,15 @@ class Drive:
     covariances  (K, 6, 6) of the motion to each scan from the one before: (rotation, translation) in the frame of the
                  later one, rad^2, m^2
     keyframes    M rows among the scans
-    points       M arrays (N, 3) of theirs, without skew, m, in the sensor's frame
     """
 
     poses: FloatArray
     covariances: FloatArray
     keyframes: list[int]
-    points: list[FloatArray]
 
     def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
         """Return the motion (4, 4) from each of these scans to the next, and its covariance (6, 6) at the end."""
-        motions = []
-        for a, b in pairwise(rows):
-            total = np.zeros((6, 6))
-            for k in range(a + 1, b + 1):
-                Ad = gtsam.Pose3(inverse_transform(self.poses[b]) @ self.poses[k]).AdjointMap()
-                total += Ad @ self.covariances[k] @ Ad.T
-            motions.append((inverse_transform(self.poses[a]) @ self.poses[b], (total + total.T) / 2))
-        return motions
+        return [motion(self.poses[a : b + 1], self.covariances[a + 1 : b + 1]) for a, b in pairwise(rows)]
 
     def carried(self, world_T_lidar: FloatArray, rows: Sequence[int] | None = None) -> FloatArray:
         """Return poses (K, 4, 4) of all scans, given some, by default the keyframes: each fixed to the one before."""
@@ -53,44 +45,66 @@ class Drive:
         return np.asarray(world_T_lidar[of] @ inverse_transform(self.poses[known[of]]) @ self.poses)
 
 
-def drive_by_lidar(
-    scans: ScanSequence, start: FloatArray, settings: OdometrySettings, progress: Progress | None = None
-) -> Drive:
-    """Return the odometry by registration of each scan, from the sensor's pose `start` (4, 4) on."""
-    odometry = LidarOdometry(settings)
-    drive = Drive(np.empty((len(scans), 4, 4)), np.empty((len(scans), 6, 6)), [], [])
-    for k, timestamp in enumerate(scans.timestamps.tolist()):
-        step = odometry.step(scans[k], timestamp)
-        drive.poses[k], drive.covariances[k] = start @ step.map_T_lidar, step.covariance + LEAST
-        if step.keyframe:
-            drive.keyframes.append(k)
-            drive.points.append(step.scan.points)
-        if progress is not None:
-            progress("odometry", k + 1, len(scans))
-    return drive
+def motion(
+    poses: Sequence[FloatArray] | FloatArray, covariances: Sequence[FloatArray] | FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the motion (4, 4) from the first of n poses to the last, and its covariance (6, 6) in the frame of that.
+
+    covariances: n - 1 of the motions from each to the next, each in the frame of the later one
+    """
+    total, last = np.zeros((6, 6)), inverse_transform(poses[-1])
+    for pose, covariance in zip(poses[1:], covariances, strict=True):
+        Ad = gtsam.Pose3(last @ pose).AdjointMap()
+        total += Ad @ covariance @ Ad.T
+    return inverse_transform(poses[0]) @ poses[-1], (total + total.T) / 2
 
 
-def drive_by_poses(
-    scans: ScanSequence,
-    rotation: float,
-    translation: float,
-    settings: OdometrySettings,
-    progress: Progress | None = None,
-) -> Drive:
-    """Return the recording's poses as odometry with deviations of `rotation`, rad, and `translation`, m, a scan."""
-    poses = scans.world_T_ego @ scans.ego_T_lidar
-    noise = np.diag([rotation] * 3 + [translation] * 3) ** 2
-    drive = Drive(poses, np.broadcast_to(noise, (len(scans), 6, 6)), [], [])
-    for k in range(len(scans)):
-        moved = inverse_transform(poses[drive.keyframes[-1]]) @ poses[k] if k else np.eye(4)
-        if k == 0 or np.linalg.norm(moved[:3, 3]) >= settings.keyframe_distance:
-            scan = scans[k].within(settings.min_range, settings.max_range)
-            before = max(k - 1, 0)
-            if scan.time is not None:
-                duration = float(scans.timestamps[before + 1] - scans.timestamps[before])
-                scan = deskewed(scan, constant_velocity(inverse_transform(poses[before]) @ poses[before + 1], duration))
-            drive.keyframes.append(k)
-            drive.points.append(scan.points)
-        if progress is not None:
-            progress("reading", k + 1, len(scans))
-    return drive
+class Odometry(Protocol):
+    """Places scans one by one, in the frame of the first; `pipelines.slam.odometry.LidarOdometry` is one."""
+
+    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
+        """Place the next scan."""
+
+
+class RecordedOdometry:
+    """The poses of a recording as odometry, with deviations of `rotation`, rad, and `translation`, m, a scan."""
+
+    def __init__(self, scans: ScanSequence, rotation: float, translation: float, settings: OdometrySettings) -> None:
+        self._poses, self._times, self._settings = scans.world_T_ego @ scans.ego_T_lidar, scans.timestamps, settings
+        self._noise = np.diag([rotation] * 3 + [translation] * 3) ** 2
+        self._row, self._keyframe = -1, 0
+
+    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
+        """Place the next scan of the recording; raises `InputError` for one of another time."""
+        k, s = self._row + 1, self._settings
+        if k == len(self._times) or timestamp != self._times[k]:
+            raise InputError(f"timestamp: expected that of scan {k} of the recording, got {timestamp:.6f} s")
+        moved = inverse_transform(self._poses[self._keyframe]) @ self._poses[k]
+        keyframe = k == 0 or bool(np.linalg.norm(moved[:3, 3]) >= s.keyframe_distance)
+        self._row, self._keyframe = k, k if keyframe else self._keyframe
+        scan = still(scan, k, self._poses, self._times, s)
+        placed = inverse_transform(self._poses[0]) @ self._poses[k]
+        return OdometryStep(timestamp, placed, self._noise if k else np.zeros((6, 6)), scan, keyframe, None)
+
+
+def still(scan: Scan, row: int, poses: FloatArray, timestamps: FloatArray, settings: OdometrySettings) -> Scan:
+    """Return a scan within range and without skew, by poses (K, 4, 4) of the sensor at all scans."""
+    scan, before = scan.within(settings.min_range, settings.max_range), max(row - 1, 0)
+    if scan.time is None or len(poses) < 2:
+        return scan
+    duration = float(timestamps[before + 1] - timestamps[before])
+    return deskewed(scan, constant_velocity(inverse_transform(poses[before]) @ poses[before + 1], duration))
+
+
+class KeyframeClouds(Sequence[FloatArray]):
+    """Points (N, 3) of keyframes in the frame of the sensor, without skew by `drive`, read from the recording again."""
+
+    def __init__(self, scans: ScanSequence, drive: Drive, settings: OdometrySettings) -> None:
+        self._scans, self._drive, self._settings = scans, drive, settings
+
+    def __len__(self) -> int:
+        return len(self._drive.keyframes)
+
+    def __getitem__(self, k: Any) -> Any:
+        row = self._drive.keyframes[k]
+        return still(self._scans[row], row, self._drive.poses, self._scans.timestamps, self._settings).points

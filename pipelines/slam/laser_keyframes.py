@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,7 @@ class Keyframe:
     way: float
 
 
-def joined(frames: list[Keyframe], centre: Keyframe) -> FloatArray:
+def joined(frames: Sequence[Keyframe], centre: Keyframe) -> FloatArray:
     """Points (n, 2) of keyframes in the frame of `centre`."""
     back = np.linalg.inv(centre.matched)
     return np.concatenate([moved(frame.points, back @ frame.matched) for frame in frames])

@@ -2,10 +2,7 @@
 
 1. Each scan that has moved is registered with a map of the last keyframes, point to line; odometry is its prior.
 2. A keyframe comes every half metre or 30 degrees, and is measured from the one before: a graph that runs (iSAM2).
-3. Loops: each second keyframe, with those just before it, is searched for in older submaps by branch and bound, inside
-   the window that the graph leaves open: it grows with the way along measurements between them, so that what has been
-   closed before is searched closely and what has drifted widely. A place that has a rival is no loop; one found in a
-   wide window waits for another that agrees with it. Along a bare corridor a scan tells no place.
+3. Loops: each second keyframe is searched for in older submaps (`pipelines.slam.laser_loops`).
 4. At the end false loops are found by consensus, and all keyframes are registered anew with every other pass of the
    same place, twice.
 """
@@ -21,7 +18,8 @@ from data_tools.laser.carmen import LaserLog
 from data_tools.laser.line_map import LineMap, thinned
 from data_tools.laser.score_grid import ScoreGrid
 from pipelines.slam.laser_interpolation import between_keyframes
-from pipelines.slam.laser_keyframes import SMEAR, Keyframe, covariance_of, determined, joined, measured_by
+from pipelines.slam.laser_keyframes import SMEAR, Keyframe, covariance_of
+from pipelines.slam.laser_loops import LoopSearch
 from pipelines.slam.laser_odometry import without_jumps
 from pipelines.slam.laser_passes import registered_passes
 from pipelines.tracking import Progress
@@ -30,19 +28,12 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.planar_poses import heading, moved, transform, vector
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
-from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph, way_along
+from saga_fg.slam.pose_graph.running import RunningPoseGraph, way_along
 
-_KNOWN = 0.8  # m, half width of a window up to which a corridor may be recognised: it then says nothing along it
-_UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
-_AGREED = np.array([0.3, 0.06])  # m and rad that two such may differ by, and 0.03 of the way between them
-_WAITING = 15.0  # m of way that a loop waits
 _LEAST_POINTS = 20  # of a scan that is registered
 _WIDEST = 3.0  # m, half width of the search where wheels slipped: its time and memory grow with the square
 _POOR = 0.8  # share of a scan that lies on the local map, below which the pose is searched
 _REACHES = (0.6, 0.3)  # m, of registrations with other passes, in turn
-_ACROSS = 5.0  # m from the centre of a submap that it is searched from, besides the window
-_UNIQUE = 0.92  # share of the best score that a rival may have
-_LONGEST = 60.0  # m of way from which the search of headings does not grow
 _DOUBT = 0.2  # share of a difference between wheels and registration that counts as standard deviation: one errs
 _TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
 
@@ -66,17 +57,6 @@ class LaserSettings(Settings):
     )
     loop_score: Annotated[float, Range(0, 1)] = setting(0.6, "least mean score of a loop; raised: fewer, surer loops")
     loop_drift: Positive = setting(0.04, "half width of the search, share of the way since; raised: slower, finds more")
-
-
-@dataclass(frozen=True, eq=False)
-class _Submap:
-    """Keyframes from `first` to before `end`, in the frame of `centre`."""
-
-    first: int
-    end: int
-    centre: int
-    grid: ScoreGrid
-    lines: LineMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +89,7 @@ class LaserSlam:
     _odometry: FloatArray | None = None
     _wheels: FloatArray = field(default_factory=lambda: np.eye(3))
     _information: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
-    _submaps: list[_Submap] = field(default_factory=list)
-    _waiting: list[Measured] = field(default_factory=list)
+    _search: LoopSearch | None = None
 
     def step(self, points: FloatArray, odometry: FloatArray) -> FloatArray:
         """Take a scan, points (n, 2) in the laser's frame, and the wheels' pose (3,); returns the pose (3, 3) now."""
@@ -200,76 +179,12 @@ class LaserSlam:
         recent = [frame for frame in frames if frame.way > way - s.local_map]
         self._map = LineMap.of(np.concatenate([moved(frame.points, frame.matched) for frame in recent]))
         self._grid = None
-        first = self._submaps[-1].end if self._submaps else 0
-        if way - frames[first].way > s.submap:
-            centre = (first + len(frames)) // 2
-            points = joined(frames[first:], frames[centre])
-            self._submaps.append(_Submap(first, len(frames), centre, ScoreGrid.of(points), LineMap.of(points)))
+        self._search = self._search or LoopSearch(frames, self._graph, s.submap, s.loop_drift, s.loop_score)
+        self._search.extend()
         if len(frames) % 2 == 0:
-            loops = self._loops(len(frames) - 1)
+            loops = self._search.loops(len(frames) - 1)
             if loops or len(frames) % 20 == 0:
                 self._graph.close(loops)
-
-    def _loops(self, row: int) -> list[Measured]:
-        """Loops of a keyframe to the nearest older submaps whose windows reach it."""
-        assert self._graph is not None
-        frames = self._keyframes
-        over = [each for each in self._submaps if frames[each.end - 1].way < frames[row].way - self.settings.submap]
-        if not over:
-            return []
-        centres = np.array([each.centre for each in over])
-        way = self._graph.distances(row)[centres]
-        poses = self._graph.poses
-        window = 0.5 + self.settings.loop_drift * way
-        apart = np.linalg.norm(poses[centres, :2, 2] - poses[row, :2, 2], axis=1)
-        near = np.flatnonzero(apart < _ACROSS + window)
-        near = near[np.argsort(apart[near])]
-        source = self._source(row)
-        found: list[Measured] = []
-        for at in near[: 3 + int(window[near].min(initial=0.0))].tolist():
-            guess = np.linalg.inv(poses[centres[at]]) @ poses[row]
-            turn = np.deg2rad(5) + 0.01 * min(way[at], _LONGEST)
-            loop = self._loop(over[at], row, source, guess, float(window[at]), float(turn))
-            if loop is not None:
-                found += [loop] if window[at] < _UNSURE else self._confirmed(loop)
-                if len(found) >= 2:
-                    break
-        return found
-
-    def _confirmed(self, loop: Measured) -> list[Measured]:
-        """The loop with those of before that agree with it; it waits if there are none."""
-        frames, now = self._keyframes, self._keyframes[loop.second].way
-        agreed = []
-        for other in self._waiting:
-            way = [abs(frames[getattr(loop, end)].way - frames[getattr(other, end)].way) for end in ("first", "second")]
-            one = _between(frames, other.first, loop.first) @ loop.first_T_second
-            off = vector(np.linalg.inv(one) @ other.first_T_second @ _between(frames, other.second, loop.second))
-            if (
-                np.array([np.hypot(off[0], off[1]), abs(off[2])]) < _AGREED + 0.03 * np.array([1, 0.1]) * sum(way)
-            ).all():
-                agreed.append(other)
-        held = {id(other) for other in agreed}
-        self._waiting = [k for k in self._waiting if id(k) not in held and frames[k.second].way > now - _WAITING]
-        if not agreed:
-            self._waiting.append(loop)
-            return []
-        return [loop, *agreed]
-
-    def _loop(
-        self, submap: _Submap, row: int, source: FloatArray, guess: FloatArray, window: float, turn: float
-    ) -> Measured | None:
-        found = submap.grid.search(source, vector(guess), window, turn, self.settings.loop_score)
-        if found is None or found.rival > _UNIQUE * found.score:
-            return None
-        fit = submap.lines.fit(self._keyframes[row].points, found.pose, np.diag([1.0, 1.0, 10.0]), reach=0.4)
-        if fit.share < self.settings.loop_score or (window > _KNOWN and not determined(fit.information)):
-            return None
-        return measured_by(submap.centre, row, fit)
-
-    def _source(self, row: int) -> FloatArray:
-        """Points of a keyframe and of the four before it, in its frame."""
-        frames = self._keyframes[max(0, row - 4) : row + 1]
-        return thinned(joined(frames, frames[-1]), 0.2)
 
 
 def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: Progress | None = None) -> LaserPath:
@@ -281,7 +196,3 @@ def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: P
         if progress is not None:
             progress("scans", row + 1, len(log))
     return replace(slam.finish(progress), jumps=jumps)
-
-
-def _between(frames: list[Keyframe], one: int, other: int) -> FloatArray:
-    return np.asarray(np.linalg.inv(frames[one].matched) @ frames[other].matched)

@@ -9,7 +9,8 @@ landmarks.json              each landmark
 landmarks.ply               points along the poles and on the observed pieces of the walls
 tracks.csv                  objects, where there are any
 above.png                   map, paths, landmarks and the objects' tracks from above
-metrics.json                errors of the trajectories against the recording's own poses, and the map's sharpness
+metrics.json                errors of the trajectories against the recording's own poses, the map's sharpness, scans
+                            that left motions open, and sensors that do not fit
 
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
@@ -29,7 +30,9 @@ from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_ply
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
-from pipelines.slam.lidar_slam import LidarSlam
+from pipelines.slam.drive import KeyframeClouds
+from pipelines.slam.lidar_slam import LidarSlamResult
+from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.results import landmark_rows, object_paths, write_covariances, write_objects
 from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
 from pipelines.slam.with_objects import SlamWithObjects
@@ -42,7 +45,7 @@ _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it 
 POLE_COLOUR, WALL_COLOUR, LINE_COLOUR = (255, 127, 14), (214, 39, 40), (148, 103, 189)
 
 
-def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
+def metrics(result: LidarSlamResult, scans: ScanSequence) -> dict[str, Any]:
     """Errors (start aligned) of the three trajectories against the recording's poses, residuals, and counts."""
     truth = Trajectory(scans.timestamps, scans.world_T_ego)
     kinds = [landmark.kind.name for landmark in result.landmarks]
@@ -50,7 +53,10 @@ def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
         "keyframes": len(result.keyframes),
         "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
         "loops": len(result.loops),
-        "scan_to_map_residual": scan_to_map_residual(result.clouds, result.world_T_lidar),
+        "submaps": len(result.submaps),
+        "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
+        "misfits": dict(result.misfits),
+        "scan_to_map_residual": _residual(result, scans),
         **{
             name: asdict(trajectory_errors(getattr(result, name), truth, "start"))
             for name in ("odometry", "online", "trajectory")
@@ -58,11 +64,31 @@ def metrics(result: LidarSlam, scans: ScanSequence) -> dict[str, Any]:
     }
 
 
+def degenerate_spans(times: FloatArray, degenerate: Sequence[tuple[str, ...]]) -> list[dict[str, Any]]:
+    """Runs of scans that leave the same motions open: first and last scan, their times, s, and the motions in words."""
+    spans = list[dict[str, Any]]()
+    for row, motions in enumerate(degenerate):
+        if spans and spans[-1]["motions"] == list(motions) and spans[-1]["last"] == row - 1:
+            spans[-1] |= {"last": row, "until": float(times[row])}
+        elif motions:
+            at = float(times[row])
+            spans.append({"first": row, "last": row, "from": at, "until": at, "motions": list(motions)})
+    return spans
+
+
+def _residual(result: LidarSlamResult, scans: ScanSequence) -> float:
+    """Mean scan-to-map residual, m, of some forty keyframes at most, whose scans are read again; NaN without points."""
+    if not any(len(submap.points) for submap in result.submaps):
+        return float("nan")
+    clouds = KeyframeClouds(scans, result.drive, OdometrySettings())
+    return scan_to_map_residual(clouds, result.world_T_lidar, every=max(5, len(clouds) // 40))
+
+
 def write_lidar_slam(
-    output: Path, found: LidarSlam | SlamWithObjects, scans: ScanSequence, spacing: float = 0.2
+    output: Path, found: LidarSlamResult | SlamWithObjects, scans: ScanSequence, spacing: float = 0.2
 ) -> dict[str, Any]:
     """Write all files of a run to a folder, or none; returns the metrics. `spacing` of the map's points, m."""
-    result, objects = (found, None) if isinstance(found, LidarSlam) else (found.slam, found.estimate)
+    result, objects = (found, None) if isinstance(found, LidarSlamResult) else (found.slam, found.estimate)
     points = accumulated_map(result, spacing)
     figures = metrics(result, scans)
     if isinstance(found, SlamWithObjects):
@@ -88,14 +114,14 @@ def write_lidar_slam(
     return figures
 
 
-def accumulated_map(result: LidarSlam, spacing: float) -> FloatArray:
-    """Points (N, 3) of all keyframes in world coordinates, m, one in each voxel of `spacing` m."""
-    placed = zip(result.world_T_lidar, result.clouds, strict=True)
-    points = np.concatenate([transform_points(pose, cloud) for pose, cloud in placed])
+def accumulated_map(result: LidarSlamResult, spacing: float) -> FloatArray:
+    """Points (N, 3) of all submaps in world coordinates, m, one in each voxel of `spacing` m."""
+    placed = zip(result.world_T_submap, result.submaps, strict=True)
+    points = np.concatenate([transform_points(pose, submap.points.astype(np.float64)) for pose, submap in placed])
     return points[voxel_downsample(points, spacing)]
 
 
-def _write_landmarks(folder: Path, result: LidarSlam) -> None:
+def _write_landmarks(folder: Path, result: LidarSlamResult) -> None:
     write_figures(folder / "landmarks.json", landmark_rows(result.landmarks))
     ground, lines, poles = float(result.world_T_lidar[0, 2, 3]), _lines(result), _poles(result.landmarks)
     shapes = [(pole[None], np.arange(ground - 1.5, ground + HEIGHT, 0.1), POLE_COLOUR) for pole in poles]
@@ -113,7 +139,7 @@ def _sampled(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.linspace(a, b, max(2, int(np.linalg.norm(b - a) / 0.2)))
 
 
-def _lines(result: LidarSlam) -> dict[str, FloatArray]:
+def _lines(result: LidarSlamResult) -> dict[str, FloatArray]:
     """Pieces of walls and road lines, under their names."""
     return {"walls": _pieces(result, WALL.name), "road lines": _pieces(result, LINE.name)}
 
@@ -124,7 +150,7 @@ def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
     return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
 
 
-def _pieces(result: LidarSlam, kind: str) -> FloatArray:
+def _pieces(result: LidarSlamResult, kind: str) -> FloatArray:
     """Ends (W, 2, 2), from above, of the pieces of walls or road lines that were observed, one or several of each."""
     ends = []
     for mark in result.landmarks:

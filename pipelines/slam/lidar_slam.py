@@ -1,12 +1,14 @@
-"""SLAM with a LiDAR: scan poses and landmarks as nodes of one graph.
+"""SLAM with a LiDAR, scan by scan: odometry, keyframes, submaps and landmarks, loops, in one running graph.
 
     prior         the first pose
     odometry      || log( (T_k^-1 T_(k+1))^-1  D_k ) ||_{P_k}      between successive keyframes
-    landmarks     walls, ground and poles observed at keyframes, associated online (`saga_fg.slam.mapping`)
+    sensors       GPS, inertial samples and wheels of the vehicle, where there are any
+    landmarks     walls, curbs and poles observed at keyframes, associated within the running submap
     loops         || log( (T_i^-1 T_j)^-1  L_ij ) ||, robust       places that the vehicle came back to
 
-Online, every keyframe is placed when it comes, by the joint Gaussian of pose and landmarks; the whole graph is smoothed
-from time to time. At the end everything is solved once more, with the loops, and covariances are read off (batch).
+`saga_fg.slam.submaps` keeps the graph small. The points of keyframes are thinned to one cloud a submap and dropped when
+it is closed; then loops are searched for. At the end everything is solved together, and covariances are read off.
+Where the scan leaves a motion open, as along a tunnel, its covariance is wide and the sensors decide.
 Scans between keyframes go along with the keyframe before them, by their odometry.
 
 Odometry is that of the LiDAR, or the recording's own poses, for comparison and for objects alone.
@@ -14,38 +16,40 @@ Odometry is that of the LiDAR, or the recording's own poses, for comparison and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import gtsam
 import numpy as np
 
-from data_tools.lidar import voxel_downsample
+from data_tools.lidar import Scan, Submap, voxel_downsample
 from data_tools.lidar.scan import ScanSequence
+from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
-from factors import Robust, between_factor
-from pipelines.slam.drive import LEAST, Drive, drive_by_lidar, drive_by_poses
-from pipelines.slam.loop_closures import LoopClosure, LoopSettings, find_loops
-from pipelines.slam.odometry import OdometrySettings
-from pipelines.slam.scan_landmarks import ObservedLandmark, ScanLandmarkSettings, observe_landmarks
+from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, motion
+from pipelines.slam.loop_closures import LoopClosure, LoopSettings, PlaceLoops
+from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
+from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmarks
+from pipelines.slam.submap_loops import SubmapLoops
+from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.tracking import Progress
-from saga_fg.estimators import BatchSolver
-from saga_fg.graph import Additions, FactorProvider, GraphView
+from saga_fg.errors import InputError
+from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
-from saga_fg.slam.mapping import (
-    AssociatedObservation,
-    LandmarkMapper,
-    LandmarkObservations,
-    MapperSettings,
-    MeasuredMotion,
-    pose_key,
-)
-from saga_fg.types.landmark import Landmark, Observation
+from saga_fg.slam.mapping import AssociatedObservation, MapperSettings
+from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers
+from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
+from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
+from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.landmark import Landmark
 
+_LOG = logging.getLogger(__name__)
 OdometrySource = Literal["lidar", "oxts"]
 _START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
@@ -67,14 +71,15 @@ class LidarSlamSettings(Settings):
 
     odometry: OdometrySettings = settings_group(OdometrySettings, "LiDAR odometry")
     observations: ScanLandmarkSettings = settings_group(ScanLandmarkSettings, "detection of landmarks in a scan")
-    mapper: MapperSettings = settings_group(lambda: MapperSettings(confirm_after=4), "association of landmarks")
-    loops: LoopSettings = settings_group(LoopSettings, "loop closures")
+    submaps: SubmapSettings = settings_group(SubmapSettings, "submaps and their landmarks")
+    loops: LoopSettings = settings_group(LoopSettings, "loop closures by place")
     landmarks: bool = setting(True, "use landmarks as nodes of the graph")
+    sensors: SensorSettings = settings_group(SensorSettings, "GPS, IMU and wheels of the vehicle")
     loop_closures: bool = setting(True, "search for loop closures")
-    robust_scale: Positive = setting(
-        3.0, "residual from which the Geman-McClure loss discounts loops and poles, standard deviations"
+    map_spacing: Positive = setting(0.25, "spacing of the points of the map, m; higher: less memory, smaller files")
+    mapper: MapperSettings = settings_group(
+        lambda: MapperSettings(confirm_after=4), "association of landmarks where objects are estimated online"
     )
-    map_spacing: Positive = setting(0.25, "spacing of the points of the accumulated map, m; higher: smaller files")
     objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "objects in the same graph")
     oxts_rotation: Positive = setting(
         1e-3, "standard deviation of the rotation of a GPS/IMU increment between scans, rad"
@@ -85,18 +90,41 @@ class LidarSlamSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class LidarSlam:
-    """Result for K scans, M of them keyframes. World coordinates are those of the recording's first pose.
+class SlamStep:
+    """One scan placed.
 
-    drive        the odometry; keyframes (M,) are rows among the scans
-    odometry     (K) poses of the vehicle by odometry alone; trajectory (K): by the graph; online (K): as estimated
-                 when the keyframe came
-    covariances  (M, 6, 6) of the sensor's pose at the keyframes, (rotation, translation) in its frame, rad^2, m^2
-    landmarks    of the map, those seen more than once
-    observations of landmarks, with the landmark and the keyframe of each
-    extents      (2, 3) of each observation: ends of the observed piece, m, in the sensor's frame
-    loops        that were closed
-    clouds       M arrays (N, 3), thinned, without skew, in the sensor's frame; world_T_lidar (M, 4, 4) their places
+    world_T_lidar  (4, 4) the sensor's pose now, in the map
+    covariance     (6, 6) of that, (rotation, translation) in the sensor's frame, rad^2, m^2
+    odometry       what the odometry said of the scan
+    keyframe       number of the keyframe that the scan became, None for none
+    submap         the one that it closed, None for none
+    loops          those found in it, between keyframes
+    """
+
+    world_T_lidar: FloatArray
+    covariance: FloatArray
+    odometry: OdometryStep
+    keyframe: int | None
+    submap: Submap | None
+    loops: tuple[LoopClosure, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LidarSlamResult:
+    """Result for K scans, M of them keyframes, in S submaps, in the world of the first pose.
+
+    drive          the odometry; keyframes (M,) are rows among the scans
+    odometry       (K) poses of the vehicle by odometry alone; trajectory (K): by the graph; online (K): as estimated
+                   when the scan came
+    covariances    (M, 6, 6) of the keyframes' poses, (rotation, translation) in the sensor's frame, rad^2, m^2
+    landmarks      of the map, those seen more than once
+    observations   of landmarks, with the landmark and the keyframe of each
+    extents        (2, 3) of each observation: ends of the observed piece, m, in the sensor's frame
+    loops          that were closed, between keyframes
+    degenerate     (K) motions that each scan left open, in words
+    misfits        what does not fit of the vehicle's sensors, in words, by their names
+    submaps        S, and world_T_submap (S, 4, 4) their places
+    world_T_lidar  (M, 4, 4) poses of the keyframes
     """
 
     drive: Drive
@@ -108,13 +136,194 @@ class LidarSlam:
     observations: Sequence[AssociatedObservation]
     extents: Sequence[FloatArray]
     loops: Sequence[LoopClosure]
-    clouds: Sequence[FloatArray]
+    degenerate: Sequence[tuple[str, ...]]
+    misfits: Mapping[str, str]
+    submaps: Sequence[Submap]
+    world_T_submap: FloatArray
     world_T_lidar: FloatArray
 
     @property
     def keyframes(self) -> IntArray:
         """(M,) rows of the keyframes among the scans."""
         return np.array(self.drive.keyframes, dtype=np.int64)
+
+
+class LidarSlam:
+    """LiDAR SLAM of a drive: `step` takes scan by scan, `finish` gives the map.
+
+    start       (4, 4) the sensor's first pose in the world, z up
+    providers   of other factors, asked at every keyframe
+    sensors     of the vehicle whose measurements `step` gets
+    detectors   of other landmarks in the points of keyframes
+    loops       search for loops, by default by place as the settings say
+    odometry    by default that of the LiDAR
+    ego_T_lidar (4, 4) pose of the sensor on the vehicle, whose path the result has, and on which its sensors are
+
+    A scan that `step` refuses is left out, and the next can follow. If a provider or detector raises, the scan is
+    placed by odometry and becomes no keyframe.
+    """
+
+    def __init__(
+        self,
+        start: FloatArray | None = None,
+        settings: LidarSlamSettings | None = None,
+        providers: Sequence[FactorProvider] = (),
+        detectors: Sequence[LandmarkDetector] = (),
+        loops: SubmapLoops | None = None,
+        odometry: Odometry | None = None,
+        ego_T_lidar: FloatArray | None = None,
+        sensors: Collection[SensorName] = (),
+    ) -> None:
+        self.settings = s = settings or LidarSlamSettings()
+        self._start = np.eye(4) if start is None else checked_transform("start", start)
+        self._ego_T_lidar = np.eye(4) if ego_T_lidar is None else checked_transform("ego_T_lidar", ego_T_lidar)
+        self._odometry = LidarOdometry(s.odometry) if odometry is None else odometry
+        self._sensors = tuple(sensors)
+        lidar_T_ego = inverse_transform(self._ego_T_lidar)
+        of_sensors = sensor_providers(s.sensors, sensors, lidar_T_ego)
+        self._graph = SubmapGraph(self._start, _START, s.submaps, [*of_sensors, *providers])
+        self._detectors = tuple(detectors)
+        self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
+        self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
+        self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
+        self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
+        self._extents, self._closed = list[FloatArray](), list[LoopClosure]()
+        self._degenerate = list[tuple[str, ...]]()
+        self._imu: list[ImuSamples] = []  # since the last keyframe
+        self._wheels: list[WheelSpeed] = []  # likewise
+        self._covariance = _START  # of the last keyframe's pose
+
+    @property
+    def graph(self) -> SubmapGraph:
+        """The running graph. To be read, not changed."""
+        return self._graph
+
+    def step(
+        self,
+        scan: Scan,
+        time: float,
+        imu: ImuSamples | None = None,
+        gps: GpsFix | None = None,
+        detections: Detections | None = None,
+        wheels: WheelSpeed | None = None,
+    ) -> SlamStep:
+        """Place the next scan, taken at `time`, s.
+
+        imu: samples since the scan before; gps: a fix at this scan; detections: of objects, in the sensor's frame;
+        wheels: speed since the scan before, which also predicts the motion. The providers read them from `view.frame`;
+        fixes and detections of scans between keyframes are left out.
+        Raises `InputError` for a scan that is not later than the one before, and for a first scan without points. A
+        later one without points lies where it was predicted, with the deviation that the settings say.
+        """
+        if not np.isfinite(time):
+            raise InputError(f"time: expected a finite number of seconds, got {time!r}")
+        if self._times and not time > self._times[-1]:
+            raise InputError(f"time: expected one after {self._times[-1]:.6f} s, got {time:.6f} s")
+        if not self._times and not len(scan) and isinstance(self._odometry, LidarOdometry):
+            raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
+        if wheels is not None and isinstance(self._odometry, LidarOdometry):
+            ahead = self._ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]
+            placed = self._odometry.step(scan, time, np.concatenate([np.full(3, np.nan), ahead]))
+        else:
+            placed = self._odometry.step(scan, time)
+        self._degenerate.append(placed.degenerate)
+        self._times.append(time)
+        self._poses.append(self._start @ placed.map_T_lidar)
+        self._covariances.append(placed.covariance + LEAST)
+        self._imu += [] if imu is None else [imu]
+        self._wheels += [] if wheels is None else [wheels]
+        self._online.append(self._poses[-1])
+        row, submap, found = len(self._poses) - 1, None, list[LoopClosure]()
+        if placed.keyframe:
+            submap, found = self._add_keyframe(row, placed, gps, detections)
+        last = self._keyframes[-1]
+        since, covariance = motion(self._poses[last:], self._covariances[last + 1 :])
+        Ad = gtsam.Pose3(inverse_transform(since)).AdjointMap()
+        self._online[-1] = self._graph.pose(len(self._graph) - 1) @ since
+        number = len(self._keyframes) - 1 if placed.keyframe else None
+        now = Ad @ self._covariance @ Ad.T + covariance
+        return SlamStep(self._online[-1], now, placed, number, submap, tuple(found))
+
+    def finish(self) -> LidarSlamResult:
+        """Close the last submap, and solve everything together."""
+        if not self._times:
+            raise InputError("expected at least one scan before the end")
+        if len(self._builder):
+            poses = self._graph.poses()
+            self._close(poses)
+        solved = self._graph.finish()
+        unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
+        for text in unfit.values():
+            _LOG.warning(text)
+        drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
+        anchors = solved.world_T_pose[[submap.anchor for submap in self._submaps]]
+        times, lidar_T_ego = np.array(self._times), inverse_transform(self._ego_T_lidar)
+        return LidarSlamResult(
+            drive,
+            Trajectory(times, drive.poses @ lidar_T_ego),
+            Trajectory(times, drive.carried(solved.world_T_pose) @ lidar_T_ego),
+            Trajectory(times, np.array(self._online) @ lidar_T_ego),
+            solved.covariances,
+            solved.landmarks,
+            self._graph.observations(),
+            self._extents,
+            self._closed,
+            self._degenerate,
+            unfit,
+            self._submaps,
+            np.array([world_T_submap(*each) for each in zip(self._submaps, anchors, strict=True)]),
+            solved.world_T_pose,
+        )
+
+    def _add_keyframe(
+        self, row: int, placed: OdometryStep, gps: GpsFix | None, detections: Detections | None
+    ) -> tuple[Submap | None, list[LoopClosure]]:
+        s, points = self.settings, placed.scan.points
+        seen = observe_landmarks(points, s.observations, self._detectors) if s.landmarks else []
+        moved = None
+        if self._keyframes:
+            last = self._keyframes[-1]
+            moved = motion(self._poses[last:], self._covariances[last + 1 :])
+        frame = _frame(self._times[row], self._imu, self._wheels, gps, detections)
+        closes = self._graph.append(self._times[row], moved, [each.observation for each in seen], frame)
+        self._imu, self._wheels = [], []
+        self._keyframes.append(row)
+        self._extents += [each.extent for each in seen]
+        submap, found = None, list[LoopClosure]()
+        if closes:
+            submap, found = self._close(self._graph.poses()[:-1])
+        pose = self._graph.pose(len(self._graph) - 1)
+        driven = 0.0 if moved is None else float(np.linalg.norm(moved[0][:3, 3]))
+        self._builder.add(points[voxel_downsample(points, s.map_spacing)], pose, driven)
+        self._covariance = self._graph.covariance()
+        return submap, found
+
+    def _close(self, poses: FloatArray) -> tuple[Submap, list[LoopClosure]]:
+        """Close the running submap, poses (n, 4, 4) of all keyframes up to its last, and search for loops in it."""
+        submap = self._builder.close(poses[-len(self._builder) :])
+        self._submaps.append(submap)
+        if self._loops is None:
+            return submap, []
+        frames = np.array([world_T_submap(one, poses[one.anchor]) for one in self._submaps])
+        found = [self._between_anchors(loop) for loop in self._loops.add(submap, frames)]
+        self._graph.close_loops(found)
+        anchors = [submap.anchor for submap in self._submaps]
+        closed = [
+            LoopClosure(anchors[one.first], anchors[one.second], one.first_T_second, one.covariance) for one in found
+        ]
+        self._closed += closed
+        return submap, closed
+
+    def _between_anchors(self, loop: LoopClosure) -> AnchorLoop:
+        """A loop between frames of submaps as one between their anchors."""
+        first, second = (self._submaps[n].anchor_T_submap for n in (loop.first, loop.second))
+        Ad = gtsam.Pose3(second).AdjointMap()
+        return AnchorLoop(
+            loop.first,
+            loop.second,
+            first @ loop.first_T_second @ inverse_transform(second),
+            Ad @ loop.covariance @ Ad.T + LEAST,
+        )
 
 
 def lidar_slam(
@@ -124,91 +333,49 @@ def lidar_slam(
     progress: Progress | None = None,
     providers: Sequence[FactorProvider] = (),
     detectors: Sequence[LandmarkDetector] = (),
-) -> LidarSlam:
-    """Estimate everything from K >= 2 scans. The only pose of the recording that counts is the first, unless the source
-    is "oxts". providers: of other factors for the graph of all keyframes, one an epoch; detectors: of other landmarks
-    in the points of keyframes.
+    log: SensorLog | None = None,
+) -> LidarSlamResult:
+    """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
+    counts is the first, unless the source is "oxts". providers, detectors: as of `LidarSlam`; log: of the vehicle's
+    sensors, in the recording's world.
     """
     s = settings or LidarSlamSettings()
+    recorded = RecordedOdometry(scans, s.oxts_rotation, s.oxts_translation, s.odometry) if source == "oxts" else None
     start = scans.world_T_ego[0] @ scans.ego_T_lidar
-    if source == "lidar":
-        drive = drive_by_lidar(scans, start, s.odometry, progress)
-    else:
-        drive = drive_by_poses(scans, s.oxts_rotation, s.oxts_translation, s.odometry, progress)
-    motions = drive.motions(drive.keyframes)
-    mapper = LandmarkMapper(drive.poses[0], _START, s.mapper)
-    online, seen = [], list[list[ObservedLandmark]]()
-    for k, points in enumerate(drive.points):
-        if k:
-            mapper.move(*motions[k - 1])
-        if s.landmarks:
-            seen.append(observe_landmarks(points, s.observations, detectors))
-            mapper.observe([each.observation for each in seen[-1]])
-        online.append(mapper.ekf.pose.matrix())
+    log, buffer = log or SensorLog({}), SensorBuffer()
+    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar, tuple(log.tables))
+    for k, time in enumerate(scans.timestamps.tolist()):
+        log.feed(buffer, time)
+        ego = buffer.take(time)
+        slam.step(scans[k], time, ego.imu, ego.gps, wheels=ego.wheels)
         if progress is not None:
-            progress("landmarks", k + 1, len(drive.points))
-    landmark_map = mapper.map()
-    clouds = [points[voxel_downsample(points, s.map_spacing)] for points in drive.points]
-    loops = find_loops(clouds, landmark_map.world_T_pose, s.loops) if s.loop_closures else []
-    count = len(drive.keyframes)
-    certain = [mark for mark in landmark_map.landmarks if mark.confirmed]
-    observations, closed = known_providers(certain, landmark_map.observations, loops, range(count), s.robust_scale)
-    solver = BatchSolver()
-    for k, (time, place) in enumerate(zip(scans.timestamps[drive.keyframes], landmark_map.world_T_pose, strict=True)):
-        motion, covariance = motions[k - 1] if k else (place, _START)
-        solver.step(time, [MeasuredMotion(motion, covariance, place), observations, closed, *providers])
-    solution = solver.solve()
-    world_T_lidar = np.array([solution.values.atPose3(pose_key(k)).matrix() for k in range(count)])
-    return LidarSlam(
-        drive,
-        _trajectory(scans, drive.poses),
-        _trajectory(scans, drive.carried(world_T_lidar)),
-        _trajectory(scans, drive.carried(np.array(online))),
-        np.array([solution.marginal(pose_key(k)) for k in range(count)]),
-        observations.landmarks(solution, s.mapper.confirm_after),
-        landmark_map.observations,
-        [each.extent for scan in seen for each in scan],
-        loops,
-        clouds,
-        world_T_lidar,
-    )
+            progress("slam", k + 1, len(scans))
+    return slam.finish()
 
 
-@dataclass(frozen=True, eq=False)
-class Loops:
-    """Loops between keyframes, whose poses are those of `epochs`."""
-
-    loops: Sequence[LoopClosure]
-    epochs: Sequence[int]
-    robust: Robust
-    name: str = "loops"
-
-    def factors(self, view: GraphView) -> Additions:
-        mine = [loop for loop in self.loops if self.epochs[loop.second] == view.epoch]
-        pairs = [(pose_key(self.epochs[loop.first]), pose_key(view.epoch)) for loop in mine]
-        return Additions(
-            factors=[
-                between_factor(*pair, loop.first_T_second, loop.covariance + LEAST, self.robust)
-                for pair, loop in zip(pairs, mine, strict=True)
-            ]
+def _frame(
+    time: float,
+    imu: Sequence[ImuSamples],
+    wheels: Sequence[WheelSpeed],
+    gps: GpsFix | None,
+    detections: Detections | None,
+) -> Frame | None:
+    """What a keyframe brings besides its scan, for providers."""
+    if not imu and not wheels and gps is None and detections is None:
+        return None
+    samples, speed = None, None
+    if imu:
+        samples = ImuSamples(
+            *(np.concatenate([getattr(one, name) for one in imu]) for name in ("dt", "acceleration", "angular_rate"))
         )
-
-
-def known_providers(
-    landmarks: Sequence[Landmark],
-    observations: Sequence[AssociatedObservation],
-    loops: Sequence[LoopClosure],
-    epochs: Sequence[int],
-    robust_scale: float,
-) -> tuple[LandmarkObservations, Loops]:
-    """Providers of landmarks seen from keyframes and of loops between these, whose poses are those of `epochs`."""
-    robust, start = Robust("geman-mcclure", robust_scale), {mark.number: mark.state for mark in landmarks}
-    seen: dict[int, list[tuple[int, Observation]]] = {}
-    for one in observations:
-        if one.landmark in start:
-            seen.setdefault(epochs[one.pose], []).append((one.landmark, one.observation))
-    return LandmarkObservations(seen, start, robust), Loops(loops, epochs, robust)
-
-
-def _trajectory(scans: ScanSequence, world_T_lidar: FloatArray) -> Trajectory:
-    return Trajectory(scans.timestamps, world_T_lidar @ inverse_transform(scans.ego_T_lidar))
+    if wheels:
+        total = sum(one.dt for one in wheels)
+        speed = WheelSpeed(sum(one.speed * one.dt for one in wheels) / total, total)
+    return Frame(
+        time,
+        "lidar",
+        Detections.empty() if detections is None else detections,
+        None,
+        "ego",
+        ego=EgoMeasurements(gps=gps, imu=samples, wheels=speed),
+    )

@@ -1,54 +1,66 @@
-"""Loop closures: revisited places, found by distance and verified by registration.
+"""Loop closures by place: submaps that look alike from above, proved by registration.
 
-A keyframe j is compared with the nearest earlier keyframe i from which it has driven a long way since. Its scan is
-registered with the surfels of the keyframes around i, started where the present estimate says. It is a loop where that
-converges, enough of the points have a surfel, and the residual is no larger than between neighbours. A robust
-loss takes care of false loops that remain.
+1. Recognition (`data_tools.lidar.places`): the images of older submaps that are most like the new one are aligned with
+   it, without a guess. Submaps further off than any drift are left out.
+2. Proof: the best are registered, and what stands above the ground must lie on each other, in both directions, where
+   both have seen. A place that has a rival is no loop: the same submap aligned otherwise, or another one that says that
+   the vehicle is elsewhere.
+3. Drift: errors of relative poses grow with the way between two submaps along measurements. A loop within what
+   odometry may be off is believed at once; one further off must be proved better, and waits until another one, found
+   later on the way, agrees with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from data_tools.lidar import RegistrationError, RegistrationSettings, SurfelMap, register, voxel_downsample
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.settings import (
-    Fraction,
-    Positive,
-    Range,
-    Settings,
-    setting,
-    settings_group,
+from data_tools.lidar import (
+    RegistrationError,
+    RegistrationSettings,
+    Submap,
+    SurfelMap,
+    register,
+    voxel_downsample,
 )
+from data_tools.lidar.overlap import Structure
+from data_tools.lidar.places import PlaceImage, PlaceIndex, PlaceMatch
+from pipelines.slam.loop_agreement import Agreement, deviation
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.settings import Fraction, Positive, Settings, setting
+from saga_fg.slam.pose_graph.distances import shortest_ways
+
+_FEWEST = 200  # points of a submap that shows a place
+_COMPARED, _REGISTERED, _TAKEN = 12, 4, 2  # places for each submap
+_ALIKE = 0.3  # correlation of images from which places are registered
+_UNIQUE = 0.92  # share of the best that a rival may have
+_SURFEL, _SPACING = 1.0, 1.5  # m: voxels of the map, and spacing of the points registered
+_SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometry
+_FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
+_SAME = 4.0  # m that two loops to one place differ by, besides drift
+_OPEN = 0.5  # m, standard deviation of an alignment of images
+_DISTORTION = np.array([2e-3] * 3 + [0.1] * 3) ** 2  # rad^2 and m^2, of submaps that odometry has bent
 
 
 @dataclass(frozen=True)
 class LoopSettings(Settings):
-    """Conditions for comparing two keyframes, and for taking them for one place."""
+    """Conditions for taking two submaps for one place."""
 
-    max_distance: Positive = setting(
-        8.0, "largest distance of two keyframes that are compared, m; higher: finds loops after more drift, slower"
+    min_path: Positive = setting(60.0, "m of way between two submaps that are compared; 50 to 100")
+    min_overlap: Fraction = setting(
+        0.6, "share of what stands above the ground that two submaps have in common; raised: fewer, surer loops"
     )
-    min_path: Positive = setting(30.0, "least distance driven between two keyframes of a loop, m")
-    search_interval: Positive = setting(5.0, "distance driven between two searches, m")
-    map_keyframes: Annotated[int, Range(0, 1000)] = setting(
-        4, "keyframes on either side whose scans make the map for registration"
+    drift: Positive = setting(
+        0.03, "drift of odometry, share of the way: loops further off wait for another; raised for poor odometry"
     )
-    surfel_size: Positive = setting(1.0, "voxel size of that map, m")
-    scan_spacing: Positive = setting(1.0, "spacing of the points of a scan that is registered, m; higher: faster")
-    min_overlap: Fraction = setting(0.5, "least share of the points that have a surfel; higher: fewer, surer loops")
-    max_residual: Positive = setting(0.3, "largest mean distance of points from their surfels, m")
-    registration: RegistrationSettings = settings_group(RegistrationSettings, "registration of the scan in the map")
 
 
 @dataclass(frozen=True, eq=False)
 class LoopClosure:
-    """Keyframe `second` seen from keyframe `first`: first_T_second (4, 4), covariance (6, 6) of its tangent."""
+    """`second` seen from `first`, keyframes or submaps: first_T_second (4, 4), covariance (6, 6) of its tangent."""
 
     first: int
     second: int
@@ -56,42 +68,140 @@ class LoopClosure:
     covariance: FloatArray
 
 
-def find_loops(
-    clouds: Sequence[FloatArray], world_T_lidar: FloatArray, settings: LoopSettings | None = None
-) -> list[LoopClosure]:
-    """Find the loops of K keyframes: points (N, 3) of each in its sensor's frame, and estimated poses (K, 4, 4)."""
-    s = settings or LoopSettings()
-    places = world_T_lidar[:, :3, 3]
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
-    loops, searched = [], -np.inf
-    for j in range(len(clouds)):
-        earlier = np.flatnonzero(way[j] - way >= s.min_path)
-        if not len(earlier) or way[j] - searched < s.search_interval:
-            continue
-        distance = np.linalg.norm(places[earlier] - places[j], axis=1)
-        if distance.min() > s.max_distance:
-            continue
-        searched = float(way[j])
-        loop = _proved(clouds, world_T_lidar, int(earlier[distance.argmin()]), j, s)
-        if loop is not None:
-            loops.append(loop)
-    return loops
+@dataclass(frozen=True, eq=False)
+class _Proved:
+    """A loop with the structure that both ends share, and its distance from the estimate, m."""
+
+    loop: LoopClosure
+    overlap: float
+    off: float
 
 
-def _proved(
-    clouds: Sequence[FloatArray], world_T_lidar: FloatArray, i: int, j: int, s: LoopSettings
-) -> LoopClosure | None:
-    i_T_world = inverse_transform(world_T_lidar[i])
-    surfels = SurfelMap(s.surfel_size, reach=np.inf)
-    for k in range(max(0, i - s.map_keyframes), min(j, i + s.map_keyframes + 1)):
-        surfels.add(transform_points(i_T_world @ world_T_lidar[k], clouds[k]), np.zeros(3))
-    points = clouds[j][voxel_downsample(clouds[j], s.scan_spacing)]
-    start = i_T_world @ world_T_lidar[j]
-    try:
-        rough = register(points, surfels, start, 3 * s.surfel_size, 1.0, s.registration)
-        found = register(points, surfels, rough.map_T_scan, s.surfel_size, 0.1, s.registration)
-    except RegistrationError:
-        return None
-    if not found.converged or found.pairs < s.min_overlap * len(points) or found.residual > s.max_residual:
-        return None
-    return LoopClosure(i, j, found.map_T_scan, found.covariance)
+@dataclass(eq=False)
+class PlaceLoops:
+    """Submaps in, loops out: `pipelines.slam.submap_loops.SubmapLoops`."""
+
+    settings: LoopSettings = field(default_factory=LoopSettings)
+    _index: PlaceIndex = field(default_factory=PlaceIndex)
+    _submaps: list[Submap] = field(default_factory=list)
+    _edges: list[tuple[int, int, float]] = field(default_factory=list)
+    _waiting: Agreement[LoopClosure] = field(
+        default_factory=lambda: Agreement(np.array([2.0, 0.05]), np.array([0.05, 1e-3]), patience=150.0, apart=15.0)
+    )
+
+    def add(self, submap: Submap, world_T_submap: FloatArray) -> Sequence[LoopClosure]:
+        """Take the next submap and return loops, `first` and `second` numbers of submaps.
+
+        world_T_submap: (number + 1, 4, 4) frames of all submaps so far, as estimated now, this one's last. A submap
+        with too few points to show a place has no loops, now and later.
+        """
+        number = len(self._submaps)
+        if number:
+            self._edges.append((number - 1, number, submap.way[1] - self._submaps[-1].way[1]))
+        self._submaps.append(submap)
+        if len(submap.points) < _FEWEST:
+            return []
+        image = PlaceImage.of(submap.points.astype(np.float64))
+        proved = self._proved(number, image, world_T_submap)
+        self._index.add(number, image)
+        taken: list[LoopClosure] = []
+        for one in proved[:_TAKEN]:
+            taken += self._believed(one, world_T_submap)
+        self._edges += [(loop.first, loop.second, float(deviation(loop.first_T_second)[0])) for loop in taken]
+        return taken
+
+    def _proved(self, number: int, image: PlaceImage, frames: FloatArray) -> list[_Proved]:
+        """Loops of the submap, without rivals, the best first."""
+        way, older = self._ways(number), self._older(number)
+        apart = np.linalg.norm(frames[older, :3, 3] - frames[number, :3, 3], axis=1)
+        length = self._submaps[number].way[1] - self._submaps[number].way[0]
+        older = older[apart < self._farthest(way[older]) + 2 * length + 20.0]
+        matches = self._index.candidates(image, older.tolist(), _COMPARED)
+        found = []
+        for match in matches[:_REGISTERED]:
+            if match.score < _ALIKE or match.rival > _UNIQUE * match.score:
+                continue
+            loop, overlap = self._registered(match, number)
+            if loop is not None and overlap >= self.settings.min_overlap:
+                off = _off(frames, loop)
+                if off < self._farthest(way[match.number]):
+                    found.append(_Proved(loop, overlap, off))
+        return self._unrivalled(found, frames)
+
+    def _registered(self, match: PlaceMatch, number: int) -> tuple[LoopClosure | None, float]:
+        old, new = (self._submaps[n].points.astype(np.float64) for n in (match.number, number))
+        surfels = SurfelMap(_SURFEL, reach=np.inf)
+        surfels.add(old, np.zeros(3))
+        points = new[voxel_downsample(new, _SPACING)]
+        criteria = RegistrationSettings()
+        try:
+            rough = register(points, surfels, match.place_T_query, 3 * _SURFEL, 1.0, criteria, "follow")
+            fine = register(points, surfels, rough.map_T_scan, _SURFEL, 0.1, criteria, "follow")
+        except RegistrationError:
+            return None, 0.0
+        if not fine.converged:
+            return None, 0.0
+        overlap = Structure.of(old).shared(Structure.of(new), fine.map_T_scan)
+        seen = fine.observed
+        free = seen.lost.T / seen.scale[:, None]  # motions that surfaces leave open: by the image
+        covariance = fine.covariance + np.diag(_DISTORTION) + _OPEN**2 * free @ free.T
+        return LoopClosure(match.number, number, fine.map_T_scan, covariance), overlap
+
+    def _unrivalled(self, found: list[_Proved], frames: FloatArray) -> list[_Proved]:
+        """The loops that agree with the best one; none if another one is nearly as good and says otherwise."""
+        if not found:
+            return []
+        trusted = [one for one in found if self._trusted(one)]
+        found = sorted(trusted or found, key=lambda one: -one.overlap)
+        best = found[0]
+        at = frames[best.loop.first] @ best.loop.first_T_second
+        same = []
+        for one in found:
+            between = abs(self._submaps[one.loop.first].way[1] - self._submaps[best.loop.first].way[1])
+            other = frames[one.loop.first] @ one.loop.first_T_second
+            if np.linalg.norm(other[:3, 3] - at[:3, 3]) < _SAME + self.settings.drift * between:
+                same.append(one)
+            elif one.overlap > _UNIQUE * best.overlap:
+                return []
+        return same
+
+    def _believed(self, one: _Proved, frames: FloatArray) -> Sequence[LoopClosure]:
+        if self._trusted(one):
+            return [one.loop]
+        if one.overlap < _SURELY:
+            return []
+        return self._waiting.confirmed(
+            one.loop,
+            lambda a, b: np.asarray(inverse_transform(frames[a]) @ frames[b]),
+            lambda number: self._submaps[number].way[1],
+        )
+
+    def _trusted(self, one: _Proved) -> bool:
+        """Whether the drift of odometry explains the loop."""
+        way = self._ways(one.loop.second)[one.loop.first]
+        return one.off < 1.0 + self.settings.drift * float(way)
+
+    def _older(self, number: int) -> IntArray:
+        """Submaps that ended `min_path` before this one began."""
+        begins = self._submaps[number].way[0]
+        return np.array(
+            [k for k, one in enumerate(self._submaps[:number]) if one.way[1] <= begins - self.settings.min_path],
+            dtype=np.int64,
+        )
+
+    def _ways(self, number: int) -> FloatArray:
+        """Way from each submap so far to this one, along measurements, m."""
+        if not self._edges:
+            return np.zeros(len(self._submaps))
+        first, second, length = (np.array(column) for column in zip(*self._edges, strict=True))
+        return shortest_ways(first, second, length, len(self._submaps), number)
+
+    @staticmethod
+    def _farthest(way: FloatArray) -> FloatArray:
+        return _FARTHEST[0] + _FARTHEST[1] * way
+
+
+def _off(frames: FloatArray, loop: LoopClosure) -> float:
+    """Distance of where a loop says that the submap is from where it is estimated, m."""
+    found = frames[loop.first] @ loop.first_T_second
+    return float(np.linalg.norm(found[:3, 3] - frames[loop.second, :3, 3]))

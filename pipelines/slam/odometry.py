@@ -1,11 +1,14 @@
 """LiDAR odometry: the motion of the sensor, scan by scan.
 
-    predict    T- = T_(k-1) exp(dt xi_(k-1))                     the velocity of the step before goes on
-    de-skew    by xi_(k-1), where the points have times
+    predict    T- = T_(k-1) exp(dt xi)                        the velocity of the step before, or of other sensors
+    de-skew    by xi, where the points have times
     register   T = point-to-plane ICP of a thinned scan against the local map of surfels, started at T-
     adapt      e_k = || trans D || + 2 r sin(angle(D) / 2),  D = (T-)^-1 T,  r a typical range
                sigma_k = root mean square of the e so far, not below a floor
     extend     the map, by scans that moved on since the last that did (keyframes)
+
+In a tunnel or an open field some motions are left open (`data_tools.lidar.degeneracy`). Along these the pose stays as
+predicted, the step names them, and its covariance is wide there, so that a graph relies on other sensors.
 
 A point may lie as far from the mean of its surfel as a voxel is wide, and three sigma more; residuals above
 max(floor, sigma) lose weight. The scheme (constant velocity, adaptive threshold, local voxel map) is that of Vizzo et
@@ -33,11 +36,12 @@ from data_tools.lidar import (
 )
 from data_tools.trajectories import rotation_angle
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.settings import Positive, Settings, setting, settings_group
 
 _LOG = logging.getLogger(__name__)
+_STANDING = 0.5  # m/s, speed from which on the motion says where the road goes
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,11 @@ class OdometrySettings(Settings):
         0.5, "distance from the last keyframe that makes a scan the next one, m; lower: a denser graph"
     )
     keyframe_rotation: Positive = setting(0.05, "rotation from the last keyframe that makes a scan the next one, rad")
-    lost_deviation: Positive = setting(1.0, "standard deviation of a motion that was only predicted, m and rad")
+    lost_deviation: Positive = setting(
+        1.0,
+        "standard deviation of a motion that was only predicted, m and rad, for want of points, or along a direction "
+        "that they leave open; higher: the graph relies more on other sensors there",
+    )
     registration: RegistrationSettings = settings_group(RegistrationSettings, "registration of a scan in the map")
 
 
@@ -71,6 +79,7 @@ class OdometryStep:
     scan         without skew, points too near and too far left out
     keyframe     whether it went into the map
     registration None for the first scan, and for one that could not be registered and lies where it was predicted
+    degenerate   motions that the scan leaves open, in words such as "along the road"
     """
 
     timestamp: float
@@ -79,6 +88,7 @@ class OdometryStep:
     scan: Scan
     keyframe: bool
     registration: Registration | None
+    degenerate: tuple[str, ...] = ()
 
 
 class LidarOdometry:
@@ -91,15 +101,25 @@ class LidarOdometry:
         self._keyframe = np.eye(4)
         self._velocity = np.zeros(6)  # rad/s, m/s, in the sensor's frame
         self._squares, self._count = self.settings.first_deviation**2, 1
+        self._degenerate: tuple[str, ...] = ()
+        self._velocity_known = False  # by a scan that showed the whole motion, or by other sensors
 
     @property
     def deviation(self) -> float:
         """Sigma: typical distance of a point from its prediction by constant velocity, m."""
         return max(self.settings.deviation_floor, float(np.sqrt(self._squares / self._count)))
 
-    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
-        """Place the next scan. Raises `InputError` for one that is not later than the one before."""
+    def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
+        """Place the next scan. Raises `InputError` for one that is not later than the one before.
+
+        velocity: (6,) since then by other sensors, turn rate, rad/s, and velocity, m/s, in the sensor's frame; NaN
+        where they say nothing. It predicts the motion in place of that of the scan before.
+        """
         s, last = self.settings, self._last
+        if velocity is not None:
+            velocity = checked("velocity", velocity, (6,), "finite-or-nan")
+            self._velocity = np.where(np.isnan(velocity), self._velocity, velocity)
+            self._velocity_known = True
         scan = scan.within(s.min_range, s.max_range)
         if scan.time is not None:
             scan = deskewed(scan, self._velocity)
@@ -123,7 +143,15 @@ class LidarOdometry:
         points = scan.points[voxel_downsample(scan.points, s.scan_spacing)]
         sigma = self.deviation
         try:
-            found = register(points, self._map, predicted, s.surfel_size + 3 * sigma, 0.1, s.registration)
+            found = register(
+                points,
+                self._map,
+                predicted,
+                s.surfel_size + 3 * sigma,
+                0.1,
+                s.registration,
+                "hold" if self._velocity_known else "follow",
+            )
         except RegistrationError as error:
             _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, error)
             return OdometryStep(timestamp, predicted, np.eye(6) * s.lost_deviation**2, scan, False, None)
@@ -133,10 +161,25 @@ class LidarOdometry:
         keyframe = bool(
             np.linalg.norm(moved[:3, 3]) >= s.keyframe_distance or rotation_angle(moved[:3, :3]) >= s.keyframe_rotation
         )
-        return OdometryStep(timestamp, found.map_T_scan, found.covariance, scan, keyframe, found)
+        names = found.observed.names(self._velocity[3:] if np.linalg.norm(self._velocity[3:]) > _STANDING else None)
+        covariance = found.covariance
+        self._velocity_known |= not names
+        if names:
+            open_motions = found.observed.lost / found.observed.scale
+            covariance = covariance + s.lost_deviation**2 * open_motions.T @ open_motions
+        if names != self._degenerate:
+            _LOG.warning("scan at %.3f s: %s", timestamp, _said(names))
+            self._degenerate = names
+        return OdometryStep(timestamp, found.map_T_scan, covariance, scan, keyframe, found, names)
 
     def _adapt(self, deviation: FloatArray, points: FloatArray) -> None:
         span = float(np.median(np.linalg.norm(points, axis=1)))
         angle = float(rotation_angle(deviation[:3, :3]))
         self._squares += (float(np.linalg.norm(deviation[:3, 3])) + 2 * span * np.sin(angle / 2)) ** 2
         self._count += 1
+
+
+def _said(names: tuple[str, ...]) -> str:
+    if not names:
+        return "the surfaces in view determine the whole motion again"
+    return f"the surfaces in view do not determine the motion {', '.join(names)}; it is only predicted there"

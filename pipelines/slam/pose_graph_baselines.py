@@ -1,6 +1,6 @@
 """Baselines for the optimisation of pose graphs: GTSAM's own optimisers on the same factors.
 
-* Levenberg-Marquardt from the guess in the graph;
+* Levenberg-Marquardt from the starts that ours begins at, beside ours, with the times of both;
 * iSAM2 with QR factorisation (with Cholesky it throws on badly conditioned graphs), a few poses at a time, each
   starting where a measurement from an earlier pose puts it, then updated until the error changes no more. Poses that
   come one by one cost an update each; where loops are large, as on a sphere, every one of these factorises most of the
@@ -11,28 +11,93 @@
 from __future__ import annotations
 
 import heapq
+import time
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
 
-from factors import pose
+from factors import PlanarPose, ResidualFactor, SpatialPose, Vector, pose, solve
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.slam.pose_graph import PoseGraph, factor_graph, pose_array, pose_values, trusted
+from saga_fg.slam.pose_graph import (
+    LandmarkObservations,
+    PoseGraph,
+    chordal_poses,
+    factor_graph,
+    pose_array,
+    pose_values,
+    trusted,
+)
+from saga_fg.slam.pose_graph.optimisation import SOLVER, graph_values, landmark_factors, placed
 
 _UNCHANGED = 1e-9  # relative change of the error below which iSAM2 counts as converged
 _ROUNDS = 20  # of relinearisation at most, after the last measurement
 
 
-def levenberg_marquardt(graph: PoseGraph) -> float:
-    """The error that `gtsam.LevenbergMarquardtOptimizer` reaches."""
-    factors = factor_graph(graph)
+@dataclass(frozen=True)
+class FromStart:
+    """Error at the result, and CPU seconds, of our solver and of `gtsam.LevenbergMarquardtOptimizer` from one start."""
+
+    start: str
+    error: float
+    seconds: float
+    gtsam_error: float
+    gtsam_seconds: float
+
+
+def from_same_starts(graph: PoseGraph) -> list[FromStart]:
+    """Both solvers from the guess in the graph and from the chordal start, on the same factors."""
+    factors, seen = factor_graph(graph), landmark_factors(graph)
+    native = factor_graph(graph)
+    if graph.landmarks is not None:
+        for observations in graph.landmarks.observations:
+            for factor in _native_factors(observations, len(graph)):
+                native.add(factor)
+    starts = {"guess": graph}
+    if not graph.with_frame_as_pose().components().any():
+        starts["chordal"] = placed(graph, chordal_poses(graph))
+    rows = []
+    for name, start in starts.items():
+        values = graph_values(start)
+        began = time.process_time()
+        error = solve(factors, seen, values, SOLVER).error
+        between = time.process_time()
+        theirs = native.error(gtsam.LevenbergMarquardtOptimizer(native, values, _levenberg_marquardt()).optimize())
+        rows.append(FromStart(name, error, between - began, float(theirs), time.process_time() - between))
+    return rows
+
+
+def _levenberg_marquardt() -> gtsam.LevenbergMarquardtParams:
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(200)
     params.setRelativeErrorTol(1e-9)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(factors, pose_values(graph.world_T_pose), params)
-    return float(factors.error(optimizer.optimize()))
+    return params
+
+
+def _native_factors(seen: LandmarkObservations, poses: int) -> Iterator[gtsam.NonlinearFactor]:
+    """GTSAM's own factors where it has them, else callbacks."""
+    variables = (PlanarPose() if seen.z.shape[1] < 3 else SpatialPose(), Vector(seen.z.shape[1]))
+    for pose_row, landmark, z, information in zip(
+        seen.pose.tolist(), seen.landmark.tolist(), seen.z, seen.information, strict=True
+    ):
+        keys = (pose_row, poses + landmark)
+        if seen.kind == "point":
+            covariance = np.linalg.inv(information)
+            residual = partial(_point_residual, z)
+            yield ResidualFactor(keys, variables, residual, (covariance + covariance.T) / 2).as_custom_factor()
+        elif seen.kind == "bearing":
+            model = gtsam.noiseModel.Gaussian.Information(information)
+            yield gtsam.BearingFactor2D(*keys, gtsam.Rot2(z[0]), model)
+        else:  # GTSAM has the bearing first
+            model = gtsam.noiseModel.Gaussian.Information(np.ascontiguousarray(information[::-1, ::-1]))
+            yield gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(z[1]), z[0], model)
+
+
+def _point_residual(z: FloatArray, at: gtsam.Pose2 | gtsam.Pose3, point: FloatArray) -> FloatArray:
+    return np.asarray(at.transformTo(point) - z)
 
 
 def isam2(graph: PoseGraph, batch: int = 10) -> float:

@@ -16,7 +16,9 @@ import numpy as np
 from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
-from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, known_providers
+from pipelines.slam.known_providers import known_providers
+from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings
+from pipelines.slam.submaps import world_T_submap
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
@@ -37,13 +39,13 @@ class SlamWithObjects:
     estimate: poses of the sensor, errors of the odometry and objects in the world at the moments of the graph.
     """
 
-    slam: LidarSlam
-    alone: LidarSlam
+    slam: LidarSlamResult
+    alone: LidarSlamResult
     estimate: JointEstimate
 
 
 def with_objects(
-    result: LidarSlam,
+    result: LidarSlamResult,
     scans: ScanSequence,
     frames: Sequence[Frame],
     config: TrackConfig,
@@ -72,18 +74,20 @@ def with_objects(
         np.array([covariance for _, covariance in motions]).reshape(-1, 6, 6),
     )
     at = np.searchsorted(rows, result.keyframes)
-    known = known_providers(result.landmarks, result.observations, result.loops, at.tolist(), s.robust_scale)
+    known = known_providers(result, at.tolist(), s.submaps)
     start = result.drive.poses[0]
     estimate = estimate_jointly(
         seen, odometry, new_tracker, s.objects, start, new_providers=lambda: [*known, *new_providers()]
     )
     poses = result.drive.carried(estimate.world_T_ego, rows) @ lidar_T_ego
+    placed = estimate.world_T_ego[at]
     slam = replace(
         result,
         trajectory=Trajectory(scans.timestamps, poses),
         covariances=estimate.pose_covariances[at],
-        landmarks=known[0].landmarks(estimate.solution, s.mapper.confirm_after),
-        world_T_lidar=estimate.world_T_ego[at],
+        landmarks=known[0].landmarks(estimate.solution, s.submaps.confirm_after),
+        world_T_submap=np.array([world_T_submap(one, placed[one.anchor]) for one in result.submaps]),
+        world_T_lidar=placed,
     )
     if lag is not None:
         observed: list[list[Observation]] = [[] for _ in rows]

@@ -25,8 +25,9 @@ taken apart in between, the rest of its N acts through what had decayed to `Bloc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import tee
 
 import numpy as np
 import scipy.sparse
@@ -43,28 +44,41 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 
 def smoothed_means(steps: Sequence[FilterStep]) -> list[FloatArray]:
     """Smoothed joint mean of every epoch, over all its nodes."""
-    means = []
+    return list(_means_backwards(reversed(steps)))[::-1]
+
+
+def smoothed_marginals(steps: Iterable[FilterStep]) -> tuple[list[FloatArray], list[MarginalCovariances]]:
+    """Smoothed joint mean of every epoch, and covariances of its nodes; steps: from the last to the first."""
+    for_means, for_covariances = tee(steps)
+    own = ((step, step.filtered.partition) for step in for_covariances)
+    means, covariances = [], []
+    for mean, whole in zip(_means_backwards(for_means), _swept(own, future_known=False), strict=True):
+        means.append(mean)
+        covariances.append(MarginalCovariances.of(whole.partition.layout, whole.blocks))
+    return means[::-1], covariances[::-1]
+
+
+def _means_backwards(steps: Iterable[FilterStep]) -> Iterator[FloatArray]:
+    """Smoothed joint mean of every epoch, from the last to the first, as the steps are."""
     after: FloatArray | None = None  # r of the next epoch, before it saw anything
-    for k in range(len(steps) - 1, -1, -1):
-        step = steps[k]
+    for step in steps:
         x, dynamics = step.filtered, step.dynamics
         r = np.zeros(len(x.mean))
         if after is None or dynamics is None:
-            means.append(x.mean)
+            yield x.mean
         else:
             back = dynamics.transpose_times(after)
             if len(back) == len(r):
                 r = back
             else:
                 r[x.layout.places(x.layout.rows(dynamics.layout.nodes))] = back
-            means.append(x.mean + block_product(x.blocks, x.partition, r))
+            yield x.mean + block_product(x.blocks, x.partition, r)
         for gain in reversed(step.gains):
             local = r[gain.places]
             unexplained = gain.whitened - (gain.W @ local[:, :, None])[:, :, 0]
             y = solve_lower(gain.L, unexplained[:, :, None], transposed=True)
             r[gain.places] = local + (np.swapaxes(gain.H, 1, 2) @ y)[:, :, 0]
         after = r[: x.layout.offsets[step.carried]]
-    return means[::-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +143,8 @@ class MarginalCovariances:
 
 def smoothed_covariances(steps: Sequence[FilterStep], joint: bool) -> Iterator[SmoothedCovariance]:
     """Smoothed covariance of every epoch, from the last to the first; those of single nodes alone if not `joint`."""
-    return _swept(steps, joined_partitions(steps) if joint else _own_partitions(steps), future_known=False)
+    found = zip(reversed(steps), reversed(joined_partitions(steps)), strict=True) if joint else _own(steps)
+    return _swept(found, future_known=False)
 
 
 def future_influence(steps: Sequence[FilterStep]) -> Iterator[FloatArray]:
@@ -137,26 +152,23 @@ def future_influence(steps: Sequence[FilterStep]) -> Iterator[FloatArray]:
 
     Nothing that is measured after the last epoch can be expected to move a smoothed mean by more.
     """
-    for reduced in _swept(steps, _own_partitions(steps), future_known=True):
+    for reduced in _swept(_own(steps), future_known=True):
         variance: FloatArray = np.empty(reduced.partition.layout.size)
         for places, P, M in zip(reduced.partition.groups, reduced.P, reduced.N, strict=True):
             variance[places] = ((P @ M) * P).sum(axis=2)
         yield np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _own_partitions(steps: Sequence[FilterStep]) -> list[Partition]:
-    """The components of every epoch as they are filtered."""
-    return [step.filtered.partition for step in steps]
+def _own(steps: Sequence[FilterStep]) -> Iterator[tuple[FilterStep, Partition]]:
+    """Every epoch from the last to the first, with its components as they are filtered."""
+    return ((step, step.filtered.partition) for step in reversed(steps))
 
 
-def _swept(
-    steps: Sequence[FilterStep], partitions: Sequence[Partition], future_known: bool
-) -> Iterator[SmoothedCovariance]:
+def _swept(steps: Iterable[tuple[FilterStep, Partition]], future_known: bool) -> Iterator[SmoothedCovariance]:
     """N of every epoch from the last to the first, or M with `future_known`, over the partition of each."""
     after: BlockDiagonal | None = None  # N of the next epoch, before it saw anything, over the nodes carried there
     after_partition: Partition | None = None
-    for k in range(len(steps) - 1, -1, -1):
-        step, partition = steps[k], partitions[k]
+    for step, partition in steps:
         x = step.filtered.over(partition)
         if after is not None and after_partition is not None and step.dynamics is not None:
             back = step.dynamics.pulled_back(after_partition, after)

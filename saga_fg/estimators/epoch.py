@@ -7,7 +7,7 @@ measurements, or linearised at better estimates.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -127,9 +127,39 @@ def initial_step(prior: BlockGaussian) -> FilterStep:
     return FilterStep(len(prior.layout), prior, prior)
 
 
-def filter_epochs(prior: BlockGaussian, epochs: list[Epoch], means: list[FloatArray] | None = None) -> list[FilterStep]:
+def filter_epochs(
+    prior: BlockGaussian, epochs: Sequence[Epoch], means: Sequence[FloatArray] | None = None
+) -> list[FilterStep]:
     """Filter `epochs` from a prior; linearised at joint states `means` if given."""
-    steps = []
+    return [step for step, _ in _filtered(prior, epochs, means)]
+
+
+def filter_backwards(prior: BlockGaussian, epochs: Sequence[Epoch], most: int) -> Iterator[FilterStep]:
+    """Filter `epochs` from a prior, and give the steps from the last to the first.
+
+    No more are kept than those of a stretch of about `most` states: where there are more, the priors of all stretches
+    are found first, and each is filtered again when its turn comes, with the same result to the last digit.
+    """
+    priors, ends, states, steps = [prior], [0], 0, list[FilterStep]()
+    for k, (step, after) in enumerate(_filtered(prior, epochs)):
+        steps.append(step)
+        states += len(step.layout)
+        if states >= most and k + 1 < len(epochs):
+            priors.append(after)
+            ends.append(k + 1)
+            states, steps = 0, []
+    while steps:
+        yield steps.pop()
+    for number in range(len(ends) - 2, -1, -1):
+        steps = filter_epochs(priors[number], epochs[ends[number] : ends[number + 1]])
+        while steps:
+            yield steps.pop()
+
+
+def _filtered(
+    prior: BlockGaussian, epochs: Sequence[Epoch], means: Sequence[FloatArray] | None = None
+) -> Iterator[tuple[FilterStep, BlockGaussian]]:
+    """The step of each epoch, and the prior of the next."""
     for k, epoch in enumerate(epochs):
         mean = None if means is None else means[k]
         step = initial_step(prior)
@@ -139,5 +169,4 @@ def filter_epochs(prior: BlockGaussian, epochs: list[Epoch], means: list[FloatAr
             step = step.updated(recorded, mean)
         if epoch.interval is not None:
             step, prior = step.to_next(epoch.leaving, epoch.interval, mean)
-        steps.append(step)
-    return steps
+        yield step, prior

@@ -26,6 +26,7 @@ from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
 from saga_fg.estimators.joint_gaussian import joint_gaussian
 from saga_fg.estimators.layout import StateLayout
+from saga_fg.graph.condensation import Condensation
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.linearisation_point import LinearisationPoint
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
@@ -123,10 +124,10 @@ class IncrementalSmoother:
         """Ask some more providers at the present epoch, and solve again."""
         self._ask_and_move(self._graph.copy(), providers)
 
-    def marginalise(self, keys: Iterable[int]) -> None:
-        """Integrate variables out; their information on others stays."""
+    def marginalise(self, keys: Iterable[int], into: Condensation | None = None) -> None:
+        """Integrate variables out; their information on others stays, in the factors that `into` makes of it."""
         graph = self._graph.copy()
-        graph.marginalise(keys)
+        graph.marginalise(keys, into)
         self._graph = graph
 
     def state(self, key: int) -> object:

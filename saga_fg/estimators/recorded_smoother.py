@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,8 +115,12 @@ class RecordedSmoother(LatestMarginals):
     def _smoothed(self, covariances: bool, joint: bool) -> tuple[SmoothedState, ...]:
         """Every epoch of the recording, oldest first."""
         recording = self._recording
-        means = recording.means()
-        P = recording.covariances(joint) if covariances else [None] * len(means)
+        P: Sequence[SmoothedCovariance | MarginalCovariances | None]
+        if covariances and not joint:
+            means, P = recording.marginals()
+        else:
+            means = recording.means()
+            P = recording.covariances(joint) if covariances else [None] * len(means)
         return tuple(
             SmoothedState(epoch.time, layout, mean, covariance)
             for epoch, layout, mean, covariance in zip(recording.epochs, recording.layouts, means, P, strict=True)

@@ -21,10 +21,19 @@ from saga_fg.estimators.backward import (
     MarginalCovariances,
     SmoothedCovariance,
     smoothed_covariances,
+    smoothed_marginals,
     smoothed_means,
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.epoch import Epoch, FilterStep, NewNodes, dead_reckoned, filter_epochs, initial_step
+from saga_fg.estimators.epoch import (
+    Epoch,
+    FilterStep,
+    NewNodes,
+    dead_reckoned,
+    filter_backwards,
+    filter_epochs,
+    initial_step,
+)
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
@@ -37,6 +46,7 @@ from saga_fg.settings import setting
 log = logging.getLogger(__name__)
 
 _SAME_TIME = 1e-9  # s
+MOST_KEPT = 100_000  # states, over all epochs, of which the filter's pass is kept: some 0.4 GB
 
 
 @dataclass(frozen=True)
@@ -227,6 +237,19 @@ class Recording:
         if self._means is None:
             self._means = smoothed_means(self._steps)
         return self._means
+
+    def marginals(self) -> tuple[list[FloatArray], Sequence[SmoothedCovariance | MarginalCovariances]]:
+        """Smoothed joint mean and covariances of single nodes of every epoch.
+
+        Where a lazy recording is long, and the filter's pass not done yet, it is not kept: it takes several times the
+        memory of all else.
+        """
+        known = len(self._steps) == len(self._epochs) or self._nonlinear
+        if self._means is None and not known and sum(map(len, self._layouts)) > MOST_KEPT:
+            steps = filter_backwards(self._prior, self._epochs, MOST_KEPT // 2)
+            self._means, self._marginals = smoothed_marginals(steps)
+            return self._means, self._marginals
+        return self.means(), self.covariances(joint=False)
 
     def covariances(self, joint: bool) -> Sequence[SmoothedCovariance | MarginalCovariances]:
         """Smoothed covariance of every epoch, joint ones or only those of single nodes, which take less memory."""

@@ -4,6 +4,7 @@ from saga_fg.graph.errors import GraphError, ProviderError, UndeterminedError
 from saga_fg.graph.factor_groups import FactorEntry
 from saga_fg.graph.keys import (
     EGO_BIAS,
+    EGO_CALIBRATION,
     EGO_ERROR,
     EGO_POSE,
     EGO_VELOCITY,
@@ -21,6 +22,7 @@ from saga_fg.graph.variables import GraphVariable, NewVariable
 
 __all__ = [
     "EGO_BIAS",
+    "EGO_CALIBRATION",
     "EGO_ERROR",
     "EGO_POSE",
     "EGO_VELOCITY",

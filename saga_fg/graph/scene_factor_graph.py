@@ -25,6 +25,7 @@ import numpy as np
 
 from factors import FactorError, Solution, SolverSettings, marginal_factors, solve
 from factors.marginal import Elimination
+from saga_fg.graph.condensation import Condensation
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.factor_checks import Factor, grouped
 from saga_fg.graph.factor_groups import (
@@ -157,8 +158,8 @@ class SceneFactorGraph:
             if len(one.active):
                 self._fresh[self._hold(one)] = factors_there
 
-    def marginalise(self, keys: Iterable[int]) -> None:
-        """Integrate variables out; their information on the others stays."""
+    def marginalise(self, keys: Iterable[int], into: Condensation | None = None) -> None:
+        """Integrate variables out; their information on the others stays, in the factors that `into` makes of it."""
         leaving = {key: self.variable(key) for key in keys}
         if not leaving:
             return
@@ -168,6 +169,11 @@ class SceneFactorGraph:
                 touched.push_back(factor)
         involved = set(touched.keyVector())
         factors = self._eliminated(touched, sorted(leaving.keys() & involved))
+        if into is not None:
+            made = into.factors(factors, point)
+            self._replace(rows, [], leaving)
+            self.add_factors(into.name, made)
+            return
         self._replace(rows, factors, leaving)
         if factors:
             self._choose(max(factor.cols() - 1 for factor in factors))

@@ -30,10 +30,11 @@ from saga_fg.numerics.columns import Columns
 from saga_fg.tracking import TrackerSettings
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.joint_state import JointTrackState
+from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.prediction import predict
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.tracking.trails import TrailPoints, Trails, TrailSettings
+from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings
 from saga_fg.types.dataset import Scene
 from saga_fg.types.labelled_objects import LabelledObjects
 
@@ -95,7 +96,7 @@ class _Shared(NamedTuple):
 
     tracks: RecordedTracks
     step: float
-    trails: TrailPoints
+    trails: Passages
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +135,7 @@ class HiddenObjects(Columns):
         first = np.cumsum([0, *(len(part.recorded.tracks.mean) for part in parts)])
         after = LATER * np.arange(len(parts))
         points = [part.recorded.trails for part in parts]
-        trails = TrailPoints.concatenate(
-            [replace(own, time=own.time + t) for own, t in zip(points, after, strict=True)]
-        )
+        trails = Passages.concatenate([replace(own, time=own.time + t) for own, t in zip(points, after, strict=True)])
         moved = [
             replace(
                 part,
@@ -168,7 +167,8 @@ class HiddenObjects(Columns):
         shift = APART * np.stack(np.divmod(np.arange(W), side), axis=1) - recorded.mean[self.start, :2]
         hidden = _placed(recorded.select(self.start[order]), np.arange(W), shift[order], 0.0)
         state = TrackerState(settings, ())
-        state.trails.points = self._trails(settings.trails.memory, shift[order], order)
+        trails = self._trails(settings.traffic, shift[order], order)
+        state.traffic.left, state.traffic.latest = trails, trails.select(slice(0, 0))
         for s in range(S):
             n = active[s]
             if n == 0:
@@ -192,9 +192,9 @@ class HiddenObjects(Columns):
             hidden = RecordedTracks(state.table.select(slice(0, n)), marginals.means[:n], marginals.covariances[:n])
         return found
 
-    def _trails(self, memory: float, shift: FloatArray, order: IntArray) -> TrailPoints:
+    def _trails(self, settings: TrafficSettings, shift: FloatArray, order: IntArray) -> Passages:
         """The trails that the gaps `order` (W,) begin with, each shifted (W, 2) to its place."""
-        points, parts = self.recorded.trails, []
+        points, parts, memory = self.recorded.trails, [], settings.memory if settings.reach > 0 else 0.0
         own, place = self.recorded.tracks.table.id[self.start], self.recorded.tracks.mean[self.start, :2]
         for k, row in enumerate(order.tolist() if memory > 0 else ()):
             lately = slice(*np.searchsorted(points.time, [self.time[row] - memory, self.time[row] + 1e-6]))
@@ -203,7 +203,7 @@ class HiddenObjects(Columns):
             found = found.select(near & (found.id != own[row]))
             ids, position = found.id + (k + 1) * LARGEST_ID, found.position + shift[k]
             parts.append(replace(found, id=ids, position=position, time=found.time - self.time[row]))
-        return TrailPoints.concatenate(parts) if parts else points.select(slice(0, 0))
+        return Passages.concatenate(parts) if parts else points.select(slice(0, 0))
 
 
 def _placed(tracks: RecordedTracks, ids: IntArray, shift: FloatArray, time: float) -> RecordedTracks:
@@ -269,14 +269,13 @@ def hidden_objects(
     return found if len(found) else None
 
 
-def _trails(parts: Sequence[RecordedTracks], moments: FloatArray) -> TrailPoints:
+def _trails(parts: Sequence[RecordedTracks], moments: FloatArray) -> Passages:
     """The trails of all tracks at their moments, by time."""
-    trails = Trails(TrailSettings(memory=LATER))
+    traffic = Traffic(TrafficSettings(memory=LATER))
     for part, time in zip(parts, moments, strict=True):
-        speed = np.hypot(*part.mean[:, 2:4].T)
-        moving = part.select((part.table.last_detected >= -1e-6) & (speed > MOVING))
-        v, times = moving.mean[:, 2:4], np.full(len(moving), time)
-        heading = np.arctan2(v[:, 1], v[:, 0])
-        trails.update(TrailPoints(moving.table.id, moving.mean[:, :2], heading, np.hypot(*v.T), times), float(time))
-    none = np.empty(0)
-    return trails.points or TrailPoints(none.astype(np.int64), np.empty((0, 2)), none, none, none)
+        now = Kinematics(part.mean[:, :2], part.mean[:, 2:4], part.P[:, :2, :2], part.P[:, 2:4, 2:4])
+        moves = (part.table.last_detected >= -1e-6) & (np.hypot(*now.velocity.T) > MOVING)
+        found = Passages.of(part.table.id, part.table.label, now, part.table.box.yaw, moves, float(time))
+        traffic.update(found.select(found.moves), float(time))
+    assert traffic.left is not None
+    return traffic.left

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_features import EdgeFeatures, features_of
@@ -26,6 +25,7 @@ from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.settings import (
     NonNegative,
     NonNegativeInt,
@@ -35,7 +35,6 @@ from saga_fg.settings import (
     settings_group,
 )
 
-_MOST_COMPARED = 250_000  # pairs that are compared one by one; a tree is faster beyond
 _LEAST = 1e-9  # probability that a certain object does not exist
 Leaders = Literal["any", "moving", "stationary"]
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
@@ -207,14 +206,17 @@ class Following(Settings):
         if not self.parked and nodes.has_moved is not None:
             follows = follows & (nodes.has_moved > 0)
         target, source = pairs_within(nodes.position, follows, able, self.max_gap)
-        bent = np.zeros(len(nodes), dtype=np.bool_)
-        if nodes.paths is not None:
-            bent[nodes.paths.row] = True
         c, s, (x, y) = np.cos(nodes.heading), np.sin(nodes.heading), nodes.position.T
         dx, dy, c, s = x[source] - x[target], y[source] - y[target], c[target], s[target]
         ahead, widest = dx * c + dy * s, math.tan(min(3 * self.heading_scale, 1.5) / 2)
-        straight = (ahead > 0) & (np.abs(dy * c - dx * s) <= 3 * self.lateral_scale + widest * ahead)
-        front = np.flatnonzero(straight | bent[target])
+        inside = (ahead > 0) & (np.abs(dy * c - dx * s) <= 3 * self.lateral_scale + widest * ahead)
+        if nodes.paths is not None and len(nodes.paths):
+            path = np.full(len(nodes), -1)
+            path[nodes.paths.row] = np.arange(len(nodes.paths))
+            bent = np.flatnonzero(path[target] >= 0)
+            places = nodes.position[source[bent]]
+            inside[bent] = nodes.paths.may_be_beside(path[target[bent]], places, 3 * self.lateral_scale)
+        front = np.flatnonzero(inside)
         return target[front], source[front]
 
 
@@ -291,12 +293,7 @@ def pairs_within(
     to, of = np.flatnonzero(targets), np.flatnonzero(sources)
     if len(to) == 0 or len(of) < 2:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    if len(to) * len(of) <= _MOST_COMPARED:
-        (x, y), (x_of, y_of) = position[to].T, position[of].T
-        i, j = np.nonzero((x[:, None] - x_of) ** 2 + (y[:, None] - y_of) ** 2 <= radius**2)
-    else:
-        near = cKDTree(position[to]).sparse_distance_matrix(cKDTree(position[of]), radius, output_type="ndarray")
-        i, j = near["i"], near["j"]
+    i, j = near_pairs(position[to], position[of], np.full(len(to), radius))
     target, source = to[i], of[j]
     different = target != source
     return target[different], source[different]

@@ -16,6 +16,9 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.polyline import Polylines
 
+_SHARP = 1.2  # rad, turn from which nothing is said about where a path is
+_ROUNDING = 1 + 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Paths(Columns):
@@ -39,6 +42,26 @@ class Paths(Columns):
     def lines(self) -> Polylines:
         """The paths as polylines."""
         return Polylines.of(list(self.position))
+
+    @cached_property
+    def _cones(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Direction (k,) at the start of each path, how far it turns from there, and its sharpest corner, rad."""
+        angle = self.lines.angle.reshape(len(self), -1)
+        return angle[:, 0], np.abs(angle - angle[:, :1]).max(axis=1), np.abs(np.diff(angle, axis=1)).max(1, initial=0.0)
+
+    def may_be_beside(self, path: IntArray, places: FloatArray, most: float) -> BoolArray:
+        """Mask (E,) of places (E, 2) that may be ahead on `path` (E,) and up to `most` m aside; all others are not.
+
+        A path that turns by at most a is in a cone of this half angle. At a corner a place may be farther from the path
+        than aside.
+        """
+        direction, turn, corner = (column[path] for column in self._cones)
+        dx, dy = (places - self.position[path, 0]).T
+        c, s = np.cos(direction), np.sin(direction)
+        near = _ROUNDING * most / np.cos(np.minimum(corner, _SHARP))
+        ahead, aside = dx * c + dy * s, np.abs(dy * c - dx * s)
+        beside = (ahead >= -near) & (aside * np.cos(turn) - ahead * np.sin(turn) <= near)
+        return np.asarray(beside | (turn > _SHARP))
 
     def of_nodes(self, rows: IntArray) -> Paths:
         """The paths of the nodes `rows` (k,), ascending, which are counted from 0 then."""

@@ -46,11 +46,17 @@ class Polylines(NamedTuple):
     @classmethod
     def of(cls, lines: Sequence[FloatArray]) -> Self:
         """Polylines (k, 2) of one piece at least, of points apart."""
-        parts = [_pieces(np.zeros((1, 2))), *map(_pieces, lines)]  # none, and those of each line
-        start, t, low, high, before, middle, angle = (np.concatenate(column) for column in zip(*parts, strict=True))
         pieces = np.array([len(line) - 1 for line in lines], dtype=np.int64)
-        length = np.array([np.hypot(*np.diff(line, axis=0).T).sum() for line in lines])
-        first, base = np.cumsum(pieces) - pieces, np.cumsum(length + 1) - length
+        first, total, length = np.cumsum(pieces) - pieces, int(pieces.sum()), np.empty(len(lines))
+        columns = tuple(np.empty((total, *width)) for width in ((2,), (2,), (), (), (), (), ()))
+        for count in np.unique(pieces).tolist():
+            alike = np.flatnonzero(pieces == count)
+            at = first[alike][:, None] + np.arange(count)
+            *parts, length[alike] = _pieces(np.array([lines[k] for k in alike.tolist()]))
+            for column, part in zip(columns, parts, strict=True):
+                column[at] = part
+        start, t, low, high, before, middle, angle = columns
+        base = np.cumsum(length + 1) - length
         return cls(start, t, low, high, before, middle, angle, first, pieces, length, base)
 
     def __len__(self) -> int:
@@ -101,12 +107,12 @@ def direction_at(polyline: FloatArray, s: FloatArray) -> FloatArray:
     return Polylines.of([polyline]).direction_at(np.zeros(len(s), dtype=np.int64), s)
 
 
-def _pieces(line: FloatArray) -> tuple[FloatArray, ...]:
-    """The pieces of one polyline (k, 2), as in `Polylines`."""
-    step = np.diff(line, axis=0)
-    length = np.hypot(*step.T)
-    end = np.cumsum(length)
-    low, high = np.zeros(len(step)), length.copy()
-    low[:1], high[-1:] = -np.inf, np.inf
-    angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    return line[:-1], step / length[:, None], low, high, end - length, end - length / 2, angle
+def _pieces(lines: FloatArray) -> tuple[FloatArray, ...]:
+    """The pieces of polylines (L, k, 2): their columns in `Polylines`, (L, k - 1, ...), and the lengths (L,)."""
+    step = np.diff(lines, axis=1)
+    length = np.hypot(step[..., 0], step[..., 1])
+    end = np.cumsum(length, axis=1)
+    low, high = np.zeros_like(length), length.copy()
+    low[:, 0], high[:, -1] = -np.inf, np.inf
+    angle = np.unwrap(np.arctan2(step[..., 1], step[..., 0]), axis=1)
+    return lines[:, :-1], step / length[..., None], low, high, end - length, end - length / 2, angle, length.sum(axis=1)

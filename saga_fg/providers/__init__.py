@@ -1,4 +1,4 @@
-"""Factor providers: the vehicle's odometry, satellite fixes, inertial sensors, landmarks, stationary objects.
+"""Factor providers: the vehicle's odometry, satellite fixes, inertial sensors, wheels, landmarks, stationary objects.
 
 Each reads what a frame brings (`Frame.ego`) and works in the running graph wherever that is: an
 `IncrementalSmoother` in Python, the tracker, and by name in a configuration with its fields as settings,
@@ -14,6 +14,7 @@ from saga_fg.providers.odometry import Odometry
 from saga_fg.providers.relative_detections import RelativeDetections
 from saga_fg.providers.start import StartSettings
 from saga_fg.providers.stationary import StationaryObjects
+from saga_fg.providers.wheels import Wheels
 
 __all__ = [
     "Gps",
@@ -24,4 +25,5 @@ __all__ = [
     "RelativeDetections",
     "StartSettings",
     "StationaryObjects",
+    "Wheels",
 ]

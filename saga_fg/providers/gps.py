@@ -1,20 +1,34 @@
-"""The vehicle's place by satellites: r = t + R a - z, with a the antenna's place on the vehicle."""
+"""The vehicle's place by satellites: r = t + R a - z, with a the antenna's place on the vehicle.
+
+A fix that is older than the frame by dt was taken at exp(-dt xi) a in the vehicle's frame of now, xi its velocity over
+the epoch. The antenna's place can be a variable for all time. A fix far off is left out by a gate, which is as wide as
+the pose is uncertain; what passes is under a robust loss.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import gtsam
 import numpy as np
 
-from factors import Robust, position_factor
+from factors import ResidualFactor, Robust, SpatialPose, Vector, position_factor, prior_factor
 from saga_fg.errors import InputError
-from saga_fg.graph.keys import EGO_POSE
+from saga_fg.graph.factor_checks import Factor
+from saga_fg.graph.keys import EGO_CALIBRATION, EGO_POSE
 from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import NewVariable
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.chi_square import chi_square_quantile
+from saga_fg.providers.mounting import ANTENNA
 from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -28,6 +42,8 @@ class Gps(Settings):
     outlier_scale: PositiveOrInf = setting(
         math.inf, "residual from which the Cauchy loss discounts a fix, standard deviations; .inf: never"
     )
+    estimate_antenna: bool = setting(False, "true: the antenna's position is a variable of the graph; poses in space")
+    antenna_deviation: Positive = setting(0.5, "standard deviation of that position beforehand, by axis, m")
     name: str = setting("gps", "name in messages")
 
     def __post_init__(self) -> None:
@@ -52,12 +68,42 @@ class Gps(Settings):
             R = np.diag(np.square([self.deviation, self.deviation, self.height_deviation]))
         R = R[:dim, :dim]
         robust = None if math.isinf(self.outlier_scale) else Robust("cauchy", self.outlier_scale)
-        factor = position_factor(pose.key, z, R, self.antenna, robust)
+        antenna = _moved_back(view, pose.key, np.array(self.antenna), fix.age)
+        factor = position_factor(pose.key, z, R, antenna, robust)
         if self.gate < 1:
             values = gtsam.Values()
             values.insert(pose.key, view.state(pose.key))
             _, (J,), (r,) = factor.linearisation(values)
             S = J[0] @ view.covariance(pose.key) @ J[0].T + R
             if float(r @ np.linalg.solve(S, r)) > chi_square_quantile(self.gate, dim):
+                _LOG.warning(
+                    "%s at %.2f s: a fix %.1f m off is left out", self.name, view.time, float(np.linalg.norm(r))
+                )
                 return Additions()
-        return Additions(factors=[factor])
+        if not self.estimate_antenna:
+            return Additions(factors=[factor])
+        if dim == 2:
+            raise InputError("gps: estimate_antenna: expected the vehicle's pose in space, got one in the plane")
+        key, place, new = view.key(EGO_CALIBRATION, ANTENNA, static=True), np.array(self.antenna), list[NewVariable]()
+        priors = list[Factor]()
+        if ANTENNA not in view.static(EGO_CALIBRATION):
+            new.append(NewVariable(EGO_CALIBRATION, ANTENNA, place, static=True, label="place of the antenna"))
+            priors.append(prior_factor(key, place, self.antenna_deviation**2 * np.eye(3)))
+        types = (SpatialPose(), Vector(3))
+        function = partial(_by_antenna, z, antenna - place)
+        return Additions(new, [*priors, ResidualFactor((pose.key, key), types, function, R, robust=robust, name="fix")])
+
+
+def _by_antenna(z: FloatArray, moved: FloatArray, pose: gtsam.Pose3, antenna: FloatArray) -> FloatArray:
+    return np.asarray(pose.transformFrom(antenna + moved) - z)
+
+
+def _moved_back(view: GraphView, key: int, antenna: FloatArray, age: float) -> FloatArray:
+    """Where the antenna was `age` s ago, in the frame of the pose of now; as now where there is no pose before."""
+    before = view.before(EGO_POSE).get(0)
+    if age == 0 or before is None or view.dt == 0:
+        return antenna
+    motion: Any = view.state(before.key).between(view.state(key))
+    share: Any = type(motion).Expmap(-age / view.dt * type(motion).Logmap(motion))
+    dim = 2 if isinstance(motion, gtsam.Pose2) else 3
+    return np.concatenate([share.transformFrom(antenna[:dim]), antenna[dim:]])

@@ -138,6 +138,7 @@ def _smoothed(epochs: Iterable[RecordingEpoch], smoother: BatchSmoother | Window
         if isinstance(smoother, WindowedSmoother):
             states += smoother.final()
     states += smoother.finish() if isinstance(smoother, WindowedSmoother) else smoother.smoothed()
+    del smoother  # and the whole recording, before the states are copied
     parts = [(begin + k, s.nodes, s.mean(s.nodes), s.covariance(s.nodes)) for k, s in enumerate(states) if len(s.nodes)]
     return StateTable.of_moments(parts)
 

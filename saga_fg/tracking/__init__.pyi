@@ -9,11 +9,11 @@ from .settings import (
     EgoNodeSettings,
     ExistenceSettings,
     TrackerSettings,
-    TrafficFlowSettings,
 )
 from .stationarity import StationaritySettings
 from .table_tracking import track
 from .tracker import Tracker
+from .traffic import SpeedPriorSettings, TrafficSettings
 
 __all__ = [
     "AssociationName",
@@ -27,12 +27,13 @@ __all__ = [
     "GreedyTracker",
     "Journal",
     "Observer",
+    "SpeedPriorSettings",
     "Stage",
     "StationaritySettings",
     "TimeVerdict",
     "Tracker",
     "TrackerSettings",
     "TrackerView",
-    "TrafficFlowSettings",
+    "TrafficSettings",
     "track",
 ]

@@ -26,10 +26,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, distinct
 from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.numerics.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.class_belief import ClassEvidence
@@ -44,7 +44,6 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_settings, class_values
 from saga_fg.types.overlap import paired_giou_3d
 
-_DENSE = 30_000  # pairs up to which looking at all of them is the fastest
 LEAST_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
 
 
@@ -150,7 +149,7 @@ def candidates(
     names = ("max_distance", "giou_weight")
     reach, giou_weight = class_values(settings.classes, ClassSettings, predicted.label, *names)
     gates = np.array([gate(class_settings(settings.classes, ClassSettings, c).gate) for c in classes])[of_track]
-    t, d = close_pairs(predicted.position[:, :2], measurements.boxes.position[:, :2], reach)
+    t, d = near_pairs(predicted.position[:, :2], measurements.boxes.position[:, :2], reach)
     alike = same[of_track[t], of_detection[d]].nonzero()[0]
     t, d = t[alike], d[alike]
     innovation = measurements.boxes.position[d, :2] - predicted.position[t, :2]
@@ -162,19 +161,6 @@ def candidates(
     found = found._replace(gain=found.gain - _overlap(found, predicted, measurements.boxes, giou_weight))
     unmatched = _unmatched(found, expected, measurements.probability, of_detection, settings.association, clutter_area)
     return found._replace(gain=found.gain - unmatched)
-
-
-def close_pairs(tracks: FloatArray, detections: FloatArray, reach: FloatArray) -> tuple[IntArray, IntArray]:
-    """Rows of the pairs of positions (n, 2) and (m, 2) closer than the reach (n,) of the track; in order of tracks."""
-    n, m = len(tracks), len(detections)
-    if n * m <= _DENSE or not np.isfinite(reach).all():
-        x, y = (detections[:, k] - tracks[:, k, None] for k in (0, 1))
-        t, d = (x * x + y * y < (reach**2)[:, None]).nonzero()
-        return t, d
-    found = cKDTree(tracks).sparse_distance_matrix(cKDTree(detections), reach.max(), output_type="ndarray")
-    t, d = np.divmod(np.sort(found["i"] * m + found["j"]), m)
-    near = ((detections[d] - tracks[t]) ** 2).sum(axis=1) < reach[t] ** 2
-    return t[near], d[near]
 
 
 def _overlap(found: CandidatePairs, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:

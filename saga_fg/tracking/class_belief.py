@@ -46,6 +46,19 @@ class ClassGroups:
         same = [[a == b or self._mated(a, b) for b in their_classes] for a in classes]
         return np.array(same, dtype=bool).reshape(len(classes), len(their_classes))[of_row[:, None], of_column]
 
+    def pairs_of_group(self, labels: StrArray, others: StrArray, i: IntArray, j: IntArray) -> BoolArray:
+        """(K,) whether the classes of labels[i] and others[j], i and j (K,), are one or share a group."""
+        if len(i) == 0:
+            return np.zeros(0, dtype=bool)
+        (classes, of_label), (their_classes, of_other) = distinct(labels), distinct(others)
+        return self.same_group(np.array(classes), np.array(their_classes))[of_label[i], of_other[j]]
+
+    def number_of_group(self, labels: StrArray) -> IntArray:
+        """(n,) how many of the labels (n,) are of the same class or group as each."""
+        classes, of_label = distinct(labels)
+        names = np.array(classes)
+        return (self.same_group(names, names) @ np.bincount(of_label, minlength=len(classes)))[of_label]
+
     def _mated(self, label: str, other: str) -> bool:
         """True if two classes share a group."""
         a, b = self._column.get(label), self._column.get(other)

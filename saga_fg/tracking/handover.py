@@ -29,6 +29,7 @@ import numpy as np
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.tracking.initiation import unmeasured_velocity
 from saga_fg.tracking.relinking import area, least_log_odds, log_survival
 from saga_fg.tracking.tracker_state import TrackerState
@@ -66,21 +67,26 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     if len(new) == 0:
         return new, new, new
     old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.max_coasting))
-    same = state.class_groups.same_group
-    others = same(table.label[new], table.label[new]).sum(axis=1)
-    i, j = np.nonzero(
-        same(table.label[new], table.label[old]) & (table.last_detected[old] < table.initiated[new][:, None])
-    )
-    near = _near(state, new[i], old[j])
-    return new[i[near]], old[j[near]], others[i[near]]
+    i, j = _near(state, new, old)
+    alike = state.class_groups.pairs_of_group(table.label[new], table.label[old], i, j)
+    chosen = alike & (table.last_detected[old[j]] < table.initiated[new[i]])
+    i, j = i[chosen], j[chosen]
+    return new[i], old[j], state.class_groups.number_of_group(table.label[new])[i]
 
 
-def _near(state: TrackerState, new: IntArray, old: IntArray) -> IntArray:
-    """Which pairs (k,) are near enough, moving or stationary, for their densities to count at all."""
-    now, still = state.kinematics(), state.table.stationarity
-    moving, _ = mahalanobis_of_pairs(now.position[new] - now.position[old], now.P[new] + now.P[old])
-    stationary, _ = mahalanobis_of_pairs(still.position[new] - still.position[old], still.P[new] + still.P[old])
-    return np.flatnonzero(np.minimum(moving, stationary) < _FARTHEST)
+def _near(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray]:
+    """Pairs (k,) of `new` and `old` near enough, moving or stationary, for their densities to count at all."""
+    if len(old) == 0:
+        return old, old
+    now, still, found = state.kinematics(), state.table.stationarity, []
+    for position, P in ((now.position, now.P), (still.position, still.P)):
+        spread = P[:, 0, 0] + P[:, 1, 1]
+        reach = np.sqrt(_FARTHEST * (spread[new] + spread[old].max()))  # no direction's variance exceeds the trace
+        i, j = near_pairs(position[new], position[old], reach)
+        d2, _ = mahalanobis_of_pairs(position[new[i]] - position[old[j]], P[new[i]] + P[old[j]])
+        found.append((i * len(old) + j)[d2 < _FARTHEST])
+    i, j = np.divmod(np.unique(np.concatenate(found)), len(old))
+    return i, j
 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:

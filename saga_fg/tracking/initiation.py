@@ -11,6 +11,7 @@ from saga_fg.tracking.box_filter import BoxFilter
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.relinking import initiating
+from saga_fg.tracking.speed_prior import speed_prior
 from saga_fg.tracking.stationarity import Stationarity, after_evidence, log_density
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
@@ -94,7 +95,8 @@ def unmeasured_velocity(state: TrackerState, boxes: Boxes, prior: float) -> tupl
     """Velocity (k, 2), its covariance (k, 2, 2) and the probability (k,) to be stationary, by class, heading and
     traffic."""
     speed, drift = state.class_values(boxes.label, "initial_speed_deviation", "initial_lateral_speed_deviation")
-    stationary, mean, variance = state.traffic.expected(boxes.label, boxes.position[:, :2], boxes.yaw, speed**2, prior)
+    place = boxes.position[:, :2]
+    stationary, mean, variance = speed_prior(state.traffic, boxes.label, place, boxes.yaw, speed**2, prior)
     known = np.isfinite(boxes.yaw)
     ahead = np.nan_to_num(np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1))
     along = np.where(known, variance - drift**2, 0.0)[:, None, None] * (ahead[:, :, None] * ahead[:, None])

@@ -19,7 +19,7 @@ from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.tracking.trails import STEP
+from saga_fg.tracking.trails import STEP, paths
 
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
 LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
@@ -45,8 +45,8 @@ def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
     speed = np.hypot(*now.velocity.T)
     curvature = np.where(speed > MOVING, rate[rows], 0.0) / np.maximum(speed, MOVING)
     heading = _course(table.box.yaw[rows], table.box.yaw_variance[rows], now)
-    paths = state.trails.paths(table.id[rows], now.position + state.origin, heading, curvature, STEPS)
-    return replace(paths, row=rows, position=paths.position - state.origin)
+    found = paths(state.traffic, table.id[rows], now.position + state.origin, heading, curvature, STEPS)
+    return replace(found, row=rows, position=found.position - state.origin)
 
 
 def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[KnownCourses, ...], FloatArray]:

@@ -27,6 +27,7 @@ import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.stationarity import log_density
 from saga_fg.tracking.tracker_state import TrackerState
@@ -52,14 +53,12 @@ def relinked(
     if len(tracks) == 0:
         return matching
     places, noise = measurements.boxes.position[rows, :2] - state.origin, measurements.R[rows, :2, :2]
-    others = state.class_groups.same_group(label, label).sum(axis=1)
-    i, j = np.nonzero(
-        _within_reach(state, tracks, position, P, places, noise)
-        & state.class_groups.same_group(state.table.label[tracks], label)
-    )
+    i, j = _within_reach(state, tracks, position, P, places, noise)
+    alike = state.class_groups.pairs_of_group(state.table.label[tracks], label, i, j)
+    i, j = i[alike], j[alike]
     if len(i) == 0:
         return matching
-    t, d, others, z, R = tracks[i], rows[j], others[j], places[j], noise[j]
+    t, d, others, z, R = tracks[i], rows[j], state.class_groups.number_of_group(label)[j], places[j], noise[j]
     moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
     still = _log_density(z - state.table.stationarity.position[t], S)
     log_odds = log_survival(state)[t] + _mixed(state, t, moving, still) - np.log(others / area(state))
@@ -71,20 +70,22 @@ def relinked(
 
 def _within_reach(
     state: TrackerState, tracks: IntArray, position: FloatArray, P: FloatArray, z: FloatArray, R: FloatArray
-) -> BoolArray:
-    """(n, m) which tracks, by `position` and P (N, ...) of all, could be re-linked with places z (m, 2) of noise R.
+) -> tuple[IntArray, IntArray]:
+    """Pairs (K,) of `tracks` (n,), by `position` and P of all, and places z (m, 2) of noise R that could be re-linked.
 
     Neither density exceeds that of a distance beyond sqrt(trace(P + R)), at a peak of covariance P.
     """
-    table, found = state.table.stationarity, np.zeros((len(tracks), len(z)), dtype=bool)
+    table, spread, found = state.table.stationarity, R[:, 0, 0] + R[:, 1, 1], []
     most = log_survival(state)[tracks] + math.log(area(state) / (2 * math.pi)) - least_log_odds(state)
     for mean, covariance in ((position, P), (table.position, table.P)):
         mean, covariance = mean[tracks], covariance[tracks]
         a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
         gate = np.maximum(2 * most - np.log(np.maximum(a * c - b * b, _LEAST)), 0.0) * _ROUNDING
-        dx, dy = z[:, 0] - mean[:, :1], z[:, 1] - mean[:, 1:]
-        found |= dx * dx + dy * dy <= gate[:, None] * ((a + c)[:, None] + R[:, 0, 0] + R[:, 1, 1])
-    return found
+        i, j = near_pairs(mean, z, np.sqrt(gate * (a + c + spread.max())))
+        near = ((z[j] - mean[i]) ** 2).sum(axis=1) <= gate[i] * ((a + c)[i] + spread[j])
+        found.append(i[near] * len(z) + j[near])
+    i, j = np.divmod(np.unique(np.concatenate(found)), len(z))
+    return i, j
 
 
 def relinkable(state: TrackerState) -> BoolArray:

@@ -34,7 +34,7 @@ from saga_fg.settings import (
 from saga_fg.tracking.clock import ClockSettings
 from saga_fg.tracking.names import AssociationName, EstimatorName
 from saga_fg.tracking.stationarity import StationaritySettings
-from saga_fg.tracking.trails import TrailSettings
+from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types.by_class import DEFAULT, class_settings
 from saga_fg.types.road_map import RoadMap
 from saga_fg.types.signal import SignalSettings
@@ -178,33 +178,6 @@ class ExistenceSettings(Settings):
 
 
 @dataclass(frozen=True)
-class TrafficFlowSettings(Settings):
-    """Prior speed of a new track from traffic that heads the same way, see `saga_fg.tracking.traffic_flow`."""
-
-    weight: NonNegative = setting(0.0, "weight of one neighbour against the prior without traffic; 0: off, usual 5")
-    ahead_scale: PositiveOrInf = setting(
-        15.0, "sigma of the kernel on the distance along the heading, m; higher: traffic further ahead counts"
-    )
-    lateral_scale: PositiveOrInf = setting(
-        2.0, "sigma of the kernel on the distance across the heading, m; usual half a lane; higher: other lanes count"
-    )
-    heading_scale: PositiveOrInf = setting(
-        0.3, "sigma of the kernel on the difference of headings, rad; higher: traffic that turns counts"
-    )
-    spread: NonNegative = setting(
-        2.0, "standard deviation of the difference between the speeds of neighbours, m/s; higher: a weaker prior"
-    )
-    max_speed_deviation: PositiveOrInf = setting(
-        1.5, "use only tracks whose speed has a standard deviation below this, m/s; higher: more, less certain speeds"
-    )
-    memory: NonNegative = setting(
-        5.0,
-        "remember where tracks have passed for this long, s; usual 5 to 10; higher: older traffic counts, "
-        "0: only present",
-    )
-
-
-@dataclass(frozen=True)
 class EgoNodeSettings(Settings):
     """The ego vehicle as a node of the scene graph, see `saga_fg.tracking.ego_node`."""
 
@@ -281,10 +254,9 @@ class TrackerSettings(Settings):
     )
     association: AssociationSettings = settings_group(AssociationSettings, "association of detections to tracks")
     existence: ExistenceSettings = settings_group(ExistenceSettings, "when tracks are confirmed, reported and deleted")
-    traffic_flow_prior: TrafficFlowSettings = settings_group(
-        TrafficFlowSettings, "speed of new tracks from the traffic around them"
+    traffic: TrafficSettings = settings_group(
+        TrafficSettings, "memory of where traffic went and how fast, for the paths and speeds of others"
     )
-    trails: TrailSettings = settings_group(TrailSettings, "paths of undetected objects from those of earlier traffic")
     stationarity: StationaritySettings = settings_group(
         StationaritySettings, "estimation of which objects are stationary"
     )

@@ -145,6 +145,7 @@ class Tracker:
         for road_map in (self.settings.road_map, frame.road_map):
             if road_map is not None:
                 state.map_nodes.add(road_map, state.origin, state.joint)
+                state.traffic.add_lanes(road_map)
         state.joint.set_frame(frame, state.origin)
         predict(state, max(time, before))
         frame = state.ego.located(frame, state.world_T_ego)

@@ -32,8 +32,7 @@ from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_table import TrackTable
-from saga_fg.tracking.traffic_flow import TrafficFlowPrior
-from saga_fg.tracking.trails import Trails
+from saga_fg.tracking.traffic import Traffic
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
@@ -50,8 +49,7 @@ class TrackerSnapshot:
     table         one row a track
     map_nodes     known lights, stop lines, lanes and walls
     ego           the vehicle as a node
-    traffic       speeds of earlier traffic
-    trails        paths of earlier traffic
+    traffic       where earlier traffic went, and how fast
     graph         scene graph of the latest interval, None before the first
     start         time from which all others in here are counted, s
     time          of the state, s
@@ -67,8 +65,7 @@ class TrackerSnapshot:
     table: TrackTable
     map_nodes: MapNodes
     ego: EgoNode
-    traffic: TrafficFlowPrior
-    trails: Trails
+    traffic: Traffic
     graph: SceneGraph | None
     start: float
     time: float
@@ -109,7 +106,7 @@ class TrackerState:
         self.table = TrackTable.empty(len(self.class_groups))
         read = MAP_CLASSES if self.providers else classes_read(self.rules)
         self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.of(settings)
-        self.traffic, self.trails = TrafficFlowPrior(settings.traffic_flow_prior), Trails(settings.trails)
+        self.traffic = Traffic(settings.traffic)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -209,7 +206,7 @@ class TrackerState:
 
 
 def _copied(value: T) -> T:
-    """Copy what is changed in place: the table, the map, the vehicle, traffic and trails; all else is never changed."""
+    """Copy what is changed in place: the table, the map, the vehicle and traffic; all else is never changed."""
     if isinstance(value, TrackTable):
         return value.snapshot()
-    return copy.copy(value) if isinstance(value, MapNodes | EgoNode | TrafficFlowPrior | Trails) else value
+    return copy.copy(value) if isinstance(value, MapNodes | EgoNode | Traffic) else value

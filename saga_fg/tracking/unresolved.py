@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, distinct
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.boxes import Boxes
@@ -51,10 +51,15 @@ def unresolved_frames(
     rank[np.argsort(-probability, kind="stable")] = np.arange(len(boxes))
     detected, now = matching.track, state.kinematics()
     live = state.boxes(now.position, now.velocity).select(detected)
-    surer = (state.table.unresolved[detected] == 0) & (state.table.existence[detected] >= probability[:, None])
-    surer = np.concatenate([rank[None] < rank[:, None], surer], axis=1)
-    overlap = _overlaps(state, boxes, Boxes.concatenate([boxes, live]), surer)
-    covered = overlap.max(axis=1, initial=0.0) > OVERLAP
+    others = Boxes.concatenate([boxes, live])
+    row, column = touching_pairs(boxes, others)
+    is_new = column < len(boxes)
+    surer = np.empty(len(row), dtype=bool)
+    surer[is_new] = rank[column[is_new]] < rank[row[is_new]]
+    track = detected[column[~is_new] - len(boxes)]
+    surer[~is_new] = (state.table.unresolved[track] == 0) & (state.table.existence[track] >= probability[row[~is_new]])
+    row, column = row[surer], column[surer]
+    covered = _largest(_overlaps(state, boxes, others, row, column), row, len(boxes)) > OVERLAP
     precise = np.sqrt(np.linalg.eigvalsh(R)[:, -1]) < PRECISE * boxes.size[:, :2].min(axis=1)
     return np.where(covered & precise, FRAMES, 0.0)
 
@@ -70,10 +75,13 @@ def resolve_tracks(state: TrackerState, matching: Matching) -> None:
     now = state.kinematics()
     boxes = state.boxes(now.position, now.velocity)
     sure = np.flatnonzero((table.unresolved == 0) & (table.existence >= table.existence[rows].min()))
-    surer = table.existence[sure] >= table.existence[rows][:, None]
-    overlap = _overlaps(state, boxes.select(rows), boxes.select(sure), surer)
-    most, other = overlap.max(axis=1, initial=0.0), ((overlap > OVERLAP) & detected[sure]).any(axis=1)
-    seen = detected[rows]
+    mine, theirs = boxes.select(rows), boxes.select(sure)
+    row, column = touching_pairs(mine, theirs)
+    surer = table.existence[sure[column]] >= table.existence[rows[row]]
+    row, column = row[surer], column[surer]
+    overlap = _overlaps(state, mine, theirs, row, column)
+    most, seen, other = _largest(overlap, row, len(rows)), detected[rows], np.zeros(len(rows), dtype=bool)
+    other[row[(overlap > OVERLAP) & detected[sure[column]]]] = True
     apart = (most <= OVERLAP) | (other & (most <= MOST_OVERLAP))
     step = np.where(seen, -1.0 * apart, ALONE * other)
     table.unresolved[rows] = np.clip(table.unresolved[rows] + step, 0.0, MOST_FRAMES)
@@ -86,23 +94,22 @@ def over_confirmed(state: TrackerState, predicted: Boxes) -> BoolArray:
     result = np.zeros(len(table), dtype=bool)
     if len(rows):
         sure = np.flatnonzero(table.confirmed & (table.unresolved == 0))
-        overlap = _overlaps(state, predicted.select(rows), predicted.select(sure))
-        result[rows] = overlap.max(axis=1, initial=0.0) > OVERLAP
+        mine, theirs = predicted.select(rows), predicted.select(sure)
+        row, column = touching_pairs(mine, theirs)
+        result[rows] = _largest(_overlaps(state, mine, theirs, row, column), row, len(rows)) > OVERLAP
     return result
 
 
-def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, surer: BoolArray | None = None) -> FloatArray:
-    """(n, m) bird's-eye IoU of boxes (n) with others (m) of their class, `surer` (n, m) ones alone; else 0."""
-    result = np.zeros((len(boxes), len(others)))
-    row, column = touching_pairs(boxes, others)
-    if surer is not None:
-        kept = surer[row, column]
-        row, column = row[kept], column[kept]
-    if len(row) == 0:
-        return result
-    (classes, of_box), (their_classes, of_other) = distinct(boxes.label), distinct(others.label)
-    same = state.class_groups.same_group(np.array(classes), np.array(their_classes))
-    kept = same[of_box[row], of_other[column]]
-    row, column = row[kept], column[kept]
-    result[row, column] = paired_bev_iou(boxes.select(row), others.select(column))
-    return result
+def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, row: IntArray, column: IntArray) -> FloatArray:
+    """(K,) bird's-eye IoU of boxes[row] with others[column] of their class or group, 0 with those of other classes."""
+    overlap = np.zeros(len(row))
+    alike = np.flatnonzero(state.class_groups.pairs_of_group(boxes.label, others.label, row, column))
+    overlap[alike] = np.nan_to_num(paired_bev_iou(boxes.select(row[alike]), others.select(column[alike])))
+    return overlap
+
+
+def _largest(overlap: FloatArray, row: IntArray, count: int) -> FloatArray:
+    """(count,) largest of the overlaps (K,) of each row, 0 where there is none."""
+    largest = np.zeros(count)
+    np.maximum.at(largest, row, overlap)
+    return largest

@@ -1,6 +1,6 @@
 """Update: the matched measurements correct position and velocity, box, stationarity and class of their tracks.
 
-Their speeds are remembered for the prior of new tracks (`saga_fg.tracking.traffic_flow`).
+Where they are, and how fast, is remembered for the paths and speeds of others (`saga_fg.tracking.traffic`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.out_of_sequence import moved_to_present
 from saga_fg.tracking.retrodiction import past_positions
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.tracking.traffic_flow import Passages
-from saga_fg.tracking.trails import TrailPoints
+from saga_fg.tracking.traffic import Passages
 
 LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 
@@ -47,12 +46,12 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
         moves = (speed > MOVING) & (speed > 3 * now.speed_deviation)
         table.box.face_motion(np.where(moves[:, None], now.velocity, 0.0))
         table.has_moved[t] |= moves[t]
-        seen = t[moves[t]]
-        heading, time = np.arctan2(*now.velocity[seen, ::-1].T), np.full(len(seen), state.time)
-        passing = TrailPoints(table.id[seen], now.position[seen] + state.origin, heading, speed[seen], time)
-        state.trails.update(passing, state.time)
-    if state.settings.traffic_flow_prior.weight > 0:
-        state.traffic.update(Passages.of(table, t, state.kinematics().select(t), state.origin, state.time))
+        if state.settings.traffic.memory > 0:
+            there = now.select(t)
+            there = there._replace(position=there.position + state.origin)
+            still = table.stationarity.probability[t]
+            passing = Passages.of(table.id[t], table.label[t], there, table.box.yaw[t], moves[t], state.time, still)
+            state.traffic.update(passing, state.time)
 
 
 def infer_signals(state: TrackerState, matching: Matching) -> None:

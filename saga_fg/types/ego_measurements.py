@@ -1,4 +1,4 @@
-"""Ego measurements of a frame: odometry, GPS, inertial samples, landmarks."""
+"""Ego measurements of a frame: odometry, GPS, inertial samples, wheel speed, landmarks."""
 
 from __future__ import annotations
 
@@ -47,12 +47,18 @@ class OdometryIncrement:
 
 @dataclass(frozen=True, eq=False)
 class GpsFix:
-    """A measured place, (2,) or (3,), world, m; covariance (2, 2) or (3, 3), None: by the provider's settings."""
+    """A measured place, (2,) or (3,), world, m.
+
+    covariance  (2, 2) or (3, 3), None: by the provider's settings
+    age         s between the fix and the frame that brings it
+    """
 
     position: FloatArray
     covariance: FloatArray | None = None
+    age: float = 0.0
 
     def __post_init__(self) -> None:
+        _check_number("gps: age", self.age, 0.0)
         place = checked("gps", self.position, (None,))
         if len(place) not in (2, 3):
             raise InputError(f"gps: expected a place of 2 or 3 coordinates, got {len(place)}")
@@ -83,6 +89,21 @@ class ImuSamples:
 
 
 @dataclass(frozen=True, eq=False)
+class WheelSpeed:
+    """Mean speed ahead over the last `dt` s, m/s, negative backwards; deviation, m/s: None: by the settings."""
+
+    speed: float
+    dt: float
+    deviation: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_number("wheels: speed", self.speed, -math.inf)
+        _check_number("wheels: dt", self.dt, 0.0)
+        if self.deviation is not None:
+            _check_number("wheels: deviation", self.deviation, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
 class EgoMeasurements:
     """All of them, as far as there are any; landmarks: what is seen of each, by its id."""
 
@@ -90,9 +111,15 @@ class EgoMeasurements:
     gps: GpsFix | None = None
     imu: ImuSamples | None = None
     landmarks: Mapping[int, Observation] = field(default_factory=dict)
+    wheels: WheelSpeed | None = None
 
     def __post_init__(self) -> None:
-        for name, kind in (("odometry", OdometryIncrement), ("gps", GpsFix), ("imu", ImuSamples)):
+        for name, kind in (
+            ("odometry", OdometryIncrement),
+            ("gps", GpsFix),
+            ("imu", ImuSamples),
+            ("wheels", WheelSpeed),
+        ):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise InputError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
@@ -104,3 +131,8 @@ class EgoMeasurements:
 
 def _covariance(name: str, value: ArrayLike | None, dim: int) -> FloatArray | None:
     return None if value is None else checked_covariances(name, checked(name, value, (dim, dim))[None], 1, dim)[0]
+
+
+def _check_number(name: str, value: float, least: float) -> None:
+    if not (isinstance(value, int | float | np.floating) and math.isfinite(value) and value >= least):
+        raise InputError(f"{name}: expected a finite number{' >= 0' if least == 0 else ''}, got {value!r}")

@@ -30,6 +30,7 @@ from __future__ import annotations
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.types.boxes import Boxes
 
 HAIR = 1e-11  # relative to the size of the boxes
@@ -83,9 +84,7 @@ def paired_giou_3d(a: Boxes, b: Boxes) -> FloatArray:
 def touching_pairs(a: Boxes, b: Boxes) -> tuple[IntArray, IntArray]:
     """Rows of `a` and of `b` of the pairs whose circumscribed circles meet: all that can overlap."""
     radius_a, radius_b = (np.hypot(x.size[:, 0], x.size[:, 1]) / 2 for x in (a, b))
-    square = _square_distances(a, b)
-    rows, columns = np.nonzero(square < (radius_a[:, None] + radius_b[None, :]) ** 2)
-    return rows, columns
+    return near_pairs(a.position[:, :2], b.position[:, :2], radius_a, radius_b)
 
 
 def paired_intersection(a: Boxes, b: Boxes) -> FloatArray:
@@ -155,13 +154,6 @@ def paired_hull(a: Boxes, b: Boxes) -> FloatArray:
     ).reshape(len(a), 16, 2)
     following = np.roll(corners, -1, axis=1)
     return np.asarray(np.sum(corners[..., 0] * following[..., 1] - corners[..., 1] * following[..., 0], axis=1) / 2)
-
-
-def _square_distances(a: Boxes, b: Boxes) -> FloatArray:
-    """(N, M) squared horizontal distances of the centres, m^2."""
-    x = a.position[:, None, 0] - b.position[None, :, 0]
-    y = a.position[:, None, 1] - b.position[None, :, 1]
-    return np.asarray(x * x + y * y)
 
 
 def _may_touch(a: Boxes, b: Boxes) -> BoolArray:

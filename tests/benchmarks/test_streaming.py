@@ -34,6 +34,7 @@ def test_memory_is_read_and_the_labels_are_those_of_the_whole(tmp_path: Path) ->
     assert result["largest_difference"] < 1e-3
     assert result["differing"] <= result["compared"] / 50
     assert result["rows"][-1]["recorded"] == 12.0
+    assert result["at_once"] > 0.1
     assert result["peak"] == max(row["peak"] for row in result["rows"])
     assert result["growth"] == pytest.approx(result["peak"] / result["rows"][0]["peak"])
 

@@ -254,8 +254,8 @@ def test_parts_of_the_graph_are_contenders_where_they_are_configured() -> None:
     base = load_config("heterogeneous")
     rules = contenders("heterogeneous")["without lights"].config(base).tracker.edges
     assert {type(rule) for rule in base.tracker.edges} - {type(rule) for rule in rules} == {RedLight}
-    assert contenders("traffic")["without trails"].config(load_config("traffic")).tracker.trails.memory == 0
-    assert load_config("traffic").tracker.trails.memory > 0
+    assert contenders("traffic")["without trails"].config(load_config("traffic")).tracker.traffic.reach == 0
+    assert load_config("traffic").tracker.traffic.reach > 0
 
 
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:

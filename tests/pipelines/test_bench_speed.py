@@ -19,7 +19,7 @@ from saga_fg.tracking import GreedySettings, GreedyTracker
 
 @pytest.fixture(scope="module")
 def result():
-    return bench_speed(SpeedBenchSettings(sizes=(5, 100, 120), frames=4))
+    return bench_speed(SpeedBenchSettings(sizes=(5, 100, 120), frames=4, round_trips=0))
 
 
 def test_every_method_and_the_frozen_one_have_a_row_for_every_case(result) -> None:
@@ -62,10 +62,13 @@ def test_the_frozen_clock_matches_as_centerpoint_does() -> None:
 
 def test_the_command_writes_figures_and_a_profile(tmp_path: Path) -> None:
     figures, profile = tmp_path / "figures.json", tmp_path / "profile.json"
-    arguments = f"bench speed --sizes 20 --frames 10 --json {figures} --profile {profile}"
+    arguments = f"bench speed --sizes 20 --frames 10 --round-trips 2 --json {figures} --profile {profile}"
     outcome = CliRunner().invoke(app, arguments.split())
     assert outcome.exit_code == 0, outcome.output
-    assert len(json.loads(figures.read_text())["rows"]) == 8
+    result = json.loads(figures.read_text())
+    assert len(result["rows"]) == 8
+    assert 0 < result["service"]["p50"] <= result["service"]["p99"]
+    assert "live service" in outcome.output
     written = json.loads(profile.read_text())
     samples, frames = written["profiles"][0]["samples"], written["shared"]["frames"]
     assert len(samples) == len(written["profiles"][0]["weights"])

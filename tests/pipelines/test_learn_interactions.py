@@ -87,7 +87,7 @@ def test_edges_that_raise_errors_are_left_out_and_the_base_motion_remains(monkey
 def test_the_base_motion_is_the_tracker_that_is_written_if_no_form_helps(monkeypatch, scenes):
     with_template(monkeypatch, replace(FOLLOW, interaction=CarFollowing(1.0, 5.0, "standstill")))
     config = load_config("file")
-    tracker = replace(config.tracker, edges=(), trails=replace(config.tracker.trails, memory=60.0))
+    tracker = replace(config.tracker, edges=(), traffic=replace(config.tracker.traffic, memory=60.0))
     config, tried = replace(config, tracker=tracker), []
 
     def bench(source, recordings, contenders, *args, **kwargs):

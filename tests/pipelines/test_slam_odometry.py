@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 
 from data_tools.datasets.kitti import KittiScans
 from data_tools.lidar import Scan
+from data_tools.simulator.featureless import tunnel
+from data_tools.simulator.scanner import ScannerSettings
 from data_tools.simulator.street import SimulatedScans, drive, scans, street
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.bench.slam import bench_slam
@@ -46,6 +48,14 @@ def test_a_drive_is_followed_to_centimetres(seed: int) -> None:
         assert np.linalg.eigvalsh(step.covariance)[0] > 0
 
 
+def test_a_start_at_full_speed_is_caught_up_with() -> None:
+    """As long as the speed is not known, no prediction is held on to."""
+    poses = drive(8, speed=16.0, turn_rate=0.0)
+    steps = run(scans(street(1), poses, 1))
+    estimate = poses[0] @ np.array([step.map_T_lidar for step in steps])
+    assert np.linalg.norm(np.diff(estimate[4:, 0, 3]) - 1.6) < 0.1
+
+
 def test_poses_stay_rigid_however_long_the_chain() -> None:
     """A rotation a little off, fed back through the predicted motion, would be off by everything within forty scans."""
     world, poses = street(0), np.repeat(drive(2, speed=0.5)[:1], 45, axis=0)
@@ -66,6 +76,25 @@ def test_a_scan_without_points_lies_where_it_was_predicted(caplog: pytest.LogCap
     assert np.linalg.eigvalsh(steps[5].covariance)[0] > 0.1
     estimate = poses[0] @ np.array([step.map_T_lidar for step in steps])
     assert np.linalg.norm(estimate[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.1
+
+
+def test_through_a_tunnel_odometry_says_what_it_does_not_see(caplog: pytest.LogCaptureFixture) -> None:
+    """A street, then a tunnel: along it other sensors decide, and the covariance leaves room for them."""
+    poses = drive(36, speed=16.0, turn_rate=0.0)
+    world = tunnel(poses[10, 0, 3], poses[10, 0, 3] + 200.0, seed=0)
+    taken = scans(world, poses, settings=ScannerSettings(rings=24, columns=360, reach=25.0))
+    odometry, wheels = LidarOdometry(), np.array([np.nan] * 3 + [16.0, np.nan, np.nan])
+    with caplog.at_level(logging.WARNING):
+        steps = [odometry.step(scan, PERIOD * k, wheels) for k, scan in enumerate(taken)]
+    assert not any(step.degenerate for step in steps[:10])
+    inside = steps[-6:]
+    assert all("along the road" in step.degenerate for step in inside)
+    assert all(step.covariance[3, 3] > 0.5 > 0.05 > step.covariance[4, 4] for step in inside)
+    assert "do not determine the motion along the road" in caplog.text
+    estimate = poses[0] @ np.array([step.map_T_lidar for step in steps])
+    assert np.linalg.norm(estimate[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.3
+    with pytest.raises(InputError, match="velocity: expected"):
+        odometry.step(taken[0], 10.0, np.zeros(3))
 
 
 def test_time_runs_forwards_and_settings_are_checked() -> None:

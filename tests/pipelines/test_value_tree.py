@@ -18,7 +18,7 @@ from pipelines.serving.value_tree import TreeWriter, read_tree
 from saga_fg import Detection, Detections, Frame, InputError
 from saga_fg.model.motion import ConstantVelocity
 from saga_fg.tracking.settings import TrackerSettings
-from saga_fg.tracking.traffic_flow import SpeedPrior
+from saga_fg.tracking.speed_prior import SpeedPrior
 
 
 def again(value: Any) -> Any:

@@ -13,6 +13,7 @@ Source: Geiger et al., Vision meets robotics: the KITTI dataset, IJRR 2013.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,14 +36,42 @@ def read_poses(path: str | Path) -> FloatArray:
         if (np.abs(angle) > largest).any():
             row = int(np.argmax(np.abs(angle) > largest))
             raise table.fault(row, f"{name}: expected degrees within {largest:g} of 0, got {angle[row]:g}")
-    scale = EARTH_RADIUS * np.cos(np.radians(latitude[0]))
-    position = np.stack(
-        [scale * np.radians(longitude), scale * np.log(np.tan(np.radians(90 + latitude) / 2)), altitude], axis=1
-    )
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3] = _turn(yaw, 0, 1) @ _turn(pitch, 2, 0) @ _turn(roll, 1, 2)
-    poses[:, :3, 3] = position - position[0]
+    poses[:, :3, 3] = world_position(latitude, longitude, altitude, np.array([latitude[0], longitude[0], altitude[0]]))
     return poses
+
+
+def world_position(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray, origin: FloatArray) -> FloatArray:
+    """Positions (K, 3) east, north and up of an origin (3,), m; latitudes and longitudes in degrees, altitudes in m."""
+    scale = EARTH_RADIUS * np.cos(np.radians(origin[0]))
+    above = [np.log(np.tan(np.radians(90 + angle) / 2)) for angle in (latitude, origin[0])]
+    return np.stack(
+        [scale * np.radians(longitude - origin[1]), scale * (above[0] - above[1]), altitude - origin[2]], axis=1
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SensorRecords:
+    """K records in the vehicle's axes, without the poses.
+
+    position (K, 3) as in `read_poses`, m; speed (K,) ahead, m/s; acceleration (K, 3) specific force, m/s^2;
+    angular_rate (K, 3), rad/s
+    """
+
+    position: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
+    angular_rate: FloatArray
+
+
+def read_sensors(path: str | Path) -> SensorRecords:
+    """Read what the records say of velocity, acceleration and turn rate. Raises `InputError` as `read_poses` does."""
+    position = read_poses(path)[:, :3, 3]
+    table = read_table(Path(path), (30,), "latitude, longitude, altitude, roll, pitch, yaw, ...")
+    names = ("vf", "ax", "ay", "az", "wx", "wy", "wz")
+    numbers = table.numbers([8, 11, 12, 13, 17, 18, 19], names)
+    return SensorRecords(position, numbers[:, 0], numbers[:, 1:4], numbers[:, 4:])
 
 
 def _turn(angle: FloatArray, from_axis: int, to_axis: int) -> FloatArray:

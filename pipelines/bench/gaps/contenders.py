@@ -81,7 +81,7 @@ def contenders(family: str | Path) -> dict[str, Variant]:
     """All, by name, for the settings of a kind of data."""
     found = (
         Variant("saga"),
-        Variant("without trails", changes={"tracker.trails.memory": 0.0}),
+        Variant("without trails", changes={"tracker.traffic.reach": 0.0}),
         Variant("without lights", changes={"tracker.edges": _without_lights}),
         Variant("kf", "kf"),
         _classical(family, "constant velocity", stationary=False, turn=False),

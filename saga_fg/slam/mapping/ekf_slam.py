@@ -19,9 +19,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import ResidualFactors, Variable, Vector, linearised, pose
+from factors import Variable, Vector, pose
 from factors.differences import central_differences
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.slam.mapping.jacobians import whitened_jacobians
 from saga_fg.types.landmark import LandmarkType, Observation
 
 _SAME = 1e-6  # variance of the difference of a landmark from itself, for the numerics
@@ -90,21 +91,8 @@ class EkfSlam:
         rows = np.stack([np.full(n, POSE), keys], axis=1)
         observed = np.broadcast_to(observation.value, (n, len(observation.value)))
         covariances = np.broadcast_to(observation.covariance, (n, *observation.covariance.shape))
-        factors = observation.kind.factors(rows, observed, covariances)
-        if not isinstance(factors, gtsam.NonlinearFactorGraph) and isinstance(factors[0], ResidualFactors):
-            W, (by_pose, by_landmark), r = factors[0].linearisation(self.values)
-            whitened = zip(keys, (W @ r[:, :, None])[:, :, 0], W @ by_pose, W @ by_landmark, strict=True)
-            return [Innovation(*one) for one in whitened]
-        if isinstance(factors, gtsam.NonlinearFactorGraph):
-            linear = factors.linearize(self.values)
-        else:
-            linear = linearised(gtsam.NonlinearFactorGraph(), factors, self.values)
-        k = self._columns[POSE].stop
-        found = []
-        for row, key in enumerate(keys):
-            A, b = linear.at(row).jacobian()
-            found.append(Innovation(key, -b, A[:, :k], A[:, k:]))
-        return found
+        whitened = whitened_jacobians(observation.kind, rows, observed, covariances, self.values)
+        return [Innovation(*one) for one in zip(keys, *whitened, strict=True)]
 
     def innovation_covariance(self, innovations: Sequence[Innovation]) -> FloatArray:
         """S (D, D) of innovations together, whitened: the identity is the noise alone."""

@@ -3,8 +3,8 @@
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import chordal_poses, nearest_rotations
 from saga_fg.slam.pose_graph.chordal_cost import ChordalCost
-from saga_fg.slam.pose_graph.consensus import Consensus, consensus, trusted
-from saga_fg.slam.pose_graph.graph import PoseGraph
+from saga_fg.slam.pose_graph.consensus import Consensus, consensus
+from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
 from saga_fg.slam.pose_graph.landmarks import (
     LandmarkObservations,
     ObservationKind,

@@ -44,7 +44,7 @@ _LARGER = 10.0  # ratio of successive shifts, until no eigenvalue is below
 class ChordalMinimum:
     """Poses of least chordal cost, and what that cost can't fall below.
 
-    world_T_pose  (N, d + 1, d + 1), the first as in the graph
+    world_T_pose  (N, d + 1, d + 1), in the frame of the priors, or with the first as in the graph
     cost          F of these poses
     bound         proven lower bound of F over all poses
     eigenvalue    a lower bound, 0 or less, of the eigenvalues of S at the frames that prove this
@@ -69,8 +69,13 @@ class ChordalMinimum:
 
 
 def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
-    """The minimum of the chordal cost by the staircase; start: poses (N, d + 1, d + 1)."""
+    """The minimum of the chordal cost by the staircase; start: poses (N, d + 1, d + 1).
+
+    Raises `InputError` for landmarks seen by bearings.
+    """
     cost, d = ChordalCost.of(graph), graph.dim
+    if graph.priors is not None:
+        start = np.concatenate([start, np.eye(d + 1)[None]])
     proofs: list[tuple[float, float, int]] = []  # bound, eigenvalue, dimensions
 
     def direction_down(frames: Frames) -> FloatArray | None:
@@ -125,7 +130,8 @@ def _with_positions(cost: ChordalCost, L: FloatArray) -> csc_array:
     """M less the multipliers, without the first position."""
     whole = np.zeros((len(L), cost.dim + 1, cost.dim + 1))
     whole[:, : cost.dim, : cost.dim] = L
-    return _without_first_position(cost, (cost.M - block_diag(list(whole), format="csc")).tocsc())
+    points = csc_array((cost.M.shape[0] - whole.shape[0] * whole.shape[1],) * 2)
+    return _without_first_position(cost, (cost.M - block_diag([*whole, points], format="csc")).tocsc())
 
 
 def _on_rotations(cost: ChordalCost, eta: float) -> csc_array:
@@ -186,9 +192,9 @@ def rounded_rotations(Y: FloatArray) -> FloatArray:
 
 
 def _poses(graph: PoseGraph, cost: ChordalCost, Y: FloatArray) -> FloatArray:
-    """Poses of rotations as frames (N, d, d), moved so that the first is that of the graph."""
+    """Poses of rotations as frames (N, d, d), in the frame of the graph."""
     n, d, _ = Y.shape
     poses = np.tile(np.eye(d + 1), (n, 1, 1))
     poses[:, :d, :d] = Y.swapaxes(1, 2)
-    poses[:, :d, d] = cost.best_positions(Y.reshape(n * d, d))
-    return np.asarray(graph.world_T_pose[0] @ np.linalg.inv(poses[0]) @ poses)
+    poses[:, :d, d] = cost.best_positions(Y.reshape(n * d, d))[:n]
+    return graph.in_its_frame(poses)

@@ -27,19 +27,19 @@ from saga_fg.slam.pose_graph.graph import PoseGraph
 
 
 def chordal_poses(graph: PoseGraph) -> FloatArray:
-    """Return poses (N, d + 1, d + 1) from the measurements alone; the first is fixed.
+    """Return poses (N, d + 1, d + 1) from the measurements and priors alone; without priors the first is fixed.
 
     Raises `InputError` for a graph that is not connected.
     """
-    d = graph.dim
-    apart = graph.components() != 0
+    d, whole = graph.dim, graph.with_frame_as_pose()
+    apart = whole.components() != 0
     if apart.any():
-        raise InputError(f"pose {int(graph.ids[apart][0])}: expected measurements that connect it with the first pose")
-    kappa, tau = edge_weights(graph)
-    poses = np.tile(np.eye(d + 1), (len(graph), 1, 1))
-    poses[:, :d, :d] = _rotations(graph, kappa)
-    poses[:, :d, d] = _positions(graph, poses[:, :d, :d], tau)
-    return np.asarray(graph.world_T_pose[0] @ poses)
+        raise InputError(f"pose {int(whole.ids[apart][0])}: expected measurements that connect it with the first pose")
+    kappa, tau = edge_weights(whole)
+    poses = np.tile(np.eye(d + 1), (len(whole), 1, 1))
+    poses[:, :d, :d] = _rotations(whole, kappa)
+    poses[:, :d, d] = _positions(whole, poses[:, :d, :d], tau)
+    return graph.in_its_frame(poses)
 
 
 def nearest_rotations(matrices: FloatArray) -> FloatArray:

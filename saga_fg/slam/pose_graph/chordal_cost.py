@@ -9,6 +9,12 @@ with an edge a row of blocks of A: 1 at its second pose, -T_e^T at its first one
 `saga_fg.slam.pose_graph.graph`, which measures rotations by their angle, but near it; and whether a minimum is the
 global one can be proved (`saga_fg.slam.pose_graph.certificate`).
 
+A point l seen at z from a pose, with information Omega, adds a row (1 at the point, -(z^T, 1) at the pose):
+
+    tau || l - t - R z ||^2,      tau = d / tr(Omega^-1)
+
+and a prior is an edge from one more pose, the frame that it is given in.
+
 Positions are free, and the best ones for given rotations solve a linear problem. What is left is a form in Y_R alone,
 
     F = tr( Y_R^T Q Y_R ),     Q = M_RR - M_Rt M_tt^+ M_tR
@@ -24,11 +30,13 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array, diags_array
+from scipy.sparse import block_diag, bsr_array, csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.pose_graph.graph import PoseGraph
+from saga_fg.slam.pose_graph.landmarks import PointLandmarks
 
 _FLOOR = 1e-9  # of the largest diagonal entry of M, added to make it definite: rotations and positions are relative
 
@@ -51,34 +59,42 @@ def edge_matrix(graph: PoseGraph, first: FloatArray, second: FloatArray) -> csc_
 
 @dataclass(frozen=True, eq=False)
 class ChordalCost:
-    """M (N (d + 1), N (d + 1)) of a pose graph of N poses in d dimensions."""
+    """M (N (d + 1) + L, N (d + 1) + L) of a pose graph of N poses, with the frame of its priors, and L points."""
 
     dim: int
+    poses: int
     M: csc_array
 
     @classmethod
     def of(cls, graph: PoseGraph) -> Self:
-        """The cost of all measurements of a graph."""
+        """The cost of all measurements of a graph. Raises `InputError` for landmarks seen by bearings."""
+        graph = graph.with_frame_as_pose()
         d, (kappa, tau) = graph.dim, edge_weights(graph)
         T = graph.first_T_second
         A = edge_matrix(graph, -T.swapaxes(1, 2), np.broadcast_to(np.eye(d + 1), T.shape))
         W = np.column_stack([np.tile(kappa[:, None], (1, d)), tau]).ravel()
-        return cls(d, (A.T @ diags_array(W) @ A).tocsc())
+        M = (A.T @ diags_array(W) @ A).tocsc()
+        if (landmarks := graph.landmarks) is not None:
+            A, W = _point_matrix(landmarks, len(graph), d)
+            M = block_diag([M, csc_array((len(landmarks.ids),) * 2)], format="csc") + A.T @ diags_array(W) @ A
+        return cls(d, len(graph), M.tocsc())
 
-    def at(self, world_T_pose: FloatArray) -> float:
-        """F of poses (N, d + 1, d + 1)."""
+    def at(self, world_T_pose: FloatArray, points: FloatArray | None = None) -> float:
+        """F of poses (N, d + 1, d + 1) and points (L, d)."""
         Y = world_T_pose[:, : self.dim].swapaxes(1, 2).reshape(-1, self.dim)
+        Y = Y if points is None else np.concatenate([Y, points])
         return float((Y * (self.M @ Y)).sum())
 
     @cached_property
     def rotations(self) -> IntArray:
         """Rows of Y_R."""
-        return np.flatnonzero(np.arange(self.M.shape[0]) % (self.dim + 1) != self.dim)
+        rows = np.arange(self.poses * (self.dim + 1))
+        return np.asarray(rows[rows % (self.dim + 1) != self.dim])
 
     @cached_property
     def positions(self) -> IntArray:
-        """Rows of Y_t."""
-        return np.arange(self.dim, self.M.shape[0], self.dim + 1)
+        """Rows of Y_t: of the poses, then of the points."""
+        return np.delete(np.arange(self.M.shape[0]), self.rotations)
 
     def times(self, Y: FloatArray) -> FloatArray:
         """Q Y for Y (N d, r)."""
@@ -86,7 +102,7 @@ class ChordalCost:
         return np.asarray(self._M_RR @ Y + self._M_Rt @ t)
 
     def best_positions(self, Y: FloatArray) -> FloatArray:
-        """Y_t (N, r) of least cost for Y_R (N d, r), the first being 0."""
+        """Y_t (N + L, r) of least cost for Y_R (N d, r), the first being 0."""
         t = np.zeros((len(self.positions), Y.shape[1]))
         if len(t) > 1:
             t[1:] = self._positions_solver.solve(np.ascontiguousarray(-(self._M_Rt.T @ Y)[1:]))
@@ -114,6 +130,27 @@ class ChordalCost:
     @cached_property
     def _solver(self) -> SuperLU:
         return factorised(self.M + _FLOOR * self.M.diagonal().max() * diags_array(np.ones(self.M.shape[0])))
+
+
+def _point_matrix(landmarks: PointLandmarks, poses: int, d: int) -> tuple[csc_array, FloatArray]:
+    """Rows (S, N (d + 1) + L) of S observations, and their weights (S,)."""
+    for seen in landmarks.observations:
+        if seen.kind != "point":
+            name = int(landmarks.ids[seen.landmark[0]])
+            raise InputError(
+                f"landmark {name}: expected a point, seen by coordinates; the chordal cost knows no {seen.kind}"
+            )
+    pose, point = (
+        np.concatenate([getattr(seen, end) for seen in landmarks.observations]) for end in ("pose", "landmark")
+    )
+    z, information = (
+        np.concatenate([getattr(seen, name) for seen in landmarks.observations]) for name in ("z", "information")
+    )
+    ones = np.ones((len(z), 1))
+    columns = np.column_stack([pose[:, None] * (d + 1) + np.arange(d + 1), poses * (d + 1) + point])
+    entries = (np.hstack([-z, -ones, ones]).ravel(), columns.ravel(), (d + 2) * np.arange(len(z) + 1))
+    A = csr_array(entries, shape=(len(z), poses * (d + 1) + len(landmarks.ids))).tocsc()
+    return A, d / np.trace(np.linalg.inv(information), axis1=1, axis2=2)
 
 
 def factorised(matrix: csc_array) -> SuperLU:

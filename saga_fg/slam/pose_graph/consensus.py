@@ -1,7 +1,7 @@
 r"""Which loop closures of a pose graph are true.
 
-Odometry (between successive poses) is trusted. First, graduated non-convexity with truncated least squares from dead
-reckoning: in each step of mu one weighted Gauss-Newton step,
+Odometry (between successive poses), priors and landmarks are trusted. First, graduated non-convexity with truncated
+least squares from dead reckoning: in each step of mu one weighted Gauss-Newton step,
 
     w = 1                     s^2 <= mu/(mu+1) c^2                s: distance of the loop's residual
         0                     s^2 >= (mu+1)/mu c^2                c^2: 99 % quantile of chi^2
@@ -32,11 +32,12 @@ from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.stats import chi2
 
+from factors import ResidualFactors, linearised
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.slam.pose_graph.chordal_cost import factorised
-from saga_fg.slam.pose_graph.graph import PoseGraph
-from saga_fg.slam.pose_graph.optimisation import factor_graph, pose_array, pose_values
+from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
+from saga_fg.slam.pose_graph.optimisation import factor_graph, graph_values, landmark_factors, placed, solved_graph
 
 PROBABILITY = 0.99  # of a true loop within c
 _CERTAIN = 0.999  # of a true loop within the gate: few of many loops may be lost
@@ -56,15 +57,11 @@ class Consensus:
     kept: BoolArray
 
 
-def trusted(graph: PoseGraph) -> BoolArray:
-    """Which measurements (M,) are odometry: they join successive poses."""
-    return np.asarray(np.abs(graph.second - graph.first) == 1)
-
-
 def consensus(graph: PoseGraph) -> Consensus:
-    """The graph without false loops. Raises `InputError` for landmarks, priors, and a graph that is not connected."""
-    if not graph.poses_alone:
-        raise InputError("consensus: expected a graph of poses alone, without landmarks and priors")
+    """The graph without false loops; priors and observations of landmarks are trusted, as odometry is.
+
+    Raises `InputError` for a graph that measurements between poses do not connect.
+    """
     apart = graph.components() != 0
     if apart.any():
         raise InputError(f"pose {int(graph.ids[apart][0])}: expected measurements that connect it with the first pose")
@@ -74,11 +71,10 @@ def consensus(graph: PoseGraph) -> Consensus:
     if not loop.any():
         return Consensus(graph, ~loop)
     problem = _Problem.of(graph)
-    values = pose_values(_spanning_start(graph, ~loop))
+    values = graph_values(placed(graph, _spanning_start(graph, ~loop)))
     values, weights = _graduated(problem, values, loop)
     values, kept = _snooped(problem, values, loop, weights > 0.5)
-    poses = pose_array(values, graph.dim)
-    return Consensus(chosen_edges(graph, kept).at(poses), kept)
+    return Consensus(chosen_edges(solved_graph(graph, values), kept), kept)
 
 
 def chosen_edges(graph: PoseGraph, kept: BoolArray) -> PoseGraph:
@@ -111,20 +107,29 @@ def _spanning_start(graph: PoseGraph, spanning: BoolArray) -> FloatArray:
     """Dead reckoning along these measurements from the first pose."""
     part = chosen_edges(graph, spanning)
     start = PoseGraph.of_measurements(part.ids, part.first, part.second, part.first_T_second, part.information)
-    return np.asarray(graph.world_T_pose[0] @ start.world_T_pose)
+    if (priors := graph.priors) is None:
+        return np.asarray(graph.world_T_pose[0] @ start.world_T_pose)
+    known = int(priors.pose[0])
+    return np.asarray(priors.world_T_pose[0] @ np.linalg.inv(start.world_T_pose[known]) @ start.world_T_pose)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The factors of a graph; k: size of the tangent. The first factor holds the first pose."""
+    """The factors of a graph: those that hold it (the first pose, or the priors), edges, and landmarks seen.
+
+    k: size of the tangent
+    """
 
     factors: gtsam.NonlinearFactorGraph
-    k: int
+    held: int
     edges: int
+    k: int
+    seen: list[ResidualFactors]
 
     @classmethod
     def of(cls, graph: PoseGraph) -> _Problem:
-        return cls(factor_graph(graph), 3 * (graph.dim - 1), len(graph.first))
+        factors, edges = factor_graph(graph), len(graph.first)
+        return cls(factors, factors.size() - edges, edges, 3 * (graph.dim - 1), landmark_factors(graph))
 
     @property
     def gate(self) -> float:
@@ -132,19 +137,18 @@ class _Problem:
 
     def distances(self, values: gtsam.Values) -> FloatArray:
         """Squares of the distances (M,), in variances."""
-        return np.array([2 * self.factors.at(1 + edge).error(values) for edge in range(self.edges)])
+        return np.array([2 * self.factors.at(self.held + edge).error(values) for edge in range(self.edges)])
 
     def step(self, values: gtsam.Values, weights: FloatArray) -> gtsam.Values:
         """A step of Gauss and Newton with weights (M,)."""
         taken = np.flatnonzero(weights > 0)
         part, full = gtsam.NonlinearFactorGraph(), np.flatnonzero(weights[taken] >= 1)
-        part.add(self.factors.at(0))
-        for edge in taken[full].tolist():
-            part.add(self.factors.at(1 + edge))
-        linear = part.linearize(values)
+        for row in [*range(self.held), *(self.held + taken[full]).tolist()]:
+            part.add(self.factors.at(row))
+        linear = linearised(part, self.seen, values)
         unit = gtsam.noiseModel.Unit.Create(self.k)
         for edge in taken[weights[taken] < 1].tolist():
-            row, root = self.factors.at(1 + edge).linearize(values), np.sqrt(weights[edge])
+            row, root = self.factors.at(self.held + edge).linearize(values), np.sqrt(weights[edge])
             A = root * row.augmentedJacobian()
             first, second = row.keys()
             linear.add(
@@ -155,13 +159,12 @@ class _Problem:
         return values.retract(linear.optimize())
 
     def rows(self, values: gtsam.Values) -> tuple[csc_array, FloatArray]:
-        """Whitened Jacobian (M k, N k) of the measurements, and residuals (M, k)."""
-        linear = self.factors.linearize(values)
+        """Whitened Jacobian of all factors, edges from row `held` k on, and residuals (M, k) of the edges."""
+        linear = linearised(self.factors, self.seen, values)
         row, column, entry = linear.sparseJacobian_()
         whole = coo_array((entry, (row.astype(np.int64) - 1, column.astype(np.int64) - 1))).tocsc()
-        matrix = whole[self.k :]
-        size = matrix.shape[1] - 1
-        return matrix[:, :size].tocsc(), matrix[:, [size]].toarray().reshape(-1, self.k)
+        size, at = whole.shape[1] - 1, self.held * self.k
+        return whole[:, :size].tocsc(), whole[at : at + self.edges * self.k, [size]].toarray().reshape(-1, self.k)
 
 
 def _graduated(problem: _Problem, values: gtsam.Values, loop: BoolArray) -> tuple[gtsam.Values, FloatArray]:
@@ -218,13 +221,14 @@ def _judged(problem: _Problem, values: gtsam.Values, edges: IntArray, kept: Bool
     """d^2 of loops (n,), each by a solution without it; infinite where the others do not determine it."""
     k = problem.k
     J, r = problem.rows(values)
-    taken = diags_array(np.repeat(kept.astype(float), k))
-    H = (J.T @ taken @ J).tocsc()[k:, k:]  # the first pose is held
-    solver = factorised(H)
+    at = problem.held * k
+    taken = np.ones(J.shape[0])
+    taken[at : at + problem.edges * k] = np.repeat(kept.astype(float), k)
+    solver = factorised((J.T @ diags_array(taken) @ J).tocsc())
     found = np.empty(len(edges))
-    J = J.tocsr()[:, k:]
-    for at in range(0, len(edges), _BLOCK):
-        block = edges[at : at + _BLOCK]
+    J = J.tocsr()[at:]
+    for first in range(0, len(edges), _BLOCK):
+        block = edges[first : first + _BLOCK]
         part = J[(block[:, None] * k + np.arange(k)).ravel()]
         spread = part @ solver.solve(part.T.toarray())
         own = np.arange(len(block) * k).reshape(-1, k)
@@ -233,5 +237,5 @@ def _judged(problem: _Problem, values: gtsam.Values, edges: IntArray, kept: Bool
         smallest = np.linalg.eigvalsh(M)[:, 0]
         M[smallest <= 1e-9] = np.eye(k)
         squares = (r[block] * np.linalg.solve(M, r[block][:, :, None])[:, :, 0]).sum(axis=1)
-        found[at : at + _BLOCK] = np.where(smallest <= 1e-9, np.inf, squares)
+        found[first : first + _BLOCK] = np.where(smallest <= 1e-9, np.inf, squares)
     return found

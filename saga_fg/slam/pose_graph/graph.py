@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_ids, checked_rows
+from saga_fg.numerics.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    checked,
+    checked_covariances,
+    checked_ids,
+    checked_rows,
+)
 from saga_fg.slam.pose_graph.landmarks import PointLandmarks, PosePriors
 
 if TYPE_CHECKING:
@@ -122,6 +130,31 @@ class PoseGraph:
         """Whether there are neither landmarks nor priors."""
         return self.landmarks is None and self.priors is None
 
+    def with_frame_as_pose(self) -> PoseGraph:
+        """Return this graph with priors as measurements from one more pose, the last: the frame they are given in."""
+        priors, n = self.priors, len(self)
+        if priors is None:
+            return self
+        return replace(
+            self,
+            ids=np.append(self.ids, self.ids.max() + 1),
+            world_T_pose=np.concatenate([self.world_T_pose, np.eye(self.dim + 1)[None]]),
+            first=np.concatenate([self.first, np.full(len(priors.pose), n)]),
+            second=np.concatenate([self.second, priors.pose]),
+            first_T_second=np.concatenate([self.first_T_second, priors.world_T_pose]),
+            information=np.concatenate([self.information, priors.information]),
+            priors=None,
+        )
+
+    def in_its_frame(self, poses: FloatArray) -> FloatArray:
+        """Return poses (N, d + 1, d + 1), given those of `with_frame_as_pose` up to a common motion.
+
+        Without priors the first pose is then that of the graph.
+        """
+        if self.priors is None:
+            return np.asarray(self.world_T_pose[0] @ np.linalg.inv(poses[0]) @ poses)
+        return np.asarray(np.linalg.inv(poses[-1]) @ poses[:-1])
+
     def components(self) -> IntArray:
         """Return the connected component (N,) of each pose, numbered from 0 in the order of their first poses."""
         from scipy.sparse.csgraph import connected_components
@@ -129,6 +162,11 @@ class PoseGraph:
         _, label = connected_components(_joined(self))
         _, first_row, part = np.unique(label, return_index=True, return_inverse=True)
         return np.asarray(np.argsort(np.argsort(first_row))[part], dtype=np.int64)
+
+
+def trusted(graph: PoseGraph) -> BoolArray:
+    """Which measurements (M,) are odometry: they join successive poses."""
+    return np.asarray(np.abs(graph.second - graph.first) == 1)
 
 
 def _joined(graph: PoseGraph) -> csr_array:

@@ -3,8 +3,7 @@
 Pose graphs have many local minima, and the start decides which one a solver finds. Dead reckoning may lie in the basin
 of a bad one; the chordal start (`chordal_poses`) uses every measurement and no guess, in closed form. Both are tried,
 and the lower error is kept; so is the minimum of the chordal cost, where it is to be certified
-(`saga_fg.slam.pose_graph.certificate`). The first pose is fixed, unless priors say where poses are; the chordal start
-is then moved to the first of them.
+(`saga_fg.slam.pose_graph.certificate`). The first pose is fixed, unless priors say where poses are.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import chordal_poses
-from saga_fg.slam.pose_graph.graph import PoseGraph
+from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
 
-_ANCHOR = 1e-8  # variance (m^2, rad^2) of the first pose
+HELD = 1e-8  # variance (m^2, rad^2) of the first pose
 _FEW = 10  # covariances that are found one by one, at a solution each; more of them all together
 _UNLIKE = "expected coordinates and information of sizes that numbers can hold together"
-_SOLVER = SolverSettings(tolerance=1e-3)  # steps below a thousandth of a standard deviation are rounding in long chains
+SOLVER = SolverSettings(tolerance=1e-3)  # steps below a thousandth of a standard deviation are rounding in long chains
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,38 +79,33 @@ def optimise_poses(graph: PoseGraph, robust: Robust | None = None, certify: bool
 
     robust: a loss over the measurements that do not join successive poses, which may be false loop closures; the errors
     then are robust costs. certify: find the global minimum of the chordal cost too, and start from there as well.
-    Raises `InputError` for a graph that is not connected, or too badly conditioned.
+    Raises `InputError` for a graph that is not connected, or too badly conditioned, and, to be certified, for
+    landmarks seen by bearings and poses that landmarks alone connect.
     """
     factors = factor_graph(graph, robust)
-    if certify and not graph.poses_alone:
-        raise InputError("certify: expected a graph of poses alone, the proof covers neither landmarks nor priors")
-    starts = {"guess": graph}
-    if graph.landmarks is None or not graph.components().any():  # otherwise landmarks hold it together
-        starts = {"chordal": _chordal_start(graph), **starts}
-    chordal = chordal_minimum(graph, starts["chordal"].world_T_pose) if certify else None
-    if chordal is not None:
-        starts["chordal minimum"] = graph.at(chordal.world_T_pose)
+    starts, chordal = {"guess": graph}, None
+    if certify or graph.landmarks is None or not graph.components().any():  # otherwise landmarks hold it together
+        starts = {"chordal": placed(graph, chordal_poses(graph)), **starts}
+    if certify:
+        chordal = chordal_minimum(graph, starts["chordal"].world_T_pose)
+        starts["chordal minimum"] = placed(graph, chordal.world_T_pose)
     seen = landmark_factors(graph)
     try:
-        solutions = {name: solve(factors, seen, _values(start), _SOLVER) for name, start in starts.items()}
+        solutions = {name: solve(factors, seen, graph_values(start), SOLVER) for name, start in starts.items()}
     except FactorError as error:
         raise InputError(f"{_UNLIKE}: {error}") from error
     best = min(solutions, key=lambda name: solutions[name].error)
     errors = {name: solution.error for name, solution in solutions.items()}
     values = solutions[best].values
-    poses = pose_array(values, graph.dim, len(graph))
-    found = None
-    if graph.landmarks is not None:
-        found = np.stack([values.atVector(len(graph) + row) for row in range(len(graph.landmarks.ids))])
-    return OptimisedPoses(poses, solutions[best].error, best, errors, solutions[best], chordal, found)
+    optimum = solved_graph(graph, values)
+    found = None if optimum.landmarks is None else optimum.landmarks.position
+    return OptimisedPoses(optimum.world_T_pose, solutions[best].error, best, errors, solutions[best], chordal, found)
 
 
-def _chordal_start(graph: PoseGraph) -> PoseGraph:
-    poses = chordal_poses(graph)
-    if (priors := graph.priors) is not None:
-        poses = priors.world_T_pose[0] @ np.linalg.inv(poses[priors.pose[0]]) @ poses
-    start = graph.at(poses)
-    return start if graph.landmarks is None else start.with_landmarks(graph.landmarks.placed(poses))
+def placed(graph: PoseGraph, world_T_pose: FloatArray) -> PoseGraph:
+    """The graph at other poses, its landmarks where these see them."""
+    start = graph.at(world_T_pose)
+    return start if graph.landmarks is None else start.with_landmarks(graph.landmarks.placed(start.world_T_pose))
 
 
 def landmark_factors(graph: PoseGraph) -> list[ResidualFactors]:
@@ -121,11 +115,11 @@ def landmark_factors(graph: PoseGraph) -> list[ResidualFactors]:
 
 def graph_error(graph: PoseGraph, robust: Robust | None = None) -> float:
     """E at the poses and landmarks of a graph."""
-    values = _values(graph)
+    values = graph_values(graph)
     return float(factor_graph(graph, robust).error(values)) + sum(f.error(values) for f in landmark_factors(graph))
 
 
-def _values(graph: PoseGraph) -> gtsam.Values:
+def graph_values(graph: PoseGraph) -> gtsam.Values:
     values = pose_values(graph.world_T_pose)
     if graph.landmarks is not None:
         for row, place in enumerate(graph.landmarks.position):
@@ -133,23 +127,32 @@ def _values(graph: PoseGraph) -> gtsam.Values:
     return values
 
 
+def solved_graph(graph: PoseGraph, values: gtsam.Values) -> PoseGraph:
+    """The graph at the poses and landmarks of GTSAM's values."""
+    solved = graph.at(pose_array(values, graph.dim, len(graph)))
+    if graph.landmarks is None:
+        return solved
+    places = np.stack([values.atVector(len(graph) + row) for row in range(len(graph.landmarks.ids))])
+    return solved.with_landmarks(graph.landmarks.at(places))
+
+
 def factor_graph(graph: PoseGraph, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
     """GTSAM's factors of a pose graph, keys being its rows: what holds the first pose, or the priors, come first."""
     factors = gtsam.NonlinearFactorGraph()
     k = graph.information.shape[1] if len(graph.information) else 3 * (graph.dim - 1)
     if (priors := graph.priors) is None:
-        factors.add(pose_prior_factor(0, graph.world_T_pose[0], _ANCHOR * np.eye(k)))
+        factors.add(pose_prior_factor(0, graph.world_T_pose[0], HELD * np.eye(k)))
     else:
         for row, known, spread in zip(
             priors.pose.tolist(), priors.world_T_pose, _inverses(priors.information), strict=True
         ):
             factors.add(pose_prior_factor(row, known, spread))
     covariances = _inverses(graph.information)
-    successive = np.abs(graph.second - graph.first) == 1
-    for first, second, measured, covariance, trusted in zip(
-        graph.first.tolist(), graph.second.tolist(), graph.first_T_second, covariances, successive, strict=True
+    losses = [None if odometry else robust for odometry in trusted(graph).tolist()]
+    for first, second, measured, covariance, loss in zip(
+        graph.first.tolist(), graph.second.tolist(), graph.first_T_second, covariances, losses, strict=True
     ):
-        factors.add(between_factor(first, second, measured, covariance, None if trusted else robust))
+        factors.add(between_factor(first, second, measured, covariance, loss))
     return factors
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from factors import Robust, between_factor, pose_prior_factor
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.pose_graph.consensus import Consensus, consensus
+from saga_fg.slam.pose_graph.distances import shortest_ways
 from saga_fg.slam.pose_graph.graph import PoseGraph
+from saga_fg.slam.pose_graph.optimisation import HELD
 
 _LOSS = Robust("cauchy", 3.0)
-_ANCHOR = 1e-8  # variance of the first pose
 _RADIAN = 1.0  # m of way that a radian of turning counts as
-_SHORTEST = 1e-6  # m: a sparse matrix takes 0 for no measurement
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class RunningPoseGraph:
         self._edges: list[Measured] = []
         self._poses = [world_T_first]
         self._new, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._new.add(pose_prior_factor(0, world_T_first, _ANCHOR * np.eye(3)))
+        self._new.add(pose_prior_factor(0, world_T_first, HELD * np.eye(3)))
         self._start.insert(0, _pose2(world_T_first))
 
     def append(self, last_T_new: FloatArray, covariance: FloatArray) -> int:
@@ -83,21 +83,11 @@ class RunningPoseGraph:
 
     def distances(self, row: int) -> FloatArray:
         """Length (N,) of the shortest way from a pose to each along measurements, m: what relative errors grow with."""
-        from scipy.sparse import csr_array
-        from scipy.sparse.csgraph import dijkstra
-
         first, second = (
             np.array([getattr(edge, end) for edge in self._edges], dtype=np.int64) for end in ("first", "second")
         )
-        T = np.array([edge.first_T_second for edge in self._edges]).reshape(-1, 3, 3)
-        length = way_along(T)
-        n = len(self._poses)
-        low, high = np.minimum(first, second), np.maximum(first, second)
-        order = np.lexsort((length, high, low))  # the shortest of several between the same two
-        _, once = np.unique(low[order] * n + high[order], return_index=True)
-        kept = order[once]
-        joined = csr_array((np.maximum(length[kept], _SHORTEST), (low[kept], high[kept])), shape=(n, n))
-        return np.asarray(dijkstra(joined, directed=False, indices=row))
+        length = way_along(np.array([edge.first_T_second for edge in self._edges]).reshape(-1, 3, 3))
+        return shortest_ways(first, second, length, len(self._poses), row)
 
     def graph(self, loops: list[Measured] | None = None) -> PoseGraph:
         """The whole graph; loops: in place of those that came."""

@@ -29,7 +29,7 @@ WORLD = StaticWorld(
     ],
 )
 def test_ranges_are_those_of_geometry(direction: tuple[float, float, float], expected: float) -> None:
-    (distance,) = ranges(WORLD, np.array([[0.0, 0.0, 1.5]]), np.array([direction]))
+    ((distance,),) = ranges(WORLD, np.array([[0.0, 0.0, 1.5]]), np.array([[direction]]))
     assert distance == pytest.approx(expected)
 
 

@@ -14,10 +14,12 @@ from saga_fg.estimators import (
     GraduatedNonConvexity,
     Measurements,
     Observations,
+    recording,
 )
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.nonlinear_interactions import SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
+from tests.saga_fg.estimator_programs import random_program
 from tests.saga_fg.estimator_scenario import EXACT, Textbook, covariance_error, mean_error, part, random_scenario, tell
 from tests.saga_fg.graph_keys import keys_of
 from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE
@@ -65,6 +67,26 @@ def test_marginals_of_nodes_that_part_and_meet_again():
     marginal, joint = smoother.smoothed(), smoother.smoothed(joint=True)
     for alone, together in zip(marginal, joint, strict=True):
         np.testing.assert_allclose(alone.covariance(nodes), together.covariance(nodes), rtol=1e-9, atol=1e-12)
+
+
+def test_a_long_recording_is_smoothed_in_stretches_to_the_last_digit(monkeypatch):
+    program = random_program(np.random.default_rng(5), 60, kinds=(CAR, CONE), intervals=(0.1, 0.2), density=0.2)
+    whole, stretched = (BatchSmoother(likelihoods=False, order="time") for _ in range(2))
+    for smoother in (whole, stretched):
+        for operation in program:
+            operation.run(smoother)
+    expected = whole.smoothed()
+    monkeypatch.setattr(recording, "MOST_KEPT", sum(len(epoch.nodes) for epoch in expected) // 7)
+    found = stretched.smoothed()
+    assert len(whole.snapshot().recording.steps) == 60
+    assert len(stretched.snapshot().recording.steps) < 60
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.nodes, other.nodes)
+        np.testing.assert_array_equal(one.state, other.state)
+        for node in one.nodes:
+            np.testing.assert_array_equal(one.covariance([node]), other.covariance([node]))
+    node = found[-1].nodes[:1]
+    np.testing.assert_array_equal(stretched.covariance(node), whole.covariance(node))  # the pass is done when asked for
 
 
 def test_a_smoother_that_waits_says_the_same_and_no_likelihoods():

@@ -501,3 +501,21 @@ def test_laws_take_the_gap_along_the_path(law):
     triples = law.triples(nodes, np.array([0]), np.array([1]))
     change = triples.A_other[0][2:, :2] @ step[1]
     assert change == pytest.approx(acceleration(further) - acceleration(nodes), rel=0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_place_beside_a_path_is_left_out(seed):
+    rng = np.random.default_rng(seed)
+    bend = rng.normal(scale=rng.choice([0.01, 0.1, 0.5]), size=20)
+    heading = rng.uniform(-3, 3) + np.concatenate([[0.0], np.cumsum(bend)])
+    places = np.concatenate([np.zeros((1, 2)), np.cumsum(3 * np.stack([np.cos(heading), np.sin(heading)], 1)[1:], 0)])
+    none = np.zeros((1, len(places)))
+    paths = Paths(np.array([0]), places[None], heading[None], none, none, *np.zeros((2, 1)))
+    others = rng.uniform(-70, 70, (2000, 2))
+    at = paths.lines.feet(np.zeros(2000, dtype=np.int64), others)
+    beside = (at.s > 0) & (np.abs(at.e) < 3.6)
+    kept = paths.may_be_beside(np.zeros(2000, dtype=np.int64), others, 3.6)
+    assert beside.any()
+    assert kept[beside].all()
+    if np.abs(np.cumsum(bend)).max() < 0.3:
+        assert kept.mean() < 0.4

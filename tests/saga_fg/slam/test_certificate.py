@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.pose_graph import ChordalCost, PoseGraph, chordal_minimum, chordal_poses, optimise_poses
+from saga_fg.slam.pose_graph import (
+    ChordalCost,
+    LandmarkObservations,
+    PointLandmarks,
+    PoseGraph,
+    PosePriors,
+    chordal_minimum,
+    chordal_poses,
+    optimise_poses,
+)
 from saga_fg.slam.pose_graph.certificate import descend, lowest_eigenvalue, rounded_rotations
 from saga_fg.slam.pose_graph.stiefel import nearest_frames
 from tests.saga_fg.loops import loop, moved
@@ -45,6 +56,57 @@ def test_the_cost_is_the_sum_over_measurements(dim: int) -> None:
     shifted = t[graph.second] - t[graph.first] - (R[graph.first] @ T[:, :dim, dim:])[:, :, 0]
     expected = (kappa * (turned**2).sum(axis=(1, 2)) + tau * (shifted**2).sum(axis=1)).sum()
     assert ChordalCost.of(graph).at(true) == pytest.approx(expected, rel=1e-9)
+
+
+def seen_from_outside(dim: int, noise: float, seed: int = 0) -> tuple[PoseGraph, FloatArray, FloatArray]:
+    """A loop with priors on two poses and four points, each seen from every third pose; the true poses and points."""
+    graph, true = loop(dim, seed=seed)
+    true, k, rng = np.linalg.inv(true[3]) @ true, 3 * (dim - 1), np.random.default_rng(seed)
+    points = true[[0, 5, 10, 15], :dim, dim] + rng.normal(size=(4, dim))
+    pose, landmark = (each.ravel() for each in np.meshgrid(np.arange(0, len(graph), 3), np.arange(4)))
+    R, t = true[pose, :dim, :dim], true[pose, :dim, dim]
+    z = (R.swapaxes(1, 2) @ (points[landmark] - t)[:, :, None])[:, :, 0] + noise * rng.normal(size=(len(pose), dim))
+    information = np.tile(np.diag(np.arange(1.0, dim + 1)), (len(pose), 1, 1))
+    seen = LandmarkObservations("point", pose, landmark, z, information)
+    priors = PosePriors(np.array([3, 9]), true[[3, 9]], np.tile(100 * np.eye(k), (2, 1, 1)))
+    landmarks = PointLandmarks(1000 + np.arange(4), (seen,), np.full((4, dim), np.nan))
+    return replace(graph, priors=priors).with_landmarks(landmarks), true, points
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_points_and_priors_are_part_of_the_cost(dim: int) -> None:
+    graph, true, points = seen_from_outside(dim, noise=0.2)
+    (seen,) = graph.landmarks.observations  # type: ignore[union-attr]
+    T = true[seen.pose]
+    off = points[seen.landmark] - T[:, :dim, dim] - (T[:, :dim, :dim] @ seen.z[:, :, None])[:, :, 0]
+    tau = dim / np.trace(np.linalg.inv(seen.information), axis1=1, axis2=2)
+    frame = np.concatenate([true, np.eye(dim + 1)[None]])  # at which the priors agree
+    expected = ChordalCost.of(replace(graph, landmarks=None, priors=None)).at(true) + (tau * (off**2).sum(axis=1)).sum()
+    assert ChordalCost.of(graph).at(frame, points) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_graph_with_points_and_priors_is_certified_in_the_frame_of_the_priors(dim: int) -> None:
+    graph, true, _ = seen_from_outside(dim, noise=0.05)
+    away = np.eye(dim + 1)
+    away[:dim, dim] = 50.0
+    optimised = optimise_poses(graph.at(away @ graph.world_T_pose), certify=True)
+    assert optimised.chordal is not None
+    assert optimised.chordal.certified
+    assert optimised.errors["chordal minimum"] == pytest.approx(optimised.error, rel=1e-6)
+    for poses in (optimised.chordal.world_T_pose, chordal_poses(graph)):
+        assert np.abs((poses - true)[:, :dim, dim]).max() < 0.5
+    assert optimised.landmarks is not None
+
+
+def test_landmarks_seen_by_bearings_are_refused_by_name() -> None:
+    graph, _, _ = seen_from_outside(2, noise=0.0)
+    (seen,) = graph.landmarks.observations  # type: ignore[union-attr]
+    bearing = np.arctan2(seen.z[:, 1], seen.z[:, 0])[:, None]
+    seen = LandmarkObservations("bearing", seen.pose, seen.landmark, bearing, np.ones((len(bearing), 1, 1)))
+    other = graph.with_landmarks(replace(graph.landmarks, observations=(seen,)))  # type: ignore[type-var]
+    with pytest.raises(InputError, match=r"landmark 1000: expected a point.* the chordal cost knows no bearing"):
+        optimise_poses(other, certify=True)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -9,7 +9,15 @@ import pytest
 
 from data_tools.pose_graphs import city, torus, with_false_loops
 from saga_fg import InputError
-from saga_fg.slam.pose_graph import PoseGraph, consensus, optimise_poses, trusted
+from saga_fg.slam.pose_graph import (
+    LandmarkObservations,
+    PointLandmarks,
+    PoseGraph,
+    PosePriors,
+    consensus,
+    optimise_poses,
+    trusted,
+)
 from saga_fg.slam.pose_graph.consensus import chosen_edges
 
 
@@ -33,6 +41,25 @@ def test_the_optimum_is_that_without_the_false_loops(dim: int, scale: float) -> 
     clean, found = optimise_poses(graph), optimise_poses(agreed.graph)
     off = (found.world_T_pose - clean.world_T_pose)[:, :dim, dim]
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
+
+
+def test_priors_and_landmarks_take_part_and_are_kept() -> None:
+    """The graph lies where the priors say, and landmarks seen from far apart speak against false loops too."""
+    graph, true = city(200, seed=1)
+    away = np.eye(3)
+    away[:2, 2] = [300.0, -40.0]
+    pose, point = np.arange(0, 200, 10), np.zeros(20, dtype=np.int64)
+    z = (np.linalg.inv(true[pose]) @ np.array([5.0, 6.0, 1.0]))[:, :2]
+    seen = LandmarkObservations("point", pose, point, z, np.tile(np.eye(2), (20, 1, 1)))
+    landmarks = PointLandmarks(np.array([999]), (seen,), np.array([[0.0, 0.0]]))
+    priors = PosePriors(np.array([7, 150]), away @ true[[7, 150]], np.tile(100 * np.eye(3), (2, 1, 1)))
+    spoilt = replace(with_false_loops(graph, 0.5, seed=3), priors=priors, landmarks=landmarks)
+    agreed, edges = consensus(spoilt), len(graph.first)
+    assert not agreed.kept[edges:].any()
+    assert agreed.kept[:edges].mean() > 0.98
+    assert agreed.graph.landmarks is not None
+    np.testing.assert_allclose(agreed.graph.landmarks.position, [[305.0, -34.0]], atol=1.0)
+    assert np.abs((agreed.graph.world_T_pose - away @ true)[:, :2, 2]).max() < 1.5
 
 
 def test_a_gap_in_the_odometry_is_bridged() -> None:

@@ -1,5 +1,6 @@
-"""Paths along the trails of earlier traffic, and tracks that follow them unseen."""
+"""Paths along the trails of earlier traffic and lanes, and tracks that follow them unseen."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -11,24 +12,28 @@ from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.known_courses import typical_speed
-from saga_fg.tracking.trails import STEP, TrailPoints, Trails, TrailSettings
+from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings
+from saga_fg.tracking.trails import STEP, paths
+from saga_fg.types.road_map import Lane, RoadMap
 from tests.saga_fg.traffic_frames import frame
 
-SETTINGS = TrailSettings(memory=60.0)
+SETTINGS = TrafficSettings(memory=60.0)
 SPEED, RADIUS, DT = 8.0, 20.0, 0.1
-NOBODY = np.array([-1])
+NOBODY = np.array([10**6])
 
 
 def passing(position, heading, time=0.0, ids=None, speed=8.0):
     n = len(position)
     ids = np.zeros(n, dtype=np.int64) if ids is None else np.array(ids)
-    headings = np.broadcast_to(heading, n).astype(float)
-    return TrailPoints(ids, np.array(position, dtype=float), headings, np.full(n, speed), np.full(n, time))
+    headings, none = np.broadcast_to(heading, n).astype(float), np.zeros(n)
+    where = np.array(position, dtype=float).reshape(-1, 2)
+    times, moves = np.full(n, time), np.ones(n, dtype=bool)
+    return Passages(ids, np.full(n, "car"), where, headings, np.full(n, speed), none, none, times, moves)
 
 
 def along(place, heading, ids=0, settings=SETTINGS):
     """The trail of one track by its places (k, 2) and headings (k,)."""
-    trails = Trails(settings)
+    trails = Traffic(settings)
     for k, (p, h) in enumerate(zip(place, heading, strict=True)):
         trails.update(passing([p], h, 0.1 * k, [ids]), 0.1 * k)
     return trails
@@ -42,12 +47,12 @@ def arc(length, radius=RADIUS):
 
 
 def path(trails, position=(-10.0, 0.0), heading=0.0, curvature=0.0, steps=10, track=NOBODY):
-    return trails.paths(track, np.array([position]), np.array([heading]), np.array([curvature]), steps)
+    return paths(trails, track, np.array([position]), np.array([heading]), np.array([curvature]), steps)
 
 
 def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
     trails = along(*arc(np.arange(-20, 20, 0.5)))
-    apart = np.hypot(*np.diff(trails.points.position, axis=0).T)
+    apart = np.hypot(*np.diff(trails.passages.position, axis=0).T)
     assert (apart >= 1.99).all()
     assert (apart < 2.6).all()
 
@@ -55,18 +60,18 @@ def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
 def test_points_are_forgotten():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
     trails.update(passing([(100.0, 0.0)], 0.0, 60.5, [3]), 60.5)
-    assert trails.points.time.min() >= 0.5
+    assert trails.passages.time.min() >= 0.5
 
 
 def test_points_are_forgotten_while_nobody_moves():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
     trails.update(passing(np.empty((0, 2)), 0.0), 1000.0)
-    assert len(trails.points) == len(trails.latest) == 0
+    assert len(trails.passages) == 0
     assert path(trails).weight.max() == 0.0
 
 
 def test_without_a_memory_nothing_is_remembered():
-    assert along(*arc(np.arange(-20, 0, 2.0)), settings=TrailSettings()).points is None
+    assert along(*arc(np.arange(-20, 0, 2.0)), settings=TrafficSettings()).passages is None
 
 
 def test_a_path_goes_round_the_bend_of_earlier_traffic():
@@ -93,7 +98,7 @@ def test_other_traffic_leads_nobody(position, heading):
 
 
 def test_without_trails_a_path_keeps_its_own_bend_which_fades():
-    straight, bent = path(Trails(SETTINGS)), path(Trails(SETTINGS), curvature=0.05)
+    straight, bent = path(Traffic(SETTINGS)), path(Traffic(SETTINGS), curvature=0.05)
     assert straight.heading[0] == pytest.approx(np.zeros(11))
     turns = np.diff(bent.heading[0])
     assert turns[0] == pytest.approx(0.05 * STEP, rel=0.1)
@@ -106,12 +111,12 @@ def test_ones_own_trail_leads_one_nowhere():
 
 
 def test_a_path_knows_the_speed_of_earlier_traffic():
-    trails = Trails(SETTINGS)
+    trails = Traffic(SETTINGS)
     for x in np.arange(-20.0, 40.0, 2.0):
         trails.update(passing([(x, 0.0)], 0.0, 0.1 * (x + 20.0), [1], speed=10.0 - 0.1 * x), 0.1 * (x + 20.0))
     found = path(trails)
     assert found.speed[0] == pytest.approx(10.0 - 0.1 * found.position[0, :, 0], abs=0.2)
-    assert path(Trails(SETTINGS)).weight.max() == 0.0
+    assert path(Traffic(SETTINGS)).weight.max() == 0.0
 
 
 @given(turn=st.floats(-3, 3), x=st.floats(-50, 50), y=st.floats(-50, 50))
@@ -125,11 +130,74 @@ def test_the_world_may_be_turned_and_moved(turn, x, y):
     assert there.heading[0] == pytest.approx(here.heading[0] + turn, abs=1e-6)
 
 
+# lanes
+
+
+def of_map(*lanes):
+    """The memory of nobody but a map, of lanes by their places (k, 2)."""
+    traffic = Traffic(TrafficSettings())
+    named = tuple(Lane(f"lane-{k}", tuple(map(tuple, centre.tolist()))) for k, centre in enumerate(lanes))
+    traffic.add_lanes(RoadMap(lanes=named))
+    return traffic
+
+
+BEND, STRAIGHT_ON = arc(np.arange(-20, 40, 5.0))[0], np.stack([np.arange(-20, 40, 5.0), np.zeros(12)], axis=-1)
+
+
+def test_a_path_follows_a_lane_without_any_traffic_and_at_no_speed():
+    found = path(of_map(BEND))
+    expected, heading = arc(-10 + STEP * np.arange(11))
+    assert found.position[0] == pytest.approx(expected, abs=0.8)
+    assert found.heading[0] == pytest.approx(heading, abs=0.15)
+    assert found.weight.max() == 0.0
+
+
+def test_a_path_goes_on_along_the_next_lane():
+    whole, parted = path(of_map(BEND)), path(of_map(BEND[:6], BEND[5:]))
+    assert parted.position[0] == pytest.approx(whole.position[0], abs=0.3)
+
+
+def test_where_a_lane_ends_the_path_goes_straight_on():
+    found = path(of_map(STRAIGHT_ON[:6]), steps=10)
+    assert found.heading[0] == pytest.approx(np.zeros(11), abs=1e-9)
+    assert found.position[0, -1] == pytest.approx([-10 + 10 * STEP, 0.0])
+
+
+@pytest.mark.parametrize(("curvature", "bends"), [(0.0, False), (0.05, True)], ids=["straight on", "turning"])
+def test_at_a_fork_a_path_takes_the_lane_that_it_turns_with(curvature, bends):
+    found = path(of_map(BEND, STRAIGHT_ON), position=(2.0, 0.0), curvature=curvature, steps=7)
+    assert (found.heading[0, -1] > 0.6) == bends
+    assert (abs(found.heading[0, -1]) < 0.4) != bends
+
+
+def test_oncoming_lanes_lead_nobody():
+    found = path(of_map(BEND), heading=np.pi)
+    assert found.heading[0] == pytest.approx(np.full(11, np.pi))
+
+
+def test_lanes_are_known_once_and_not_at_a_reach_of_zero():
+    traffic = of_map(BEND)
+    known = len(traffic.lanes)
+    traffic.add_lanes(RoadMap(lanes=(Lane("lane-0", tuple(map(tuple, BEND.tolist()))),)))
+    assert len(traffic.lanes) == known
+    off = Traffic(TrafficSettings(reach=0.0))
+    off.add_lanes(RoadMap(lanes=(Lane("lane-0", tuple(map(tuple, BEND.tolist()))),)))
+    assert off.lanes is None
+
+
+def test_a_copy_of_the_memory_has_no_tree():
+    traffic = of_map(BEND)
+    assert traffic.trails() is not None
+    twin = copy.copy(traffic)
+    assert twin._trails is None
+    assert twin.lanes is traffic.lanes
+
+
 # tracks
 
 SENSORS = {"lidar": Sensor(noise={"default": NoiseModel(position=0.1, yaw=0.05)})}
 CAR = ClassSettings(Curvilinear(course_time=0.7), max_deviation=np.inf)
-ON = TrackerSettings({"default": CAR}, edges=(), trails=SETTINGS)
+ON = TrackerSettings({"default": CAR}, edges=(), traffic=SETTINGS)
 
 
 def driven(settings, follower=3.0, hidden=2.0, gap=2.5, seed=0):
@@ -150,7 +218,7 @@ def driven(settings, follower=3.0, hidden=2.0, gap=2.5, seed=0):
 
 
 def test_a_hidden_car_follows_the_path_of_earlier_traffic_round_a_bend():
-    off = replace(ON, trails=TrailSettings(), classes={"default": replace(CAR, motion=Curvilinear())})
+    off = replace(ON, traffic=TrafficSettings(), classes={"default": replace(CAR, motion=Curvilinear())})
     with_trails, without = np.mean([driven((ON, off), seed=seed)[1] for seed in range(3)], axis=0)
     assert with_trails < 0.4 * without
 
@@ -187,7 +255,7 @@ def test_where_trails_part_the_place_is_less_certain():
     for p in np.arange(-20, 40, 1.0):
         trails.update(passing([(p, 0.0)], 0.0, 10.0, [1]), 10.0)
     at_the_fork = path(trails, *(each[0] for each in arc(np.array([6.0]))))
-    assert before.certainty[0] > 0.7 > 0.0 == path(Trails(SETTINGS)).certainty[0]
+    assert before.certainty[0] > 0.7 > 0.0 == path(Traffic(SETTINGS)).certainty[0]
     assert before.disagreement == pytest.approx(0.0, abs=1e-9)
     assert at_the_fork.disagreement > 0.01
     assert at_the_fork.certainty < 0.9 * before.certainty
@@ -204,7 +272,7 @@ def test_where_nothing_is_known_of_earlier_traffic_its_speed_is_not_zero():
 def test_a_hidden_car_takes_on_the_speed_of_earlier_traffic():
     """One car slows down from 10 to 5 m/s between 0 and 30 m, the other is hidden at 0 m and does the same."""
     x, speed, t = -30.0, 10.0, 0.0
-    slow, fast = Tracker(ON, SENSORS), Tracker(replace(ON, trails=TrailSettings()), SENSORS)
+    slow, fast = Tracker(ON, SENSORS), Tracker(replace(ON, traffic=TrafficSettings()), SENSORS)
     places = []
     while t < 9.0:
         places.append(x)
@@ -218,3 +286,17 @@ def test_a_hidden_car_takes_on_the_speed_of_earlier_traffic():
     truth = places[hidden + gap - 1 - behind]
     off = [abs(tracker.tracks((hidden + gap - 1) * DT).boxes.position[1, 0] - truth) for tracker in (slow, fast)]
     assert off[0] < 0.92 * off[1], "from one vehicle alone"
+
+
+def test_a_hidden_car_keeps_to_the_lane_of_the_map_round_a_bend():
+    """Nobody went before it, and the map alone tells of the bend."""
+    road = RoadMap(lanes=(Lane("bend", tuple(map(tuple, BEND.tolist()))),))
+    trackers = [
+        Tracker(replace(ON, traffic=TrafficSettings(reach=reach), road_map=road), SENSORS) for reach in (1.5, 0)
+    ]
+    for k in range(45):
+        place, yaw = arc(np.array(-20.0 + SPEED * k * DT))
+        seen = frame(k * DT, place[None] if k < 20 else np.empty((0, 2)), yaw=yaw)
+        reported = [tracker.step(seen) for tracker in trackers]
+    with_lane, without = (np.hypot(*(tracks.boxes.position[0, :2] - place)) for tracks in reported)
+    assert with_lane < 1.0 < 3.0 < without

@@ -6,12 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import Tracker, TrackerSettings
-from saga_fg.tracking import TrafficFlowSettings
-from saga_fg.tracking.traffic_flow import Passages, TrafficFlowPrior
+from saga_fg.tracking.speed_prior import speed_prior
+from saga_fg.tracking.traffic import Passages, SpeedPriorSettings, Traffic, TrafficSettings
 from saga_fg.types.track import known_velocities
 from tests.saga_fg.traffic_frames import frame
 
-ON = TrafficFlowSettings(weight=5.0)
+ON = TrafficSettings(memory=5.0, speed_prior=SpeedPriorSettings(weight=5.0))
+SPREAD = ON.speed_prior.spread
 
 
 def passages(position, heading, speed, variance=0.1, time=0.0, ids=None, label="car", standing=0.0):
@@ -25,31 +26,37 @@ def passages(position, heading, speed, variance=0.1, time=0.0, ids=None, label="
         np.full(n, variance),
         np.broadcast_to(np.asarray(standing, dtype=float), n),
         np.full(n, time),
+        np.broadcast_to(np.asarray(standing, dtype=float) < 0.5, n),
     )
 
 
-def speed_at(flow, position=(0.0, 0.0), heading=0.0, label="car", variance=25.0):
-    return expected_at(flow, 0.0, position, heading, label, variance)[1:]
+def speed_at(traffic, position=(0.0, 0.0), heading=0.0, label="car", variance=25.0):
+    return expected_at(traffic, 0.0, position, heading, label, variance)[1:]
 
 
-def expected_at(flow, standing, position=(0.0, 0.0), heading=0.0, label="car", variance=25.0):
-    expected = flow.expected(
-        np.array([label]), np.array([position]), np.array([heading]), np.array([variance], dtype=float), standing
+def expected_at(traffic, standing, position=(0.0, 0.0), heading=0.0, label="car", variance=25.0):
+    expected = speed_prior(
+        traffic,
+        np.array([label]),
+        np.array([position]),
+        np.array([heading]),
+        np.array([variance], dtype=float),
+        standing,
     )
     return tuple(column[0] for column in expected)
 
 
 def remembering(*tables, settings=ON):
-    flow = TrafficFlowPrior(settings)
+    traffic = Traffic(settings)
     for table in tables:
-        flow.update(table)
-    return flow
+        traffic.update(table, float(table.time.max()))
+    return traffic
 
 
 def test_a_neighbour_in_the_same_place_gives_the_mean_and_variance_of_the_mixture():
     mean, variance = speed_at(remembering(passages([(0, 0)], [0.0], [12.0])))
     assert mean == pytest.approx(5 * 12 / 6)
-    assert variance == pytest.approx((25 + 5 * (144 + 0.1 + ON.spread**2)) / 6 - mean**2)
+    assert variance == pytest.approx((25 + 5 * (144 + 0.1 + SPREAD**2)) / 6 - mean**2)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +86,7 @@ def test_standing_neighbours_say_that_a_new_one_stands_and_nothing_of_its_speed_
     standing, mean, variance = expected_at(both, 0.4)
     assert standing == pytest.approx((0.4 + 5) / 11)
     assert mean == pytest.approx(5 * 12 / 5.6)
-    assert variance == pytest.approx((0.6 * 25 + 5 * (144 + 0.1 + ON.spread**2)) / 5.6 - mean**2)
+    assert variance == pytest.approx((0.6 * 25 + 5 * (144 + 0.1 + SPREAD**2)) / 5.6 - mean**2)
     assert expected_at(remembering(), 0.4) == pytest.approx((0.4, 0.0, 25.0))
 
 
@@ -113,7 +120,7 @@ def behind_a_leader(settings, newcomer=True):
 
 
 def test_a_car_that_appears_behind_another_starts_at_its_speed_with_less_doubt():
-    on = behind_a_leader(TrackerSettings(edges=(), traffic_flow_prior=ON))
+    on = behind_a_leader(TrackerSettings(edges=(), traffic=ON))
     off = behind_a_leader(TrackerSettings(edges=()))
     assert off.boxes.velocity[1] == pytest.approx([0.0, 0.0])
     assert on.boxes.velocity[1] == pytest.approx([9.0, 0.0], abs=1.5)
@@ -129,7 +136,7 @@ def test_a_track_is_reported_at_once_with_a_velocity_as_wide_as_it_is():
 
 
 def test_a_snapshot_remembers_the_traffic():
-    settings = TrackerSettings(edges=(), traffic_flow_prior=ON)
+    settings = TrackerSettings(edges=(), traffic=ON)
     tracker, fresh = Tracker(settings), Tracker(settings)
     for k in range(20):
         tracker.step(frame(0.1 * k, [(1.2 * k, 0.0)]))

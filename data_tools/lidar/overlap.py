@@ -1,0 +1,51 @@
+"""How much of what stands above the ground two registered submaps share: the proof of a place.
+
+Ground lies on ground everywhere, so it proves nothing; and what only one of the two has seen says nothing either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from data_tools.lidar.places import heights_above_ground
+from data_tools.lidar.voxels import voxel_downsample
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
+
+_STANDS = 0.5  # m above the ground
+_SPACING, _CELL = 0.8, 1.0  # m: of the points compared, and of the cells that were seen
+_SEEN, _NEAR = 2.0, 0.6  # m from above to a cell that was seen, and to a point that is the same
+_FEWEST = 20  # points that tell an overlap
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Points above the ground, thinned (M, 3), with trees of more of them, and of the cells seen from above."""
+
+    points: FloatArray
+    tree: cKDTree
+    seen: cKDTree
+
+    @classmethod
+    def of(cls, points: FloatArray) -> Structure:
+        """The structure of points (N, 3), m, z up; N > 0."""
+        standing = points[heights_above_ground(points)[0] > _STANDS]
+        cells = np.unique(np.floor(points[:, :2] / _CELL), axis=0) * _CELL + _CELL / 2
+        standing = standing[voxel_downsample(standing, _SPACING / 2)]
+        return cls(standing[voxel_downsample(standing, _SPACING)], cKDTree(standing), cKDTree(cells))
+
+    def shared(self, other: Structure, self_T_other: FloatArray) -> float:
+        """Share of the points of each that lie on the other, where that one has seen: the smaller one; 0: too few."""
+        return min(self._share(other.points, self_T_other), other._share(self.points, inverse_transform(self_T_other)))
+
+    def _share(self, points: FloatArray, T: FloatArray) -> float:
+        moved = transform_points(T, points)
+        distance, _ = self.seen.query(moved[:, :2], distance_upper_bound=_SEEN)
+        moved = moved[np.isfinite(distance)]
+        if len(moved) < _FEWEST or not len(self.points):
+            return 0.0
+        distance, _ = self.tree.query(moved, distance_upper_bound=_NEAR)
+        return float(np.isfinite(distance).mean())

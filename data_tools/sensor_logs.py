@@ -1,0 +1,139 @@
+"""Logs of the vehicle's own sensors as tables: inertial samples, speeds of the wheels, satellite fixes.
+
+A file begins with a line of columns, each a name and its unit in brackets, in any order; others are left out:
+
+    imu      time [s], acceleration_x [m/s^2], ..y, ..z, angular_rate_x [rad/s], ..y, ..z
+    wheels   time [s], speed [m/s]
+    gps      time [s], x [m], y [m], z [m];  or  latitude [deg], longitude [deg], altitude [m]
+
+Units: s, ms, us, ns; m/s^2, g; rad/s, deg/s; m/s, km/h, mph; m, km, ft; deg, rad. Rows are in order of time. Latitude
+and longitude become metres east and north of an origin, by the Mercator projection at its scale (as KITTI's
+development kit does). Accelerations are specific forces: (0, 0, 9.81) at rest.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.datasets.kitti.oxts import read_sensors, world_position
+from data_tools.files.text_tables import TextTable, read_lines
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.slam.sensors import SensorBuffer, SensorName
+
+_AXES = ("x", "y", "z")
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_LENGTH = {"m": 1.0, "km": 1000.0, "ft": 0.3048}
+_ANGLE = {"deg": math.pi / 180, "rad": 1.0}
+_UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": _TIME,
+    **{f"acceleration_{axis}": {"m/s^2": 1.0, "g": 9.80665} for axis in _AXES},
+    **{f"angular_rate_{axis}": {"rad/s": 1.0, "deg/s": math.pi / 180} for axis in _AXES},
+    "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704},
+    **dict.fromkeys((*_AXES, "altitude"), _LENGTH),
+    **dict.fromkeys(("latitude", "longitude"), _ANGLE),
+}
+_COLUMNS: Mapping[SensorName, tuple[str, ...]] = {
+    "imu": tuple(name for name in _UNITS if name.startswith(("acceleration", "angular_rate"))),
+    "wheels": ("speed",),
+    "gps": _AXES,
+}
+_GEODETIC = ("latitude", "longitude", "altitude")
+_HEADER = re.compile(r"\s*([A-Za-z_]+)\s*\[\s*([^\]]*?)\s*\]\s*")
+
+
+def read_sensor_log(
+    path: str | Path, sensor: SensorName, origin: tuple[float, float, float] | None = None
+) -> FloatArray:
+    """Read a log: times (n,), s, and what was measured then, (n, 1 + d), in SI units.
+
+    origin: latitude, longitude (deg) and altitude (m) of the world's origin; None: the first fix. Raises `InputError`
+    naming the file and the line for a column without unit, an unknown unit, a missing column, and time that runs
+    backwards.
+    """
+    path = Path(path)
+    lines = [(number, line) for number, line in enumerate(read_lines(path), start=1) if line.strip()]
+    if not lines:
+        raise InputError(f"{path}: expected a line of columns, the file is empty")
+    titles = [_HEADER.fullmatch(title) for title in lines[0][1].split(",")]
+    found = {title[1]: (column, title[2]) for column, title in enumerate(titles) if title is not None}
+    names = _GEODETIC if sensor == "gps" and "latitude" in found else _COLUMNS[sensor]
+    wanted = ("time", *names)
+    for name in wanted:
+        if name not in found:
+            unit = next(iter(_UNITS[name]))
+            raise InputError(
+                f"{path}: line {lines[0][0]}: expected a column {name} with its unit, such as {name} [{unit}]"
+            )
+        if found[name][1] not in _UNITS[name]:
+            known = ", ".join(_UNITS[name])
+            raise InputError(
+                f"{path}: line {lines[0][0]}: {name}: expected one of {known}, got {found[name][1][:20]!r}"
+            )
+    rows = [(number, line.split(",")) for number, line in lines[1:]]
+    for number, row in rows:
+        if len(row) != len(titles):
+            raise InputError(f"{path}: line {number}: expected {len(titles)} columns, got {len(row)}")
+    table = TextTable.of(path, [row for _, row in rows], [number for number, _ in rows], len(titles))
+    numbers = table.numbers([found[name][0] for name in wanted], wanted)
+    numbers = numbers * [_UNITS[name][found[name][1]] for name in wanted]
+    backwards = np.flatnonzero(np.diff(numbers[:, 0]) <= 0)
+    if len(backwards):
+        at = int(backwards[0]) + 1
+        raise table.fault(at, f"time: expected one after {numbers[at - 1, 0]:.6f} s, got {numbers[at, 0]:.6f} s")
+    if names == _GEODETIC and len(numbers):
+        degrees = numbers[:, 1:] * [180 / math.pi, 180 / math.pi, 1.0]
+        begin = degrees[0] if origin is None else np.array(origin)
+        numbers[:, 1:] = world_position(degrees[:, 0], degrees[:, 1], degrees[:, 2], begin)
+    return numbers
+
+
+@dataclass(eq=False)
+class SensorLog:
+    """Tables of a drive by sensor, (n, 1 + d) with the time first, fed to a buffer as time goes on."""
+
+    tables: Mapping[SensorName, FloatArray]
+    _row: dict[str, int] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        for name, table in self.tables.items():
+            checked(name, table, (None, 1 + len(_COLUMNS[name])))
+
+    def feed(self, buffer: SensorBuffer, until: float) -> None:
+        """Add what was measured up to a time, s."""
+        for name, table in self.tables.items():
+            first = self._row.get(name, 0)
+            last = int(np.searchsorted(table[:, 0], until, side="right"))
+            for time, *values in table[first:last].tolist():
+                if name == "imu":
+                    buffer.add_imu(time, np.array(values[:3]), np.array(values[3:]))
+                elif name == "wheels":
+                    buffer.add_wheels(time, values[0])
+                else:
+                    buffer.add_gps(time, np.array(values))
+            self._row[name] = last
+
+
+def kitti_sensor_log(
+    path: str | Path, sensors: tuple[SensorName, ...], period: float, gps: float, wheels: float, seed: int
+) -> SensorLog:
+    """Return the sensors of a KITTI sequence from its GPS/IMU records, one every `period` s.
+
+    Inertial samples are those recorded. Fixes and speeds are of the filtered solution that the estimate is compared
+    with; so they get noise from `seed`: `gps`, m, by axis, and `wheels`, m/s, with a scale that is wrong by 1 %.
+    """
+    records, rng = read_sensors(path), np.random.default_rng(seed)
+    time = period * np.arange(len(records.position))
+    scale = 1 + rng.choice([-0.01, 0.01])
+    noisy: dict[SensorName, FloatArray] = {
+        "imu": np.hstack([records.acceleration, records.angular_rate]),
+        "wheels": (scale * records.speed + rng.normal(0, wheels, len(time)))[:, None],
+        "gps": records.position + rng.normal(0, gps, (len(time), 3)),
+    }
+    return SensorLog({name: np.column_stack([time, noisy[name]]) for name in sensors})

@@ -1,0 +1,46 @@
+"""Factor providers of what LiDAR SLAM has associated: landmarks seen from keyframes, and loops between these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from factors import Robust, between_factor
+from pipelines.slam.lidar_slam import LidarSlamResult
+from pipelines.slam.loop_closures import LoopClosure
+from saga_fg.graph import Additions, GraphView
+from saga_fg.slam.mapping import LandmarkObservations, pose_key
+from saga_fg.slam.submaps import SubmapSettings
+from saga_fg.types.landmark import Observation
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Loops between keyframes, whose poses are those of `epochs`."""
+
+    loops: Sequence[LoopClosure]
+    epochs: Sequence[int]
+    robust: Robust
+    name: str = "loops"
+
+    def factors(self, view: GraphView) -> Additions:
+        mine = [loop for loop in self.loops if self.epochs[loop.second] == view.epoch]
+        pairs = [(pose_key(self.epochs[loop.first]), pose_key(view.epoch)) for loop in mine]
+        return Additions(
+            factors=[
+                between_factor(*pair, loop.first_T_second, loop.covariance, self.robust)
+                for pair, loop in zip(pairs, mine, strict=True)
+            ]
+        )
+
+
+def known_providers(
+    result: LidarSlamResult, epochs: Sequence[int], settings: SubmapSettings
+) -> tuple[LandmarkObservations, Loops]:
+    """Providers of landmarks seen from keyframes and of loops between these, whose poses are those of `epochs`."""
+    start = {mark.number: mark.state for mark in result.landmarks}
+    seen: dict[int, list[tuple[int, Observation]]] = {}
+    for one in result.observations:
+        if one.landmark in start:
+            seen.setdefault(epochs[one.pose], []).append((one.landmark, one.observation))
+    return LandmarkObservations(seen, start, settings.robust), Loops(result.loops, epochs, settings.robust_loops)

@@ -1,0 +1,42 @@
+"""The options of a command that say which sensors of the vehicle take part, and where their measurements are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast, get_args
+
+import numpy as np
+
+from data_tools.datasets.kitti.dataset import FRAME_PERIOD
+from data_tools.sensor_logs import SensorLog, kitti_sensor_log, read_sensor_log
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.sensors import SensorName
+
+GPS_NOISE, WHEELS_NOISE = 1.0, 0.05  # m and m/s, of the fixes and speeds made from GPS/IMU records
+
+
+def sensor_log(records: Path, sensors: str, files: Sequence[str], seed: int) -> SensorLog | None:
+    """Measurements of the sensors named, like "gps,imu", from KITTI's GPS/IMU records, and of files like "imu=FILE".
+
+    Raises `InputError` for an unknown sensor, and for one that is named twice.
+    """
+    named = [one.strip() for one in sensors.split(",") if one.strip()]
+    given = [one.partition("=") for one in files]
+    known = get_args(SensorName)
+    for name in (*named, *(name for name, _, _ in given)):
+        if name not in known:
+            raise InputError(f"sensors: expected some of {', '.join(known)}, got {name[:40]!r}")
+    twice = [name for name in known if (*named, *(name for name, _, _ in given)).count(name) > 1]
+    if twice:
+        raise InputError(f"sensors: {twice[0]}: expected either --sensors or --sensor-log, once")
+    if not named and not given:
+        return None
+    tables: dict[SensorName, FloatArray] = {}
+    if named:
+        chosen = tuple(cast(SensorName, name) for name in named)
+        tables |= kitti_sensor_log(records, chosen, FRAME_PERIOD, GPS_NOISE, WHEELS_NOISE, seed).tables
+    for name, _, path in given:
+        tables[cast(SensorName, name)] = read_sensor_log(path, cast(SensorName, name))
+    return SensorLog({name: np.asarray(table) for name, table in tables.items()})

@@ -1,0 +1,57 @@
+"""Pairs of places that are near each other, from a k-d tree where there are many.
+
+Up to `MOST_COMPARED` distances are all computed at once, which is faster. Beyond, rows whose reach differs by less than
+a factor of two are searched together, so that a few far-reaching ones do not widen the search of all others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from saga_fg.numerics.arrays import FloatArray, IntArray
+
+MOST_COMPARED = 30_000  # distances that are computed at once: those of 170 places to each other
+_LEAST = 1e-9  # m, so that a reach of 0 has a logarithm
+
+
+def near_pairs(
+    a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray | float = 0.0
+) -> tuple[IntArray, IntArray]:
+    """Rows (K,) of `a` and of `b` with |a_i - b_j| <= reach_i + further_j, in order of i, then of j.
+
+    a (n, 2), b (m, 2), reach (n,) and further (m,) in m; where one of these is NaN there is no pair
+    """
+    further = np.broadcast_to(further, len(b))
+    if len(a) * len(b) <= MOST_COMPARED:
+        return _compared(a, b, reach, further)
+    i, j = np.flatnonzero(~np.isnan(reach)), np.flatnonzero(~np.isnan(further))
+    if len(i) == 0 or len(j) == 0:
+        return i[:0], j[:0]
+    widest = reach[i] + further[j].max()
+    bounded = np.isfinite(widest)
+    all_i, all_j = _compared(a[i[~bounded]], b[j], reach[i[~bounded]], further[j])
+    found, tree = [i[~bounded][all_i] * len(b) + j[all_j]], cKDTree(b[j])
+    i, widest = i[bounded], widest[bounded]
+    octave = np.ceil(np.log2(np.maximum(widest, _LEAST)))
+    for level in np.unique(octave).tolist():
+        alike = np.flatnonzero(octave == level)
+        radius = float(widest[alike].max()) * (1 + 1e-9)
+        near = cKDTree(a[i[alike]]).sparse_distance_matrix(tree, radius, output_type="ndarray")
+        row, column = i[alike[near["i"]]], j[near["j"]]
+        within = _square(a[row], b[column]) <= (reach[row] + further[column]) ** 2
+        found.append(row[within] * len(b) + column[within])
+    row, column = np.divmod(np.sort(np.concatenate(found)), len(b))
+    return row, column
+
+
+def _compared(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
+    """The pairs by all distances."""
+    i, j = np.nonzero(_square(a[:, None], b) <= (reach[:, None] + further) ** 2)
+    return i, j
+
+
+def _square(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Squared distances (...) of places (..., 2)."""
+    x, y = a[..., 0] - b[..., 0], a[..., 1] - b[..., 1]
+    return np.asarray(x * x + y * y)

@@ -1,0 +1,5 @@
+"""Incremental SLAM in submaps: a running graph of bounded size."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,326 @@
+"""Incremental SLAM in submaps: one running graph of bounded size.
+
+    keyframes and landmarks of the running submap      as they come, in iSAM2
+    closed submaps                                     one factor each, between its anchor and the next
+    loops                                              factors between anchors, under a robust loss
+
+A submap is anchored at its first keyframe. When it is long enough, the keyframe at hand becomes the anchor of the next
+one, and everything in between is eliminated (`condensing`). Landmarks belong to one submap: what is seen on is a
+landmark of the next again, and they are tied through the poses. So the graph grows by one pose and one factor a submap,
+and a keyframe costs as much at the end of a drive as at its beginning.
+
+The measurements themselves are kept. `finish` solves them all together, nothing condensed, from the running estimate.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+
+from factors import Robust, SolverSettings, between_factor
+from saga_fg.errors import InputError
+from saga_fg.estimators.batch_solver import BatchSolver
+from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.estimators.incremental_smoother import IncrementalSmoother
+from saga_fg.estimators.isam2_engine import RelinearisationSettings
+from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.settings import Positive, Range, Settings, setting
+from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, landmark_key, pose_key
+from saga_fg.slam.submaps.association import SubmapLandmarks
+from saga_fg.slam.submaps.condensing import CondensedSubmap
+from saga_fg.slam.submaps.recording import recorded
+from saga_fg.types.frame import Frame
+from saga_fg.types.landmark import Landmark, Observation
+
+_SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
+
+
+@dataclass(frozen=True)
+class SubmapSettings(Settings):
+    """Size of submaps, association and confirmation of landmarks."""
+
+    length: Positive = setting(30.0, "way after which the next submap begins, m; usual 20 to 50; higher: slower")
+    keyframes: Annotated[int, Range(2, 1000)] = setting(
+        80, "keyframes after which the next submap begins, on a shorter way; higher: slower"
+    )
+    gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
+        0.999, "gate probability of association; higher: fewer duplicates, more wrong matches"
+    )
+    confirm_after: Annotated[int, Range(1, 10**9)] = setting(4, "observations that confirm a landmark")
+    relinearise_above: Positive = setting(
+        0.3, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
+    )
+    robust_scale: Positive = setting(
+        3.0,
+        "residual from which losses discount poles and curbs (Geman-McClure) and loops (Cauchy, which pulls from far), "
+        "standard deviations",
+    )
+
+    @property
+    def robust(self) -> Robust:
+        """The loss of landmarks."""
+        return Robust("geman-mcclure", self.robust_scale)
+
+    @property
+    def robust_loops(self) -> Robust:
+        """The loss of loops."""
+        return Robust("cauchy", self.robust_scale)
+
+
+@dataclass(frozen=True, eq=False)
+class AnchorLoop:
+    """The anchor of submap `second` seen from that of `first` (4, 4), and the covariance (6, 6) of its tangent."""
+
+    first: int
+    second: int
+    first_T_second: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedDrive:
+    """Everything solved together: N poses (N, 4, 4), their covariances (N, 6, 6), and the landmarks seen often enough.
+
+    solution: of the whole graph, with all variables; graph: that, at its solution
+    """
+
+    world_T_pose: FloatArray
+    covariances: FloatArray
+    landmarks: list[Landmark]
+    solution: GraphSolution
+    graph: SceneFactorGraph
+
+
+class SubmapGraph:
+    """Add keyframes in order of time; read poses at any moment; `finish` at the end.
+
+    graph = SubmapGraph(world_T_first, covariance)
+    graph.append(0.0, None, observations)
+    graph.append(0.1, (last_T_new, covariance), observations)      # True: a submap was closed, and the next begun
+    ...
+    graph.finish().world_T_pose
+
+    providers: of other factors, asked at every keyframe; frames that are given with keyframes are theirs to read. An
+    error of theirs leaves the graph as it was before the keyframe.
+    """
+
+    def __init__(
+        self,
+        world_T_first: FloatArray,
+        covariance: FloatArray,
+        settings: SubmapSettings | None = None,
+        providers: Sequence[FactorProvider] = (),
+    ) -> None:
+        self.settings = settings or SubmapSettings()
+        self._providers = recorded(providers)
+        self._smoother = IncrementalSmoother(
+            lag=None, settings=RelinearisationSettings(self.settings.relinearise_above)
+        )
+        self._motions: list[tuple[FloatArray, FloatArray]] = [(world_T_first, covariance)]
+        self._times: list[float] = []
+        self._seen: list[Sequence[tuple[int, Observation]]] = []
+        self._anchors: list[int] = []
+        self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
+        self._states: dict[int, Any] = {}  # of landmarks of closed submaps
+        self._loops: list[tuple[int, AnchorLoop]] = []  # with the keyframe at which they came
+        self._landmarks = SubmapLandmarks(self.settings.gate)
+        self._numbers, self._way = 0, 0.0
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    @property
+    def anchors(self) -> Sequence[int]:
+        """Numbers of the keyframes that are anchors, that of the running submap last."""
+        return self._anchors
+
+    @property
+    def landmarks(self) -> int:
+        """Number of landmarks so far."""
+        return self._numbers
+
+    @property
+    def size(self) -> int:
+        """Number of variables in the running graph."""
+        return len(self._smoother.graph().variables)
+
+    def append(
+        self,
+        time: float,
+        motion: tuple[FloatArray, FloatArray] | None,
+        observations: Sequence[Observation] = (),
+        frame: Frame | None = None,
+    ) -> bool:
+        """Add the next keyframe; returns whether it closed a submap and is the anchor of the next.
+
+        motion: last_T_new (4, 4) and the covariance (6, 6) of its tangent; None for the first one
+        """
+        k = len(self)
+        if (motion is None) != (k == 0):
+            raise InputError("motion: expected one for every keyframe but the first")
+        measured = self._motions[0] if motion is None else motion
+        way = self._way + (0.0 if motion is None else float(np.linalg.norm(measured[0][:3, 3])))
+        begins = k == 0 or way >= self.settings.length or k - self._anchors[-1] >= self.settings.keyframes
+        start = measured[0] if k == 0 else self.pose(k - 1) @ measured[0]
+        landmarks, numbers = self._associated(begins, motion, start, observations)
+        now = list(zip(numbers, observations, strict=True))
+        motion_provider = MeasuredMotion(*measured, start)
+        seen = LandmarkObservations({k: now}, {n: landmarks.state(n) for n in set(numbers)}, self.settings.robust)
+        self._smoother.step(time, [motion_provider, seen, *self._providers], frame)
+        self._landmarks, self._way = landmarks, way
+        self._numbers = max(self._numbers, *(n + 1 for n in numbers), 0)
+        if k:
+            self._motions.append(measured)
+        self._times.append(time)
+        self._seen.append(now)
+        if begins:
+            self._begin_submap(k)
+        landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
+        return begins and k > 0
+
+    def close_loops(self, loops: Sequence[AnchorLoop]) -> None:
+        """Add loops between submaps, by their numbers, and solve."""
+        for loop in loops:
+            if not 0 <= loop.first < loop.second < len(self._anchors):
+                raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
+        if not loops:
+            return
+        self._smoother.extend([_Loops(loops, self._anchors, self.settings.robust_loops)])
+        self._loops += [(len(self) - 1, loop) for loop in loops]
+        self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
+
+    def pose(self, k: int) -> FloatArray:
+        """The present estimate (4, 4) of a keyframe's pose; in a closed submap it goes along with the anchor."""
+        if k < len(self._offsets):
+            anchor = self._anchors[int(np.searchsorted(self._anchors, k, side="right")) - 1]
+            return np.asarray(self._running(anchor) @ self._offsets[k])
+        return self._running(k)
+
+    def covariance(self) -> FloatArray:
+        """The covariance (6, 6) of the newest keyframe's pose."""
+        return self._smoother.covariance(pose_key(len(self) - 1))
+
+    def world_T_anchor(self) -> FloatArray:
+        """The present estimates (n, 4, 4) of all anchors."""
+        return np.array([self._running(k) for k in self._anchors])
+
+    def poses(self) -> FloatArray:
+        """The present estimates (N, 4, 4) of all keyframes."""
+        closed = len(self._offsets)
+        of = np.searchsorted(self._anchors, np.arange(closed), side="right") - 1
+        poses = np.empty((len(self), 4, 4))
+        poses[:closed] = self.world_T_anchor()[of] @ np.array(self._offsets).reshape(-1, 4, 4)
+        for k in range(closed, len(self)):
+            poses[k] = self._running(k)
+        return poses
+
+    def observations(self) -> list[AssociatedObservation]:
+        """All observations with their keyframes and landmarks."""
+        return [AssociatedObservation(k, one, n) for k, now in enumerate(self._seen) for n, one in now]
+
+    def measurements(self) -> SceneFactorGraph:
+        """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed."""
+        graph, poses = SceneFactorGraph(), self.poses()
+        seen = LandmarkObservations(self._confirmed(), self._starts(poses), self.settings.robust)
+        loops: dict[int, list[AnchorLoop]] = {}
+        for k, loop in self._loops:
+            loops.setdefault(k, []).append(loop)
+        for k, (time, motion) in enumerate(zip(self._times, self._motions, strict=True)):
+            graph.advance(time)
+            own: list[FactorProvider] = [MeasuredMotion(*motion, poses[k]), seen]
+            if k in loops:
+                own.append(_Loops(loops[k], self._anchors, self.settings.robust_loops))
+            ask_all([*own, *(again for provider in self._providers for again in provider.again(k))], graph)
+        return graph
+
+    def finish(self) -> SolvedDrive:
+        """Solve all measurements together."""
+        if not len(self):
+            raise InputError("expected at least one keyframe before the end")
+        solver = BatchSolver(graph=self.measurements(), settings=_SOLVER)
+        solution = solver.solve()
+        keys = [pose_key(k) for k in range(len(self))]
+        seen = LandmarkObservations(self._confirmed(), {})
+        marks = seen.landmarks(solution, self.settings.confirm_after)
+        return SolvedDrive(
+            np.array([solution.values.atPose3(key).matrix() for key in keys]),
+            np.array([solution.marginal(key) for key in keys]),
+            marks,
+            solution,
+            solver.graph(),
+        )
+
+    def _running(self, k: int) -> FloatArray:
+        state: Any = self._smoother.state(pose_key(k))
+        return np.asarray(state.matrix())
+
+    def _associated(
+        self,
+        begins: bool,
+        motion: tuple[FloatArray, FloatArray] | None,
+        start: FloatArray,
+        observations: Sequence[Observation],
+    ) -> tuple[SubmapLandmarks, list[int]]:
+        landmarks = SubmapLandmarks(self.settings.gate) if begins else self._landmarks.copy()
+        if motion is not None and not begins:
+            landmarks.move(*motion)
+        return landmarks, landmarks.observe(start, observations, self._numbers)
+
+    def _begin_submap(self, k: int) -> None:
+        """Close the running submap, if any, and make the keyframe k an anchor."""
+        if k:
+            anchor = self._anchors[-1]
+            self._close(anchor, k)
+        self._anchors.append(k)
+        self._way = 0.0
+
+    def _close(self, anchor: int, successor: int) -> None:
+        keep = {pose_key(k) for k in self._anchors} | {pose_key(successor)}
+        mine = {n for now in self._seen[anchor:successor] for n, _ in now}
+        world = inverse_transform(self._running(anchor))
+        self._offsets += [np.eye(4), *(world @ self._running(k) for k in range(anchor + 1, successor))]
+        self._states |= {n: self._smoother.state(landmark_key(n)) for n in mine}
+        variables = self._smoother.graph().variables.values()
+        old = [one.key for one in variables if one.epoch is not None and one.epoch < successor and one.key not in keep]
+        into = CondensedSubmap(pose_key(anchor), pose_key(successor))
+        self._smoother.marginalise([*old, *map(landmark_key, mine)], into)
+
+    def _confirmed(self) -> dict[int, Sequence[tuple[int, Observation]]]:
+        """Observations of landmarks that were seen often enough, by keyframe."""
+        counts = Counter(n for now in self._seen for n, _ in now)
+        often = {n for n, count in counts.items() if count >= self.settings.confirm_after}
+        return {k: [(n, one) for n, one in now if n in often] for k, now in enumerate(self._seen)}
+
+    def _starts(self, poses: FloatArray) -> Mapping[int, Any]:
+        """Where landmarks begin: those of closed submaps anew from their last observation, since anchors have moved."""
+        start: dict[int, Any] = {}
+        for k, now in enumerate(self._seen):
+            for number, one in now:
+                if number in self._states:
+                    start[number] = one.kind.initialise(poses[k], one.value)
+                elif number not in start:
+                    start[number] = self._smoother.state(landmark_key(number))
+        return start
+
+
+@dataclass(frozen=True, eq=False)
+class _Loops:
+    """Factors of loops between anchors."""
+
+    loops: Sequence[AnchorLoop]
+    anchors: Sequence[int]
+    robust: Robust
+    name: str = "loops"
+
+    def factors(self, view: GraphView) -> Additions:
+        keys = [(pose_key(self.anchors[one.first]), pose_key(self.anchors[one.second])) for one in self.loops]
+        pairs = zip(keys, self.loops, strict=True)
+        return Additions(
+            factors=[between_factor(*pair, one.first_T_second, one.covariance, self.robust) for pair, one in pairs]
+        )

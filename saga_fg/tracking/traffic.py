@@ -1,0 +1,187 @@
+"""Memory of traffic: where vehicles went lately and how fast, for the paths and speeds of others.
+
+A passage is a place of a track with its heading and speed there: where it was last, and every `SPACING` m. Passages
+outlive their tracks and are forgotten after `memory` s. The lanes of the road map are among them: they tell where to
+go, at no speed, and are never forgotten.
+
+`saga_fg.tracking.trails` predicts paths from this memory, `saga_fg.tracking.speed_prior` the speeds of new tracks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.columns import Columns
+from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
+from saga_fg.tracking.kinematics import Kinematics
+from saga_fg.types.road_map import LANE, Lane, RoadMap
+
+SPACING = 2.0  # m between the passages of a track
+FIRST_LANE = -2  # ids of lanes count down from here, so that they are never those of tracks
+
+
+@dataclass(frozen=True)
+class SpeedPriorSettings(Settings):
+    """Prior speed of a new track from traffic that heads the same way, see `saga_fg.tracking.speed_prior`."""
+
+    weight: NonNegative = setting(0.0, "weight of one neighbour against the prior without traffic; 0: off, usual 5")
+    ahead_scale: PositiveOrInf = setting(
+        15.0, "sigma of the kernel on the distance along the heading, m; higher: traffic further ahead counts"
+    )
+    lateral_scale: PositiveOrInf = setting(
+        2.0, "sigma of the kernel on the distance across the heading, m; usual half a lane; higher: other lanes count"
+    )
+    heading_scale: PositiveOrInf = setting(
+        0.3, "sigma of the kernel on the difference of headings, rad; higher: traffic that turns counts"
+    )
+    spread: NonNegative = setting(
+        2.0, "standard deviation of the difference between the speeds of neighbours, m/s; higher: a weaker prior"
+    )
+    max_speed_deviation: PositiveOrInf = setting(
+        1.5, "use only tracks whose speed has a standard deviation below this, m/s; higher: more, less certain speeds"
+    )
+
+
+@dataclass(frozen=True)
+class TrafficSettings(Settings):
+    """Memory of where traffic went and how fast, see `saga_fg.tracking.traffic`."""
+
+    memory: NonNegative = setting(
+        0.0, "remember where tracks have passed for this long, s; usual 5 to 120; higher: older traffic counts, 0: none"
+    )
+    reach: NonNegative = setting(
+        1.5,
+        "sigma of the kernel on the distance to the trails of earlier traffic and to lanes of the map, along which "
+        "undetected objects with a course_time go, m; usual half a lane; higher: other lanes count, 0: no such paths",
+    )
+    speed_prior: SpeedPriorSettings = settings_group(
+        SpeedPriorSettings, "speed of new tracks from the traffic around them"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Passages(Columns):
+    """n passages of tracks: id, class, position (n, 2), world, m, heading, rad, speed along it, m/s, its
+    variance, infinite for a lane, probability of being stationary, time, s, and whether it moves."""
+
+    id: IntArray
+    label: StrArray
+    position: FloatArray
+    heading: FloatArray
+    speed: FloatArray
+    variance: FloatArray
+    stationary: FloatArray
+    time: FloatArray
+    moves: BoolArray
+
+    @classmethod
+    def of(
+        cls,
+        ids: IntArray,
+        label: StrArray,
+        now: Kinematics,
+        yaw: FloatArray,
+        moves: BoolArray,
+        time: float,
+        stationary: FloatArray | None = None,
+    ) -> Self:
+        """The passages of tracks at a `time`, s, by their kinematics in the world.
+
+        Those of unknown `yaw` head where they go; if they do not move either, they have none. stationary: 0 if not
+        given.
+        """
+        v = now.velocity
+        heading = np.where(np.isfinite(yaw) | ~moves, yaw, np.arctan2(v[:, 1], v[:, 0]))
+        ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        speed, variance = np.einsum("ni,ni->n", ahead, v), np.einsum("ni,nij,nj->n", ahead, now.P_velocity, ahead)
+        stationary = np.zeros(len(ids)) if stationary is None else stationary
+        found = cls(ids, label, now.position, heading, speed, variance, stationary, np.full(len(ids), time), moves)
+        return found if np.isfinite(heading).all() else found.select(np.isfinite(heading))
+
+    @classmethod
+    def of_lane(cls, lane: Lane, ids: int) -> Self:
+        """The passages along a lane."""
+        centre = np.array(lane.centre)
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
+        at = np.linspace(0.0, way[-1], max(2, round(way[-1] / SPACING) + 1))
+        place = np.stack([np.interp(at, way, each) for each in centre.T], axis=-1)
+        heading = np.arctan2(*np.gradient(place, axis=0)[:, ::-1].T)
+        n = len(at)
+        none, always = np.zeros(n), np.full(n, np.inf)
+        return cls(
+            np.full(n, ids), np.full(n, LANE), place, heading, none, always, none, always, np.ones(n, dtype=np.bool_)
+        )
+
+
+@dataclass(eq=False)
+class Traffic:
+    """The passages of the last `memory` seconds: those that tracks have left behind, in the order of time, the
+    last of these of each track, by id, and where tracks were last; and those along the lanes of the map."""
+
+    settings: TrafficSettings
+    left: Passages | None = None
+    marked: Passages | None = None
+    latest: Passages | None = None
+    lanes: Passages | None = None
+    lane_names: tuple[str, ...] = ()
+    _map: RoadMap | None = None
+    _trails: tuple[Passages, cKDTree] | None = field(default=None, repr=False)
+
+    def __copy__(self) -> Traffic:
+        """A memory that changes independently of this one, without the tree, which is no part of a state."""
+        return replace(self, _trails=None)
+
+    @property
+    def passages(self) -> Passages | None:
+        """The passages of tracks, None before the first."""
+        return None if self.left is None or self.latest is None else self.left.append(self.latest)
+
+    def update(self, passing: Passages, time: float) -> None:
+        """Remember where tracks are at `time`, s, every `SPACING` m, and forget what is older than `memory`."""
+        if self.settings.memory == 0:
+            return
+        none, self._trails = passing.select(slice(0, 0)), None
+        left, marked, latest = (
+            none if each is None else each.select(each.time >= time - self.settings.memory)
+            for each in (self.left, self.marked, self.latest)
+        )
+        new = passing.select(_moved(passing, marked))
+        self.left, self.latest = left.append(new), latest.select(~np.isin(latest.id, passing.id)).append(passing)
+        marked = marked.select(~np.isin(marked.id, new.id)).append(new)
+        self.marked = marked.select(np.argsort(marked.id))
+
+    def add_lanes(self, road_map: RoadMap) -> None:
+        """Take in the lanes of a map that are not known yet."""
+        if road_map is self._map or self.settings.reach == 0:
+            return
+        self._map = road_map
+        new = [lane for lane in road_map.lanes if lane.name not in self.lane_names]
+        if new:
+            first = FIRST_LANE - len(self.lane_names)
+            parts = [Passages.of_lane(lane, first - k) for k, lane in enumerate(new)]
+            self.lanes = Passages.concatenate([*([] if self.lanes is None else [self.lanes]), *parts])
+            self.lane_names, self._trails = self.lane_names + tuple(lane.name for lane in new), None
+
+    def trails(self) -> tuple[Passages, cKDTree] | None:
+        """The passages of those that move, and of lanes, with a tree of their positions; None without any."""
+        if self._trails is None:
+            parts = [each.select(each.moves) for each in (self.left, self.latest, self.lanes) if each is not None]
+            found = Passages.concatenate(parts) if parts else None
+            if found is None or len(found) == 0:
+                return None
+            self._trails = found, cKDTree(found.position, balanced_tree=False, compact_nodes=False)
+        return self._trails
+
+
+def _moved(passing: Passages, marked: Passages) -> BoolArray:
+    """(n,) whether tracks are at least `SPACING` m from their marked passages, or have none."""
+    if len(marked) == 0:
+        return np.ones(len(passing), dtype=np.bool_)
+    at = np.minimum(np.searchsorted(marked.id, passing.id), len(marked) - 1)
+    dx, dy = (passing.position - marked.position[at]).T
+    return np.asarray((marked.id[at] != passing.id) | (dx * dx + dy * dy >= SPACING**2))

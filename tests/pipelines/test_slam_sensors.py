@@ -1,0 +1,87 @@
+"""LiDAR SLAM with the vehicle's sensors: through a tunnel, over a field, and KITTI's records by the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.sensor_logs import SensorLog
+from data_tools.simulator.featureless import open_field, tunnel
+from data_tools.simulator.scanner import ScannerSettings, StaticWorld
+from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans
+from pipelines.cli import app
+from pipelines.slam.lidar_results import degenerate_spans, metrics
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from pipelines.slam.sensor_options import sensor_log
+from saga_fg.errors import InputError
+from saga_fg.numerics.geometry import yaw_transform
+
+PERIOD = 0.1
+PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False)
+
+
+def braking_drive(world: StaticWorld, count: int = 34) -> tuple[SimulatedScans, np.ndarray]:
+    """A straight drive that brakes from 12 to 6 m/s, as odometry by constant velocity does not expect; its speeds."""
+    speed = np.clip(12.0 - 0.4 * (np.arange(count) - 14), 6.0, 12.0)
+    x = np.concatenate([[0.0], np.cumsum(speed[1:] * PERIOD)])
+    poses = np.array([yaw_transform(-5.0 + at, -1.5, SENSOR_HEIGHT, 0.0) for at in x])
+    settings = ScannerSettings(rings=24, columns=360, reach=25.0)
+    return SimulatedScans(0, world_T_lidar=poses, settings=settings, world=world), speed
+
+
+def test_in_a_tunnel_the_wheels_say_how_far() -> None:
+    scans, speed = braking_drive(tunnel(5.0, 300.0, seed=0))
+    rng, times = np.random.default_rng(0), PERIOD * np.arange(len(speed))
+    wheels = np.column_stack([times, speed + rng.normal(0, 0.05, len(speed))])
+    alone, helped = (lidar_slam(scans, settings=PLAIN, log=log) for log in (None, SensorLog({"wheels": wheels})))
+    ends = [np.linalg.norm(one.trajectory.positions[-1] - scans.world_T_ego[-1, :3, 3]) for one in (alone, helped)]
+    assert ends[1] < 0.5 < 2.0 < ends[0]
+    figures = metrics(helped, scans)
+    assert figures["misfits"] == {}
+    last = figures["degenerate"][-1]
+    assert "along the road" in last["motions"]
+    assert last["last"] == len(speed) - 1
+    assert alone.covariances[-1, 3, 3] > 1.0
+    assert helped.covariances[-1, 3, 3] < 0.1
+
+
+def test_over_a_field_gps_and_wheels_carry_the_pose() -> None:
+    scans, speed = braking_drive(open_field())
+    rng, times = np.random.default_rng(1), PERIOD * np.arange(len(speed))
+    fixes = scans.world_T_ego[:, :3, 3] + rng.normal(0, 0.5, (len(speed), 3))
+    fixes[20] += [1000.0, 0.0, 0.0]  # a jump
+    log = SensorLog({"gps": np.column_stack([times, fixes]), "wheels": np.column_stack([times, speed])})
+    found = lidar_slam(scans, settings=PLAIN, log=log)
+    assert np.linalg.norm(found.trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1).max() < 1.0
+    assert all("across the road" in motions for motions in found.degenerate[1:])
+    assert found.misfits == {}
+
+
+def test_spans_of_scans_that_leave_the_same_motions_open() -> None:
+    road, none = ("along the road",), ()
+    spans = degenerate_spans(np.arange(6.0), [none, road, road, none, road, ("heading",)])
+    assert [(one["first"], one["last"], one["until"]) for one in spans] == [(1, 2, 2.0), (4, 4, 4.0), (5, 5, 5.0)]
+
+
+def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) -> None:
+    table = tmp_path / "wheels.csv"
+    table.write_text("time [s],speed [km/h]\n" + "".join(f"{0.1 * k:.1f},12.6\n" for k in range(1, 12)))
+    options = ["--dataroot", str(recordings / "kitti"), "--scans", "8", "--no-landmarks", "--sensors", "gps,imu"]
+    command = ["slam", "kitti", *options, "--sensor-log", f"wheels={table}", "--output", str(tmp_path / "run")]
+    outcome = CliRunner().invoke(app, command)
+    assert outcome.exit_code == 0, outcome.output
+    figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert figures["degenerate"] == []
+    assert figures["trajectory"]["ate"] < 0.5
+
+
+def test_sensors_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected some of gps, imu, wheels, got 'radar'"):
+        sensor_log(tmp_path, "radar", [], 0)
+    with pytest.raises(InputError, match="imu: expected either --sensors or --sensor-log, once"):
+        sensor_log(tmp_path, "imu", ["imu=imu.csv"], 0)
+    assert sensor_log(tmp_path, "", [], 0) is None

@@ -1,0 +1,51 @@
+"""Pairs within reach: the tree finds what comparing all distances finds."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from saga_fg.numerics import near_pairs as module
+from saga_fg.numerics.near_pairs import near_pairs
+
+
+def by_distances(a, b, reach, further):
+    distance = np.hypot(*np.moveaxis(a[:, None] - b, -1, 0))
+    return np.nonzero(distance <= reach[:, None] + further)
+
+
+@pytest.fixture(params=[0, 10**9], ids=["tree", "compared"])
+def most_compared(request, monkeypatch):
+    monkeypatch.setattr(module, "MOST_COMPARED", request.param)
+
+
+@pytest.mark.usefixtures("most_compared")
+@pytest.mark.parametrize("seed", range(5))
+def test_pairs_are_those_of_all_distances_in_order(seed):
+    rng = np.random.default_rng(seed)
+    a, b = rng.uniform(-50, 50, (80, 2)), rng.uniform(-50, 50, (60, 2))
+    reach, further = rng.lognormal(1, 1.5, 80), rng.uniform(0, 2, 60)
+    found = near_pairs(a, b, reach, further)
+    np.testing.assert_array_equal(found, by_distances(a, b, reach, further))
+    assert len(found[0]) > 20
+
+
+@pytest.mark.usefixtures("most_compared")
+def test_unknown_reaches_find_nothing_and_infinite_ones_everything():
+    a, b = np.array([[0.0, 0.0], [1e9, 0.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [5.0, 5.0]])
+    i, j = near_pairs(a, b, np.array([np.nan, np.inf, 1.0]), np.array([0.0, np.nan]))
+    assert (i.tolist(), j.tolist()) == ([1, 2], [0, 0])
+
+
+@pytest.mark.usefixtures("most_compared")
+@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 3), (3, 0)])
+def test_nothing_is_near_nothing(n, m):
+    i, j = near_pairs(np.zeros((n, 2)), np.zeros((m, 2)), np.ones(n))
+    assert len(i) == len(j) == 0
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-3, 1.0, 1e5]))
+def test_a_place_is_near_itself(seed, reach):
+    places = np.random.default_rng(seed).normal(scale=1e4, size=(310, 2))
+    i, j = near_pairs(places, places, np.full(len(places), reach))
+    assert set(zip(range(310), range(310), strict=True)) <= set(zip(i.tolist(), j.tolist(), strict=True))
