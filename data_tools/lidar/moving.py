@@ -19,8 +19,8 @@ def on_moving_objects(
 ) -> BoolArray:
     """Mask (N,) of the points (N, 3) inside boxes of probably moving objects, all in one frame.
 
-    moving: (n,) probability that each object moves; margin: m; likely: probability from which it counts. Boxes without a
-    size or heading are left out. Raises `InputError` for arrays that don't fit the boxes and a negative margin.
+    moving: (n,) probability that each object moves; margin: m; likely: probability from which it counts. Boxes without
+    a size or heading are left out. Raises `InputError` for arrays that don't fit the boxes and a negative margin.
     """
     places = checked("points", points, (None, 3))
     probability = checked("moving", moving, (len(boxes),))
