@@ -14,10 +14,9 @@ These are GTSAM's definitions (gtsam/linear/LossFunctions.h). Source: Z. Zhang, 
 Image and Vision Computing 15 (1997), table 1. With Gaussian residuals of one dimension, 95 % efficiency is reached at
 c = 1.345 (huber), 2.385 (cauchy), 4.685 (tukey).
 
-`Mixture` is the loss of a factor that holds with a probability P only; with 1 - P it says nothing. A residual of m
-components that is as large as expected, s^2 = m, leaves P as it is:
+`Mixture` is the loss of a factor that holds with a probability P only; with 1 - P it says nothing:
 
-    rho(s) = -log( P exp(-(s^2 - m) / 2) + 1 - P ),   w(s) = P exp(-(s^2 - m) / 2) / (P exp(-(s^2 - m) / 2) + 1 - P)
+    rho(s) = -log( P exp(-s^2 / 2) + 1 - P ),   w(s) = P exp(-s^2 / 2) / (P exp(-s^2 / 2) + 1 - P)
 
 Source: E. Olson and P. Agarwal, "Inference on networks of mixtures for robust robot mapping", International Journal of
 Robotics Research 32 (2013), here with the sum of the components.
@@ -101,39 +100,39 @@ class Robust:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """The loss of factors with residuals of `dim` components that hold with `probability` (n,), or one for all."""
+    """The loss of factors that hold with `probability` (n,), or one for all."""
 
     probability: FloatArray
-    dim: int
 
     def __post_init__(self) -> None:
-        probability = checked("probability", np.atleast_1d(np.asarray(self.probability, dtype=np.float64)), (None,))
-        if (probability < 0).any() or (probability > 1).any():
-            raise FactorError(f"probability: expected numbers from 0 to 1, got {probability}")
-        object.__setattr__(self, "probability", probability)
+        given = np.asarray(self.probability, dtype=np.float64)
+        every = checked("probability", np.atleast_1d(given), (None,))
+        if (every < 0).any() or (every > 1).any():
+            raise FactorError(f"probability: expected numbers from 0 to 1, got {given}")
+        object.__setattr__(self, "probability", given)
 
     def cost(self, distance: ArrayLike) -> FloatArray:
         """Return rho at the distances (n,), standard deviations."""
         holds, fails = self._logarithms(distance)
-        return -np.logaddexp(holds, fails)
+        return np.asarray(-np.logaddexp(holds, fails))
 
     def weight(self, distance: ArrayLike) -> FloatArray:
         """Return w at the distances (n,)."""
         holds, fails = self._logarithms(distance)
-        return np.exp(holds - np.logaddexp(holds, fails))
+        return np.asarray(np.exp(holds - np.logaddexp(holds, fails)))
 
     def of_row(self, row: int) -> Mixture:
         """Return the loss of one factor."""
-        return Mixture(self.probability[[min(row, len(self.probability) - 1)]], self.dim)
+        return Mixture(self.probability[row] if self.probability.ndim else self.probability)
 
     def model(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
         """Return GTSAM's noise model for the loss of one factor over `noise`."""
         loss = gtsam.noiseModel.mEstimator.Custom.Create(
-            lambda s: float(self.weight(float(s))[0]), lambda s: float(self.cost(float(s))[0])
+            lambda s: float(self.weight(float(s))), lambda s: float(self.cost(float(s)))
         )
         return gtsam.noiseModel.Robust.Create(loss, noise)
 
     def _logarithms(self, distance: ArrayLike) -> tuple[FloatArray, FloatArray]:
         with np.errstate(divide="ignore"):
             holds, fails = np.log(self.probability), np.log1p(-self.probability)
-        return holds - (np.square(distance) - self.dim) / 2, np.broadcast_to(fails, np.shape(holds))
+        return holds - np.square(distance) / 2, np.broadcast_to(fails, np.shape(holds))

@@ -40,7 +40,7 @@ from saga_fg.slam.joint.record import RecordedEpoch, RecordedObjects, motion_cov
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.mapping import pose_key
 
-_UNLIKELY = 0.05  # an object that is stationary with less than this probability gets no such factor
+_LIKELY = 0.5  # an object that is stationary with less than this probability gets no such factor
 _ANY_SPEED = 100.0  # m/s, deviation of an unknown velocity
 Record = Sequence[RecordedEpoch]
 
@@ -126,7 +126,7 @@ def stationary_factors(record: Record, stationary: Sequence[FloatArray], setting
     for (before, p_before), (now, p_now) in pairwise(zip(record, stationary, strict=True)):
         names, here, there = np.intersect1d(now.objects.id, before.objects.id, return_indices=True)
         p = np.minimum(p_now[here], p_before[there])
-        for row in np.flatnonzero(p > _UNLIKELY).tolist():
+        for row in np.flatnonzero(p > _LIKELY).tolist():
             name, node_type = int(names[row]), now.objects.types[int(here[row])]
             keys = object_key(before.epoch, name), object_key(now.epoch, name)
             collected.setdefault(node_type, []).append((*keys, float(p[row]), now.time - before.time))
@@ -142,7 +142,7 @@ def stationary_factors(record: Record, stationary: Sequence[FloatArray], setting
                 model.residual,
                 np.stack([drift, drift, speed, speed], axis=1)[:, :, None] * np.eye(4),
                 model.jacobians,
-                Mixture(p, 4),
+                Mixture(p),
                 name="stationary objects",
             )
         )
