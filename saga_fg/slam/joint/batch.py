@@ -1,9 +1,9 @@
 """Path of the vehicle and objects around it, from a whole recording at once.
 
 Discrete unknowns depend on the path: the association of detections, and the identity and stationarity of objects. A
-pass associates along the path so far, starting with the odometry's, and solves the graph of all epochs; probabilities
-of identity and stationarity are then taken from the solution, and it is solved again. Passes end when associations
-repeat.
+pass associates along the path so far, starting with the odometry's, takes the probabilities of stationarity from the
+detections, solves the graph of all epochs, weighs the detections by the objects found, and solves again. Passes end
+when associations repeat.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 
-_ROUNDS = 2  # of probabilities, each along the latest path
 TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
 
 
@@ -100,24 +99,23 @@ def _solve(
     settings: JointSettings,
 ) -> JointEstimate:
     """Solve several times, each from the solution before: if `start_moving` with all objects moving, which needs no
-    good start; with those stationary that seem so along the path; with identities and stationarity by the solution; at
-    last with vehicles assigned to lanes along the solution before.
+    good start; with those stationary that seem so along the path; with identities by the solution; at last with
+    vehicles assigned to lanes along the solution before.
     """
     graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=settings.max_iterations, tolerance=TOLERANCE)
-    epochs, name = VehicleAndObjects(record, path, settings), StationaryPairs.name
+    epochs = VehicleAndObjects(record, path, settings)
     for now in record:
         graph.advance(now.time)
         ask_all([epochs, *providers], graph)
     if start_moving:
         graph.solve(solver)
-    for _ in range(_ROUNDS):
-        probabilities = stationary_probabilities(record, path, slow, settings)
-        graph.add_factors(name, stationary_factors(record, probabilities, settings), name)
-        solution = graph.solve(solver)
-        estimate = read_estimate(record, solution, probabilities)
-        path, slow = estimate.world_T_ego, estimate.slow_errors
-        record = with_all_identities(record, path, [one.position for one in estimate.objects], clutter_area)
-        graph.add_factors(epochs.name, detections(record, settings), detections_name(record[-1]))
+    probabilities = stationary_probabilities(record, path, slow, settings)
+    name = StationaryPairs.name
+    graph.add_factors(name, stationary_factors(record, probabilities, settings), name)
+    estimate = read_estimate(record, graph.solve(solver), probabilities)
+    places = [one.position for one in estimate.objects]
+    record = with_all_identities(record, estimate.world_T_ego, places, clutter_area)
+    graph.add_factors(epochs.name, detections(record, settings), detections_name(record[-1]))
     solution = graph.solve(solver)
     for _ in range(lanes.rounds):
         lanes.assign(record, read_estimate(record, solution, probabilities), probabilities)

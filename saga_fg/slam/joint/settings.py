@@ -84,7 +84,7 @@ class JointSettings(Settings):
         0.15, "skip frames that follow a keyframe within this time, s; higher: faster, coarser"
     )
     passes: PositiveInt = setting(
-        4, "most passes of associating objects along the latest path; they end when associations repeat; higher: slower"
+        3, "most passes of associating objects along the latest path; they end when associations repeat; higher: slower"
     )
     max_iterations: PositiveInt = setting(
         30, "largest number of linearisations in each pass; usual 10 to 50; higher: slower where they do not converge"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
@@ -21,7 +22,7 @@ POOR = JointSettings(OdometryNoise(scale=0.02, bias=0.005))
 
 def epoch(z: list[list[float]], names: list[int], labels: tuple[str, ...]) -> RecordedEpoch:
     """Detections at `z` of the objects `names`, in order."""
-    node_type = record_epochs(*drive(n=1)[:1], np.eye(4)[None], drive(n=1)[1], new_tracker())[0].objects.types[0]
+    node_type = NodeType("car", ConstantVelocity())
     objects = RecordedObjects(np.arange(len(labels)), (node_type,) * len(labels), labels)
     places = np.column_stack([z, np.zeros(len(z))])
     R, ones = np.tile(0.01 * np.eye(2), (len(z), 1, 1)), np.ones(len(z))
