@@ -41,6 +41,7 @@ from factors.robust import Mixture, Robust, RobustLoss
 from factors.solver import Solution, SolverSettings, linearised, solve
 from factors.stacked import ResidualFactors
 from factors.variables import ImuBias, PlanarPose, SpatialPose, Variable, Vector
+from factors.wrapping import unwrapped_angles
 
 __all__ = [
     "ERROR_DIM",
@@ -114,4 +115,5 @@ __all__ = [
     "relative_factors",
     "relative_range_bearing_factors",
     "solve",
+    "unwrapped_angles",
 ]

@@ -92,19 +92,20 @@ class ResidualFactors:
 
     def individual_factors(self) -> list[ResidualFactor]:
         """Return the same as factors of their own, each of which evaluates the whole stack."""
-        return [
-            ResidualFactor(
-                keys=tuple(keys),
-                variables=self._variables,
-                residual=partial(self._single_residual, k),
-                covariance=self.covariances[min(k, len(self.covariances) - 1)],  # one may serve all
-                jacobians=partial(self._single_jacobians, k),
-                robust=self.robust.of_row(k) if isinstance(self.robust, Mixture) else self.robust,
-                angles=self.angles,
-                name=self.name,
-            )
-            for k, keys in enumerate(self.rows.tolist())
-        ]
+        return [self.individual_factor(k) for k in range(len(self.rows))]
+
+    def individual_factor(self, k: int) -> ResidualFactor:
+        """Return one of them."""
+        return ResidualFactor(
+            keys=tuple(self.rows[k].tolist()),
+            variables=self._variables,
+            residual=partial(self._single_residual, k),
+            covariance=self.covariances[min(k, len(self.covariances) - 1)],  # one may serve all
+            jacobians=partial(self._single_jacobians, k),
+            robust=self.robust.of_row(k) if isinstance(self.robust, Mixture) else self.robust,
+            angles=self.angles,
+            name=self.name,
+        )
 
     def _single_residual(self, k: int, *states: FloatArray) -> FloatArray:
         return np.asarray(self._residuals(self._filled(self._stacks(states), np.array([k])))[k])

@@ -23,7 +23,7 @@ from typing import Annotated
 import numpy as np
 
 from data_tools.lidar.voxels import cell_order_statistics
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import Positive, PositiveInt, Range, Settings, setting
 
 
@@ -55,26 +55,28 @@ def extract_curbs(points: FloatArray, height: FloatArray, settings: CurbSettings
     sector = (turn * s.sectors).astype(np.int64) % s.sectors
     bin_ = sector * steps + ((distance - s.min_range) / s.spacing).astype(np.int64)
     profile = cell_order_statistics(points[:, 2], bin_, s.sectors * steps, 2).reshape(s.sectors, steps)
-    found = []
-    for row in np.flatnonzero(np.isfinite(profile).sum(axis=1) >= 4):
-        step = _first_step(profile[row], s)
-        if step is not None:
-            angle = ((row + 0.5) / s.sectors - 0.5) * 2 * np.pi
-            out = s.min_range + (step + 0.5) * s.spacing
-            found.append((out * np.cos(angle), out * np.sin(angle), profile[row, step]))
-    return np.array(found).reshape(-1, 3)
+    row, step = _first_steps(profile, s)
+    angle = ((row + 0.5) / s.sectors - 0.5) * 2 * np.pi
+    out = s.min_range + (step + 0.5) * s.spacing
+    return np.column_stack([out * np.cos(angle), out * np.sin(angle), profile[row, step]])
 
 
-def _first_step(profile: FloatArray, s: CurbSettings) -> int | None:
-    """Index at which the profile (steps,) of one sector first rises and stays higher, or None."""
-    at = np.flatnonzero(np.isfinite(profile))
-    z = profile[at]
-    for k in range(len(at) - 3):
-        near = at[k + 1] - at[k] <= 2
-        rise = z[k + 1 : k + 3].min() - z[: k + 1][-4:].mean()
-        if near and s.min_step <= rise <= s.max_step and abs(z[k] - z[max(k - 2, 0)]) < s.min_step / 2:
-            return int(at[k + 1])
-    return None
+def _first_steps(profile: FloatArray, s: CurbSettings) -> tuple[IntArray, IntArray]:
+    """Sectors of the profile (sectors, steps) that rise and stay higher, and the index at which each first does."""
+    seen = np.isfinite(profile)
+    at = np.argsort(~seen, axis=1, kind="stable")  # filled steps of a sector in front, outwards
+    z, count = np.take_along_axis(profile, at, axis=1), seen.sum(axis=1)
+    k = np.arange(z.shape[1] - 3)
+    before = np.maximum(k[:, None] - np.arange(4), 0)  # the last four up to k
+    weight = (k[:, None] >= np.arange(4)).astype(np.float64)
+    mean = np.einsum("rki,ki->rk", z[:, before], weight) / weight.sum(axis=1)
+    rise = np.minimum(z[:, 1:-2], z[:, 2:-1]) - mean
+    with np.errstate(invalid="ignore"):  # NaN beyond the filled ones
+        found = (at[:, 1:-2] - at[:, :-3] <= 2) & (s.min_step <= rise) & (rise <= s.max_step)
+        found &= np.abs(z[:, :-3] - z[:, np.maximum(k - 2, 0)]) < s.min_step / 2
+    found &= k < count[:, None] - 3
+    row = np.flatnonzero(found.any(axis=1))
+    return row, at[row, found[row].argmax(axis=1) + 1]
 
 
 @dataclass(frozen=True)

@@ -52,10 +52,10 @@ def deskewed(scan: Scan, velocity: FloatArray) -> Scan:
     if rate < 1e-9:
         return Scan(scan.points + t * v, scan.intensity, np.zeros(len(scan)))
     k, a = w / rate, rate * t
-    turned = np.cross(k, scan.points)
-    points = scan.points + np.sin(a) * turned + (1 - np.cos(a)) * np.cross(k, turned)
-    across = np.cross(k, v)
-    points += t * v + (1 - np.cos(a)) / rate * across + (t - np.sin(a) / rate) * np.cross(k, across)
+    K = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
+    sine, rest = np.sin(a), 1 - np.cos(a)
+    points = scan.points + sine * (scan.points @ K.T) + rest * (scan.points @ (K @ K).T)
+    points += t * v + rest / rate * (K @ v) + (t - sine / rate) * (K @ K @ v)
     return Scan(points, scan.intensity, np.zeros(len(scan)))
 
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from data_tools.lidar.planes import Plane, near_walls
 from data_tools.lidar.voxels import clusters_from_above
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 
@@ -64,12 +64,12 @@ def extract_poles(
     points = points[(height >= s.min_height) & (np.hypot(points[:, 0], points[:, 1]) <= s.max_range)]
     everything = points
     points = points[~near_walls(points, walls, s.cell)]
-    tree = cKDTree(everything[:, :2])
+    slender = [points[rows] for rows in _slender(points, clusters_from_above(points, s.cell), s)]
+    if not slender:
+        return []
+    tree = cKDTree(everything[:, :2], balanced_tree=False, compact_nodes=False)
     poles = []
-    for rows in clusters_from_above(points, s.cell):
-        candidate = points[rows]
-        if not _slender(candidate, s):
-            continue
+    for candidate in slender:
         pole = _pole(candidate, s)
         around = everything[
             tree.query_ball_point(pole.foot[:2], max(s.clear_radius, s.clear_share * float(np.hypot(*pole.foot[:2]))))
@@ -80,14 +80,21 @@ def extract_poles(
     return poles
 
 
-def _slender(points: FloatArray, s: PoleSettings) -> bool:
-    if len(points) < s.min_points:
-        return False
-    size = np.ptp(points, axis=0)
-    if max(size[0], size[1]) > s.max_width or size[2] < s.min_length:
-        return False
-    steps = np.floor((points[:, 2] - points[:, 2].min()) / 0.5)
-    return bool(len(np.unique(steps)) >= s.min_filled * np.ceil(size[2] / 0.5))
+def _slender(points: FloatArray, clusters: Sequence[IntArray], s: PoleSettings) -> list[IntArray]:
+    """The clusters that are thin, tall and filled."""
+    if not clusters:
+        return []
+    count = np.array([len(rows) for rows in clusters])
+    grouped, start = points[np.concatenate(clusters)], np.cumsum(count) - count
+    low, high = np.minimum.reduceat(grouped, start), np.maximum.reduceat(grouped, start)
+    size = high - low
+    thin = (count >= s.min_points) & (size[:, :2].max(axis=1) <= s.max_width) & (size[:, 2] >= s.min_length)
+    return [clusters[k] for k in np.flatnonzero(thin).tolist() if _filled(points[clusters[k], 2], s)]
+
+
+def _filled(height: FloatArray, s: PoleSettings) -> bool:
+    steps = np.floor((height - height.min()) / 0.5)
+    return bool(len(np.unique(steps)) >= s.min_filled * np.ceil(np.ptp(height) / 0.5))
 
 
 def _pole(points: FloatArray, s: PoleSettings) -> Pole:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from data_tools.lidar.voxels import voxel_keys
+from data_tools.lidar.voxels import voxel_groups, voxel_keys
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 
@@ -99,16 +99,17 @@ class SurfelMap:
 
 
 def _moments(points: FloatArray, size: float) -> Surfels:
-    voxel, row, count = np.unique(voxel_keys(points, size), return_inverse=True, return_counts=True)
-    m = len(voxel)
+    order, start = voxel_groups(points, size)
+    m = len(start)
     if not m:
         return Surfels.empty()
-    order = np.argsort(row, kind="stable")
-    start = np.concatenate([[0], np.cumsum(count)[:-1]])
     grouped = points[order]
+    voxel, count = voxel_keys(grouped[start], size), np.diff(start, append=len(points))
     mean = np.add.reduceat(grouped, start) / count[:, None]
-    off = grouped - mean[row[order]]
-    scatter = np.add.reduceat(off[:, :, None] * off[:, None, :], start)
+    off = grouped - np.repeat(mean, count, axis=0)
+    scatter = np.empty((m, 3, 3))
+    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        scatter[:, i, j] = scatter[:, j, i] = np.add.reduceat(off[:, i] * off[:, j], start)
     return Surfels(voxel, count.astype(np.float64), mean, scatter, np.zeros((m, 3)), np.zeros(m, dtype=np.bool_))
 
 

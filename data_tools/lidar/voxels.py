@@ -23,13 +23,27 @@ _NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))  # half of the eight: the links 
 
 def voxel_keys(points: FloatArray, size: float) -> IntArray:
     """The voxels (N,) of points (N, 3), m; `size` in m. Raises `InputError` for points off the grid."""
-    if not size > 0:
-        raise InputError(f"size: expected a voxel size > 0 m, got {size!r}")
-    index = np.floor(points / size)
-    if len(index) and np.abs(index).max() >= _HALF:
-        raise InputError(f"points: expected coordinates within {_HALF * size:g} m for voxels of {size:g} m")
-    cell = index.astype(np.int64) + _HALF
-    return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])
+    cell = _cells(points, size) + _HALF
+    return np.asarray((cell[0] << 2 * _BITS) | (cell[1] << _BITS) | cell[2])
+
+
+def voxel_groups(points: FloatArray, size: float) -> tuple[IntArray, IntArray]:
+    """Rows (N,) of points (N, 3) voxel by voxel, ascending in each, and where (M,) each of the M voxels begins."""
+    if not len(points):
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    cell = _cells(points, size)
+    low = cell.min(axis=1)
+    bits = [int(span).bit_length() for span in cell.max(axis=1) - low]
+    row_bits = len(points).bit_length()
+    key = ((cell[0] - low[0]) << bits[1] | (cell[1] - low[1])) << bits[2] | (cell[2] - low[2])
+    if sum(bits) + row_bits < 63:  # voxel and row as one number: sorting numbers is far quicker than sorting rows
+        packed = np.sort(key << row_bits | np.arange(len(points)))
+        order, key = packed & ((1 << row_bits) - 1), packed >> row_bits
+    else:
+        key = voxel_keys(points, size)
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+    return order, np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
 
 
 def voxel_downsample(points: FloatArray, size: float) -> IntArray:
@@ -37,8 +51,18 @@ def voxel_downsample(points: FloatArray, size: float) -> IntArray:
 
     Means of several points would not lie on the surface near corners.
     """
-    _, first = np.unique(voxel_keys(points, size), return_index=True)
-    return np.sort(first)
+    order, start = voxel_groups(points, size)
+    return np.sort(order[start])
+
+
+def _cells(points: FloatArray, size: float) -> IntArray:
+    """Voxels (3, N) of points (N, 3)."""
+    if not size > 0:
+        raise InputError(f"size: expected a voxel size > 0 m, got {size!r}")
+    index = np.floor(np.ascontiguousarray(points.T) / size)
+    if index.size and max(-index.min(), index.max()) >= _HALF:
+        raise InputError(f"points: expected coordinates within {_HALF * size:g} m for voxels of {size:g} m")
+    return index.astype(np.int64)
 
 
 def clusters_from_above(points: FloatArray, cell: float) -> list[IntArray]:
@@ -64,10 +88,15 @@ def clusters_from_above(points: FloatArray, cell: float) -> list[IntArray]:
 
 def cell_order_statistics(values: FloatArray, cell: IntArray, cells: int, divisor: int) -> FloatArray:
     """Value (cells,) of rank count // divisor in each cell, NaN in empty ones; values (N,) and their cells (N,)."""
-    order = np.lexsort((values, cell))
     count = np.bincount(cell, minlength=cells)
     start = np.cumsum(count) - count
     filled = count > 0
     result = np.full(cells, np.nan)
-    result[filled] = values[order[(start + count // divisor)[filled]]]
+    if len(values):
+        by_value = np.empty(len(values), dtype=np.int64)
+        ranked = np.argsort(values)
+        by_value[ranked] = np.arange(len(values))
+        bits = len(values).bit_length()
+        ordered = np.sort(cell.astype(np.int64) << bits | by_value) & ((1 << bits) - 1)  # ranks, cell by cell
+        result[filled] = values[ranked[ordered[(start + count // divisor)[filled]]]]
     return result

@@ -33,9 +33,11 @@ from saga_fg.estimators import (
 )
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import setting
+from saga_fg.tracking import TrackerSettings
 
 KINDS: tuple[Kind, ...] = ("connected", "components")
 LAG = 5  # frames
+TRACKER = "kalman, as in the tracker"  # with the bounds that the tracker has by default
 WARM_UP = 3  # frames that are not counted
 WHOLE = 100  # more nodes take the running graph seconds a frame
 DENSE = INCREMENTAL = 300  # more nodes in one graph are hopeless for the textbook and for iSAM2
@@ -113,6 +115,8 @@ def _filters(kind: Kind, n: int, settings: EstimatorBenchSettings) -> list[Row]:
     contenders["kalman"] = Ours(JointKalmanFilter(), scene)
     if kind == "connected":
         contenders["kalman, bounded"] = Ours(BoundedKalmanFilter(), scene)
+        tracker = TrackerSettings()
+        contenders[TRACKER] = Ours(JointKalmanFilter((), tracker.tolerance, tracker.max_component), scene)
     if kind == "components" or n <= INCREMENTAL or settings.everything:
         contenders["isam2"] = Ours(IncrementalFilter(), scene)
     race = _race(contenders, scene, settings)

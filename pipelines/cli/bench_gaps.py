@@ -89,7 +89,7 @@ def gaps(
     ] = False,
     passes: Annotated[
         int, typer.Option("--passes", min=0, help="Runs over each recording with made gaps; 0: real gaps alone.")
-    ] = 4,
+    ] = 2,
     life: Annotated[
         Literal["both", "kept", "shipped"],
         typer.Option("--life", help="Tracks kept alive through all gaps, ended as configured, or both."),

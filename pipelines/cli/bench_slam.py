@@ -1,10 +1,10 @@
-"""`saga-fg bench slam`: LiDAR odometry beside KISS-ICP."""
+"""`saga-fg bench slam`: LiDAR odometry beside KISS-ICP, and what SLAM costs."""
 
 from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,32 +12,62 @@ from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Verbose
 from pipelines.cli.tables import JsonFile, report
 
+if TYPE_CHECKING:
+    from data_tools.figures import FigureTable
+    from pipelines.bench.slam_all_in import AllIn
+
 
 def slam(
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="KITTI tracking: training/, or oxts/ and velodyne/.")],
+    dataroot: Annotated[
+        Path | None, typer.Option("--dataroot", help="KITTI tracking: training/, or oxts/ and velodyne/.")
+    ] = None,
     sequence: Annotated[str, typer.Option("--sequence", help="A sequence with LiDAR scans.")] = "0000",
     scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
     kiss: Annotated[
         bool, typer.Option("--kiss/--no-kiss", help="With KISS-ICP, of the extra bench, or ours alone.")
     ] = True,
+    drive: Annotated[
+        int | None,
+        typer.Option("--drive", min=100, help="Instead: cost of so many keyframes in a simulated town, without scans."),
+    ] = None,
+    dense: Annotated[
+        int | None,
+        typer.Option("--dense", min=2, help="Instead: SLAM all in on so many simulated scans of full density."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of --drive and --dense.")] = 0,
     json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
     """LiDAR odometry against KISS-ICP, on the same scans in turn.
 
     RPE is the error over 10 m against GPS/IMU, which is itself not exact; the residual of scans in the map of their
-    neighbours needs no reference. Both are printed for the scans as recorded and for de-skewed ones.
+    neighbours needs no reference. Both are printed for the scans as recorded and for de-skewed ones. Then follows the
+    CPU time of SLAM all in: odometry, landmarks, graph and loops.
 
     \b
-    Example:
+    Examples:
       saga-fg bench slam --dataroot data/kitti --sequence 0000
+      saga-fg bench slam --dense 40
+      saga-fg bench slam --drive 10000
     """
     from data_tools.datasets.kitti import KittiScans
     from data_tools.figures import FigureTable, cell
     from pipelines.bench.slam import bench_slam
+    from pipelines.bench.slam_all_in import bench_all_in
+    from saga_fg.errors import InputError
 
+    if (dataroot is not None) + (drive is not None) + (dense is not None) != 1:
+        raise InputError("expected one of --dataroot, --drive and --dense")
+    if drive is not None:
+        _drive(drive, seed, json_file)
+    elif dense is not None:
+        _dense(dense, seed, json_file)
+    if dataroot is None:
+        return
     with progress_bar() as progress:
-        rows = bench_slam(KittiScans(dataroot, sequence, most=scans), kiss, progress=progress)
+        recorded = KittiScans(dataroot, sequence, most=scans)
+        rows = bench_slam(recorded, kiss, progress=progress)
+        cost = bench_all_in(f"sequence {sequence}", recorded, progress)
     shown = []
     for row in rows:
         e = row.errors
@@ -45,7 +75,7 @@ def slam(
         shown.append((row.case, row.contender, *(cell(x) for x in errors), cell(row.milliseconds, 1)))
     columns = ("scans", "method", "RPE, m per 10 m", "RPE, deg per 10 m", "end, m", "residual, mm", "ms a scan")
     table = FigureTable(f"sequence {sequence}: odometry against GPS/IMU", columns, tuple(shown))
-    report([table], rows, json_file)
+    report([table, _all_in(cost)], [*rows, cost], json_file)
     for ours, theirs in itertools.pairwise(rows):
         if ours.case == theirs.case:
             worse = 100 * (ours.errors.relative_translation - theirs.errors.relative_translation)
@@ -55,3 +85,52 @@ def slam(
                 f"{ours.case}: RPE {worse:+.1f} cm per 10 m, residual {duller:+.1f} %, "
                 f"time {share:.2f} of {theirs.contender}'s"
             )
+
+
+def _all_in(cost: AllIn) -> FigureTable:
+    from data_tools.figures import FigureTable, cell
+
+    columns = (
+        "scans",
+        "keyframes",
+        "submaps",
+        "points a scan",
+        "ms a scan",
+        "ms, no keyframe",
+        "ms, keyframe",
+        "longest",
+    )
+    counts = (f"{cost.case}: {cost.scans}", str(cost.keyframes), str(cost.submaps), f"{cost.points:.0f}")
+    times = (cost.mean, cost.between, cost.keyframe, cost.longest)
+    return FigureTable("SLAM all in, CPU time", columns, ((*counts, *(cell(x, 1) for x in times)),))
+
+
+def _dense(scans: int, seed: int, json_file: Path | None) -> None:
+    """Scans as those of 64 beams and 2000 columns."""
+    from data_tools.simulator.course import SimulatedCourse
+    from data_tools.simulator.scanner import ScannerSettings
+    from pipelines.bench.slam_all_in import bench_all_in
+
+    course = SimulatedCourse(seed, 0.8 * scans, settings=ScannerSettings(rings=64, columns=2000))
+    with progress_bar() as progress:
+        cost = bench_all_in(f"simulated, seed {seed}", course, progress)
+    report([_all_in(cost)], [cost], json_file)
+
+
+def _drive(keyframes: int, seed: int, json_file: Path | None) -> None:
+    from data_tools.figures import FigureTable, cell
+    from pipelines.bench.slam_drive import bench_drive
+
+    with progress_bar() as progress:
+        cost = bench_drive(keyframes, seed, progress)
+    columns = ("keyframes", "ms a keyframe", "ms where a submap closes, with loops", "variables at most")
+    rows = [
+        (f"{part.first} to {part.last}", cell(part.keyframe), cell(part.submap), str(part.variables))
+        for part in cost.parts
+    ]
+    title = f"{cost.keyframes} keyframes, {cost.metres:.0f} m, {cost.submaps} submaps, {cost.loops} loops"
+    report([FigureTable(title, columns, tuple(rows))], [cost], json_file)
+    typer.echo(
+        f"last lap to first one: {cost.ratio:.3f} of the time; memory at most {cost.memory:.0f} MB; error "
+        f"{cost.error:.2f} m (odometry {cost.before:.2f} m); everything together at the end: {cost.finish:.1f} s"
+    )

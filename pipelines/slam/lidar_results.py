@@ -161,8 +161,9 @@ def _pieces(result: LidarSlamResult, kind: str) -> FloatArray:
         along = np.array([-normal[1], normal[0]])
         foot = (np.array([place["x"], place["y"]]) @ normal) * normal
         spans = []
-        for seen, extent in zip(result.observations, result.extents, strict=True):
-            if seen.landmark == mark.number:
+        for seen in result.observations:
+            extent = seen.observation.extent
+            if seen.landmark == mark.number and extent is not None:
                 u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
                 spans.append((float(u.min()), float(u.max())))
         ends += [np.stack([foot + low * along, foot + high * along]) for low, high in covered_spans(spans)]

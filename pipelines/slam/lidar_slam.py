@@ -121,7 +121,6 @@ class LidarSlamResult:
     covariances    (M, 6, 6) of the keyframes' poses, (rotation, translation) in the sensor's frame, rad^2, m^2
     landmarks      of the map, those seen more than once
     observations   of landmarks, with the landmark and the keyframe of each
-    extents        (2, 3) of each observation: ends of the observed piece, m, in the sensor's frame
     loops          that were closed, between keyframes
     degenerate     (K) motions that each scan left open, in words
     misfits        what does not fit of the vehicle's sensors, in words, by their names
@@ -136,7 +135,6 @@ class LidarSlamResult:
     covariances: FloatArray
     landmarks: Sequence[Landmark]
     observations: Sequence[AssociatedObservation]
-    extents: Sequence[FloatArray]
     loops: Sequence[LoopClosure]
     degenerate: Sequence[tuple[str, ...]]
     misfits: Mapping[str, str]
@@ -191,7 +189,7 @@ class LidarSlam:
         self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
         self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
-        self._extents, self._closed = list[FloatArray](), list[LoopClosure]()
+        self._closed: list[LoopClosure] = []
         self._degenerate = list[tuple[str, ...]]()
         self._imu: list[ImuSamples] = []  # since the last keyframe
         self._wheels: list[WheelSpeed] = []  # likewise
@@ -272,7 +270,6 @@ class LidarSlam:
             solved.covariances,
             solved.landmarks,
             self._graph.observations(),
-            self._extents,
             self._closed,
             self._degenerate,
             unfit,
@@ -300,10 +297,9 @@ class LidarSlam:
             last = self._keyframes[-1]
             moved = motion(self._poses[last:], self._covariances[last + 1 :])
         frame = _frame(self._times[row], self._imu, self._wheels, gps, detections)
-        closes = self._graph.append(self._times[row], moved, [each.observation for each in seen], frame)
+        closes = self._graph.append(self._times[row], moved, seen, frame)
         self._imu, self._wheels = [], []
         self._keyframes.append(row)
-        self._extents += [each.extent for each in seen]
         submap, found = None, list[LoopClosure]()
         if closes:
             submap, found = self._close(self._graph.poses()[:-1])

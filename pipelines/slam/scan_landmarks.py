@@ -49,38 +49,28 @@ class ScanLandmarkSettings:
     line: LineSettings = settings_group(LineSettings, "straight lines through points on curbs")
 
 
-@dataclass(frozen=True, eq=False)
-class ObservedLandmark:
-    """An observation, and the ends (2, 3) of the observed piece of a wall or line, m, in the sensor's frame."""
-
-    observation: Observation
-    extent: FloatArray
-
-
 def observe_landmarks(
     points: FloatArray, settings: ScanLandmarkSettings | None = None, detectors: Sequence[LandmarkDetector] = ()
-) -> list[ObservedLandmark]:
+) -> list[Observation]:
     """Observe landmarks in points (N, 3) of a scan without skew, m, in the sensor's frame.
 
     detectors: of further kinds of landmarks
     """
     s = settings or ScanLandmarkSettings()
     ground = segment_ground(points, s.segmentation)
-    found = []
+    found: list[Observation] = []
     if s.ground:
         plane = fit_ground(points[ground.is_ground], s.plane)
         if plane is not None:
-            found.append(ObservedLandmark(Observation(GROUND, plane.coefficients, plane.covariance), plane.extent))
+            found.append(Observation(GROUND, plane.coefficients, plane.covariance, plane.extent))
     walls = extract_walls(points[~ground.is_ground], s.plane)
     for wall in walls[: s.walls]:
-        found.append(ObservedLandmark(Observation(WALL, wall.coefficients, wall.covariance), wall.extent))
+        found.append(Observation(WALL, wall.coefficients, wall.covariance, wall.extent))
     poles = extract_poles(points, ground.height, walls, s.pole)
     for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
         extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
-        found.append(ObservedLandmark(Observation(POLE, pole.foot, pole.covariance), extent))
+        found.append(Observation(POLE, pole.foot, pole.covariance, extent))
     curbs = extract_curbs(points, ground.height, s.curb) if s.lines else np.empty((0, 3))
     for line in straight_lines(curbs, s.lines, s.line):
-        found.append(ObservedLandmark(Observation(LINE, line.ends.ravel(), line.covariance), line.ends))
-    others = [other for detector in detectors for other in detector.observations(points)]
-    found += [ObservedLandmark(other, np.zeros((2, 3))) for other in others]
-    return found
+        found.append(Observation(LINE, line.ends.ravel(), line.covariance, line.ends))
+    return found + [other for detector in detectors for other in detector.observations(points)]

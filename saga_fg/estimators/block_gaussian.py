@@ -9,8 +9,9 @@ import numpy as np
 
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
+_IN_CACHE = 100_000  # entries of components that are compared at once
 _UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
 
 
@@ -83,12 +84,13 @@ class BlockGaussian:
             d = int(layout.dims[node[0, 0]])
             if s == d and (node == node[:, :1]).all():  # nodes on their own
                 continue
-            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-            tied = np.abs(P) > tolerance * sigma[:, :, None] * sigma[:, None, :]
-            if s % d == 0 and (layout.dims[node] == d).all():  # node by node where all are of one size
-                tied = np.asarray(tied.reshape(c, s // d, d, s // d, d).any(axis=(2, 4)))
-                node = node[:, ::d]
-            k, i, j = np.nonzero(tied)
+            of_nodes = (
+                d if s % d == 0 and (layout.dims[node] == d).all() else 1
+            )  # node by node where all are of one size
+            chunk = max(1, _IN_CACHE // (s * s))
+            tied = [_tied(P[first : first + chunk], tolerance, of_nodes) for first in range(0, c, chunk)]
+            node = node[:, ::of_nodes]
+            k, i, j = np.nonzero(np.concatenate(tied))
             once = i < j
             a.append(node[k[once], i[once]])
             b.append(node[k[once], j[once]])
@@ -129,6 +131,14 @@ class BlockGaussian:
         for places, P in zip(self.partition.groups, self.blocks, strict=True):
             variances[places] = np.diagonal(P, axis1=1, axis2=2)
         return variances
+
+
+def _tied(P: FloatArray, tolerance: float, d: int) -> BoolArray:
+    """(c, s / d, s / d) which nodes, of d states each, any correlation above `tolerance` ties; P (c, s, s)."""
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    tied = np.abs(P) > tolerance * sigma[:, :, None] * sigma[:, None, :]
+    columns = np.logical_or.reduce([tied[:, :, k::d] for k in range(d)])
+    return np.asarray(np.logical_or.reduce([columns[:, k::d] for k in range(d)]))
 
 
 def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:

@@ -20,6 +20,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 
 import numpy as np
 
+from factors.marginal import Elimination
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.graph_solution import GraphSolution
@@ -42,6 +43,8 @@ class IncrementalSmoother:
     lag         s; epochs leave but for the last that is at least so old: 0 is a filter, None keeps everything. What has
                 one variable for all time stays until it is marginalised by hand
     settings    of relinearisation
+    elimination "qr", or "cholesky": several times as fast where many variables hang together, with half the digits;
+                once priors are left by what is marginalised, their width decides
 
     Every method raises `GraphError`, for what the graph does not take, and then the smoother is as it was before.
     """
@@ -51,6 +54,7 @@ class IncrementalSmoother:
         providers: Sequence[FactorProvider] = (),
         lag: float | None = 0.0,
         settings: RelinearisationSettings | None = None,
+        elimination: Elimination = "qr",
     ) -> None:
         if lag is not None and not (math.isfinite(lag) and lag >= 0):
             raise InputError(f"lag: expected a finite number of seconds >= 0, or None, got {lag!r}")
@@ -58,7 +62,7 @@ class IncrementalSmoother:
         self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
         self.frame: Frame | None = None  # of the present epoch
         self._lag, self._settings = lag, settings or RelinearisationSettings()
-        self._graph = SceneFactorGraph()
+        self._graph = SceneFactorGraph(elimination)
         self._engine: Engine | None = None
         self._times: list[float] = []
 
@@ -120,9 +124,11 @@ class IncrementalSmoother:
             self._ask(graph, [*predictors(providers), *providers])
         self._move_to(graph)
 
-    def extend(self, providers: Sequence[FactorProvider]) -> None:
-        """Ask some more providers at the present epoch, and solve again."""
-        self._ask_and_move(self._graph.copy(), providers)
+    def extend(self, providers: Sequence[FactorProvider], settings: RelinearisationSettings | None = None) -> None:
+        """Ask some more providers at the present epoch, and solve again; settings: of this solution alone."""
+        graph = self._graph.copy()
+        self._ask(graph, providers)
+        self._move_to(graph, settings)
 
     def marginalise(self, keys: Iterable[int], into: Condensation | None = None) -> None:
         """Integrate variables out; their information on others stays, in the factors that `into` makes of it."""
@@ -200,28 +206,28 @@ class IncrementalSmoother:
             if k == 0 and change is not None:
                 change(graph)
 
-    def _move_to(self, graph: SceneFactorGraph) -> None:
-        self._engine = self._solve(graph)
+    def _move_to(self, graph: SceneFactorGraph, settings: RelinearisationSettings | None = None) -> None:
+        self._engine = self._solve(graph, settings or self._settings)
         self._graph = graph
 
     def _ready(self) -> Engine:
         """iSAM2 with the graph as it is."""
         if self._engine is None:
             graph = self._graph.copy()
-            self._engine = self._solve(graph)
+            self._engine = self._solve(graph, self._settings)
             self._graph = graph
         return self._engine
 
-    def _solve(self, graph: SceneFactorGraph) -> Engine:
+    def _solve(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
         """iSAM2 with the graph, which moves to the solution."""
         engine, self._engine = self._engine, None  # it is begun anew, should it fail
         start = graph.values
         if engine is None or engine.elimination != graph.elimination:
             engine = Engine(graph.elimination)
         try:
-            return engine.solved(graph, self._settings)
+            return engine.solved(graph, settings)
         except UndeterminedError:
             if graph.elimination == "qr":
                 raise
         graph.moved_to(start)  # Cholesky has half the digits
-        return Engine("qr").solved(graph, self._settings)
+        return Engine("qr").solved(graph, settings)

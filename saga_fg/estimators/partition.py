@@ -240,9 +240,16 @@ def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: Int
     for number in np.unique(kind).tolist():
         alike = np.flatnonzero(kind == number)
         i, j = origin[first[alike]], to[first[alike]]
-        places = start[alike][:, None] + np.arange(size[alike[0]])
-        a, b = before[places], after[places]
-        result[new.group[j[0]]][new.row[j][:, None, None], b[:, :, None], b[:, None, :]] = blocks[old.group[i[0]]][
-            old.row[i][:, None, None], a[:, :, None], a[:, None, :]
-        ]
+        s = int(size[alike[0]])
+        places = start[alike][:, None] + np.arange(s)
+        a, b, given, copy = before[places], after[places], blocks[old.group[i[0]]], result[new.group[j[0]]]
+        i, j = old.row[i], new.row[j]
+        if given.shape[1] == s == copy.shape[1]:  # components that stay as they are
+            part = ((a != np.arange(s)) | (b != np.arange(s))).any(axis=1)
+            copy[j[~part]] = given[i[~part]]
+            i, j, a, b = i[part], j[part], a[part], b[part]
+        if old.size and old.size == new.size and given.flags.c_contiguous:  # node by node
+            a, b = a[:, :: old.size] // old.size, b[:, :: old.size] // old.size
+            given, copy = old.by_nodes(given), new.by_nodes(copy)
+        copy[j[:, None, None], b[:, :, None], b[:, None, :]] = given[i[:, None, None], a[:, :, None], a[:, None, :]]
     return result

@@ -302,3 +302,12 @@ class HeldGroup:
         of a millisecond, whose interactions have next to no noise, three to five digits.
         """
         return isinstance(self.factors, PriorGroup), -max(map(len, self.factors.rows))
+
+
+def first_residual(group: FactorGroup) -> ResidualFactor | None:
+    """The first factor of a group that is made of residual functions."""
+    if isinstance(group, StackedGroup) and len(group.rows):
+        return group.factors.individual_factor(0)
+    if isinstance(group, SingleGroup) and isinstance(group.factor, ResidualFactor):
+        return group.factor
+    return None

@@ -23,7 +23,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import FactorError, Solution, SolverSettings, marginal_factors, solve
+from factors import FactorError, Solution, SolverSettings, marginal_factors, solve, unwrapped_angles
 from factors.marginal import Elimination
 from saga_fg.graph.condensation import Condensation
 from saga_fg.graph.errors import GraphError
@@ -36,6 +36,7 @@ from saga_fg.graph.factor_groups import (
     LinearGroup,
     NativeGroup,
     PriorGroup,
+    first_residual,
 )
 from saga_fg.graph.keys import VariableKind, described, key_of
 from saga_fg.graph.linearisation_point import LinearisationPoint
@@ -48,17 +49,21 @@ _WIDE = 64  # dimensions that hang together, from which QR takes many times as l
 
 
 class SceneFactorGraph:
-    """Variables, factors and values. Every method raises `GraphError` and then has changed nothing."""
+    """Variables, factors and values. Every method raises `GraphError` and then has changed nothing.
 
-    def __init__(self) -> None:
+    elimination: of back ends, "qr" or "cholesky", until priors are left that choose
+    """
+
+    def __init__(self, elimination: Elimination = "qr") -> None:
         self._variables: dict[int, GraphVariable] = {}
         self._base, self._values = gtsam.Values(), gtsam.Values()
         self._groups: dict[int, HeldGroup] = {}
         self._touching: dict[int, tuple[int, ...]] = {}  # groups with a factor on a variable, now or before
         self._factor_counts: dict[int, int] = {}  # number of factors on each variable
-        self.elimination: Elimination = "qr"
+        self.elimination: Elimination = elimination
         self._fresh: dict[int, list[gtsam.JacobianFactor]] = {}  # as linearised when they were added
         self._count = 0
+        self._angles_checked: set[tuple[str, str]] = set()
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
         self.carried_over: Mapping[int, int] = {}  # variables of earlier epochs that are those of this one, too
 
@@ -150,6 +155,8 @@ class SceneFactorGraph:
         held = [HeldGroup(provider, name, group, np.ones(len(group.rows), dtype=bool)) for group in groups]
         point = self.point()
         linear = [self.linearised(one, one.rows, point) for one in held]
+        for one in held:
+            self._check_angles(one)
         if name is not None:
             earlier = [n for n, one in self._groups.items() if one.name == name and one.provider == provider]
             for number in earlier:
@@ -157,6 +164,19 @@ class SceneFactorGraph:
         for one, factors_there in zip(held, linear, strict=True):
             if len(one.active):
                 self._fresh[self._hold(one)] = factors_there
+
+    def _check_angles(self, held: HeldGroup) -> None:
+        """Refuse residuals with angles that nobody wraps, at the first factor of each kind."""
+        factor = first_residual(held.factors)
+        if factor is None or (kind := (held.provider, factor.name)) in self._angles_checked:
+            return
+        self._angles_checked.add(kind)
+        if angles := unwrapped_angles(factor, factor.states(self._values)):
+            named = ", ".join(str(self._variables[key]) for key in factor.keys)
+            raise GraphError(
+                f"provider {held.provider}: {factor.name} on {named}: component {angles[0]} of the residual jumps by "
+                f"2 pi while the pose turns; expected angles={factor.angles + angles} in the factor"
+            )
 
     def marginalise(self, keys: Iterable[int], into: Condensation | None = None) -> None:
         """Integrate variables out; their information on the others stays, in the factors that `into` makes of it."""
@@ -168,12 +188,12 @@ class SceneFactorGraph:
             for factor in self.linearised(self._groups[number], np.array(mine), point):
                 touched.push_back(factor)
         involved = set(touched.keyVector())
-        factors = self._eliminated(touched, sorted(leaving.keys() & involved))
         if into is not None:
-            made = into.factors(factors, point)
+            made = into.factors(self._eliminated(touched, sorted(leaving.keys() & involved), "qr"), point)
             self._replace(rows, [], leaving)
             self.add_factors(into.name, made)
             return
+        factors = self._eliminated(touched, sorted(leaving.keys() & involved), self.elimination)
         self._replace(rows, factors, leaving)
         if factors:
             self._choose(max(factor.cols() - 1 for factor in factors))
@@ -318,9 +338,11 @@ class SceneFactorGraph:
             for key in group.rows[row]:
                 self._factor_counts[key] += step
 
-    def _eliminated(self, touched: gtsam.GaussianFactorGraph, keys: list[int]) -> list[gtsam.JacobianFactor]:
+    def _eliminated(
+        self, touched: gtsam.GaussianFactorGraph, keys: list[int], elimination: Elimination
+    ) -> list[gtsam.JacobianFactor]:
         """Factors that are left on the other variables."""
-        if self.elimination == "cholesky":
+        if elimination == "cholesky":
             with contextlib.suppress(FactorError, RuntimeError):  # it has half the digits that QR has
                 return _jacobians(marginal_factors(touched, keys, "cholesky"))
         try:

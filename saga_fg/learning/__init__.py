@@ -5,6 +5,7 @@ from saga_fg.learning.curvilinear_motion import fit_curvilinear, fit_curvilinear
 from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
 from saga_fg.learning.hidden_objects import GapPrediction, GapSettings, HiddenObjects, hidden_objects
 from saga_fg.learning.interaction_fit import (
+    MOST_GAPS,
     TEMPLATE,
     FittedInteractions,
     Rule,
@@ -31,6 +32,7 @@ from saga_fg.learning.truth_matches import (
 
 __all__ = [
     "GATE",
+    "MOST_GAPS",
     "TEMPLATE",
     "DetectedTrajectory",
     "DetectionSample",

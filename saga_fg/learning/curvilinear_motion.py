@@ -40,7 +40,11 @@ HORIZONS = (1.0, 2.0, 3.0)  # s: gaps
 FOLLOWED, SPACING = 1.5, 1.0  # s in view before a gap, and between gaps
 STEP = 0.5  # s, of predictions through a gap
 TAILS = 30.0  # degrees of freedom
-MOST, FEWEST = 300, 20  # objects used of a class, evenly spread; and those that a fit needs
+FEWEST = 20  # objects that a fit needs
+MOST, LONGEST = (
+    300,
+    100,
+)  # pieces of objects used of a class, evenly spread; detections of one: side by side they are fast
 INDEPENDENT = 10  # objects
 MAJORITY = 0.8  # share of all objects; the motion of all together is that of such a class
 EVALUATIONS = 80
@@ -146,7 +150,8 @@ def fit_curvilinear(objects: Sequence[MeasuredTrajectory], start: Curvilinear) -
     useful = [one for one in objects if len(one) >= 3]
     if len(useful) < FEWEST:
         return start
-    used = [useful[k] for k in np.unique(np.linspace(0, len(useful) - 1, MOST).astype(np.int64)).tolist()]
+    pieces = [piece for one in useful for piece in one.pieces(LONGEST) if len(piece) >= 3]
+    used = [pieces[k] for k in np.unique(np.linspace(0, len(pieces) - 1, MOST).astype(np.int64)).tolist()]
     halves = [CurvilinearLikelihood.of(used[k::2]) for k in range(2)]
     for learned, held_out in (halves, halves[::-1]):
         if held_out.loss(_most_likely(learned, start)) >= held_out.loss(start):

@@ -138,11 +138,13 @@ def fit_interactions(
     template: Sequence[Rule] = TEMPLATE,
     iterations: int = 8,
     prior: float = PRIOR,
+    most: int = MOST_GAPS,
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
 
     settings   of the tracker, with its base motion; template: where the search begins
     prior      weight of the template; gaps of one recording tell much the same, so it is not small
+    most       gaps that are learned from, a random sample
 
     Rules whose classes do not occur are left out. Rules that reach no gap stay as they are, with a loss of NaN. Raises
     `InputError` for a sample without gaps.
@@ -152,7 +154,7 @@ def fit_interactions(
     occurring = set(np.unique(sample.label).tolist())
     parameters = RuleParameters.of([rule for rule in template if occurring & set(rule.classes)])
     start = parameters.start
-    sample = reached(sample, settings, parameters).sampled(MOST_GAPS, seed=0)
+    sample = reached(sample, settings, parameters).sampled(most, seed=0)
     if len(sample) == 0:
         return FittedInteractions(parameters.rules, math.nan)
 

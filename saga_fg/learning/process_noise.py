@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -49,6 +50,12 @@ class MeasuredTrajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def pieces(self, longest: int) -> list[Self]:
+        """Cut into pieces of about the same length, of at most `longest` measurements."""
+        parts = np.array_split(np.arange(len(self)), math.ceil(len(self) / longest))
+        columns = (self.time, self.position, self.R, self.yaw, self.yaw_noise)
+        return [type(self)(*(column[rows] for column in columns)) for rows in parts]
 
 
 def fit_acceleration_noise(

@@ -3,13 +3,15 @@ r"""States of all objects at all moments of a recording, given all of its detect
     prior         position unknown, velocity as of a new track             first moment of an object
     interaction   || x_i(k+1) - sum_j F_ij x_j(k) - b_i ||_{Q_i}            every interval, edges frozen
     detection     rho( || z - H x_i(k) ||_R )                              every assigned detection
-    stationary    || v_i(k) ||_{s^2 I}, Q_i scaled                          while the object is stationary
+    stationary    || v_i(k) ||_{d^2/dt I}, Q_i scaled                       while the object is stationary
 
 over one factor graph (`saga_fg.estimators.BatchSmoother`; long recordings in windows, by `WindowedSmoother`, which
 comes to the same within a millimetre and does not keep all matrices of an hour; with factors of users' own the running
-graph itself, `saga_fg.smoothing.graph_states`). The edges of an interval follow from
-given states at its start: those of an earlier, simpler pass. Robust losses (`factors.robust`) are reached by
-reweighting between passes.
+graph itself, `saga_fg.smoothing.graph_states`). The edges of an interval follow from given states at its start: those
+of an earlier, simpler pass. Robust losses (`factors.robust`) are reached by reweighting between passes.
+
+The velocity of a stationary object is zero with the covariance d^2/dt in every interval dt, by which its position
+wanders by d in a second, whatever the rate of frames: as far as the vehicle's own poses drift.
 """
 
 from __future__ import annotations
@@ -116,7 +118,8 @@ def _epochs(
         measured = _measured(evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
         pinned = lifespans.id[present][stationary.at(k, lifespans.id[present])]
         if len(pinned):
-            H, R = types[0].selector(VELOCITY), stationary.settings.velocity_deviation**2 * np.eye(2)
+            interval = evidence.times[max(k, 1)] - evidence.times[max(k, 1) - 1]
+            H, R = types[0].selector(VELOCITY), stationary.settings.position_drift**2 / interval * np.eye(2)
             measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
         gone = lifespans.last[present] == k
         yield RecordingEpoch(k, transition, new_objects, measured, lifespans.id[present[gone]])

@@ -79,8 +79,10 @@ class StationarySettings(Settings):
     min_time: NonNegative = setting(
         1.0, "shortest stationary interval, s; usual 0.5 to 3; higher: short stops stay in motion"
     )
-    velocity_deviation: Positive = setting(
-        0.02, "standard deviation of the velocity while stationary, m/s; lower: held more firmly"
+    position_drift: Positive = setting(
+        0.03,
+        "standard deviation of the place after one second while stationary, m: by the drift of the vehicle's poses; "
+        "usual 0.01 to 0.1; lower: held more firmly",
     )
     noise_scale: Positive = setting(1e-4, "factor on the process noise while stationary; lower: held more firmly")
 

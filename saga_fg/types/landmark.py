@@ -60,18 +60,20 @@ class LandmarkType(Protocol):
 @dataclass(frozen=True, eq=False)
 class Observation:
     """kind: of the landmark; value: (m,) what was measured, in the frame of the pose; covariance: (d, d) of the
-    residuals.
+    residuals; extent: (2, 3) ends of the piece of a wall or line that was seen, m, in that frame, None where unknown.
     """
 
     kind: LandmarkType
     value: FloatArray
     covariance: FloatArray
+    extent: FloatArray | None = None
 
     def __post_init__(self) -> None:
         d = self.kind.variable.dim
         value = checked(f"observed {self.kind.name}", self.value, (None,))
         covariance = checked_covariances(f"covariance of a {self.kind.name}", [self.covariance], 1, d)[0]
-        vars(self).update(value=value, covariance=covariance)
+        extent = None if self.extent is None else checked(f"extent of a {self.kind.name}", self.extent, (2, 3))
+        vars(self).update(value=value, covariance=covariance, extent=extent)
 
 
 @dataclass(frozen=True, eq=False)

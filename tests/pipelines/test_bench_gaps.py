@@ -311,7 +311,7 @@ def test_contenders_are_fitted_to_the_recordings_that_teach(monkeypatch: pytest.
     """Learning finds no interactions here: then saga is kf."""
     taught_by = []
 
-    def learn(recordings, origin, base, progress=None):  # type: ignore[no-untyped-def]
+    def learn(recordings, origin, base, **how):  # type: ignore[no-untyped-def]
         taught_by.append(origin)
         return LearnedForms(LearnedInteractions(learned_from=origin), {}, {}, (), {})
 
@@ -327,6 +327,29 @@ def test_contenders_are_fitted_to_the_recordings_that_teach(monkeypatch: pytest.
         (s, n) for s in ("scene-0001", "scene-0002") for n in names
     ]
     assert runs[0].outcomes == runs[2].outcomes
+
+
+@pytest.mark.usefixtures("short_scenes")
+def test_a_fit_that_changes_nothing_has_the_runs_of_its_contender(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = load_config("simulated")
+    saga = Contender.of(contenders("simulated")["saga"], base)
+    shipped = LearnedInteractions(
+        learned_from="", edges=base.tracker.edges, explained_noise=base.tracker.explained_noise
+    )
+    monkeypatch.setattr(fitted, "learn_interactions", lambda *recordings, **how: LearnedForms(shipped, {}, {}, (), {}))
+    tracked = []
+
+    def judged(source, names, compared, settings, workers, progress):  # type: ignore[no-untyped-def]
+        tracked.extend(one.name for one in compared)
+        return bench_gaps(source, names, compared, settings, workers, progress)
+
+    monkeypatch.setattr(fitted, "bench_gaps", judged)
+    source, settings = RecordingSource("simulated", scenes=2, labels=True), GapBenchSettings(0, ("kept",))
+    split = [Split(("scene-0001",), ("scene-0002",))]
+    runs = fitted.bench_splits(source, split, [saga], base, settings, ["edges"])
+    assert tracked == ["saga"]
+    assert [run.contender for run in runs] == ["saga", "saga, learned edges"]
+    assert runs[0].outcomes == runs[1].outcomes
 
 
 def test_scenes_without_truth_or_detections_are_refused() -> None:

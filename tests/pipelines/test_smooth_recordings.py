@@ -15,8 +15,8 @@ from pipelines.smoothing import load_smooth_config, smooth_scene
 from pipelines.tracking import track_scene
 from saga_fg.types.dataset import Dataset, Scene
 
-SCENES = {"nuscenes": ("scene-0553", "scene-1094"), "kitti": ("0000", "0017")}
-FEWEST = 50  # boxes of a class that is compared
+SCENES = {"nuscenes": ("scene-0061", "scene-0553", "scene-1094"), "kitti": ("0000", "0011", "0017")}
+FEWEST = 30  # boxes of a class that is compared
 
 
 def dataset_of(family: str, recordings: Path) -> Dataset:

@@ -1,8 +1,9 @@
 """Errors of several systems on common true boxes: those that every system matches.
 
 Pairs are the nearest within a gate, frame by frame and class by class (`nearest_pairs`): first with the visible
-objects, then, of the remaining boxes, with the hidden ones. A system that finds more boxes also finds more difficult
-ones, so systems are compared on the boxes that all of them find.
+objects, then, of the remaining boxes, with the hidden ones. A pair counts if its track is paired with no other object
+more often: where one system has no box any more, the nearest one is that of a neighbour. A system that finds more boxes
+also finds more difficult ones, so systems are compared on the boxes that all of them find.
 """
 
 from __future__ import annotations
@@ -111,6 +112,8 @@ def _errors(scene: LabelledScene, found: SceneBoxes, gate: float) -> dict[str, F
     """The errors of one system at all true boxes, NaN where it has none."""
     columns = {name: np.full(len(scene.truth), np.nan) for name in QUANTITIES}
     row, column = visible_then_hidden(scene.truth, scene.visible, found, gate)
+    own = _holds_most(scene.truth.id[row], found.id[column])
+    row, column = row[own], column[own]
     a, b = scene.truth.boxes.select(row), found.boxes.select(column)
     offset = (b.position - a.position)[:, :2]
     columns["position"][row] = np.hypot(*offset.T)
@@ -119,3 +122,17 @@ def _errors(scene: LabelledScene, found: SceneBoxes, gate: float) -> dict[str, F
     columns["velocity"][row] = np.hypot(*(b.velocity - scene.velocity[row]).T)
     columns["nees"][row] = nees(offset, found.position_covariance[column])
     return columns
+
+
+def _holds_most(objects: StrArray, tracks: StrArray) -> BoolArray:
+    """(P,) of pairs whose track is paired with no other object more often."""
+    track, of_track = np.unique(tracks, return_inverse=True)
+    pair, of_pair, count = np.unique(
+        np.stack([of_track, np.unique(objects, return_inverse=True)[1]]),
+        axis=1,
+        return_inverse=True,
+        return_counts=True,
+    )
+    most = np.zeros(len(track), dtype=np.int64)
+    np.maximum.at(most, pair[0], count)
+    return np.asarray(count[of_pair.ravel()] == most[of_track])

@@ -47,7 +47,7 @@ class GapBenchSettings:
     real  whether the gaps of the recordings themselves are judged too, and the links
     """
 
-    passes: int = 4
+    passes: int = 2
     lives: tuple[Life, ...] = LIVES
     lengths: tuple[float, ...] = LENGTHS
     seed: int = 0

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pipelines.bench.gaps.bench import Contender, GapBenchSettings, Run, bench_gaps
 from pipelines.bench.gaps.boosted import boosted_runs
-from pipelines.bench.gaps.learned import LEARNED, learn_interactions
+from pipelines.bench.gaps.learned import LEARNED, LearningSettings, learn_interactions
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.config import TrackConfig
 from pipelines.learning import learned_motions
@@ -18,6 +18,7 @@ from saga_fg.learning import measured_trajectories
 
 Fit = Literal["noise", "edges", "boosted"]
 FITS: tuple[Fit, ...] = ("noise", "edges", "boosted")
+LEARNING = LearningSettings(passes=1, most=150)  # there is a fit to every fold, and a half of the usual tells enough
 
 
 @dataclass(frozen=True)
@@ -78,11 +79,28 @@ def bench_splits(
         if split.train and "noise" in fits:
             fitted.append(_with_fitted_noise(source, split, base))
         if split.train and "edges" in fits:
-            fitted.append(_with_learned_edges(source, split, base, progress))
-        runs += bench_gaps(source, split.test, [*contenders, *fitted], settings, workers, progress)
+            fitted.append(_with_learned_edges(source, split, base, progress, workers))
+        runs += _judged(source, split, contenders, fitted, settings, workers, progress)
         if split.train and "boosted" in fits:
             runs += boosted_runs(source, split.train, split.test, settings, base.sensors)
     return runs
+
+
+def _judged(
+    source: RecordingSource,
+    split: Split,
+    contenders: Sequence[Contender],
+    fitted: Sequence[Contender],
+    settings: GapBenchSettings,
+    workers: int,
+    progress: Progress | None,
+) -> list[Run]:
+    """The runs of all; one whose fit came to the settings of another has the runs of that one."""
+    same = {one.name: next((other.name for other in contenders if one.same_as(other)), None) for one in fitted}
+    different = [one for one in fitted if same[one.name] is None]
+    runs = bench_gaps(source, split.test, [*contenders, *different], settings, workers, progress)
+    copies = [(name, run) for name, other in same.items() for run in runs if run.contender == other]
+    return [*runs, *(replace(run, contender=name) for name, run in copies)]
 
 
 def _with_fitted_noise(source: RecordingSource, split: Split, base: TrackConfig) -> Contender:
@@ -93,9 +111,10 @@ def _with_fitted_noise(source: RecordingSource, split: Split, base: TrackConfig)
 
 
 def _with_learned_edges(
-    source: RecordingSource, split: Split, base: TrackConfig, progress: Progress | None
+    source: RecordingSource, split: Split, base: TrackConfig, progress: Progress | None, workers: int
 ) -> Contender:
     """Saga with the edges of some annotated recordings."""
     scenes = {name: source.scene(name) for name in split.train}
-    learned = learn_interactions(scenes, f"recordings {', '.join(scenes)}", base, progress=progress).interactions
-    return Contender(f"saga, {LEARNED}", "saga", base.with_interactions(learned))
+    origin = f"recordings {', '.join(scenes)}"
+    learned = learn_interactions(scenes, origin, base, settings=LEARNING, progress=progress, workers=workers)
+    return Contender(f"saga, {LEARNED}", "saga", base.with_interactions(learned.interactions))

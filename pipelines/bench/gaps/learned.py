@@ -30,7 +30,7 @@ from pipelines.bench.gaps.gap import LENGTHS
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.learning import TEMPLATE, GapSettings, HiddenObjects, Rule, fit_interactions, hidden_objects
+from saga_fg.learning import MOST_GAPS, TEMPLATE, GapSettings, HiddenObjects, Rule, fit_interactions, hidden_objects
 from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
 from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
@@ -49,11 +49,13 @@ class LearningSettings:
     passes  number of times that each recording held out is tracked, each time with other made gaps
     seed    of the choice of these gaps
     gaps    choice of the gaps to learn from
+    most    largest number of these, a random sample
     """
 
     passes: int = 2
     seed: int = 0
     gaps: GapSettings = GapSettings()
+    most: int = MOST_GAPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +100,13 @@ def learn_interactions(
     start: LearnedInteractions | None = None,
     settings: LearningSettings | None = None,
     progress: Progress | None = None,
+    workers: int = 1,
 ) -> LearnedForms:
     """Learn from annotated scenes with detections; `origin` says in the file where from.
 
     config   of the tracker: its motion, turns and stationarity are the base on which edges are learned
     start    rules from which the search begins, in place of the forms of the template
+    workers  processes that track the recordings held out
 
     Raises `InputError` where no object is followed for long enough.
     """
@@ -127,7 +131,7 @@ def learn_interactions(
         found: dict[str, Rules] = {}
         for done, (form, rules) in enumerate(forms.items()):
             if own := _of_group(rules, group):
-                found[form] = fit_interactions(mine, config.tracker, own).rules
+                found[form] = fit_interactions(mine, config.tracker, own, most=settings.most).rules
             if progress is not None:
                 progress(f"fit {form}, {group[0]}, ...", done + 1, len(forms))
         return found
@@ -137,7 +141,7 @@ def learn_interactions(
         _Part(tested, {group: fitted(tuple(taught), templates, group) for group in groups})
         for taught, tested in ((first, second), (second, first))
     ]
-    trials = _trials(parts, config, origin, settings, progress)
+    trials = _trials(parts, config, origin, settings, progress, workers)
     ratios, chosen = {}, {}
     for group in groups:
         ratios[group] = {form: _ratio(runs, trials[BASE], group) for form, runs in trials.items() if form != BASE}
@@ -162,7 +166,7 @@ def learn_interactions(
         for part in parts:
             if part.tested:
                 learned = Contender(LEARNED, "saga", config.with_interactions(combined(part.rules, origin)))
-                runs += _judged(part.tested, [learned], settings, progress)
+                runs += _judged(part.tested, [learned], settings, progress, workers)
     everything = {
         group: fitted(tuple(scenes), {form: templates[form]}, group)
         for group, form in chosen.items()
@@ -208,7 +212,12 @@ def _of_group(rules: Sequence[Rule], group: Sequence[str]) -> Rules:
 
 
 def _trials(
-    parts: Sequence[_Part], config: TrackConfig, origin: str, settings: LearningSettings, progress: Progress | None
+    parts: Sequence[_Part],
+    config: TrackConfig,
+    origin: str,
+    settings: LearningSettings,
+    progress: Progress | None,
+    workers: int,
 ) -> dict[str, list[Run]]:
     """The runs of every form on the recordings held out, by form."""
     found: dict[str, list[Run]] = {BASE: [], SHIPPED: []}
@@ -222,17 +231,21 @@ def _trials(
                 learned_from=origin, edges=rules, explained_noise=config.tracker.explained_noise
             )
             contenders.append(Contender(form, "saga", config.with_interactions(learned)))
-        for run in _judged(part.tested, contenders, settings, progress):
+        for run in _judged(part.tested, contenders, settings, progress, workers):
             found.setdefault(run.contender, []).append(run)
     return found
 
 
 def _judged(
-    scenes: Mapping[str, Scene], contenders: Sequence[Contender], settings: LearningSettings, progress: Progress | None
+    scenes: Mapping[str, Scene],
+    contenders: Sequence[Contender],
+    settings: LearningSettings,
+    progress: Progress | None,
+    workers: int,
 ) -> list[Run]:
     source = _HeldScenes("held out", scenes, {})
     bench = GapBenchSettings(settings.passes, lives=("kept",), seed=settings.seed, real=False)
-    return bench_gaps(source, tuple(scenes), contenders, bench, progress=progress)
+    return bench_gaps(source, tuple(scenes), contenders, bench, workers, progress)
 
 
 def _ratio(runs: Sequence[Run], base: Sequence[Run], group: Sequence[str]) -> float:

@@ -9,6 +9,9 @@ P_rel is the covariance of the motion since the landmark was seen last, P_l what
 graph is asked for, and a submap far from the start is associated as the first one. A pair is possible inside the
 gate and where it is likelier than an observation of a landmark not yet in the map (`log_odds`); the likeliest
 assignment is taken, each landmark once.
+
+Walls and lines are finite: two pieces farther apart along the wall than `_GAP` are not of one, though in one plane, as
+the fronts of houses in a row are.
 """
 
 from __future__ import annotations
@@ -27,18 +30,21 @@ from saga_fg.slam.mapping.association import log_odds
 from saga_fg.slam.mapping.jacobians import whitened_jacobians
 from saga_fg.types.landmark import LandmarkType, Observation
 
+_GAP = 3.0  # m
+
 
 @dataclass(eq=False)
 class _Known:
-    """Landmarks of one kind: number, state, P_l (n, d, d) and P_rel (n, 6, 6) of each."""
+    """Landmarks of one kind: number, state, P_l (n, d, d), P_rel (n, 6, 6), and ends (2, 2) seen from above of each."""
 
     numbers: list[int] = field(default_factory=list)
     states: list[Any] = field(default_factory=list)
     own: list[FloatArray] = field(default_factory=list)
     since: list[FloatArray] = field(default_factory=list)
+    ends: list[FloatArray | None] = field(default_factory=list)
 
     def copy(self) -> _Known:
-        return _Known(list(self.numbers), list(self.states), list(self.own), list(self.since))
+        return _Known(list(self.numbers), list(self.states), list(self.own), list(self.since), list(self.ends))
 
 
 class SubmapLandmarks:
@@ -102,24 +108,33 @@ class SubmapLandmarks:
         _, A_p, A_l = whitened_jacobians(kind, rows, observed, R, values)
         root = np.linalg.inv(A_l)
         G, N = -root @ A_p, root @ root.swapaxes(1, 2)
-        pairs = self._pairs(kind, known, states, G, N)
+        ends = [_from_above(world_T_pose, one.extent) for one in observations]
+        pairs = self._pairs(kind, known, states, G, N, ends)
         numbers = []
         for row, state in enumerate(states):
             if row in pairs:
                 j = pairs[row]
                 known.own[j], known.since[j] = N[row], np.zeros_like(known.since[j])
+                known.ends[j] = _together(known.ends[j], ends[row])
             else:
                 j = len(known.numbers)
                 known.numbers.append(first)
                 known.states.append(state)
                 known.own.append(N[row])
+                known.ends.append(ends[row])
                 known.since.append(np.zeros((A_p.shape[2], A_p.shape[2])))
                 first += 1
             numbers.append(known.numbers[j])
         return numbers
 
     def _pairs(
-        self, kind: LandmarkType, known: _Known, states: Sequence[Any], G: FloatArray, N: FloatArray
+        self,
+        kind: LandmarkType,
+        known: _Known,
+        states: Sequence[Any],
+        G: FloatArray,
+        N: FloatArray,
+        ends: Sequence[FloatArray | None],
     ) -> dict[int, int]:
         """Rows of matched observations with the rows of their landmarks."""
         if not known.numbers:
@@ -130,6 +145,8 @@ class SubmapLandmarks:
         squared = (delta * np.linalg.solve(S, delta[..., None])[..., 0]).sum(axis=2)
         odds = log_odds(squared, np.linalg.slogdet(S)[1], d, kind.density)
         possible = (squared < gate(self._probability, d)) & (odds > 0)
+        for row, j in zip(*np.nonzero(possible), strict=True):
+            possible[row, j] = _gap(known.ends[j], ends[row]) <= _GAP
         rows, columns = assign(-np.where(possible, odds, 0.0), possible, 0.0)
         return dict(zip(rows.tolist(), columns.tolist(), strict=True))
 
@@ -139,3 +156,32 @@ def _differences(kind: LandmarkType, landmarks: Sequence[Any], states: Sequence[
     if isinstance(kind.variable, Vector):
         return np.asarray(np.stack(landmarks)[None] - np.stack(states)[:, None])
     return np.array([[kind.variable.local(state, mark) for mark in landmarks] for state in states])
+
+
+def _from_above(world_T_pose: FloatArray, extent: FloatArray | None) -> FloatArray | None:
+    """Ends (2, 2) in the world, from above."""
+    return None if extent is None else (extent @ world_T_pose[:3, :3].T + world_T_pose[:3, 3])[:, :2]
+
+
+def _gap(known: FloatArray | None, seen: FloatArray | None) -> float:
+    """How far apart two pieces are, m, along the first one."""
+    if known is None or seen is None:
+        return 0.0
+    along = _direction(known)
+    (low, high), (first, second) = np.sort(known @ along), np.sort(seen @ along)
+    return float(max(first - high, low - second, 0.0))
+
+
+def _together(known: FloatArray | None, seen: FloatArray | None) -> FloatArray | None:
+    """The ends of both pieces together, along the first one."""
+    if known is None or seen is None:
+        return known if seen is None else seen
+    every = np.concatenate([known, seen])
+    u = every @ _direction(known)
+    return every[[int(u.argmin()), int(u.argmax())]]
+
+
+def _direction(ends: FloatArray) -> FloatArray:
+    off = ends[1] - ends[0]
+    length = float(np.linalg.norm(off))
+    return off / length if length > 0 else np.array([1.0, 0.0])

@@ -38,6 +38,7 @@ from saga_fg.slam.submaps.recording import recorded
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Landmark, Observation
 
+_AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
 _SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
 
 
@@ -54,7 +55,7 @@ class SubmapSettings(Settings):
     )
     confirm_after: Annotated[int, Range(1, 10**9)] = setting(4, "observations that confirm a landmark")
     relinearise_above: Positive = setting(
-        0.3, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
+        0.5, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
     )
     robust_scale: Positive = setting(
         3.0,
@@ -120,7 +121,7 @@ class SubmapGraph:
         self.settings = settings or SubmapSettings()
         self._providers = recorded(providers)
         self._smoother = IncrementalSmoother(
-            lag=None, settings=RelinearisationSettings(self.settings.relinearise_above)
+            lag=None, settings=RelinearisationSettings(self.settings.relinearise_above), elimination="cholesky"
         )
         self._motions: list[tuple[FloatArray, FloatArray]] = [(world_T_first, covariance)]
         self._times: list[float] = []
@@ -191,7 +192,7 @@ class SubmapGraph:
                 raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
         if not loops:
             return
-        self._smoother.extend([_Loops(loops, self._anchors, self.settings.robust_loops)])
+        self._smoother.extend([_Loops(loops, self._anchors, self.settings.robust_loops)], _AFTER_LOOPS)
         self._loops += [(len(self) - 1, loop) for loop in loops]
         self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
 

@@ -89,6 +89,13 @@ def test_a_box_stays_with_the_visible_object() -> None:
     assert same.visible.all()
 
 
+def test_the_box_of_a_neighbour_is_not_that_of_the_object() -> None:
+    truth = table([0, 0, 1, 1, 2], ["a", "b", "a", "b", "a"], [0.0, 1.5, 0.0, 1.5, 0.0])
+    systems = {"one": table([0, 0, 1, 1, 2], ["1", "2", "1", "2", "2"], [0.1, 1.5, 0.1, 1.5, 1.5])}
+    same = common_boxes(LabelledScene(truth, np.ones(5, dtype=bool), np.zeros((5, 2)), np.zeros(5), systems), 2.0)
+    assert same.errors["one"]["position"].tolist() == pytest.approx([0.1, 0.0, 0.1, 0.0])
+
+
 def test_self_consistency_sees_jumps_turns_and_gaps() -> None:
     times = np.arange(5) * 0.5
     steady = self_consistency(table([0, 1, 2, 3, 4], ["1"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]), times)

@@ -10,7 +10,16 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import ResidualFactor, ResidualFactors, Vector, gaussian_factor, interaction_factor, prior_factor
+from factors import (
+    PlanarPose,
+    ResidualFactor,
+    ResidualFactors,
+    Vector,
+    gaussian_factor,
+    interaction_factor,
+    pose_prior_factor,
+    prior_factor,
+)
 from saga_fg import InputError, SceneGraph
 from saga_fg.estimators import GraphFilter, IncrementalSmoother, JointKalmanFilter, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, LANDMARK, OBJECT, Additions, GraphError, NewVariable, SceneFactorGraph, key_of
@@ -318,3 +327,31 @@ def test_settings_and_snapshots_are_checked():
         IncrementalSmoother().restore(3)
     with pytest.raises(GraphError, match="object 4 of epoch 2 is not in the graph"):
         SceneFactorGraph().state(key_of(OBJECT, 4, 2))
+
+
+class Bearings:
+    """A pose that sees a post behind it, by a factor whose residual is an angle."""
+
+    name = "radar"
+
+    def __init__(self, angles):
+        self.angles = angles
+
+    def factors(self, view):
+        key, post = view.key(EGO_POSE, 0), view.key(LANDMARK, 5, static=True)
+
+        def bearing(pose, place):
+            return [np.arctan2(*pose.transformTo(place)[::-1]) - 3.1]
+
+        seen = ResidualFactor(
+            (key, post), (PlanarPose(), Vector(2)), bearing, [[1e-4]], angles=self.angles, name="bearing"
+        )
+        new = [NewVariable(EGO_POSE, 0, gtsam.Pose2(1, 2, 0.3)), NewVariable(LANDMARK, 5, np.zeros(2), static=True)]
+        known = [pose_prior_factor(key, np.eye(3), np.eye(3)), prior_factor(post, np.zeros(2), np.eye(2))]
+        return Additions(new, [*known, seen])
+
+
+def test_an_angle_that_nobody_wraps_is_refused_with_what_it_takes():
+    with pytest.raises(GraphError, match=r"provider radar: bearing on .*0.40 s.*5.* jumps by 2 pi .*angles=\(0,\)"):
+        IncrementalSmoother(providers=[Bearings(())]).step(0.4)
+    IncrementalSmoother(providers=[Bearings((0,))]).step(0.4)

@@ -72,3 +72,10 @@ def test_objects_seen_too_seldom_tell_nothing():
 def test_wrong_sightings_are_named(columns, message):
     with pytest.raises(InputError, match=message):
         MeasuredTrajectory(*columns)
+
+
+def test_a_long_trajectory_is_cut_into_pieces_of_about_one_length() -> None:
+    one = MeasuredTrajectory(np.arange(25.0), np.zeros((25, 2)), np.tile(np.eye(2), (25, 1, 1)))
+    pieces = one.pieces(10)
+    assert [len(piece) for piece in pieces] == [9, 8, 8]
+    assert np.concatenate([piece.time for piece in pieces]).tolist() == one.time.tolist()

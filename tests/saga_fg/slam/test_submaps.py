@@ -111,7 +111,7 @@ def test_while_running_submaps_say_nearly_what_their_measurements_do() -> None:
     found = graph.finish()
     rows = [*graph.anchors, *range(graph.anchors[-1], 150)]
     assert sigmas(graph.poses()[rows], found.world_T_pose[rows], found.covariances[rows]).max() < 0.02
-    np.testing.assert_allclose(graph.covariance(), found.covariances[-1], rtol=0.02, atol=1e-9)
+    np.testing.assert_allclose(graph.covariance(), found.covariances[-1], rtol=0.05, atol=3e-6)
 
 
 def test_one_submap_is_the_whole_graph_at_every_moment() -> None:
@@ -151,6 +151,18 @@ def test_far_from_the_start_association_is_the_same(where: float) -> None:
         drive.into(graph, range(60))
     numbers = [[one.landmark for one in graph.observations()] for graph in graphs]
     assert numbers[0] == numbers[1]
+
+
+def test_fronts_in_one_plane_are_walls_of_their_own() -> None:
+    def seen(x: float, d: float) -> Observation:
+        return Observation(WALL, [0, -1, 0, d], np.diag([3e-3, 3e-3, 0.02]) ** 2, [[x - 3, d, 0], [x + 3, d, 2]])
+
+    graph = SubmapGraph(np.eye(4), FIRST)
+    graph.append(0.0, None, [seen(0.0, 8.0), seen(12.0, 8.02)])
+    graph.append(0.1, (yaw_transform(1.0), Q), [seen(4.0, 8.0), seen(11.0, 8.02)])  # on from the first; the second
+    assert [one.landmark for one in graph.observations()] == [0, 1, 0, 1]
+    graph.append(0.2, (yaw_transform(1.0), Q), [seen(22.0, 8.0), Observation(WALL, [0, -1, 0, 8.0], Q[:3, :3])])
+    assert graph.observations()[-2].landmark == 2
 
 
 def test_a_loop_moves_submaps_as_a_whole() -> None:

@@ -122,10 +122,25 @@ def test_a_pinned_object_stays_where_it_is() -> None:
     evidence = evidence_of(times.tolist(), path[:, None].tolist())
     mine = np.zeros(20, dtype=np.int64)
     lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
-    stands = StationaryStates(StationarySettings(), np.arange(20), mine)
+    stands = StationaryStates(StationarySettings(position_drift=0.01), np.arange(20), mine)
     states = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES, stationary=stands)
     assert np.ptp(states.mean[:, :2], axis=0).max() < 0.1 * SIGMA
     assert np.allclose(states.mean[:, :2] + evidence.origin, path.mean(axis=0), atol=0.1 * SIGMA)
+
+
+def test_a_pinned_object_wanders_by_the_drift_of_the_poses_whatever_the_rate() -> None:
+    settings, deviations = StationarySettings(position_drift=0.2), []
+    for rate in (2, 20):
+        times = np.arange(20 * rate + 1) / rate
+        places: list[list[list[float]]] = [[] for _ in times]
+        places[0] = [[10.0, 5.0]]
+        evidence = evidence_of(times.tolist(), places)
+        lifespans = Lifespans(np.array([0]), np.array(["car"]), np.array([0]), np.array([len(times) - 1]))
+        stands = StationaryStates(settings, np.arange(len(times)), np.zeros(len(times), dtype=np.int64))
+        first = np.zeros(1, dtype=np.int64)
+        states = smooth_states(evidence, first, lifespans, 25 * np.eye(2)[None], CLASSES, stationary=stands)
+        deviations.append(np.sqrt(states.covariance[-1, 0, 0] - states.covariance[0, 0, 0]))
+    assert deviations == pytest.approx([0.2 * np.sqrt(20)] * 2, rel=0.3)
 
 
 def test_an_outlier_counts_little_after_reweighting() -> None:
