@@ -40,7 +40,7 @@ from saga_fg.slam.joint.record import RecordedEpoch, RecordedObjects, motion_cov
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.mapping import pose_key
 
-_LIKELY = 0.5  # an object that is stationary with less than this probability gets no such factor
+_LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
 _ANY_SPEED = 100.0  # m/s, deviation of an unknown velocity
 Record = Sequence[RecordedEpoch]
 
