@@ -7,7 +7,7 @@ from .planes import Plane, PlaneSettings, extract_walls, fit_ground, fit_plane
 from .poles import Pole, PoleSettings, extract_poles
 from .registration import Registration, RegistrationError, RegistrationSettings, register
 from .scan import Scan
-from .scan_files import read_scan, write_ply
+from .scan_files import read_scan, write_cloud
 from .sharpness import scan_to_map_residual
 from .submap import Submap, upright
 from .surfels import SurfelMap, Surfels, surfels_of
@@ -52,5 +52,5 @@ __all__ = [
     "upright",
     "voxel_downsample",
     "voxel_keys",
-    "write_ply",
+    "write_cloud",
 ]

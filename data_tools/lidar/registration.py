@@ -48,8 +48,11 @@ class RegistrationError(SagaError):
 
 @dataclass(frozen=True)
 class RegistrationSettings(Settings):
-    """Convergence criteria of the registration."""
+    """Method and convergence criteria of the registration."""
 
+    method: Literal["gauss-newton", "open3d"] = setting(
+        "gauss-newton", "our own iterations, or Open3D's tensor ICP on the same surfels"
+    )
     max_iterations: PositiveInt = setting(30, "largest number of iterations")
     translation_tolerance: Positive = setting(1e-3, "largest translation of the last step, m")
     rotation_tolerance: Positive = setting(1e-4, "largest rotation of the last step, rad")
@@ -132,6 +135,8 @@ def _refined(
     free: FloatArray,
 ) -> Registration:
     """The registration among the motions free (6, k)."""
+    if settings.method == "open3d" and free.shape[1] == 6 and len(points) >= LEAST_PAIRS and len(surfels.flat):
+        return _by_open3d(points, surfels, map_T_scan, farthest, scale, settings)
     T = _rigid(map_T_scan)
     span = float(np.sqrt(np.mean(np.square(points)) * 3)) if len(points) else 1.0
     converged, step = False, 0
@@ -147,9 +152,34 @@ def _refined(
             np.linalg.norm(x[3:]) < settings.translation_tolerance
             and np.linalg.norm(x[:3]) < settings.rotation_tolerance
         )
-    J, r, w = _linearised(points[rows], paired, T, scale)
+    return _assessed(points[rows], paired, T, scale, free, step, converged)
+
+
+def _by_open3d(
+    points: FloatArray,
+    surfels: SurfelMap,
+    map_T_scan: FloatArray,
+    farthest: float,
+    scale: float,
+    settings: RegistrationSettings,
+) -> Registration:
+    from data_tools.lidar.open3d_registration import icp  # which imports Open3D
+
+    T, iterations, converged = icp(points, surfels, map_T_scan, farthest, scale, settings.max_iterations)
+    T = _rigid(T)
+    rows, paired = surfels.nearest(transform_points(T, points), farthest)
+    return _assessed(points[rows], paired, T, scale, np.eye(6), iterations, converged)
+
+
+def _assessed(
+    points: FloatArray, paired: Surfels, T: FloatArray, scale: float, free: FloatArray, step: int, converged: bool
+) -> Registration:
+    """The registration with its covariance, given pairs at its end."""
+    J, r, w = _linearised(points, paired, T, scale)
+    seen = observability(points, paired, J[:, 3:], w)
+    if free.shape[1] == 6 and np.linalg.matrix_rank(J.T @ (w[:, None] * J)) < 6:
+        raise _UnconstrainedError(seen)
     P = free @ _covariance(J @ free, r, w, paired.voxel) @ free.T
-    seen = observability(points[rows], paired, J[:, 3:], w)
     return Registration(T, P, float(np.abs(r).mean()), len(r), step, converged, seen)
 
 

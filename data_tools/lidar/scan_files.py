@@ -1,4 +1,4 @@
-"""Scans read from files, by the suffix of their name, and point clouds written as PLY.
+"""Scans read from files, by the suffix of their name, and point clouds written as PLY or PCD, by Open3D.
 
     .bin      KITTI: float32 x, y, z, intensity of each point, without a header
     .pcd.bin  nuScenes: float32 x, y, z, intensity, ring of each point, without a header
@@ -14,6 +14,7 @@ elsewhere they are errors. Sources: development kits of KITTI (https://www.cvlib
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
@@ -43,27 +44,29 @@ def read_scan(path: str | Path) -> Scan:
         return _READERS[ending](file, path)
 
 
-def write_ply(path: str | Path, points: FloatArray, colours: NDArray[np.uint8] | None = None) -> None:
-    """Write points (N, 3), m, as float32, and red, green, blue (N, 3) from 0 to 255 if given; atomically.
+def write_cloud(path: str | Path, points: FloatArray, colours: NDArray[np.uint8] | None = None) -> None:
+    """Write points (N, 3), m, as float32, and red, green, blue (N, 3) from 0 to 255 if given, atomically.
 
-    Raises `InputError` for positions that are not finite, and for colours of another shape or type.
+    path: .ply or .pcd
+    Raises `InputError` for another suffix, positions that are not finite, and colours of another shape or type.
     """
-    points = checked("points", points, (None, 3))
-    properties = [(axis, "<f4") for axis in "xyz"]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    header += [f"property float {axis}" for axis in "xyz"]
+    points, suffix = checked("points", points, (None, 3)), Path(path).suffix.lower()
+    if suffix not in (".ply", ".pcd"):
+        raise InputError(f"{path}: expected a name that ends in .ply or .pcd")
+    if colours is not None and (colours.shape != points.shape or colours.dtype != np.uint8):
+        raise InputError(f"colours: expected {points.shape} bytes, got {colours.dtype} {colours.shape}")
+    if not len(points) and suffix == ".ply":  # which Open3D refuses
+        write_bytes(path, _EMPTY.encode("ascii"))
+        return
+    open3d = load_open3d()
+    cloud = open3d.t.geometry.PointCloud(open3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)))
     if colours is not None:
-        if colours.shape != points.shape or colours.dtype != np.uint8:
-            raise InputError(f"colours: expected {points.shape} bytes, got {colours.dtype} {colours.shape}")
-        properties += [(colour, "u1") for colour in ("red", "green", "blue")]
-        header += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    vertices = np.empty(len(points), dtype=properties)
-    for k, axis in enumerate("xyz"):
-        vertices[axis] = points[:, k]
-    if colours is not None:
-        for k, colour in enumerate(("red", "green", "blue")):
-            vertices[colour] = colours[:, k]
-    write_bytes(path, "\n".join([*header, "end_header", ""]).encode("ascii") + vertices.tobytes())
+        cloud.point.colors = open3d.core.Tensor(np.ascontiguousarray(colours))
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / f"cloud{suffix}"
+        if not open3d.t.io.write_point_cloud(str(whole), cloud):
+            raise InputError(f"{path}: Open3D cannot write it")
+        write_bytes(path, whole.read_bytes())
 
 
 def _kitti(file: BinaryIO, _: Path) -> Scan:
@@ -121,6 +124,9 @@ def _of_columns(columns: FloatArray) -> Scan:
     return Scan(columns[:, :3], intensity)
 
 
+_EMPTY = "\n".join(
+    ["ply", "format ascii 1.0", "element vertex 0", *(f"property float {axis}" for axis in "xyz"), "end_header", ""]
+)
 _READERS: dict[str, Callable[[BinaryIO, Path], Scan]] = {
     ".pcd.bin": _nuscenes,
     ".bin": _kitti,

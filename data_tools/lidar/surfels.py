@@ -91,6 +91,11 @@ class SurfelMap:
         self._flat = self.surfels.select(self.surfels.flat)
         self._tree = cKDTree(self._flat.mean, balanced_tree=False, compact_nodes=False)
 
+    @property
+    def flat(self) -> Surfels:
+        """The flat surfels."""
+        return self._flat
+
     def nearest(self, points: FloatArray, farthest: float) -> tuple[IntArray, Surfels]:
         """Rows (K,) of the points that have a flat surfel with its mean within `farthest` m, and the surfel of each."""
         distance, row = self._tree.query(points, distance_upper_bound=farthest)

@@ -33,7 +33,7 @@ from saga_fg.errors import MissingExtraError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 
-OURS, KISS = "saga-fg", "kiss-icp"
+OURS, OPEN3D, KISS = "saga-fg", "saga-fg, open3d icp", "kiss-icp"
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,23 @@ class SlamRow:
 
 
 def bench_slam(
-    scans: ScanSequence, kiss: bool = True, settings: OdometrySettings | None = None, progress: Progress | None = None
+    scans: ScanSequence,
+    kiss: bool = True,
+    settings: OdometrySettings | None = None,
+    progress: Progress | None = None,
+    open3d: bool = False,
 ) -> list[SlamRow]:
-    """All rows. Raises `MissingExtraError` when `kiss` is wanted and not installed."""
+    """All rows; open3d: our odometry with Open3D's registration as well.
+
+    Raises `MissingExtraError` when `kiss` is wanted and not installed.
+    """
     settings = settings or OdometrySettings()
     rows = []
     for case, timed in (("as recorded", False), ("de-skewed", True)):
         contenders: dict[str, Callable[[Scan, float], FloatArray]] = {OURS: _ours(settings)}
+        if open3d:
+            theirs = replace(settings.registration, method="open3d")
+            contenders[OPEN3D] = _ours(replace(settings, registration=theirs))
         if kiss:
             contenders[KISS] = _kiss(settings, timed)
         poses: dict[str, list[FloatArray]] = {name: [] for name in contenders}

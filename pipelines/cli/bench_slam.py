@@ -26,6 +26,9 @@ def slam(
     kiss: Annotated[
         bool, typer.Option("--kiss/--no-kiss", help="With KISS-ICP, of the extra bench, or ours alone.")
     ] = True,
+    open3d: Annotated[
+        bool, typer.Option("--open3d", help="Our odometry with Open3D's registration in place of ours, too.")
+    ] = False,
     drive: Annotated[
         int | None,
         typer.Option("--drive", min=100, help="Instead: cost of so many keyframes in a simulated town, without scans."),
@@ -52,7 +55,7 @@ def slam(
     """
     from data_tools.datasets.kitti import KittiScans
     from data_tools.figures import FigureTable, cell
-    from pipelines.bench.slam import bench_slam
+    from pipelines.bench.slam import OURS, bench_slam
     from pipelines.bench.slam_all_in import bench_all_in
     from saga_fg.errors import InputError
 
@@ -66,7 +69,7 @@ def slam(
         return
     with progress_bar() as progress:
         recorded = KittiScans(dataroot, sequence, most=scans)
-        rows = bench_slam(recorded, kiss, progress=progress)
+        rows = bench_slam(recorded, kiss, progress=progress, open3d=open3d)
         cost = bench_all_in(f"sequence {sequence}", recorded, progress)
     shown = []
     for row in rows:
@@ -76,8 +79,8 @@ def slam(
     columns = ("scans", "method", "RPE, m per 10 m", "RPE, deg per 10 m", "end, m", "residual, mm", "ms a scan")
     table = FigureTable(f"sequence {sequence}: odometry against GPS/IMU", columns, tuple(shown))
     report([table, _all_in(cost)], [*rows, cost], json_file)
-    for ours, theirs in itertools.pairwise(rows):
-        if ours.case == theirs.case:
+    for ours, theirs in itertools.product(rows, rows):
+        if ours.case == theirs.case and ours.contender == OURS != theirs.contender:
             worse = 100 * (ours.errors.relative_translation - theirs.errors.relative_translation)
             duller = 100 * (ours.residual / theirs.residual - 1)
             share = ours.milliseconds / theirs.milliseconds

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from pipelines.cli.console import progress_bar, working
 from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
 from pipelines.cli.summary import counted
+
+if TYPE_CHECKING:
+    from data_tools.lidar.scan import ScanSequence
+    from pipelines.slam.localisation import LocaliserSettings
 
 
 def kitti(
@@ -49,6 +53,14 @@ def kitti(
         typer.Option("--sensor-log", help="A table of your own in their place: gps=FILE, imu=FILE or wheels=FILE."),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Of the noise of --sensors.")] = 0,
+    known_map: Annotated[
+        Path | None,
+        typer.Option("--map", help="Localise in the map of an earlier run, its output folder, in place of SLAM."),
+    ] = None,
+    guess: Annotated[
+        str | None,
+        typer.Option("--guess", help="x,y,z,yaw of the vehicle at the first scan in that map, m and rad."),
+    ] = None,
     online: Online = False,
     lag: Lag = None,
     scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
@@ -65,6 +77,7 @@ def kitti(
     Examples:
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --output slam
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --sensors gps,imu,wheels --output slam
+      saga-fg slam kitti --dataroot data/kitti --sequence 0000 --map slam --output again
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --objects --output slam
       saga-fg slam kitti --dataroot data/kitti --sequence 0004 --objects --odometry oxts --output slam
     """
@@ -84,6 +97,10 @@ def kitti(
         raise InputError("--detections: expected with --objects only")
     if online and not objects:
         raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
+    if known_map is None and guess is not None:
+        raise InputError("--guess: expected with --map only")
+    if known_map is not None and (objects or sensors or sensor_logs or odometry == "oxts"):
+        raise InputError("--map: expected without --objects, --sensors, --sensor-log and --odometry oxts")
     window = online_window(online, lag)
     check_writable_folder(output)
     frames, settings = [], load_slam_config("kitti", config)
@@ -94,6 +111,9 @@ def kitti(
     training = dataroot / "training" if (dataroot / "training").is_dir() else dataroot
     blind = objects and odometry == "oxts" and not (training / "velodyne" / sequence).is_dir()
     recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans, blind=blind)
+    if known_map is not None:
+        _localise(recorded, known_map, guess, slam.localisation, output)
+        return
     log = sensor_log(training / "oxts" / f"{sequence}.txt", sensors, sensor_logs or (), seed)
     with progress_bar() as progress:
         lidar = replace(
@@ -128,3 +148,20 @@ def kitti(
         typer.echo(f"scans {span['first']} to {span['last']} leave open: {', '.join(span['motions'])}")
     if not blind:
         typer.echo(f"mean scan-to-map residual: {1e3 * figures['scan_to_map_residual']:.1f} mm")
+
+
+def _localise(scans: ScanSequence, folder: Path, guess: str | None, settings: LocaliserSettings, output: Path) -> None:
+    from pipelines.slam.localisation import guess_of
+    from pipelines.slam.localised_drive import localise, write_localised
+    from pipelines.slam.slam_map import read_map
+
+    slam_map = read_map(folder)
+    with progress_bar() as progress:
+        found = localise(scans, slam_map, None if guess is None else guess_of(guess), settings, progress)
+    figures = write_localised(output, found, scans, slam_map)
+    registered = (
+        f"{figures['registered']} registered with the map, the first of them scan {figures['first_registered']}"
+    )
+    typer.echo(f"{output}: {counted(figures['scans'], 'scan')}, {registered}")
+    for name, what in (("trajectory", "in the map's frame"), ("aligned", "aligned with it")):
+        typer.echo(f"against GPS/IMU, {what}: ATE {figures[name]['ate']:.3f} m, end {figures[name]['end_error']:.3f} m")

@@ -9,6 +9,7 @@ from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings
 from pipelines.slam.laser_slam import LaserSettings
 from pipelines.slam.lidar_slam import LidarSlamSettings
+from pipelines.slam.localisation import LocaliserSettings
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
@@ -27,6 +28,7 @@ class SlamSettings:
     landmarks: tuple[str, ...] = setting((), "your own detectors of landmarks, MODULE:NAME, asked at every pose")
     joint: JointSettings = settings_group(JointSettings, "simulated: ego path and objects together")
     lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, with objects")
+    localisation: LocaliserSettings = settings_group(LocaliserSettings, "kitti --map: localisation in a map")
     laser: LaserSettings = settings_group(LaserSettings, "laser: planar laser and wheels")
 
     def new_providers(self) -> list[FactorProvider]:

@@ -5,7 +5,10 @@ trajectory.tum              the same in the TUM format
 odometry.tum                by odometry alone; online.tum: as estimated when each keyframe came
 covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
-landmarks.json              each landmark
+reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
+map/                        the points of each submap and its place, to localise in (`pipelines.slam.slam_map`)
+graph.g2o                   keyframes, odometry and loops
+landmarks.json              each landmark; landmarks.csv: the same as a table, with shapes as WKT
 landmarks.ply               points along the poles and on the observed pieces of the walls
 tracks.csv                  objects, where there are any
 above.png                   map, paths, landmarks and the objects' tracks from above
@@ -26,15 +29,18 @@ import numpy as np
 
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes
-from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_ply
+from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_cloud
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
+from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.drive import KeyframeClouds
+from pipelines.slam.graph_export import pose_graph_of, write_landmark_table
 from pipelines.slam.lidar_slam import LidarSlamResult
 from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.results import landmark_rows, object_paths, write_covariances, write_objects
 from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
+from pipelines.slam.slam_map import SlamMap, write_map
 from pipelines.slam.with_objects import SlamWithObjects
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
@@ -42,6 +48,7 @@ from saga_fg.types.landmark import Landmark
 
 HEIGHT = 3.0  # m above the first pose, to which poles and walls are drawn
 _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
+_LINED = (WALL.name, LINE.name)
 POLE_COLOUR, WALL_COLOUR, LINE_COLOUR = (255, 127, 14), (214, 39, 40), (148, 103, 189)
 
 
@@ -100,9 +107,16 @@ def write_lidar_slam(
             ("trajectory", result.trajectory), ("odometry", result.odometry), ("online", result.online)
         ):  # fmt: skip
             write_tum_poses(folder / f"{name}.tum", trajectory)
+        write_tum_poses(folder / "reference.tum", Trajectory(scans.timestamps, scans.world_T_ego))
+        if len(points):
+            (folder / "map").mkdir()
+            clouds = [submap.points for submap in result.submaps]
+            write_map(folder / "map", SlamMap(clouds, result.world_T_submap))
+        if len(result.keyframes) > 1:
+            write_g2o(folder / "graph.g2o", pose_graph_of(result))
         times = result.trajectory.timestamps[result.keyframes].tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
-        write_ply(folder / "map.ply", points)
+        write_cloud(folder / "map.ply", points)
         _write_landmarks(folder, result)
         paths = {"reference": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
         if objects is not None:
@@ -123,6 +137,8 @@ def accumulated_map(result: LidarSlamResult, spacing: float) -> FloatArray:
 
 def _write_landmarks(folder: Path, result: LidarSlamResult) -> None:
     write_figures(folder / "landmarks.json", landmark_rows(result.landmarks))
+    lined = {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind.name in _LINED}
+    write_landmark_table(folder / "landmarks.csv", result.landmarks, lined)
     ground, lines, poles = float(result.world_T_lidar[0, 2, 3]), _lines(result), _poles(result.landmarks)
     shapes = [(pole[None], np.arange(ground - 1.5, ground + HEIGHT, 0.1), POLE_COLOUR) for pole in poles]
     shapes += [(_sampled(*ends), np.array([ground - 1.7]), LINE_COLOUR) for ends in lines["road lines"]]
@@ -131,7 +147,7 @@ def _write_landmarks(folder: Path, result: LidarSlamResult) -> None:
     for foot, z, colour in shapes:
         points.append(np.column_stack([np.repeat(foot, len(z), axis=0), np.tile(z, len(foot))]))
         colours.append(np.full((len(points[-1]), 3), colour, dtype=np.uint8))
-    write_ply(folder / "landmarks.ply", np.concatenate(points), np.concatenate(colours))
+    write_cloud(folder / "landmarks.ply", np.concatenate(points), np.concatenate(colours))
 
 
 def _sampled(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -152,22 +168,24 @@ def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
 
 def _pieces(result: LidarSlamResult, kind: str) -> FloatArray:
     """Ends (W, 2, 2), from above, of the pieces of walls or road lines that were observed, one or several of each."""
-    ends = []
-    for mark in result.landmarks:
-        if mark.kind.name != kind:
-            continue
-        place = mark.kind.coordinates(mark.state)
-        normal = np.array([place["nx"], place["ny"]]) / np.hypot(place["nx"], place["ny"])
-        along = np.array([-normal[1], normal[0]])
-        foot = (np.array([place["x"], place["y"]]) @ normal) * normal
-        spans = []
-        for seen in result.observations:
-            extent = seen.observation.extent
-            if seen.landmark == mark.number and extent is not None:
-                u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
-                spans.append((float(u.min()), float(u.max())))
-        ends += [np.stack([foot + low * along, foot + high * along]) for low, high in covered_spans(spans)]
-    return np.array(ends).reshape(-1, 2, 2)
+    ends = [_seen_pieces(result, mark) for mark in result.landmarks if mark.kind.name == kind]
+    return np.concatenate([np.empty((0, 2, 2)), *ends])
+
+
+def _seen_pieces(result: LidarSlamResult, mark: Landmark) -> FloatArray:
+    """Ends (n, 2, 2) of the pieces of a wall or road line that were observed."""
+    place = mark.kind.coordinates(mark.state)
+    normal = np.array([place["nx"], place["ny"]]) / np.hypot(place["nx"], place["ny"])
+    along = np.array([-normal[1], normal[0]])
+    foot = (np.array([place["x"], place["y"]]) @ normal) * normal
+    spans = []
+    for seen in result.observations:
+        extent = seen.observation.extent
+        if seen.landmark == mark.number and extent is not None:
+            u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
+            spans.append((float(u.min()), float(u.max())))
+    pieces = [np.stack([foot + low * along, foot + high * along]) for low, high in covered_spans(spans)]
+    return np.array(pieces).reshape(-1, 2, 2)
 
 
 def covered_spans(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
-from data_tools.lidar import write_ply
+from data_tools.lidar import write_cloud
 from data_tools.plots import paths_from_above, png
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
@@ -106,7 +106,7 @@ def write_landmark_map(
         write_tum_poses(folder / "trajectory.tum", trajectory)
         write_kitti_poses(folder / "trajectory.kitti", trajectory)
         write_figures(folder / "landmarks.json", landmarks)
-        write_ply(folder / "landmarks.ply", places)
+        write_cloud(folder / "landmarks.ply", places)
         write_figures(folder / "figures.json", dict(figures))
         write_bytes(folder / "above.png", png(picture))
 

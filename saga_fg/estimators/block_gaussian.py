@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped
+from saga_fg.estimators.partition import BlockDiagonal, Partition, flattened, regrouped
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.components import node_blocks, uncorrelated_labels
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 _IN_CACHE = 100_000  # entries of components that are compared at once
@@ -31,6 +33,11 @@ class BlockGaussian:
     @property
     def layout(self) -> StateLayout:
         return self.partition.layout
+
+    @property
+    def flat(self) -> FloatArray:
+        """The blocks one after the other, as kernels take them."""
+        return flattened(self.blocks)
 
     def over(self, partition: Partition) -> BlockGaussian:
         """Change the partition; nodes that it separates lose their correlation."""
@@ -60,7 +67,9 @@ class BlockGaussian:
         kept = np.flatnonzero(keep)
         old = self.partition
         partition = old.restricted(self.layout.without(rows), kept)
-        if old.count - partition.count == len(rows):  # nodes without partners go, all others stay as they are
+        if not compiled_kernels() and old.count - partition.count == len(
+            rows
+        ):  # nodes without partners go, all others stay as they are
             leaving = [old.row[rows[old.group[rows] == number]] for number in range(len(self.blocks))]
             left = (np.delete(P, of_group, axis=0) for P, of_group in zip(self.blocks, leaving, strict=True))
             blocks = tuple(P for P in left if len(P))
@@ -77,6 +86,11 @@ class BlockGaussian:
         partition, layout = self.partition, self.layout
         if partition.count == len(layout):
             return partition
+        if compiled_kernels():
+            at = partition.block_places
+            place = at.start, at.size, at.offset
+            parts = Partition(layout, uncorrelated_labels(self.flat, partition.label, *place, layout.dims, tolerance))
+            return partition if parts.count == partition.count else parts
         node_of = np.repeat(np.arange(len(layout)), layout.dims)
         a, b = [], []
         for places, P in zip(partition.groups, self.blocks, strict=True):
@@ -147,6 +161,9 @@ def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray)
     result = np.empty((len(rows), d, d))
     if len(rows) == 0:
         return result
+    if compiled_kernels():
+        place = partition.block_places
+        return node_blocks(flattened(blocks), place.start, place.size, place.offset, rows, d)
     if partition.size:
         own = np.empty((len(partition.layout), d, d))
         for (nodes, row, slot), block in zip(partition.nodes_by_group, blocks, strict=True):

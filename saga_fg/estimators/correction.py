@@ -21,7 +21,7 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
-_CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
+CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
 _BATCHED_BELOW = 10  # size from which a triangular system is worth a call of its own
 
 
@@ -196,9 +196,14 @@ def _innovation_root(stacked: _Stacked) -> FloatArray:
     try:
         return np.asarray(np.linalg.cholesky(S), dtype=np.float64)  # reads the lower triangle alone
     except np.linalg.LinAlgError:
-        raise InputError(
-            f"measurements: their noise is lost in the rounding of what is predicted, variances up to {S.max():.3g}"
-        ) from None
+        raise lost_in_rounding(S.max()) from None
+
+
+def lost_in_rounding(variance: float) -> InputError:
+    """The error of a correction whose R no longer counts among the digits of a `variance`."""
+    return InputError(
+        f"measurements: their noise is lost in the rounding of what is predicted, variances up to {variance:.3g}"
+    )
 
 
 def _correct(stacked: _Stacked) -> tuple[Gain, FloatArray]:
@@ -209,7 +214,7 @@ def _correct(stacked: _Stacked) -> tuple[Gain, FloatArray]:
     posterior = np.swapaxes(gain.W, 1, 2) @ gain.W
     np.subtract(P, posterior, out=posterior)
     after, before = (np.diagonal(array, axis1=1, axis2=2) for array in (posterior, P))
-    lost = (after < _CANCELLATION * before).any(axis=1)
+    lost = (after < CANCELLATION * before).any(axis=1)
     if lost.any():
         K_T = solve_lower(L[lost], gain.W[lost], transposed=True)
         H, R = stacked.H[lost], stacked.R[lost]

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.bounds import ComponentBounds
+from saga_fg.estimators.compiled_filter import corrected, predicted
 from saga_fg.estimators.correction import correct
 from saga_fg.estimators.dynamics import predict
 from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
@@ -29,6 +30,8 @@ from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.components import planar_marginals
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.frame import Frame
@@ -117,7 +120,9 @@ class JointKalmanFilter(LatestMarginals):
     def predict(self, transition: Transition) -> None:
         dynamics = self._auxiliary.dynamics(transition, self._state)
         look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
-        if self.bounds is None:
+        if compiled_kernels():
+            self._state = predicted(self._state, dynamics, self.bounds, look)
+        elif self.bounds is None:
             self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
         else:
             self._state = predict(self._state, *self.bounds.applied(self._state, dynamics))
@@ -130,7 +135,10 @@ class JointKalmanFilter(LatestMarginals):
         if len(measurements) == 0:
             return 0.0
         seen = recorded.linearised(self._state.layout, self._state.mean)
-        self._state, _, log_likelihood = correct(self._state, *seen)
+        if compiled_kernels():
+            self._state, log_likelihood = corrected(self._state, seen)
+        else:
+            self._state, _, log_likelihood = correct(self._state, *seen)
         return log_likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -139,6 +147,15 @@ class JointKalmanFilter(LatestMarginals):
             leaving = set(np.asarray(nodes).tolist())
             labels = {node: label for node, label in self._auxiliary.labels.items() if node not in leaving}
             self._auxiliary = replace(self._auxiliary, labels=labels)
+
+    def planar_marginals(self, nodes: ArrayLike, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Positions and velocities (k, 4) with their covariances (k, 4, 4), by a kernel.
+
+        places (k, 4): where x, y, vx, vy are in the states, -1 for none, which gives zeros
+        """
+        x, rows = self._at(nodes)
+        at = x.partition.block_places
+        return planar_marginals(x.mean, x.flat, x.layout.offsets, at.start, at.size, at.offset, rows, places)
 
     def posterior(self) -> BlockGaussian:
         """The joint Gaussian."""

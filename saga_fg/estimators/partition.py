@@ -10,17 +10,35 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from saga_fg.estimators.layout import StateLayout
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.components import component_tables, regrouped_blocks
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _FEW = 4  # components of a size that are not worth a batched operation of their own
 _PACK = 64  # states that such components together may have
 _PAIRS = 200  # from which on a graph of pairs is worth building
+
+
+class BlockPlaces(NamedTuple):
+    """Where kernels find the blocks of a block-diagonal matrix, one after the other in one array.
+
+    start, size (n,) of the block of each node's component; offset (n,) of the node's state in it; first (n,): where its
+    component begins in `places` (D,), which are those of the states in the joint state. See
+    `saga_fg.kernels.components`.
+    """
+
+    start: IntArray
+    size: IntArray
+    offset: IntArray
+    first: IntArray
+    places: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +112,24 @@ class Partition:
         return tuple((of_group, self.row[of_group], self.slot[of_group]) for of_group in nodes)
 
     @cached_property
+    def _compiled_tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, BlockPlaces]:
+        """Groups, group and row as by `_tables`, made by a kernel, and what other kernels need."""
+        group, row, offset, start, size, first, sizes, counts, places = component_tables(self.label, self.layout.dims)
+        groups, at = [], 0
+        for s, c in zip(sizes.tolist(), counts.tolist(), strict=True):
+            groups.append(places[at : at + c * s].reshape(c, s))
+            at += c * s
+        return tuple(groups), group, row, BlockPlaces(start, size, offset, first, places)
+
+    @property
+    def block_places(self) -> BlockPlaces:
+        """Where kernels find the blocks."""
+        return self._compiled_tables[3]
+
+    @cached_property
     def _tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, IntArray]:
+        if compiled_kernels():
+            return (*self._compiled_tables[:3], self.block_places.offset)
         layout, label = self.layout, self.label
         none = np.empty(0, dtype=np.int64)
         if len(label) == 0:
@@ -214,12 +249,37 @@ def zeros(partition: Partition) -> BlockDiagonal:
     return tuple(np.zeros((*places.shape, places.shape[1])) for places in partition.groups)
 
 
+def flattened(blocks: BlockDiagonal) -> FloatArray:
+    """All blocks one after the other, as kernels take them; without copying if they are parts of one array already."""
+    if len(blocks) == 0:
+        return np.empty(0)
+    whole, size = blocks[0].base, sum(block.size for block in blocks)
+    if whole is not None and whole.ndim == 1 and whole.size == size and all(block.base is whole for block in blocks):
+        return whole
+    return np.concatenate([block.ravel() for block in blocks])
+
+
+def unflattened(flat: FloatArray, partition: Partition) -> BlockDiagonal:
+    """The blocks (c, s, s) of each group as views of one array."""
+    blocks, at = [], 0
+    for places in partition.groups:
+        c, s = places.shape
+        blocks.append(flat[at : at + c * s * s].reshape(c, s, s))
+        at += c * s * s
+    return tuple(blocks)
+
+
 def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: IntArray) -> BlockDiagonal:
     """Copy the blocks of a matrix over to another partition.
 
     source: for each node of `new` its row in `old`, -1 for none; a row may serve several nodes. Entries between nodes
     in different components of either partition are zero.
     """
+    if compiled_kernels() and len(new.label):
+        here, there, length = old.block_places, new.block_places, sum(p.size * p.shape[1] for p in new.groups)
+        before = flattened(blocks), old.label, here.start, here.size, here.offset, old.layout.dims
+        after = new.label, there.start, there.size, there.offset
+        return unflattened(regrouped_blocks(*before, source, *after, length), new)
     result = zeros(new)
     to = np.flatnonzero(source >= 0)
     if len(to) == 0:

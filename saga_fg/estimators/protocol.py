@@ -46,6 +46,13 @@ class Measurements:
         for name, array in (("nodes", nodes), ("z", z), ("H", H), ("R", R)):
             object.__setattr__(self, name, array)
 
+    @classmethod
+    def unchecked(cls, nodes: IntArray, z: FloatArray, H: FloatArray, R: FloatArray) -> Measurements:
+        """Measurements of arrays that were checked where they came in: H (m, k, d), R (m, k, k)."""
+        made = object.__new__(cls)
+        vars(made).update(nodes=nodes, z=z, H=H, R=R)
+        return made
+
     def __len__(self) -> int:
         return len(self.nodes)
 

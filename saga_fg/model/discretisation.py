@@ -36,6 +36,8 @@ import scipy.linalg
 import scipy.sparse
 
 from saga_fg.errors import InputError
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise
 from saga_fg.model.motion import NodeType, distinct_types
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.transition import Blocks, Transition
@@ -211,7 +213,11 @@ def _phi_and_noise(
     degree, noise_degree, doublings = _TAYLOR_DEGREE, _TAYLOR_DEGREE + 1, 0
     if nilpotency is not None:
         degree, noise_degree = max(nilpotency - 1, 0), max(2 * nilpotency - 1, 1)
-    else:
+    if compiled_kernels():
+        radius = math.inf if nilpotency is not None else _TAYLOR_RADIUS
+        of_order, Q = phi_and_noise(M, Qc, dt, order, degree, noise_degree, radius)
+        return list(of_order), Q
+    if nilpotency is None:
         doublings = _doublings(float(np.abs(M).sum(axis=-1).max(initial=0.0)) * dt)
     h = dt / 2**doublings
     Z = M * h
@@ -272,6 +278,8 @@ def _van_loan(M: FloatArray, at: IntArray, C: FloatArray, A: FloatArray, of: Int
     at (m,) and of (m,) are rows of M and A. This is the corner of the exponential of [[M, C], [0, A]] dt, whose other
     blocks are those of a node and of a type.
     """
+    if compiled_kernels():
+        return coupling_integrals(M, at, C, A, of, dt, _TAYLOR_DEGREE, _TAYLOR_RADIUS)
     row_sums = np.abs(M).sum(axis=-1)[at] + np.abs(C).sum(axis=-1)
     doublings = _doublings(dt * max(row_sums.max(initial=0.0), np.abs(A).sum(axis=-1).max(initial=0.0)))
     h = dt / 2**doublings

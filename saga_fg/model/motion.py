@@ -249,6 +249,13 @@ class NodeType:
         return checked("initial_deviation", given, (self.dim,))
 
     @cached_property
+    def planar(self) -> tuple[int, int, int, int]:
+        """Where x, y, vx, vy are in the state; -1, -1 for the velocity of a type that has none."""
+        velocity = ("vx", "vy")
+        x, y = self.index(("x", "y")).tolist()
+        return (x, y, *self.index(velocity).tolist()) if self.has(velocity) else (x, y, -1, -1)
+
+    @cached_property
     def nilpotency(self) -> int | None:
         """Smallest k with A^k = 0, so that exp(A s) is a polynomial in s of degree k - 1; None if there is none."""
         power = np.eye(self.dim)

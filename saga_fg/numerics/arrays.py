@@ -6,6 +6,7 @@ number is needed, ever reaches the numerics (or GTSAM, which would crash the int
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Container
 from functools import lru_cache
 from typing import Any, Literal
@@ -14,11 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from saga_fg.errors import InputError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
-StrArray = NDArray[np.str_]
+from saga_fg.kernels.array_types import BoolArray as BoolArray
+from saga_fg.kernels.array_types import FloatArray as FloatArray
+from saga_fg.kernels.array_types import IntArray as IntArray
+from saga_fg.kernels.array_types import StrArray as StrArray
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.labels import numbered_rows
 
 Values = Literal["finite", "finite-or-nan", "any"]
 _REMEMBERED = 1 << 16  # bytes; tables of whole recordings are not kept
@@ -150,14 +152,30 @@ def from_upper_triangle(entries: FloatArray) -> FloatArray:
 def distinct(label: StrArray) -> tuple[tuple[str, ...], IntArray]:
     """The labels that occur, in order of appearance, and the number (n,) of each row's among them, read-only.
 
-    Asked for again and again of the few tables that a frame has, it looks up what it has found before.
+    A read-only array is looked up when it is asked for again.
     """
-    look = _distinct if label.nbytes < _REMEMBERED else _distinct.__wrapped__
-    return look(np.ascontiguousarray(label).tobytes(), label.dtype.str, len(label))
+    known = _of_array.get(id(label))
+    if known is not None and known[0]() is label:
+        return known[1]
+    if not compiled_kernels() or len(label) == 0:
+        look = _distinct if label.nbytes < _REMEMBERED else _distinct.__wrapped__
+        found = look(np.ascontiguousarray(label).tobytes(), label.dtype.str, len(label))
+    else:
+        number, first = numbered_rows(np.ascontiguousarray(label).view(np.uint32).reshape(len(label), -1))
+        number.flags.writeable = False
+        found = tuple(label[first].tolist()), number
+    if not label.flags.writeable and label.base is None:
+        key = id(label)
+        _of_array[key] = weakref.ref(label, lambda _: _of_array.pop(key, None)), found
+    return found
+
+
+_Distinct = tuple[tuple[str, ...], IntArray]
+_of_array: dict[int, tuple[weakref.ref[StrArray], _Distinct]] = {}  # by id, while the array lives
 
 
 @lru_cache(maxsize=256)
-def _distinct(label: bytes, dtype: str, count: int) -> tuple[tuple[str, ...], IntArray]:
+def _distinct(label: bytes, dtype: str, count: int) -> _Distinct:
     of_row = np.frombuffer(label, dtype=dtype, count=count).tolist()
     names = tuple(dict.fromkeys(of_row))
     number = dict(zip(names, range(len(names)), strict=True))

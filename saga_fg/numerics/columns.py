@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from saga_fg.numerics.arrays import BoolArray, IntArray
 
@@ -33,8 +34,8 @@ class Columns:
         return self._each(lambda column: column[index])
 
     def copied(self) -> Self:
-        """A table of the same rows that shares no array with this one."""
-        return self._each(np.ndarray.copy)
+        """A table of the same rows that shares no array with this one that can be written."""
+        return self._each(lambda column: column.copy() if column.flags.writeable else column)
 
     def _each(self, change: Callable[[Any], Any]) -> Self:
         """The table with its arrays changed: rows of a validated table, nothing to check again."""
@@ -42,7 +43,7 @@ class Columns:
         for name in self.__dataclass_fields__:
             column = mine[name]
             if isinstance(column, np.ndarray):  # anything else belongs to the whole table, or is one
-                column = change(column)
+                column = _frozen_names(change(column))
             elif isinstance(column, Columns):
                 column = column._each(change)
             vars(changed)[name] = column
@@ -63,4 +64,11 @@ def _concatenated(columns: Sequence[Any]) -> Any:
     first = columns[0]
     if isinstance(first, tuple):
         return first
-    return first.concatenate(columns) if isinstance(first, Columns) else np.concatenate(columns)
+    return first.concatenate(columns) if isinstance(first, Columns) else _frozen_names(np.concatenate(columns))
+
+
+def _frozen_names(column: NDArray[Any]) -> NDArray[Any]:
+    """A column that nobody else has, read-only if it has strings: they are replaced as a whole, and looked up often."""
+    if column.dtype.kind == "U":
+        column.flags.writeable = False
+    return column

@@ -9,9 +9,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.pairs import compared_pairs
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 MOST_COMPARED = 30_000  # distances that are computed at once: those of 170 places to each other
+MOST_LOOPED = 500_000  # distances that a kernel computes
 _LEAST = 1e-9  # m, so that a reach of 0 has a logarithm
 
 
@@ -23,6 +26,8 @@ def near_pairs(
     a (n, 2), b (m, 2), reach (n,) and further (m,) in m; where one of these is NaN there is no pair
     """
     further = np.broadcast_to(further, len(b))
+    if compiled_kernels() and len(a) * len(b) <= MOST_LOOPED:
+        return compared_pairs(a, b, reach, further)
     if len(a) * len(b) <= MOST_COMPARED:
         return _compared(a, b, reach, further)
     i, j = np.flatnonzero(~np.isnan(reach)), np.flatnonzero(~np.isnan(further))

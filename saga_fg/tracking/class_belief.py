@@ -36,33 +36,33 @@ class ClassGroups:
         self.classes = tuple(label for group in self._groups for label in group)
         self._number = [number for number, group in enumerate(self._groups) for _ in group]
         self._column = {label: k for k, label in enumerate(self.classes)}
+        self._of_label: dict[str, int] = {}  # numbers as `numbers` gives them
 
     def __len__(self) -> int:
         return len(self.classes)
 
     def same_group(self, labels: StrArray, others: StrArray) -> BoolArray:
         """(n, m) which classes (n,) equal others (m,) or share a group with them."""
-        (classes, of_row), (their_classes, of_column) = distinct(labels), distinct(others)
-        same = [[a == b or self._mated(a, b) for b in their_classes] for a in classes]
-        return np.array(same, dtype=bool).reshape(len(classes), len(their_classes))[of_row[:, None], of_column]
+        return np.asarray(self.numbers(labels)[:, None] == self.numbers(others))
+
+    def numbers(self, label: StrArray) -> IntArray:
+        """(n,) equal for classes that equal each other or share a group, also between calls."""
+        classes, of_row = distinct(label)
+        return np.array([self._of_label.get(c) or self._numbered(c) for c in classes], dtype=np.int64)[of_row]
+
+    def _numbered(self, label: str) -> int:
+        column = self._column.get(label)
+        first = label if column is None else self._groups[self._number[column]][0]
+        return self._of_label.setdefault(label, self._of_label.setdefault(first, len(self._of_label) + 1))
 
     def pairs_of_group(self, labels: StrArray, others: StrArray, i: IntArray, j: IntArray) -> BoolArray:
         """(K,) whether the classes of labels[i] and others[j], i and j (K,), are one or share a group."""
-        if len(i) == 0:
-            return np.zeros(0, dtype=bool)
-        (classes, of_label), (their_classes, of_other) = distinct(labels), distinct(others)
-        return self.same_group(np.array(classes), np.array(their_classes))[of_label[i], of_other[j]]
+        return np.asarray(self.numbers(labels)[i] == self.numbers(others)[j])
 
     def number_of_group(self, labels: StrArray) -> IntArray:
         """(n,) how many of the labels (n,) are of the same class or group as each."""
-        classes, of_label = distinct(labels)
-        names = np.array(classes)
-        return (self.same_group(names, names) @ np.bincount(of_label, minlength=len(classes)))[of_label]
-
-    def _mated(self, label: str, other: str) -> bool:
-        """True if two classes share a group."""
-        a, b = self._column.get(label), self._column.get(other)
-        return a is not None and b is not None and self._number[a] == self._number[b]
+        number = self.numbers(labels)
+        return np.bincount(number)[number]
 
     def likelihood(self, label: StrArray, sensor: Sensor) -> FloatArray:
         """L (m, C) of detections of the classes `label` (m,) by a sensor."""
@@ -88,6 +88,8 @@ class ClassGroups:
         had = np.where(of_group, belief[np.arange(len(label)), row], np.inf)
         best = belief.argmax(axis=1)
         likelier = belief.max(axis=1, initial=0.0) > had + 1e-9
+        if not likelier.any():
+            return label
         return np.where(likelier, np.array(self.classes)[best], label)
 
     def certainty(self, belief: FloatArray) -> FloatArray:

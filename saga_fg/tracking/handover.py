@@ -26,10 +26,13 @@ import math
 
 import numpy as np
 
+from saga_fg.estimators import JointKalmanFilter
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.returns import return_evidence, returned_pairs
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
-from saga_fg.numerics.near_pairs import near_pairs
+from saga_fg.numerics.near_pairs import MOST_LOOPED, near_pairs
 from saga_fg.tracking.initiation import unmeasured_velocity
 from saga_fg.tracking.relinking import area, least_log_odds, log_survival
 from saga_fg.tracking.tracker_state import TrackerState
@@ -67,6 +70,10 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     if len(new) == 0:
         return new, new, new
     old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.max_coasting))
+    if compiled_kernels() and len(new) * len(old) <= MOST_LOOPED:
+        now, still, group = state.kinematics(), table.stationarity, state.class_groups.numbers(table.label)
+        places = now.position, now.P, still.position, still.P
+        return returned_pairs(new, old, group, table.initiated, table.last_detected, *places, _FARTHEST)
     i, j = _near(state, new, old)
     alike = state.class_groups.pairs_of_group(table.label[new], table.label[old], i, j)
     chosen = alike & (table.last_detected[old[j]] < table.initiated[new[i]])
@@ -95,6 +102,13 @@ def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[Fl
     now, prior = state.kinematics(), state.settings.stationarity.prior
     each, of_pair = np.unique(new, return_inverse=True)  # a new track is in many pairs
     _, V_0, p = unmeasured_velocity(state, state.boxes(now.position, now.velocity).select(each), prior)
+    if compiled_kernels() and isinstance(state.joint.estimator, JointKalmanFilter):
+        ends, places = (new, old), state.joint.places(table.label)
+        (x, P), (x_old, P_old) = (state.joint.estimator.planar_marginals(table.id[k], places[k]) for k in ends)
+        place, D, s = stationarity.position, stationarity.P, stationarity.probability
+        velocity = places[new, 2] >= 0, V_0[of_pair], p[of_pair]
+        if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
+        return return_evidence(x, P, x_old, P_old, *velocity, *if_still)
     V_0, p = V_0[of_pair], np.clip(p, 1e-9, 1 - 1e-9)[of_pair]
     s, s_new = (np.clip(stationarity.probability[rows], 0.0, 1 - 1e-9) for rows in (old, new))
     moving = np.log1p(-s) + np.log1p(-s_new) - np.log1p(-p)

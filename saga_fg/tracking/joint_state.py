@@ -15,6 +15,7 @@ import numpy as np
 
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
+from saga_fg.kernels.compilation import compiled_kernels
 from saga_fg.model.discretisation import discretise, own_motion
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import POSITION, VELOCITY
@@ -57,16 +58,20 @@ class JointTrackState:
         self.estimator = estimator
         self._motion = motion
         self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
+        self._type_of: dict[str, NodeType] = {}
+        self._kinds: dict[tuple[tuple[str, ...], bool], tuple[list[NodeType], IntArray]] = {}
         self._initiated: dict[int, float] = {}  # on the estimator's clock
         self._modes: dict[Mixture, ModeTable] = {}  # of tracks that move by a mixture
         self._kinematics: Kinematics | None = None  # until the state changes
 
     def type_of(self, label: str) -> NodeType:
         """The node type of a class."""
-        motion = self._motion(label)
-        if motion not in self._types:
-            self._types[motion] = NodeType(type(motion).__name__, motion)
-        return self._types[motion]
+        found = self._type_of.get(label)
+        if found is None:
+            motion = self._motion(label)
+            found = self._types.setdefault(motion, NodeType(type(motion).__name__, motion))
+            self._type_of[label] = found
+        return found
 
     def types_of(self, label: StrArray) -> tuple[NodeType, ...]:
         """The node type of each row (n,)."""
@@ -211,6 +216,9 @@ class JointTrackState:
 
     def kinematics_of(self, ids: IntArray, label: StrArray) -> Kinematics:
         """The estimates of some nodes, which need not be tracks."""
+        if compiled_kernels() and isinstance(self.estimator, JointKalmanFilter):
+            x, P = self.estimator.planar_marginals(ids, self.places(label))
+            return Kinematics(x[:, :2], x[:, 2:], P[:, :2, :2], P[:, 2:, 2:])
         n = len(ids)
         result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
         for node_type, rows in self.rows_by_type(label):
@@ -221,6 +229,11 @@ class JointTrackState:
                 at_v = node_type.index(VELOCITY)
                 result.velocity[rows], result.P_velocity[rows] = mean[:, at_v], covariance[:, at_v[:, None], at_v]
         return result
+
+    def places(self, label: StrArray) -> IntArray:
+        """(n, 4) where x, y, vx, vy are in the state of each track, -1 for none."""
+        classes, index = distinct(label)
+        return np.array([self.type_of(c).planar for c in classes], dtype=np.int64).reshape(-1, 4)[index]
 
     def position_covariance(self, ids: IntArray, label: StrArray) -> FloatArray:
         """(2n, 2n) joint covariance of the positions of n tracks, track by track."""
@@ -254,7 +267,10 @@ class JointTrackState:
     def measure(
         self, node_type: NodeType, ids: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, delay: float
     ) -> None:
-        """Take in linear measurements of tracks of one type: z (k, m), H (k, m, d), R (k, m, m), `delay` s old."""
+        """Take in linear measurements of tracks of one type: z (k, m), H (k, m, d), R (k, m, m), `delay` s old.
+
+        They are not checked: detections and the settings of sensors are, when they are made.
+        """
         estimator = self._estimator_to_change()
         if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
             self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
@@ -264,11 +280,11 @@ class JointTrackState:
             known = [self._initiated[track] <= then for track in ids.tolist()]
             there = np.array(known, dtype=np.bool_) & (then >= estimator.start)
             if there.any():
-                estimator.update(Measurements(ids[there], z[there], H[there], R[there]), time=then)
+                estimator.update(Measurements.unchecked(ids[there], z[there], H[there], R[there]), time=then)
             ids, z, H, R = ids[~there], z[~there], H[~there], R[~there]
         if delay > 0:
             H, R = moved_to_present(node_type, H, R, delay)
-        estimator.update(Measurements(ids, z, H, R))
+        estimator.update(Measurements.unchecked(ids, z, H, R))
 
     def _anchor_modes(self) -> None:
         estimator = self.estimator
@@ -286,15 +302,22 @@ class JointTrackState:
         Nonlinear motions and mixtures are always separate.
         """
         classes, index = distinct(label)
+        types, kind = self._kinds.get((classes, moving)) or self._kinds_of(classes, moving)
+        if len(types) == 1:
+            return [(types[0], np.arange(len(label)))]
+        of_row = kind[index]
+        return [(node_type, (of_row == k).nonzero()[0]) for k, node_type in enumerate(types)]
+
+    def _kinds_of(self, classes: tuple[str, ...], moving: bool) -> tuple[list[NodeType], IntArray]:
+        """A type of each kind that `rows_by_type` distinguishes, and the kind (k,) of each class."""
         types = [self.type_of(c) for c in classes]
         number: dict[object, int] = {}
         apart = [moving or t.flow is not None or isinstance(t.motion, Mixture) for t in types]
         names = [id(t) if own else t.components for own, t in zip(apart, types, strict=True)]
         kind = [number.setdefault(name, len(number)) for name in names]
-        if len(number) == 1:
-            return [(types[0], np.arange(len(label)))]
-        of_row = np.array(kind, dtype=np.int64)[index]
-        return [(types[kind.index(k)], np.flatnonzero(of_row == k)) for k in range(len(number))]
+        found = [types[kind.index(k)] for k in range(len(number))], np.array(kind, dtype=np.int64)
+        self._kinds[classes, moving] = found
+        return found
 
 
 def _local_pose(graph: SceneFactorGraph) -> FloatArray | None:

@@ -6,7 +6,7 @@ A tracker without an observer pays nothing for the possibility; a view is made o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -80,7 +80,7 @@ class TrackerView:
             measurements,
             matching,
             np.empty(0, dtype=np.int64) if initiated is None else initiated,
-            state.boxes(now.position, now.velocity),
+            replace(state.boxes(now.position, now.velocity)),
             state.joint.estimator.graph() if state.providers else None,
         )
 

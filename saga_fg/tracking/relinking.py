@@ -25,9 +25,11 @@ import math
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.pairs import relinking_pairs
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
-from saga_fg.numerics.near_pairs import near_pairs
+from saga_fg.numerics.near_pairs import MOST_LOOPED, near_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.stationarity import log_density
 from saga_fg.tracking.tracker_state import TrackerState
@@ -53,19 +55,43 @@ def relinked(
     if len(tracks) == 0:
         return matching
     places, noise = measurements.boxes.position[rows, :2] - state.origin, measurements.R[rows, :2, :2]
-    i, j = _within_reach(state, tracks, position, P, places, noise)
-    alike = state.class_groups.pairs_of_group(state.table.label[tracks], label, i, j)
-    i, j = i[alike], j[alike]
-    if len(i) == 0:
-        return matching
-    t, d, others, z, R = tracks[i], rows[j], state.class_groups.number_of_group(label)[j], places[j], noise[j]
-    moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
-    still = _log_density(z - state.table.stationarity.position[t], S)
-    log_odds = log_survival(state)[t] + _mixed(state, t, moving, still) - np.log(others / area(state))
-    chosen = least_total(t, d, least_log_odds(state) - log_odds)
+    if compiled_kernels() and len(tracks) * len(rows) <= MOST_LOOPED:
+        t, j, cost = _pairs(state, tracks, position, P, label, places, noise)
+        if len(t) == 0:
+            return matching
+        d, z, R = rows[j], places[j], noise[j]
+    else:
+        i, j = _within_reach(state, tracks, position, P, places, noise)
+        alike = state.class_groups.pairs_of_group(state.table.label[tracks], label, i, j)
+        i, j = i[alike], j[alike]
+        if len(i) == 0:
+            return matching
+        t, d, others, z, R = tracks[i], rows[j], state.class_groups.number_of_group(label)[j], places[j], noise[j]
+        moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
+        still = _log_density(z - state.table.stationarity.position[t], S)
+        log_odds = log_survival(state)[t] + _mixed(state, t, moving, still) - np.log(others / area(state))
+        cost = least_log_odds(state) - log_odds
+    chosen = least_total(t, d, cost)
     t, d = t[chosen], d[chosen]
     distance, _ = mahalanobis_of_pairs(z[chosen] - position[t], P[t] + R[chosen])
     return matching.append(Matching(t, d, distance))
+
+
+def _pairs(
+    state: TrackerState,
+    tracks: IntArray,
+    position: FloatArray,
+    P: FloatArray,
+    label: StrArray,
+    z: FloatArray,
+    R: FloatArray,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Rows of tracks, of places `z` (m, 2) of classes `label` (m,), and costs (k,) of all pairs, by a kernel."""
+    still, number = state.table.stationarity, state.class_groups.numbers
+    group, of_place = number(state.table.label), number(label)
+    log_density = np.log(np.bincount(of_place)[of_place] / area(state))
+    objects = position, P, still.position, still.P, still.probability, log_survival(state)
+    return relinking_pairs(tracks, group, *objects, z, R, of_place, log_density, least_log_odds(state), _ROUNDING)
 
 
 def _within_reach(

@@ -20,6 +20,8 @@ growth are the sensor's noise settings, see `saga_fg.model.sensor`.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -36,7 +38,7 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     table, settings, rows = state.table, state.settings, reported_rows(state)
     coasting, tentative = table.coasting(state.time), table.tentative
     table, coasting, now = table.select(rows), coasting[rows], state.reported_kinematics().select(rows)
-    boxes = table.boxes(now.position + state.origin, now.velocity)
+    boxes = replace(table.boxes(now.position + state.origin, now.velocity))  # checked, and their own
     P = calibrated_covariance(now.P, boxes.yaw, table.covariance_scale, table.position_bias)
     certainty = state.class_groups.certainty(table.class_belief)
     score = reported_score(table, certainty, coasting > 0, settings.existence)

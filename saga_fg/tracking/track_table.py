@@ -88,7 +88,7 @@ class TrackTable(Columns):
         )
 
     def snapshot(self) -> Self:
-        """A copy that shares no array with this table."""
+        """A copy that shares no array with this table that can be written."""
         return self.copied()
 
     @property
@@ -105,6 +105,6 @@ class TrackTable(Columns):
         return np.asarray(np.round(now - self.last_in_view, 6))
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
-        """The boxes of all tracks at positions (n, 2), world, with velocities (n, 2)."""
+        """The boxes of all tracks at positions (n, 2), world, with velocities (n, 2), which are not checked."""
         centre = np.concatenate([position, self.box.z[:, None]], axis=1)
-        return Boxes(self.label, centre, self.box.size, self.box.yaw, velocity)
+        return Boxes.unchecked(self.label, centre, self.box.size, self.box.yaw, velocity)

@@ -167,12 +167,17 @@ class Traffic:
             self.lanes = Passages.concatenate([*([] if self.lanes is None else [self.lanes]), *parts])
             self.lane_names, self._trails = self.lane_names + tuple(lane.name for lane in new), None
 
+    def trail_points(self) -> Passages | None:
+        """The passages of those that move, and of lanes; None without any."""
+        parts = [each.select(each.moves) for each in (self.left, self.latest, self.lanes) if each is not None]
+        found = Passages.concatenate(parts) if parts else None
+        return None if found is None or len(found) == 0 else found
+
     def trails(self) -> tuple[Passages, cKDTree] | None:
         """The passages of those that move, and of lanes, with a tree of their positions; None without any."""
         if self._trails is None:
-            parts = [each.select(each.moves) for each in (self.left, self.latest, self.lanes) if each is not None]
-            found = Passages.concatenate(parts) if parts else None
-            if found is None or len(found) == 0:
+            found = self.trail_points()
+            if found is None:
                 return None
             self._trails = found, cKDTree(found.position, balanced_tree=False, compact_nodes=False)
         return self._trails

@@ -18,6 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.trails import trail_paths
 from saga_fg.model.interactions import unit
 from saga_fg.model.paths import Paths
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -31,6 +33,7 @@ TURN = 0.3  # rad, sigma of the kernel on the difference of headings
 AGREEMENT = 0.2  # rad, deviation of the headings of trails from which they say little
 _BEND = 20.0  # m, along which a curvature of one's own fades
 _LEAST = 1e-9
+_NO_POINTS = (np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0, dtype=bool))
 _NEARER = np.tril(np.ones((NEAREST, NEAREST), dtype=np.bool_), -1)
 
 
@@ -52,6 +55,15 @@ def paths(
 
     Their steps are `STEP` m long, their rows 0 to n - 1.
     """
+    if compiled_kernels():
+        points = traffic.trail_points() if traffic.settings.reach > 0 else None
+        scales = max(traffic.settings.reach, _LEAST), STEP, _BEND, TURN, PRIOR, AGREEMENT
+        known = _NO_POINTS
+        if points is not None:
+            timed = np.isfinite(points.variance)
+            known = points.id, points.position, points.heading, points.speed, timed
+        tracks = ids, position, heading, curvature
+        return Paths(np.arange(len(ids)), *trail_paths(*known, *tracks, steps, NEAREST, *scales))
     place, beside = position, _beside(traffic, ids, position, heading)
     course = heading + beside.certainty * beside.turn
     certainty, disagreement = beside.certainty, beside.variance

@@ -60,6 +60,15 @@ class Boxes(Columns):
         vars(self).update(label=label, position=position, size=size, yaw=yaw, velocity=velocity)
 
     @classmethod
+    def unchecked(
+        cls, label: StrArray, position: FloatArray, size: FloatArray, yaw: FloatArray, velocity: FloatArray
+    ) -> Self:
+        """Boxes of arrays that were checked where they came in, with headings that are wrapped."""
+        made = object.__new__(cls)
+        vars(made).update(label=label, position=position, size=size, yaw=yaw, velocity=velocity)
+        return made
+
+    @classmethod
     def of(
         cls,
         label: Sequence[str] | StrArray,

@@ -29,6 +29,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.overlap import paired_overlaps
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.types.boxes import Boxes
@@ -56,6 +58,8 @@ def iou_3d(a: Boxes, b: Boxes) -> FloatArray:
 
 def paired_bev_iou(a: Boxes, b: Boxes) -> FloatArray:
     """(N,) IoU of the footprints of a[n] and b[n]; NaN where a size or heading is unknown."""
+    if compiled_kernels():
+        return paired_overlaps(a.position, a.size, a.yaw, b.position, b.size, b.yaw, HAIR)
     common = paired_intersection(a, b)
     return np.asarray(common / (_area(a) + _area(b) - common))
 

@@ -129,6 +129,28 @@ def test_a_scan_is_registered_to_a_centimetre_and_the_covariance_says_so() -> No
     assert 1.5 < np.mean(squares) < 24  # 6 if the map were exact; it is one noisy scan
 
 
+def test_the_registration_of_open3d_agrees_with_ours() -> None:
+    world, poses = street(3), drive(2, speed=4.0)
+    first, second = scans(world, poses, 0, skewed=False)
+    surfels = SurfelMap(1.0, reach=100.0)
+    surfels.add(first.points[voxel_downsample(first.points, 0.25)], np.zeros(3))
+    points = second.points[voxel_downsample(second.points, 1.5)]
+    ours, theirs = (
+        register(points, surfels, np.eye(4), 3.0, 0.1, RegistrationSettings(method=method))
+        for method in ("gauss-newton", "open3d")
+    )
+    between = gtsam.Pose3.Logmap(gtsam.Pose3(inverse_transform(ours.map_T_scan) @ theirs.map_T_scan))
+    assert theirs.converged
+    assert np.linalg.norm(between[3:]) < 0.02
+    assert np.linalg.norm(between[:3]) < 0.001
+    np.testing.assert_allclose(np.diag(theirs.covariance), np.diag(ours.covariance), rtol=1.0)
+    plane = np.random.default_rng(0).uniform([-20, -20, 0], [20, 20, 0.02], (20000, 3))
+    ground = SurfelMap(1.0, reach=100.0)
+    ground.add(plane, np.zeros(3))
+    with pytest.raises(RegistrationError, match="leave a direction of motion unconstrained"):
+        register(plane[::20], ground, np.eye(4), 1.0, 0.1, RegistrationSettings(method="open3d"))
+
+
 def test_what_cannot_be_registered_is_said() -> None:
     surfels = SurfelMap(1.0, reach=100.0)
     ground = np.random.default_rng(0).uniform([-20, -20, 0], [20, 20, 0.02], (20000, 3))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.lidar import Scan, read_scan, write_ply
+from data_tools.lidar import Scan, read_scan, write_cloud
 from saga_fg.errors import InputError
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.5, 0.25, -1.75], [10.0, -20.0, 0.5]])
@@ -71,7 +71,7 @@ def test_every_format_gives_the_same_points(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["scan.ply", "scan.npy"])
 def test_points_without_intensity_have_none(tmp_path: Path, name: str) -> None:
     if name == "scan.ply":
-        write_ply(tmp_path / name, POINTS, np.full((3, 3), 200, dtype=np.uint8))
+        write_cloud(tmp_path / name, POINTS, np.full((3, 3), 200, dtype=np.uint8))
     else:
         np.save(tmp_path / name, POINTS)
     scan = read_scan(tmp_path / name)
@@ -119,7 +119,7 @@ def test_an_array_of_another_shape_and_an_archive_without_points_are_refused(tmp
 
 def test_colours_must_fit_the_points(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"colours: expected \(3, 3\) bytes"):
-        write_ply(tmp_path / "a.ply", POINTS, np.zeros((2, 3), dtype=np.uint8))
+        write_cloud(tmp_path / "a.ply", POINTS, np.zeros((2, 3), dtype=np.uint8))
     assert not list(tmp_path.iterdir())
 
 
@@ -128,3 +128,14 @@ def test_a_scan_is_checked_and_cut_by_range() -> None:
     assert scan.within(4.0, 10.0).time.tolist() == [0.1]  # type: ignore[union-attr]
     with pytest.raises(InputError, match=r"intensity: expected shape \(3,\)"):
         Scan(POINTS, INTENSITY[:2])
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd"])
+def test_clouds_are_written_and_read_back(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    write_cloud(path, POINTS)
+    np.testing.assert_array_equal(read_scan(path).points, POINTS)
+    write_cloud(tmp_path / "none.ply", np.empty((0, 3)))
+    assert len(read_scan(tmp_path / "none.ply")) == 0
+    with pytest.raises(InputError, match=r"expected a name that ends in \.ply or \.pcd"):
+        write_cloud(tmp_path / "a.las", POINTS)

@@ -14,9 +14,10 @@ def by_distances(a, b, reach, further):
     return np.nonzero(distance <= reach[:, None] + further)
 
 
-@pytest.fixture(params=[0, 10**9], ids=["tree", "compared"])
+@pytest.fixture(params=[(0, 0), (10**9, 0), (0, 10**9)], ids=["tree", "compared", "kernel"])
 def most_compared(request, monkeypatch):
-    monkeypatch.setattr(module, "MOST_COMPARED", request.param)
+    monkeypatch.setattr(module, "MOST_COMPARED", request.param[0])
+    monkeypatch.setattr(module, "MOST_LOOPED", request.param[1])
 
 
 @pytest.mark.usefixtures("most_compared")

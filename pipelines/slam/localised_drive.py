@@ -1,0 +1,84 @@
+"""A recording localised in the map of an earlier drive, and its results as files.
+
+trajectory.tum, trajectory.txt, times.txt   poses of the vehicle in the map's frame
+reference.tum                               the recording's own poses
+metrics.json    errors against these, as they are and with the path aligned; scans, those registered with the map, and
+                the first that was
+above.png       map and paths from above
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.figures import write_figures
+from data_tools.files.atomic_files import atomic_directory, write_bytes
+from data_tools.lidar import voxel_downsample
+from data_tools.lidar.scan import ScanSequence
+from data_tools.plots import png, scan_map_from_above
+from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
+from pipelines.slam.localisation import Localiser, LocaliserSettings
+from pipelines.slam.slam_map import SlamMap
+from pipelines.tracking import Progress
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
+
+
+@dataclass(frozen=True, eq=False)
+class LocalisedDrive:
+    """Poses (K) of the vehicle in the map, and whether each scan (K,) was registered with it."""
+
+    trajectory: Trajectory
+    registered: BoolArray
+
+
+def localise(
+    scans: ScanSequence,
+    slam_map: SlamMap,
+    guess: FloatArray | None = None,
+    settings: LocaliserSettings | None = None,
+    progress: Progress | None = None,
+) -> LocalisedDrive:
+    """Localise a recording in a map.
+
+    guess: map_T_ego (4, 4) of the vehicle at the first scan, None: it is looked for. Of the recording's poses none is
+    used. Raises `InputError` where no place of the map was found.
+    """
+    localiser = Localiser(slam_map, None if guess is None else guess @ scans.ego_T_lidar, settings)
+    registered: BoolArray = np.zeros(len(scans), dtype=np.bool_)
+    for k, time in enumerate(scans.timestamps.tolist()):
+        registered[k] = localiser.step(scans[k], time).registered
+        if progress is not None:
+            progress("localising", k + 1, len(scans))
+    path = localiser.path()
+    if path is None:
+        raise InputError("map: expected one that shows a place of this drive, none was found; a guess may help")
+    return LocalisedDrive(Trajectory(scans.timestamps, path @ inverse_transform(scans.ego_T_lidar)), registered)
+
+
+def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, slam_map: SlamMap) -> dict[str, Any]:
+    """Write all files, or none; returns the metrics."""
+    truth, path = Trajectory(scans.timestamps, scans.world_T_ego), found.trajectory
+    figures: dict[str, Any] = {
+        "scans": len(scans),
+        "registered": int(found.registered.sum()),
+        "first_registered": int(np.argmax(found.registered)) if found.registered.any() else None,
+        "trajectory": asdict(trajectory_errors(path, truth, "none")),
+        "aligned": asdict(trajectory_errors(path, truth, "rigid")),
+    }
+    placed = zip(slam_map.map_T_submap, slam_map.points, strict=True)
+    points = np.concatenate([transform_points(pose, cloud.astype(np.float64)) for pose, cloud in placed])
+    points = points[voxel_downsample(points, 0.3)]
+    with atomic_directory(output) as folder:
+        write_kitti_poses(folder / "trajectory.txt", path, folder / "times.txt")
+        write_tum_poses(folder / "trajectory.tum", path)
+        write_tum_poses(folder / "reference.tum", truth)
+        drawn = {"reference": truth.positions, "trajectory": path.positions}
+        write_bytes(folder / "above.png", png(scan_map_from_above(points, drawn, np.empty((0, 2)), {})))
+        write_figures(folder / "metrics.json", figures)
+    return figures

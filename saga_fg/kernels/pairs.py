@@ -1,0 +1,180 @@
+"""Pairs of tracks and measurements that may belong together, with their costs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from saga_fg.kernels.array_types import FloatArray, IntArray
+from saga_fg.kernels.compilation import kernel
+
+Gated = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+@kernel("f2 f2 f1 f1")
+def compared_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
+    """Rows (k,) of places a (n, 2) and b (m, 2) with |a_i - b_j| <= reach_i + further_j, in order of i, then of j."""
+    n, m = len(a), len(b)
+    k, room = 0, max(64, 2 * (n + m))
+    row, column = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
+    low, high, widest = math.inf, -math.inf, -math.inf
+    for j in range(m):
+        low, high = min(low, b[j, 0]), max(high, b[j, 0])
+        if further[j] > widest:
+            widest = further[j]
+    width = max((high - low) / max(m, 1), 1e-9)
+    first, following = np.full(m, -1, dtype=np.int64), np.empty(m, dtype=np.int64)
+    for j in range(m - 1, -1, -1):  # strips of equal width along x
+        strip = min(int((b[j, 0] - low) / width), m - 1)
+        following[j], first[strip] = first[strip], j
+    for i in range(n):
+        span, begin = reach[i] + widest, k
+        if not span >= 0 or m == 0:
+            continue
+        start, end = (a[i, 0] - span - low) / width - 1, (a[i, 0] + span - low) / width + 1
+        if end < 0 or start >= m:
+            continue
+        for strip in range(int(max(start, 0.0)), int(min(end, m - 1.0)) + 1):
+            j = first[strip]
+            while j >= 0:
+                x, y, r = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], reach[i] + further[j]
+                if x * x + y * y <= r * r:
+                    if k == room:
+                        row, column, room = np.append(row, row), np.append(column, column), 2 * room
+                    row[k] = i
+                    at = k
+                    while at > begin and column[at - 1] > j:
+                        column[at] = column[at - 1]
+                        at -= 1
+                    column[at] = j
+                    k += 1
+                j = following[j]
+    return row[:k].copy(), column[:k].copy()
+
+
+@kernel("f2 f3 f1 f1 i1 f2 f2 f3 i1 f2")
+def gated_pairs(
+    position: FloatArray,
+    P: FloatArray,
+    reach: FloatArray,
+    gate: FloatArray,
+    group: IntArray,
+    belief: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    group_z: IntArray,
+    likelihood: FloatArray,
+) -> Gated:
+    """Rows of the tracks and of the measurements (k,) of pairs inside the gates, innovation (k, 2), S (k, 2, 2), d2 and
+    cost (k,), as `saga_fg.tracking.association` defines them, without overlap.
+
+    Of n tracks: position (n, 2), P (n, 2, 2), reach (n,), gate (n,), group (n,), belief (n, C); of m measurements: z
+    (m, 2), R (m, 2, 2), group_z (m,), likelihood (m, C); C = 0: classes tell nothing more
+    """
+    n, m, classes = len(position), len(z), belief.shape[1]
+    k, room = 0, max(64, 2 * (n + m))
+    track, detection = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
+    numbers = np.empty((room, 7))
+    for i in range(n):
+        for j in range(m):
+            if group[i] != group_z[j]:
+                continue
+            x, y = z[j, 0] - position[i, 0], z[j, 1] - position[i, 1]
+            if not x * x + y * y <= reach[i] * reach[i]:
+                continue
+            a, b, c = P[i, 0, 0] + R[j, 0, 0], P[i, 0, 1] + R[j, 0, 1], P[i, 1, 1] + R[j, 1, 1]
+            det = a * c - b * b
+            d2 = (c * x * x - 2 * b * x * y + a * y * y) / det
+            of_class = 0.0
+            if classes > 0:
+                chance = 0.0
+                for q in range(classes):
+                    chance += belief[i, q] * likelihood[j, q]
+                if chance > 0:
+                    of_class = -2 * math.log(chance)
+            if not d2 + of_class < gate[i]:
+                continue
+            if k == room:
+                track, detection = np.append(track, track), np.append(detection, detection)
+                numbers, room = np.concatenate((numbers, numbers)), 2 * room
+            track[k], detection[k] = i, j
+            numbers[k, 0], numbers[k, 1], numbers[k, 2], numbers[k, 3], numbers[k, 4] = x, y, a, b, c
+            numbers[k, 5], numbers[k, 6] = d2, d2 + np.log(det) + of_class
+            k += 1
+    S = np.empty((k, 2, 2))
+    for p in range(k):
+        S[p, 0, 0], S[p, 0, 1], S[p, 1, 0], S[p, 1, 1] = numbers[p, 2], numbers[p, 3], numbers[p, 3], numbers[p, 4]
+    found = numbers[:k]
+    return (
+        track[:k].copy(),
+        detection[:k].copy(),
+        found[:, :2].copy(),
+        S,
+        found[:, 5].copy(),
+        found[:, 6].copy(),
+    )
+
+
+@kernel("i1 i1 f2 f3 f2 f3 f1 f1 f2 f3 i1 f1 f f")
+def relinking_pairs(
+    tracks: IntArray,
+    group: IntArray,
+    position: FloatArray,
+    P: FloatArray,
+    place: FloatArray,
+    D: FloatArray,
+    stationary: FloatArray,
+    log_survival: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    group_z: IntArray,
+    log_density: FloatArray,
+    least: float,
+    rounding: float,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Pairs of `tracks` and measurements (k,) with their costs (k,), the least log-odds less theirs.
+
+    Of all n tracks: group (n,), N(position, P) if they move, N(place, D) if they are stationary, with the probability
+    `stationary` (n,); of m measurements: z (m, 2), R (m, 2, 2), group_z (m,), log_density (m,) of others like them.
+    Left out are pairs whose distance neither density reaches, see `saga_fg.tracking.relinking`; rounding: factor on it
+    """
+    largest = -math.inf
+    for j in range(len(z)):
+        largest = max(largest, -log_density[j])
+    found_t, found_d, costs = [0][:0], [0][:0], [0.0][:0]
+    gates = np.empty(2)
+    log_2_pi = math.log(2 * math.pi)
+    for i in tracks:
+        most = log_survival[i] + largest - log_2_pi - least
+        for still in range(2):
+            C = D if still else P
+            det = max(C[i, 0, 0] * C[i, 1, 1] - C[i, 0, 1] * C[i, 0, 1], 1e-300)
+            gates[still] = max(2 * most - math.log(det), 0.0) * rounding
+        for j in range(len(z)):
+            if group[i] != group_z[j]:
+                continue
+            near = False
+            for still in range(2):
+                mean, C = (place, D) if still else (position, P)
+                x, y = z[j, 0] - mean[i, 0], z[j, 1] - mean[i, 1]
+                trace = C[i, 0, 0] + C[i, 1, 1] + R[j, 0, 0] + R[j, 1, 1]
+                near = near or x * x + y * y <= gates[still] * trace
+            if not near:
+                continue
+            s = min(max(stationary[i], 0.0), 1 - 1e-9)
+            terms = math.log1p(-s), math.log(max(s, 1e-300))
+            total = -math.inf
+            for still in range(2):
+                mean, C = (place, D) if still else (position, P)
+                x, y = z[j, 0] - mean[i, 0], z[j, 1] - mean[i, 1]
+                a, b, c = C[i, 0, 0] + R[j, 0, 0], C[i, 0, 1] + R[j, 0, 1], C[i, 1, 1] + R[j, 1, 1]
+                det = a * c - b * b
+                density = -0.5 * ((c * x * x - 2 * b * x * y + a * y * y) / det + np.log(det)) - log_2_pi
+                term = density + (terms[1] if still else terms[0])
+                high, low = max(total, term), min(total, term)
+                total = high if low == -math.inf else high + math.log1p(math.exp(low - high))
+            found_t.append(i)
+            found_d.append(j)
+            costs.append(least - (log_survival[i] + total - log_density[j]))
+    return np.array(found_t), np.array(found_d), np.array(costs)

@@ -1,0 +1,140 @@
+"""Localisation in the map of an earlier drive: another lane, the other direction, a guess, and no place at all."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from data_tools.pose_graphs import read_g2o
+from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans
+from pipelines.cli import app
+from pipelines.slam.lidar_results import write_lidar_slam
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from pipelines.slam.localisation import Localiser, LocaliserSettings, guess_of
+from pipelines.slam.localised_drive import localise, write_localised
+from pipelines.slam.slam_map import SlamMap, read_map, write_map
+from saga_fg.errors import InputError
+from saga_fg.numerics.geometry import inverse_transform, yaw_transform
+from saga_fg.slam.pose_graph import optimise_poses
+from saga_fg.slam.submaps import SubmapSettings
+
+PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False, submaps=SubmapSettings(length=20.0))
+
+
+def drive(start: float, y: float, count: int, back: bool = False) -> np.ndarray:
+    """A drive along the street at 10 m/s."""
+    way = start + (-1.0 if back else 1.0) * np.arange(count)
+    return np.array([yaw_transform(x, y, SENSOR_HEIGHT, np.pi if back else 0.02 * np.sin(x / 5)) for x in way])
+
+
+@pytest.fixture(scope="module")
+def known() -> SlamMap:
+    """The map of a drive, in the world of the street."""
+    scans = SimulatedScans(3, world_T_lidar=drive(-10.0, -1.5, 60))
+    found = lidar_slam(scans, settings=PLAIN)
+    return SlamMap([submap.points for submap in found.submaps], found.world_T_submap)
+
+
+def localised(known: SlamMap, poses: np.ndarray, guess: np.ndarray | None = None) -> tuple[Localiser, np.ndarray, int]:
+    """The localiser, its errors (K,), m, over the whole path, and the number of scans registered."""
+    scans, localiser, registered = SimulatedScans(3, world_T_lidar=poses), Localiser(known, guess), 0
+    for k, time in enumerate(scans.timestamps.tolist()):
+        registered += localiser.step(scans[k], time).registered
+    path = localiser.path()
+    assert path is not None
+    return localiser, np.linalg.norm((inverse_transform(poses) @ path)[:, :3, 3], axis=1), registered
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_a_second_drive_is_recognised_and_followed(known: SlamMap, back: bool) -> None:
+    poses = drive(45.0, 1.5, 34, back) if back else drive(5.0, 0.5, 34)
+    _, errors, registered = localised(known, poses)
+    assert errors.max() < 0.3
+    assert np.median(errors) < 0.1
+    assert registered > 10
+
+
+def test_a_guess_takes_the_place_of_the_search(known: SlamMap, tmp_path: Path) -> None:
+    write_map(tmp_path, known, "pcd")
+    again = read_map(tmp_path)
+    np.testing.assert_allclose(again.map_T_submap, known.map_T_submap, atol=1e-8)
+    np.testing.assert_array_equal(again.points[1], known.points[1])
+    poses = drive(0.0, 0.5, 8)
+    _, errors, registered = localised(again, poses, guess_of("0.8,0.0,1.6,0.05"))
+    assert errors.max() < 0.2
+    assert registered == 8
+
+
+def test_where_the_map_has_no_such_place_none_is_found(known: SlamMap) -> None:
+    scans = SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 24))
+    localiser = Localiser(known, settings=LocaliserSettings(search_way=10.0))
+    steps = [localiser.step(scans[k], 0.1 * k) for k in range(24)]
+    assert all(step.map_T_lidar is None for step in steps)
+    assert localiser.path() is None
+
+
+def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
+    """What SLAM has written is read back: submaps, pose graph, landmarks; a second drive finds itself in it."""
+    scans = SimulatedScans(3, world_T_lidar=drive(0.0, -1.5, 40))
+    result = lidar_slam(scans, settings=LidarSlamSettings(submaps=SubmapSettings(length=20.0)))
+    write_lidar_slam(tmp_path / "first", result, scans)
+    graph = read_g2o(tmp_path / "first" / "graph.g2o")
+    assert len(graph) == len(result.keyframes)
+    np.testing.assert_allclose(graph.world_T_pose, result.world_T_lidar, atol=1e-9)
+    settled = result.world_T_lidar[0] @ inverse_transform(graph.world_T_pose[0]) @ optimise_poses(graph).world_T_pose
+    assert np.linalg.norm(settled[-1, :3, 3] - result.world_T_lidar[-1, :3, 3]) < 0.5
+    header, *rows = (tmp_path / "first" / "landmarks.csv").read_text().splitlines()
+    assert header == "number,kind,observations,deviations,geometry"
+    assert len(rows) == len(result.landmarks)
+    assert any(",wall," in row and '"MULTILINESTRING ((' in row for row in rows)
+    assert any(",pole," in row and '"POINT (' in row for row in rows)
+    second = SimulatedScans(3, world_T_lidar=drive(10.0, 0.5, 26))
+    slam_map = read_map(tmp_path / "first")
+    found = localise(second, slam_map)
+    figures = write_localised(tmp_path / "second", found, second, slam_map)
+    assert figures["trajectory"]["ate"] < 0.2
+    assert figures["registered"] > 5
+    assert (tmp_path / "second" / "trajectory.tum").is_file()
+    with pytest.raises(InputError, match="expected one that shows a place of this drive"):
+        localise(SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 4)), slam_map)
+
+
+@pytest.mark.skipif(shutil.which("evo_ape") is None, reason="evo has an environment of its own: put it on the path")
+def test_evo_finds_the_same_error(tmp_path: Path) -> None:
+    scans = SimulatedScans(3, world_T_lidar=drive(0.0, -1.5, 12))
+    figures = write_lidar_slam(tmp_path / "run", lidar_slam(scans, settings=PLAIN), scans)
+    command = ["evo_ape", "tum", "reference.tum", "trajectory.tum", "--align_origin"]
+    said = subprocess.run(command, cwd=tmp_path / "run", capture_output=True, text=True, check=True).stdout
+    rmse = next(float(line.split()[1]) for line in said.splitlines() if line.split()[:1] == ["rmse"])
+    assert rmse == pytest.approx(figures["trajectory"]["ate"], abs=1e-6)
+
+
+def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_path: Path) -> None:
+    options = ["slam", "kitti", "--dataroot", str(recordings / "kitti")]
+    first = CliRunner().invoke(app, [*options, "--scans", "20", "--no-landmarks", "--output", str(tmp_path / "first")])
+    assert first.exit_code == 0, first.output
+    again = ["--scans", "10", "--map", str(tmp_path / "first"), "--guess", "0.5,0.3,0,-1.2", "--output"]
+    outcome = CliRunner().invoke(app, [*options, *again, str(tmp_path / "again")])
+    assert outcome.exit_code == 0, outcome.output
+    assert "registered with the map, the first of them scan 0" in outcome.stdout
+    assert "in the map's frame: ATE 0." in outcome.stdout
+
+
+def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected a map: a folder with submaps\.csv"):
+        read_map(tmp_path)
+    (tmp_path / "submaps.csv").write_text("number,file,x,y,z,qx,qy,qz,qw\n0,../a.ply,0,0,0,0,0,0,1\n")
+    with pytest.raises(InputError, match=r"line 2: file: expected a file beside submaps\.csv"):
+        read_map(tmp_path)
+    (tmp_path / "submaps.csv").write_text("number,file,x,y,z,qx,qy,qz,qw\n0,a.ply,0,0,0,0,0,0,2\n")
+    with pytest.raises(InputError, match="line 2: expected a quaternion"):
+        read_map(tmp_path)
+    with pytest.raises(InputError, match="expected points in at least one submap"):
+        SlamMap([np.empty((0, 3), dtype=np.float32)], np.eye(4)[None])
+    with pytest.raises(InputError, match=r"guess: expected x,y,z,yaw, m and rad, got '1,2'"):
+        guess_of("1,2")

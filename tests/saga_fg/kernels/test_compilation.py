@@ -1,0 +1,63 @@
+"""Where kernels are used, where they are kept, and what is said of it."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import saga_fg
+from saga_fg.kernels.compilation import compiled_kernels, only_numpy
+
+pytest.importorskip("numba")  # of the extra test
+LABELS = (
+    "import numpy as np; from saga_fg.numerics.arrays import distinct; print(distinct(np.array(['a', 'b', 'a']))[1])"
+)
+USED = "from saga_fg.kernels.compilation import compiled_kernels; print(compiled_kernels())"
+
+
+def run(code, cwd, **environment):
+    """What a fresh interpreter prints, on both streams."""
+    run_in = {**os.environ, "PYTHONPATH": str(cwd), **environment}
+    done = subprocess.run([sys.executable, "-c", code], cwd=cwd, env=run_in, capture_output=True, text=True, check=True)
+    return done.stdout.strip(), done.stderr
+
+
+def test_kernels_are_used_here_and_can_be_left_out():
+    assert compiled_kernels()
+    with only_numpy():
+        assert not compiled_kernels()
+    assert compiled_kernels()
+
+
+@pytest.mark.parametrize(("disabled", "used"), [("1", "False"), ("0", "True"), ("", "True")])
+def test_numba_can_be_switched_off(disabled, used):
+    assert run(USED, Path(saga_fg.__file__).parents[1], NUMBA_DISABLE_JIT=disabled)[0] == used
+
+
+def test_without_numba_there_are_no_kernels():
+    hidden = (
+        "import importlib.util as u; real = u.find_spec\n"
+        "u.find_spec = lambda name, *rest: None if name == 'numba' else real(name, *rest)\n"
+    )
+    assert run(hidden + USED, Path(saga_fg.__file__).parents[1])[0] == "False"
+    out, _ = run(hidden + LABELS + "; import sys; print('numba' in sys.modules)", Path(saga_fg.__file__).parents[1])
+    assert out.split("\n") == ["[0 1 0]", "False"]
+
+
+def test_a_read_only_installation_keeps_its_kernels_in_the_cache_of_the_user(tmp_path):
+    """The second process finds them there; only the first says that it compiles."""
+    installed = tmp_path / "installed"
+    shutil.copytree(Path(saga_fg.__file__).parent, installed / "saga_fg", ignore=shutil.ignore_patterns("__pycache__"))
+    (installed / "saga_fg" / "kernels" / "__pycache__").touch()  # no folder can be made there, not even by root
+    cache = tmp_path / "cache"
+    environment = {"XDG_CACHE_HOME": str(cache), "NUMBA_CACHE_DIR": "", "PYTHONDONTWRITEBYTECODE": "1"}
+    out, said = run(LABELS, installed, **environment)
+    assert out == "[0 1 0]"
+    assert said.count("compiling kernels") == 1
+    assert list(cache.rglob("*.nbi"))
+    out, said = run(LABELS, installed, **environment)
+    assert out == "[0 1 0]"
+    assert "compiling" not in said

@@ -1,0 +1,77 @@
+"""What comes in is checked once, at the door; inside, tables of tracks and measurements are not checked again."""
+
+import numpy as np
+import pytest
+
+from pipelines.config import load_config
+from saga_fg import InputError, Sensor, Tracker
+from saga_fg.estimators import Measurements
+from saga_fg.model.sensor import NoiseModel
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Detections, Frame
+
+
+def frame(number, count=6):
+    place = np.zeros((count, 3))
+    place[:, 0] = 20.0 * np.arange(count) + 0.1 * number
+    boxes = Boxes.of(
+        ["car"] * count, place, np.tile((4.0, 1.8, 1.6), (count, 1)), np.zeros(count), np.tile((1.0, 0.0), (count, 1))
+    )
+    return Frame(0.1 * number, "lidar", Detections(boxes, np.full(count, 0.9)), np.eye(4))
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "range_rate", "yaw"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_noise_without_which_no_measurement_can_be_taken_in(name, value):
+    with pytest.raises(InputError, match=name):
+        NoiseModel(**{name: value})
+
+
+@pytest.mark.parametrize("bad", [np.zeros((2, 2)), -np.eye(2), [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]])
+def test_covariances_of_detections_are_positive_definite(bad):
+    boxes = Boxes.of(["car"], np.zeros((1, 3)))
+    with pytest.raises(InputError):
+        Detections(boxes, np.array([0.9]), position_covariance=np.array(bad)[None])
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("position", np.nan), ("position", 1e300), ("size", -1.0), ("size", 0.0)]
+)
+def test_boxes_that_cannot_be(column, value):
+    columns = {"position": np.zeros((1, 3)), "size": np.ones((1, 3))}
+    columns[column][0, 0] = value
+    with pytest.raises(InputError, match=column):
+        Boxes.of(["car"], **columns)
+
+
+def test_inside_nothing_is_checked_again(monkeypatch):
+    """Of boxes only those that the sensor places in the world and those reported; of measurements none."""
+    tracker = load_config("nuscenes").new_tracker("saga")
+    for number in range(5):
+        tracker.step(frame(number))
+    made: dict = {Boxes: 0, Measurements: 0}
+    for kind in (Boxes, Measurements):
+        real = kind.__post_init__
+
+        def counted(self, kind=kind, real=real):
+            made[kind] += 1
+            real(self)
+
+        monkeypatch.setattr(kind, "__post_init__", counted)
+    coming = frame(5)
+    made[Boxes] = 0
+    reported = tracker.step(coming)
+    assert len(reported.id) == 6
+    assert made[Measurements] == 0
+    assert made[Boxes] <= 2
+
+
+def test_what_is_reported_is_checked_and_its_own():
+    tracker = Tracker(sensors={"lidar": Sensor()})
+    for number in range(4):
+        tracks = tracker.step(frame(number))
+    for name in ("label", "position", "size", "yaw", "velocity"):
+        assert not getattr(tracks.boxes, name).flags.writeable
+    before = tracks.boxes.position.copy()
+    tracker.step(frame(4))
+    np.testing.assert_array_equal(tracks.boxes.position, before)
