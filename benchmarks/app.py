@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from benchmarks.fusion import fusion
-from benchmarks.joint import joint
 from benchmarks.metrics import metrics
 from benchmarks.scaling import scaling
 from benchmarks.signals import signals
@@ -14,7 +13,7 @@ from pipelines.cli.console import new_command
 
 app = new_command()
 
-for command in (fusion, joint, metrics, scaling, signals, smoothing, streaming, synthetic):
+for command in (fusion, metrics, scaling, signals, smoothing, streaming, synthetic):
     app.command()(command)
 
 

@@ -37,7 +37,7 @@ from factors.relative import (
     relative_factors,
     relative_range_bearing_factors,
 )
-from factors.robust import Robust, RobustLoss
+from factors.robust import Mixture, Robust, RobustLoss
 from factors.solver import Solution, SolverSettings, linearised, solve
 from factors.stacked import ResidualFactors
 from factors.variables import ImuBias, PlanarPose, SpatialPose, Variable, Vector
@@ -53,6 +53,7 @@ __all__ = [
     "ImuBias",
     "Linearisable",
     "MeasurementModel",
+    "Mixture",
     "NonlinearInteraction",
     "OrientedPlane",
     "PixelBearing",

@@ -13,6 +13,13 @@ Solvers reach its minimum by iteratively reweighted least squares: each linearis
 These are GTSAM's definitions (gtsam/linear/LossFunctions.h). Source: Z. Zhang, "Parameter estimation techniques",
 Image and Vision Computing 15 (1997), table 1. With Gaussian residuals of one dimension, 95 % efficiency is reached at
 c = 1.345 (huber), 2.385 (cauchy), 4.685 (tukey).
+
+`Mixture` is the loss of a factor that holds with a probability P only; with 1 - P it says nothing:
+
+    rho(s) = -log( P exp(-s^2 / 2) + 1 - P ),   w(s) = P exp(-s^2 / 2) / (P exp(-s^2 / 2) + 1 - P)
+
+Source: E. Olson and P. Agarwal, "Inference on networks of mixtures for robust robot mapping", International Journal of
+Robotics Research 32 (2013), here with the sum of the components.
 """
 
 from __future__ import annotations
@@ -26,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.errors import FactorError
-from factors.validation import FloatArray
+from factors.validation import FloatArray, checked
 
 Loss = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
 
@@ -89,3 +96,43 @@ class Robust:
             "tukey": gtsam.noiseModel.mEstimator.Tukey.Create,
         }
         return gtsam.noiseModel.Robust.Create(estimators[self.loss](self.scale), noise)
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """The loss of factors that hold with `probability` (n,), or one for all."""
+
+    probability: FloatArray
+
+    def __post_init__(self) -> None:
+        given = np.asarray(self.probability, dtype=np.float64)
+        every = checked("probability", np.atleast_1d(given), (None,))
+        if (every < 0).any() or (every > 1).any():
+            raise FactorError(f"probability: expected numbers from 0 to 1, got {given}")
+        object.__setattr__(self, "probability", given)
+
+    def cost(self, distance: ArrayLike) -> FloatArray:
+        """Return rho at the distances (n,), standard deviations."""
+        holds, fails = self._logarithms(distance)
+        return np.asarray(-np.logaddexp(holds, fails))
+
+    def weight(self, distance: ArrayLike) -> FloatArray:
+        """Return w at the distances (n,)."""
+        holds, fails = self._logarithms(distance)
+        return np.asarray(np.exp(holds - np.logaddexp(holds, fails)))
+
+    def of_row(self, row: int) -> Mixture:
+        """Return the loss of one factor."""
+        return Mixture(self.probability[row] if self.probability.ndim else self.probability)
+
+    def model(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
+        """Return GTSAM's noise model for the loss of one factor over `noise`."""
+        loss = gtsam.noiseModel.mEstimator.Custom.Create(
+            lambda s: float(self.weight(float(s))), lambda s: float(self.cost(float(s)))
+        )
+        return gtsam.noiseModel.Robust.Create(loss, noise)
+
+    def _logarithms(self, distance: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        with np.errstate(divide="ignore"):
+            holds, fails = np.log(self.probability), np.log1p(-self.probability)
+        return holds - np.square(distance) / 2, np.broadcast_to(fails, np.shape(holds))

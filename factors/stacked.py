@@ -21,7 +21,7 @@ from factors.differences import stacked_differences, wrap_angles
 from factors.errors import FactorError
 from factors.gaussian import gaussian_graph, whitened_factors
 from factors.nonlinear import ResidualFactor
-from factors.robust import RobustLoss
+from factors.robust import Mixture, RobustLoss
 from factors.validation import (
     FloatArray,
     KeyArray,
@@ -102,7 +102,7 @@ class ResidualFactors:
             residual=partial(self._single_residual, k),
             covariance=self.covariances[min(k, len(self.covariances) - 1)],  # one may serve all
             jacobians=partial(self._single_jacobians, k),
-            robust=self.robust,
+            robust=self.robust.of_row(k) if isinstance(self.robust, Mixture) else self.robust,
             angles=self.angles,
             name=self.name,
         )
@@ -124,8 +124,8 @@ class ResidualFactors:
     def errors(self, values: gtsam.Values, chosen: IntArray | None = None) -> FloatArray:
         """Return the cost rho(|| r_i ||) of each factor, (N,), or of the rows `chosen` (n,)."""
         residuals = self._residuals(self._filled(self.states(values, chosen), chosen))
-        distances = _of(self._distances(residuals), chosen)
-        return 0.5 * distances**2 if self.robust is None else self.robust.cost(distances)
+        distances = self._distances(residuals)
+        return _of(0.5 * distances**2 if self.robust is None else self.robust.cost(distances), chosen)
 
     def error(self, values: gtsam.Values) -> float:
         """Return the cost of all together."""

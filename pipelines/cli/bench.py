@@ -6,6 +6,7 @@ import typer
 
 from pipelines.cli.bench_estimators import estimators
 from pipelines.cli.bench_gaps import gaps
+from pipelines.cli.bench_joint import joint
 from pipelines.cli.bench_loops import loops
 from pipelines.cli.bench_service import service
 from pipelines.cli.bench_slam import slam
@@ -15,7 +16,7 @@ from pipelines.cli.console import ReportingGroup
 
 bench_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 
-for command in (estimators, gaps, loops, service, slam, speed, tracking):
+for command in (estimators, gaps, joint, loops, service, slam, speed, tracking):
     bench_app.command()(command)
 
 

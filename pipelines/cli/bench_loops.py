@@ -72,6 +72,7 @@ def _courses(seeds: list[float], drifts: list[float], json_file: Path | None) ->
         (
             f"{row.seed}, {row.drift:g}",
             cell(row.length, 0),
+            cell(100 * row.error, 2),
             cell(row.odometry, 2),
             cell(row.graph, 2),
             cell(row.ratio, 3),
@@ -81,7 +82,17 @@ def _courses(seeds: list[float], drifts: list[float], json_file: Path | None) ->
         )
         for row in rows
     ]
-    columns = ("seed, drift", "m", "ATE, m: odometry", "with loops", "ratio", "stretches found", "loops", "false")
+    columns = (
+        "seed, drift",
+        "m",
+        "odometry, %",
+        "ATE, m: odometry",
+        "with loops",
+        "ratio",
+        "stretches found",
+        "loops",
+        "false",
+    )
     report(
         [FigureTable("simulated courses: odometry that errs by 1 %, and loops", columns, tuple(shown))], rows, json_file
     )

@@ -86,6 +86,7 @@ def kitti(
     from data_tools.datasets.kitti import KittiScans, KittiTracking
     from data_tools.files.atomic_files import check_writable_folder
     from pipelines.slam.configuration import load_slam_config
+    from pipelines.slam.joint import path_tracker
     from pipelines.slam.lidar_results import write_lidar_slam
     from pipelines.slam.lidar_slam import lidar_slam
     from pipelines.slam.sensor_options import sensor_log
@@ -120,7 +121,10 @@ def kitti(
             landmarks=slam.lidar.landmarks and landmarks and not blind,
             loop_closures=slam.lidar.loop_closures and not blind,
         )
-        result = lidar_slam(recorded, odometry, lidar, progress, slam.new_providers(), slam.new_detectors(), log)
+        tracker = path_tracker(settings) if objects and not blind else None
+        result = lidar_slam(
+            recorded, odometry, lidar, progress, slam.new_providers(), slam.new_detectors(), log, frames, tracker
+        )
     if objects:
         with working("objects"):
             together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -33,8 +34,11 @@ from saga_fg.types.frame import Frame
 
 @dataclass(frozen=True, eq=False)
 class JointRun:
-    """One scene: the true path, the odometry's, the estimate, and the online one where there is one."""
+    """One scene: its frames and odometry, the true path, the odometry's, the estimate, and the online one if there is
+    one."""
 
+    frames: Sequence[Frame]
+    increments: OdometryIncrements
     truth: Trajectory
     odometry: Trajectory
     estimate: JointEstimate
@@ -79,16 +83,19 @@ def run_joint(
     frames, truth, odometry = degraded_drive(scene, settings, sensor, seed)
     start = truth.world_T_ego[0]
 
-    def new_tracker() -> Tracker:
-        return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
-
+    new_tracker = partial(path_tracker, config)
     observed = None if landmarks is None else landmarks(frames)
     estimate = estimate_jointly(frames, odometry, new_tracker, settings, start, observed, new_providers)
     online = None
     if lag is not None:
         tracker, own = new_tracker(), new_providers()
         online = estimate_online(frames, odometry, tracker, lag, settings, start, observed, providers=own)
-    return JointRun(truth, Trajectory(truth.timestamps, odometry.path(start)), estimate, online)
+    return JointRun(frames, odometry, truth, Trajectory(truth.timestamps, odometry.path(start)), estimate, online)
+
+
+def path_tracker(config: TrackConfig) -> Tracker:
+    """A new tracker along a path."""
+    return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
 
 
 def degraded_drive(

@@ -28,7 +28,7 @@ class Loops:
         pairs = [(pose_key(self.epochs[loop.first]), pose_key(view.epoch)) for loop in mine]
         return Additions(
             factors=[
-                between_factor(*pair, loop.first_T_second, loop.covariance, self.robust)
+                between_factor(*pair, loop.first_T_second, loop.covariance, None if loop.confirmed else self.robust)
                 for pair, loop in zip(pairs, mine, strict=True)
             ]
         )

@@ -30,6 +30,7 @@ from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, motion
 from pipelines.slam.loop_closures import LoopClosure, LoopSettings, PlaceLoops
+from pipelines.slam.moving_objects import MovingObjects, frames_at
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmarks
 from pipelines.slam.submap_loops import SubmapLoops
@@ -45,6 +46,7 @@ from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import AssociatedObservation, MapperSettings
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers
 from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
+from saga_fg.tracking import Tracker
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 from saga_fg.types.frame import Detections, Frame
 from saga_fg.types.landmark import Landmark
@@ -152,6 +154,7 @@ class LidarSlam:
     start       (4, 4) the sensor's first pose in the world, z up
     providers   of other factors, asked at every keyframe
     sensors     of the vehicle whose measurements `step` gets
+    moving      leaves points on moving objects out of the scans, by the detections that `step` gets
     detectors   of other landmarks in the points of keyframes
     loops       search for loops, by default by place as the settings say
     odometry    by default that of the LiDAR
@@ -171,12 +174,13 @@ class LidarSlam:
         odometry: Odometry | None = None,
         ego_T_lidar: FloatArray | None = None,
         sensors: Collection[SensorName] = (),
+        moving: MovingObjects | None = None,
     ) -> None:
         self.settings = s = settings or LidarSlamSettings()
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._ego_T_lidar = np.eye(4) if ego_T_lidar is None else checked_transform("ego_T_lidar", ego_T_lidar)
         self._odometry = LidarOdometry(s.odometry) if odometry is None else odometry
-        self._sensors = tuple(sensors)
+        self._sensors, self._moving = tuple(sensors), moving
         lidar_T_ego = inverse_transform(self._ego_T_lidar)
         of_sensors = sensor_providers(s.sensors, sensors, lidar_T_ego)
         self._graph = SubmapGraph(self._start, _START, s.submaps, [*of_sensors, *providers])
@@ -219,6 +223,8 @@ class LidarSlam:
             raise InputError(f"time: expected one after {self._times[-1]:.6f} s, got {time:.6f} s")
         if not self._times and not len(scan) and isinstance(self._odometry, LidarOdometry):
             raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
+        if self._moving is not None and detections is not None:
+            scan = self._moving.without(scan, time, detections, self._expected(time))
         if wheels is not None and isinstance(self._odometry, LidarOdometry):
             ahead = self._ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]
             placed = self._odometry.step(scan, time, np.concatenate([np.full(3, np.nan), ahead]))
@@ -272,6 +278,15 @@ class LidarSlam:
             solved.world_T_pose,
         )
 
+    def _expected(self, time: float) -> FloatArray:
+        """The pose (4, 4) at `time` by the motion between the last two scans."""
+        if len(self._poses) < 2:
+            return self._poses[-1] if self._poses else self._start
+        before, last = (gtsam.Pose3(pose) for pose in self._poses[-2:])
+        share = (time - self._times[-1]) / (self._times[-1] - self._times[-2])
+        expected: FloatArray = last.retract(share * before.localCoordinates(last)).matrix()
+        return expected
+
     def _add_keyframe(
         self, row: int, placed: OdometryStep, gps: GpsFix | None, detections: Detections | None
     ) -> tuple[Submap | None, list[LoopClosure]]:
@@ -305,7 +320,7 @@ class LidarSlam:
         self._graph.close_loops(found)
         anchors = [submap.anchor for submap in self._submaps]
         closed = [
-            LoopClosure(anchors[one.first], anchors[one.second], one.first_T_second, one.covariance) for one in found
+            LoopClosure(anchors[k.first], anchors[k.second], k.first_T_second, k.covariance, k.confirmed) for k in found
         ]
         self._closed += closed
         return submap, closed
@@ -319,6 +334,7 @@ class LidarSlam:
             loop.second,
             first @ loop.first_T_second @ inverse_transform(second),
             Ad @ loop.covariance @ Ad.T + LEAST,
+            loop.confirmed,
         )
 
 
@@ -330,20 +346,28 @@ def lidar_slam(
     providers: Sequence[FactorProvider] = (),
     detectors: Sequence[LandmarkDetector] = (),
     log: SensorLog | None = None,
+    frames: Sequence[Frame] = (),
+    tracker: Tracker | None = None,
 ) -> LidarSlamResult:
     """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
     counts is the first, unless the source is "oxts". providers, detectors: as of `LidarSlam`; log: of the vehicle's
-    sensors, in the recording's world.
+    sensors, in the recording's world; frames: with detections at the times of all scans, and a new tracker: moving
+    objects leave the scans. Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
     recorded = RecordedOdometry(scans, s.oxts_rotation, s.oxts_translation, s.odometry) if source == "oxts" else None
     start = scans.world_T_ego[0] @ scans.ego_T_lidar
     log, buffer = log or SensorLog({}), SensorBuffer()
-    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar, tuple(log.tables))
+    moving = None if tracker is None else MovingObjects(tracker)
+    seen: Sequence[Frame | None] = [None] * len(scans.timestamps)
+    if tracker is not None:
+        seen = frames_at(frames, scans.timestamps, inverse_transform(scans.ego_T_lidar), tracker)
+    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar, tuple(log.tables), moving)
     for k, time in enumerate(scans.timestamps.tolist()):
         log.feed(buffer, time)
         ego = buffer.take(time)
-        slam.step(scans[k], time, ego.imu, ego.gps, wheels=ego.wheels)
+        detections = None if (frame := seen[k]) is None else frame.detections
+        slam.step(scans[k], time, ego.imu, ego.gps, detections, ego.wheels)
         if progress is not None:
             progress("slam", k + 1, len(scans))
     return slam.finish()

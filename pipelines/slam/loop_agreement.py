@@ -60,6 +60,7 @@ class Agreement(Generic[Loop]):
         """
         now = way(loop.second)
         agreed = []
+        self._waiting = [k for k in self._waiting if way(k.second) > now - self.patience]
         for other in self._waiting:
             far = abs(way(loop.first) - way(other.first)) + abs(now - way(other.second))
             one = between(other.first, loop.first) @ loop.first_T_second
@@ -67,7 +68,7 @@ class Agreement(Generic[Loop]):
             if now - way(other.second) >= self.apart and (off < self.within + self.drift * far).all():
                 agreed.append(other)
         held = {id(other) for other in agreed}
-        self._waiting = [k for k in self._waiting if id(k) not in held and way(k.second) > now - self.patience]
+        self._waiting = [k for k in self._waiting if id(k) not in held]
         if not agreed:
             self._waiting.append(loop)
             return []

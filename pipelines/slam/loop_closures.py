@@ -6,14 +6,14 @@
    both have seen. A place that has a rival is no loop: the same submap aligned otherwise, or another one that says that
    the vehicle is elsewhere.
 3. Drift: errors of relative poses grow with the way between two submaps along measurements. A loop within what
-   odometry may be off is believed at once; one further off must be proved better, and waits until another one, found
-   later on the way, agrees with it.
+   odometry may be off is believed at once; one further off must be proved better, or waits until another one, found
+   later on the way, agrees with it. Then odometry is wrong, and the loop is `confirmed`: no robust loss gives it up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,9 +36,11 @@ from saga_fg.slam.pose_graph.distances import shortest_ways
 _FEWEST = 200  # points of a submap that shows a place
 _COMPARED, _REGISTERED, _TAKEN = 12, 4, 2  # places for each submap
 _ALIKE = 0.3  # correlation of images from which places are registered
-_UNIQUE = 0.92  # share of the best that a rival may have
+_SINGLE = 0.8  # share of the correlation that another alignment of the two may have
+_UNIQUE = 0.92  # share of the shared structure that a loop to elsewhere may have
 _SURFEL, _SPACING = 1.0, 1.5  # m: voxels of the map, and spacing of the points registered
-_SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometry
+_SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometry, with another that agrees
+_ALONE = 0.85  # and without one, up to twice the drift
 _FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
 _SAME = 4.0  # m that two loops to one place differ by, besides drift
 _OPEN = 0.5  # m, standard deviation of an alignment of images
@@ -60,12 +62,16 @@ class LoopSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class LoopClosure:
-    """`second` seen from `first`, keyframes or submaps: first_T_second (4, 4), covariance (6, 6) of its tangent."""
+    """`second` seen from `first`, keyframes or submaps: first_T_second (4, 4), covariance (6, 6) of its tangent.
+
+    confirmed: by another loop or by its proof, where odometry says otherwise
+    """
 
     first: int
     second: int
     first_T_second: FloatArray
     covariance: FloatArray
+    confirmed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +125,7 @@ class PlaceLoops:
         matches = self._index.candidates(image, older.tolist(), _COMPARED)
         found = []
         for match in matches[:_REGISTERED]:
-            if match.score < _ALIKE or match.rival > _UNIQUE * match.score:
+            if match.score < _ALIKE or match.rival > _SINGLE * match.score:
                 continue
             loop, overlap = self._registered(match, number)
             if loop is not None and overlap >= self.settings.min_overlap:
@@ -168,18 +174,21 @@ class PlaceLoops:
     def _believed(self, one: _Proved, frames: FloatArray) -> Sequence[LoopClosure]:
         if self._trusted(one):
             return [one.loop]
+        if one.overlap >= _ALONE and self._trusted(one, 2.0):
+            return [replace(one.loop, confirmed=True)]
         if one.overlap < _SURELY:
             return []
-        return self._waiting.confirmed(
+        agreed = self._waiting.confirmed(
             one.loop,
             lambda a, b: np.asarray(inverse_transform(frames[a]) @ frames[b]),
             lambda number: self._submaps[number].way[1],
         )
+        return [replace(loop, confirmed=True) for loop in agreed]
 
-    def _trusted(self, one: _Proved) -> bool:
-        """Whether the drift of odometry explains the loop."""
+    def _trusted(self, one: _Proved, times: float = 1.0) -> bool:
+        """Whether the drift of odometry, or so many times of it, explains the loop."""
         way = self._ways(one.loop.second)[one.loop.first]
-        return one.off < 1.0 + self.settings.drift * float(way)
+        return one.off < 1.0 + times * self.settings.drift * float(way)
 
     def _older(self, number: int) -> IntArray:
         """Submaps that ended `min_path` before this one began."""

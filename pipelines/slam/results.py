@@ -8,7 +8,7 @@ landmarks.ply     landmarks for viewers of point clouds
 covariances.csv   of each pose: its name, then the upper triangle in the pose's own frame, rad and m: (x, y, heading) or
                   (rotation vector, translation)
 tracks.csv        a row for each object and moment: timestamp (s), id, class, x, y (m), vx, vy (m/s) in world
-                  coordinates, and the standard deviations of the last four
+                  coordinates, the standard deviations of the last four, and the probability of being stationary
 above.png         the results from above
 """
 
@@ -70,10 +70,10 @@ def object_paths(estimate: JointEstimate) -> dict[int, FloatArray]:
 
 def write_objects(path: Path, estimate: JointEstimate) -> None:
     """Write tracks.csv."""
-    rows = ["timestamp,id,class,x,y,vx,vy,sigma_x,sigma_y,sigma_vx,sigma_vy"]
+    rows = ["timestamp,id,class,x,y,vx,vy,sigma_x,sigma_y,sigma_vx,sigma_vy,stationary"]
     for moment, (time, objects) in enumerate(zip(estimate.timestamps, estimate.objects, strict=True)):
         sigma = np.sqrt(np.diagonal(estimate.object_covariances(moment), axis1=1, axis2=2))
-        table = np.concatenate([objects.position, objects.velocity, sigma], axis=1)
+        table = np.column_stack([objects.position, objects.velocity, sigma, objects.stationary])
         rows += [
             f"{time:.6f},{name},{label}," + ",".join(f"{x:.4f}" for x in row)
             for name, label, row in zip(objects.id.tolist(), objects.label, table, strict=True)

@@ -18,18 +18,15 @@ from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
 from pipelines.slam.known_providers import known_providers
 from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings
+from pipelines.slam.moving_objects import frames_at
 from pipelines.slam.submaps import world_T_submap
-from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import JointEstimate, OdometryIncrements, estimate_jointly, estimate_online
-from saga_fg.slam.joint.record import in_ego
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
-
-_SAME_TIME = 0.01  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +63,7 @@ def with_objects(
     def new_tracker() -> Tracker:
         return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
 
-    seen = _frames_at(frames, scans.timestamps[rows], lidar_T_ego, new_tracker())
+    seen = frames_at(frames, scans.timestamps[rows], lidar_T_ego, new_tracker())
     motions = result.drive.motions(rows)
     odometry = OdometryIncrements(
         scans.timestamps[rows],
@@ -109,19 +106,3 @@ def _moments(keyframes: Sequence[int], timestamps: FloatArray, period: float) ->
         if row in waiting or not chosen or time > timestamps[chosen[-1]] + period:
             chosen.append(row)
     return chosen
-
-
-def _frames_at(
-    frames: Sequence[Frame], timestamps: FloatArray, lidar_T_ego: FloatArray, tracker: Tracker
-) -> list[Frame]:
-    """The frame at each time, its detections in the frame of the scanner."""
-    times = np.array([frame.timestamp for frame in frames])
-    found = []
-    for time in timestamps.tolist():
-        nearest = int(np.argmin(np.abs(times - time))) if len(times) else -1
-        if nearest < 0 or abs(times[nearest] - time) > _SAME_TIME:
-            raise InputError(f"frames: expected one of detections at {time:.3f} s, the time of a scan; there is none")
-        frame = frames[nearest]
-        detections = in_ego(frame, tracker.sensor(frame.sensor)).transformed(lidar_T_ego)
-        found.append(Frame(time, frame.sensor, detections, np.eye(4), "ego"))
-    return found

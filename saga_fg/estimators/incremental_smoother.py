@@ -221,7 +221,7 @@ class IncrementalSmoother:
     def _solve(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
         """iSAM2 with the graph, which moves to the solution."""
         engine, self._engine = self._engine, None  # it is begun anew, should it fail
-        start = graph.values
+        start = graph.point().values
         if engine is None or engine.elimination != graph.elimination:
             engine = Engine(graph.elimination)
         try:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, KeysView, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -24,6 +24,7 @@ from factors import SingularSystemError, SolverSettings, marginal_moments
 from factors.marginal import Elimination
 from factors.singular import singular_system
 from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.factor_groups import HeldGroup
 from saga_fg.graph.messages import solver_error
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
@@ -57,12 +58,13 @@ class Engine:
         self.isam, self.elimination = gtsam.ISAM2(parameters), elimination
         self.points = Displacements()
         self.slots: dict[int, IntArray] = {}
+        self._held: dict[int, HeldGroup] = {}  # groups as they were at the last update
         self.converged = True
         self.elimination_order: dict[int, tuple[bool, int]] = {}
 
     def solved(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
         """The engine with everything that has changed in the graph, which moves to the solution."""
-        start, self.converged = graph.values, True
+        start, self.converged = graph.point().values, True
         try:
             if not self._synchronised(graph):
                 return self
@@ -112,8 +114,8 @@ class Engine:
 
     def _synchronised(self, graph: SceneFactorGraph) -> bool:
         """Update iSAM2 with the changes of the graph, which moves to the solution; true where a factor is nonlinear."""
-        leaving = [key for key in self.points.keys if key not in graph.variables]
-        new = {key: one.dim for key, one in graph.variables.items() if key not in self.points}
+        leaving = self.points.keys - graph.variables.keys()
+        new = {key: graph.variable(key).dim for key in sorted(graph.variables.keys() - self.points.keys)}
         removed = self._remove_factors(graph)
         rows: list[tuple[int, IntArray]] = []
         linear: list[gtsam.JacobianFactor] = []
@@ -157,14 +159,18 @@ class Engine:
     def _remove_factors(self, graph: SceneFactorGraph) -> list[int]:
         """Forget factors that have left; returns their indices."""
         removed: list[int] = []
+        groups = graph.groups
         for number, slots in list(self.slots.items()):
-            held = graph.groups.get(number)
+            held = groups.get(number)
+            if held is not None and held is self._held.get(number):
+                continue
             if held is None:
                 removed += slots[slots >= 0].tolist()
                 del self.slots[number], self.elimination_order[number]
             elif (out := (slots >= 0) & ~held.active).any():
                 removed += slots[out].tolist()
                 self.slots[number] = np.where(out, -1, slots)
+        self._held = dict(groups)
         return removed
 
     def _relinearised(self, graph: SceneFactorGraph, threshold: float) -> bool:
@@ -196,18 +202,15 @@ class Engine:
         new: Iterable[int],
     ) -> None:
         """One update of iSAM2: `linear` in, which are `rows` of groups, `removed` out; and the graph is moved."""
-        factors, values, base = gtsam.GaussianFactorGraph(), gtsam.Values(), graph.base
+        factors, values, base = gtsam.GaussianFactorGraph(), gtsam.Values(), graph.point().base
         for factor in linear:
             factors.push_back(factor)
         for key in new:
             insert_state(values, graph.variable(key), graph.variable(key).type.read(base, key))
         parameters, last = gtsam.ISAM2UpdateParams(), gtsam.KeyGroupMap()
         parameters.removeFactorIndices = removed
-        for key, one in graph.variables.items():
-            if (
-                one.epoch == graph.epoch or key in graph.carried_over
-            ):  # at the root, where the next frame's factors will touch the tree
-                last.insert2(key, 1)
+        for key in {*graph.newest, *(graph.carried_over.keys() & graph.variables.keys())}:
+            last.insert2(key, 1)  # at the root, where the next frame's factors will touch the tree
         parameters.constrainedKeys = last
         try:
             # without a linearisation point: increments are those that iSAM2 counts, from the base
@@ -255,7 +258,7 @@ class Displacements:
         return key in self._dims
 
     @property
-    def keys(self) -> Iterable[int]:
+    def keys(self) -> KeysView[int]:
         """All variables."""
         return self._dims.keys()
 

@@ -58,6 +58,7 @@ class SceneFactorGraph:
         self._variables: dict[int, GraphVariable] = {}
         self._base, self._values = gtsam.Values(), gtsam.Values()
         self._groups: dict[int, HeldGroup] = {}
+        self._named: dict[tuple[str, Hashable], tuple[int, ...]] = {}  # groups by provider and name
         self._touching: dict[int, tuple[int, ...]] = {}  # groups with a factor on a variable, now or before
         self._factor_counts: dict[int, int] = {}  # number of factors on each variable
         self.elimination: Elimination = elimination
@@ -65,6 +66,7 @@ class SceneFactorGraph:
         self._count = 0
         self._angles_checked: set[tuple[str, str]] = set()
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
+        self._newest: tuple[int, ...] = ()
         self.carried_over: Mapping[int, int] = {}  # variables of earlier epochs that are those of this one, too
 
     @property
@@ -111,7 +113,13 @@ class SceneFactorGraph:
         self.epoch, self.previous_time, self.time = self.epoch + 1, self.time, float(time)
         its = ((self._variables[key], key) for key in carried_over)
         self.carried_over = {key_of(one.kind, one.id, self.epoch): key for one, key in its}
+        self._newest = ()
         return self.epoch
+
+    @property
+    def newest(self) -> list[int]:
+        """Keys of the variables of this epoch."""
+        return [key for key in self._newest if key in self._variables]
 
     def add_variables(self, provider: str, variables: Iterable[NewVariable]) -> list[int]:
         """Add variables, of the present epoch where they are not static; returns their keys."""
@@ -138,6 +146,7 @@ class SceneFactorGraph:
                 raise GraphError(f"provider {provider}: {error}") from error
             added[key] = variable
         self._variables |= added
+        self._newest += tuple(key for key, one in added.items() if one.epoch is not None)
         self._values.insert(values)
         self._base.insert(values)
         self._touching |= dict.fromkeys(added, ())
@@ -158,12 +167,14 @@ class SceneFactorGraph:
         for one in held:
             self._check_angles(one)
         if name is not None:
-            earlier = [n for n, one in self._groups.items() if one.name == name and one.provider == provider]
-            for number in earlier:
+            for number in self._named.get((provider, name), ()):
                 self._drop(number)
         for one, factors_there in zip(held, linear, strict=True):
             if len(one.active):
-                self._fresh[self._hold(one)] = factors_there
+                number = self._hold(one)
+                self._fresh[number] = factors_there
+                if name is not None:
+                    self._named[provider, name] = (*self._named.get((provider, name), ()), number)
 
     def _check_angles(self, held: HeldGroup) -> None:
         """Refuse residuals with angles that nobody wraps, at the first factor of each kind."""
@@ -314,7 +325,7 @@ class SceneFactorGraph:
         other.__dict__ |= self.__dict__
         other._variables, other._groups = dict(self._variables), dict(self._groups)
         other._touching, other._fresh = dict(self._touching), dict(self._fresh)
-        other._factor_counts = dict(self._factor_counts)
+        other._factor_counts, other._named = dict(self._factor_counts), dict(self._named)
         if not share_values:
             other._base, other._values = self.base, self.values
         return other
@@ -360,6 +371,10 @@ class SceneFactorGraph:
     def _drop(self, number: int) -> None:
         held = self._groups.pop(number)
         self._fresh.pop(number, None)
+        if held.name is not None and (held.provider, held.name) in self._named:
+            rest = tuple(n for n in self._named.pop((held.provider, held.name)) if n != number)
+            if rest:
+                self._named[held.provider, held.name] = rest
         self._count_rows(held.factors, held.rows.tolist(), -1)
         for key in {key for row in held.factors.rows for key in row}:
             if key in self._touching:

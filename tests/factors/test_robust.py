@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, Robust
+from factors import FactorError, Mixture, ResidualFactors, Robust
 
 LOSSES = ["huber", "cauchy", "geman-mcclure", "tukey"]
 DISTANCES = np.array([0.0, 0.1, 0.999, 1.7, 1.70001, 5.0, 1e3])
@@ -39,3 +39,34 @@ def test_small_residuals_cost_what_they_always_do(loss):
 def test_bad_loss_is_refused(loss, scale):
     with pytest.raises(FactorError):
         Robust(loss, scale)
+
+
+def test_a_mixture_holds_with_its_probability():
+    s = np.linspace(0.01, 6.0, 200) + 1e-4
+    for probability in (0.05, 0.5, 0.99):
+        mixture, h = Mixture(probability), 1e-6
+        slope = (mixture.cost(s + h) - mixture.cost(s - h)) / (2 * h)
+        np.testing.assert_allclose(mixture.weight(s) * s, slope, atol=1e-8)
+        assert mixture.weight(0.0) == pytest.approx(probability)
+        assert mixture.weight(20.0) == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(Mixture(1.0).cost(s), s * s / 2)
+    assert not Mixture(0.0).weight(s).any()
+    each = Mixture([0.2, 0.9])
+    np.testing.assert_allclose(each.weight([1.0, 1.0]), [Mixture(p).weight(1.0) for p in (0.2, 0.9)])
+    for bad in (-0.1, 1.1, np.nan):
+        with pytest.raises(FactorError, match="probability"):
+            Mixture(bad)
+
+
+def test_stacked_factors_have_probabilities_of_their_own():
+    rows, z = np.arange(3, dtype=np.uint64)[:, None], np.array([[0.5], [1.0], [2.0]])
+    mixture = Mixture([0.9, 0.5, 0.99])
+    stack = ResidualFactors(rows, (1,), lambda x: x - z, np.eye(1), lambda x: [np.ones((3, 1, 1))], mixture)
+    values = gtsam.Values()
+    for key in range(3):
+        values.insert(key, np.zeros(1))
+    alone = [one.error(values) for one in stack.individual_factors()]
+    np.testing.assert_allclose(stack.errors(values), alone)
+    np.testing.assert_allclose(stack.errors(values, np.array([2, 0])), [alone[2], alone[0]])
+    model = mixture.of_row(1).model(gtsam.noiseModel.Unit.Create(1))
+    assert model.loss(1.0) == pytest.approx(float(Mixture(0.5).cost(1.0)))

@@ -7,10 +7,13 @@ import pytest
 
 from data_tools.lidar import Submap, voxel_downsample
 from data_tools.simulator.course import SimulatedCourse
+from data_tools.simulator.scanner import StaticWorld, simulate_scan
+from data_tools.simulator.street import SMALL
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
+from saga_fg.types.boxes import Boxes
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +52,31 @@ def test_loops_are_found_with_drift(drive: tuple[list[Submap], FloatArray], drif
 def test_far_off_a_loop_waits_for_another(drive: tuple[list[Submap], FloatArray]) -> None:
     submaps, true = drive
     estimated = true.copy()
-    estimated[6:, :2, 3] += 80.0
+    estimated[6:, :2, 3] += 95.0
     search = PlaceLoops()
     found = [len(search.add(one, estimated[: k + 1])) for k, one in enumerate(submaps)]
     assert found[:7] == [0] * 7
     assert found[7] >= 2
+
+
+def test_row_houses_are_no_place() -> None:
+    """A street that repeats every 12 m: where along it the vehicle is, nobody can tell."""
+    x = np.arange(-150.0, 250.0, 12.0)
+    houses = [(at, side * 12.0, 3.0) for at in x for side in (-1, 1)]
+    n = len(houses)
+    boxes = Boxes.of(["house"] * n, houses, [(8.0, 6.0, 6.0)] * n, np.zeros(n), np.zeros((n, 2)))
+    world, rng = StaticWorld(boxes, np.empty((0, 4))), np.random.default_rng(0)
+    submaps, frames = [], []
+    for number, start in enumerate((0.0, 96.0)):
+        steps = [yaw_transform(x=d) for d in (0.0, 8.0, 16.0)]
+        start_T_world = yaw_transform(-start, z=-1.8)
+        scans = [simulate_scan(world, inverse_transform(start_T_world) @ step, rng, SMALL).points for step in steps]
+        placed = [transform_points(step, scan) for step, scan in zip(steps, scans, strict=True)]
+        points = np.concatenate(placed).astype(np.float32)
+        submaps.append(Submap(number, (number, number + 1), number, np.eye(4), points, (start, start + 16.0)))
+        frames.append(yaw_transform(10.0 * number, z=1.8))  # an odometry that says that the vehicle came back
+    search = PlaceLoops()
+    assert [len(search.add(one, np.array(frames[: k + 1]))) for k, one in enumerate(submaps)] == [0, 0]
 
 
 def test_a_submap_without_points_has_no_loops(drive: tuple[list[Submap], FloatArray]) -> None:

@@ -1,7 +1,9 @@
 """Path of the vehicle and objects around it, from a whole recording at once.
 
-Two discrete unknowns depend on the path: the association of detections and the stationarity of objects. They are
-decided along the odometry's path, the graph of all epochs is solved, and they are decided again along the path found.
+Discrete unknowns depend on the path: the association of detections, and the identity and stationarity of objects. A
+pass associates along the path so far, starting with the odometry's, takes the probabilities of stationarity from the
+detections, solves the graph of all epochs, weighs the detections by the objects found, and solves again. Passes end
+when associations repeat.
 """
 
 from __future__ import annotations
@@ -16,11 +18,12 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.joint.estimate import JointEstimate, read_estimate
-from saga_fg.slam.joint.graph import Record, stationary_factors
+from saga_fg.slam.joint.graph import Record, detections, stationary_factors
+from saga_fg.slam.joint.identity import with_all_identities
 from saga_fg.slam.joint.landmarks import Observations, nearest_landmarks
 from saga_fg.slam.joint.lanes import LaneAssociation
 from saga_fg.slam.joint.odometry import OdometryIncrements
-from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects
+from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects, detections_name
 from saga_fg.slam.joint.record import record_epochs
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
@@ -52,14 +55,18 @@ def estimate_jointly(
     path = odometry.path(start)
     slow = SlowErrors.at_start(settings)
     estimate = None
+    links: list[list[int]] = []
     for _ in range(settings.passes):
         tracker = new_tracker()
         lanes = LaneAssociation(settings.lanes, [tracker.settings.road_map, *(frame.road_map for frame in frames)])
-        record = record_epochs(frames, path, odometry, tracker, settings.motion_noise)
-        stationary = stationary_probabilities(record, path, slow, settings)
+        record = record_epochs(frames, path, odometry, tracker)
+        before, links = links, [now.seen.id.tolist() for now in record]
+        if links == before:
+            break
         seen = nearest_landmarks(landmarks, path, settings.max_landmark_distance)
-        first = [None] if estimate is None else []
-        estimate = _solve(record, path, [*first, stationary], lanes, [seen, *new_providers()], settings)
+        clutter = tracker.settings.association.clutter_area
+        start_moving = estimate is None
+        estimate = _solve(record, path, slow, start_moving, clutter, lanes, [seen, *new_providers()], settings)
         estimate = replace(estimate, observations=seen)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
@@ -84,26 +91,34 @@ def checked_landmarks(
 def _solve(
     record: Record,
     path: FloatArray,
-    stationary: Sequence[Sequence[FloatArray] | None],
+    slow: SlowErrors,
+    start_moving: bool,
+    clutter_area: float,
     lanes: LaneAssociation,
     providers: Sequence[FactorProvider],
     settings: JointSettings,
 ) -> JointEstimate:
-    """Solve several times, each from the solution before: with all objects moving (None), which needs no good start, or
-    with stationary ones by these probabilities; at last with vehicles assigned to lanes along the solution before.
+    """Solve several times, each from the solution before: if `start_moving` with all objects moving, which needs no
+    good start; with those stationary that seem so along the path; with identities by the solution; at last with
+    vehicles assigned to lanes along the solution before.
     """
     graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=settings.max_iterations, tolerance=TOLERANCE)
     epochs = VehicleAndObjects(record, path, settings)
     for now in record:
         graph.advance(now.time)
         ask_all([epochs, *providers], graph)
+    if start_moving:
+        graph.solve(solver)
+    probabilities = stationary_probabilities(record, path, slow, settings)
     name = StationaryPairs.name
-    for probabilities in stationary:
-        if probabilities is not None:
-            graph.add_factors(name, stationary_factors(record, probabilities, settings), name)
-        solution = graph.solve(solver)
+    graph.add_factors(name, stationary_factors(record, probabilities, settings), name)
+    estimate = read_estimate(record, graph.solve(solver), probabilities)
+    places = [one.position for one in estimate.objects]
+    record = with_all_identities(record, estimate.world_T_ego, places, clutter_area)
+    graph.add_factors(epochs.name, detections(record, settings), detections_name(record[-1]))
+    solution = graph.solve(solver)
     for _ in range(lanes.rounds):
-        lanes.assign(record, read_estimate(record, solution), stationary[-1] or ())
+        lanes.assign(record, read_estimate(record, solution, probabilities), probabilities)
         ask_all([lanes], graph)
         solution = graph.solve(solver)
-    return read_estimate(record, solution)
+    return read_estimate(record, solution, probabilities)

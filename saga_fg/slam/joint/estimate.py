@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,6 +13,7 @@ from factors import Solution
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import Assignment
 from saga_fg.slam.joint.graph import Record, error_key, object_key
 from saga_fg.slam.joint.record import RecordedEpoch
 from saga_fg.slam.joint.stationarity import SlowErrors
@@ -21,12 +23,16 @@ from saga_fg.types.landmark import Landmark
 
 @dataclass(frozen=True, eq=False)
 class ObjectStates:
-    """Objects of an epoch: id (n,), n classes, position (n, 2), m, and velocity (n, 2), m/s, in the world."""
+    """Objects of an epoch: id (n,), n classes, position (n, 2), m, and velocity (n, 2), m/s, in the world.
+
+    stationary  (n,) probability of being at rest
+    """
 
     id: IntArray
     label: tuple[str, ...]
     position: FloatArray
     velocity: FloatArray
+    stationary: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +71,11 @@ class JointEstimate:
             result[k] = self.solution.marginal(object_key(now.epoch, name))[at[:, None], at]
         return result
 
+    def assignment(self, row: int) -> Assignment:
+        """Objects and their detections at a row of the estimate."""
+        seen = self._record[row].seen
+        return Assignment(seen.id, seen.row)
+
     @cached_property
     def landmarks(self) -> list[Landmark]:
         """Landmarks that were associated along the path."""
@@ -78,23 +89,25 @@ class JointEstimate:
         return SlowErrors(*np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)).tolist())
 
 
-def read_estimate(record: Record, solution: Solution | GraphSolution) -> JointEstimate:
-    """The estimate at the epochs of a record."""
+def read_estimate(
+    record: Record, solution: Solution | GraphSolution, stationary: Sequence[FloatArray]
+) -> JointEstimate:
+    """The estimate at the epochs of a record; stationary: probabilities (n,) of the objects of each."""
     values = solution.values
     return JointEstimate(
         timestamps=np.array([now.time for now in record]),
         world_T_ego=np.stack([values.atPose3(pose_key(now.epoch)).matrix() for now in record]),
         errors=np.stack([values.atVector(error_key(now.epoch)) for now in record]),
-        objects=tuple(_objects(now, values) for now in record),
+        objects=tuple(_objects(now, values, p) for now, p in zip(record, stationary, strict=True)),
         converged=solution.converged,
         solution=solution,
         _record=record,
     )
 
 
-def _objects(now: RecordedEpoch, values: gtsam.Values) -> ObjectStates:
+def _objects(now: RecordedEpoch, values: gtsam.Values, stationary: FloatArray) -> ObjectStates:
     objects = now.objects
     state = np.zeros((len(objects.id), 4))
     for row, (name, node_type) in enumerate(zip(objects.id.tolist(), objects.types, strict=True)):
         state[row] = values.atVector(object_key(now.epoch, name))[node_type.index(POSITION + VELOCITY)]
-    return ObjectStates(objects.id, objects.label, state[:, :2], state[:, 2:])
+    return ObjectStates(objects.id, objects.label, state[:, :2], state[:, 2:], stationary)

@@ -2,13 +2,14 @@
 
     prior        first pose; first errors; velocity of a new object
     odometry     poses and errors of two epochs            (`factors.odometry`)
-    interaction  an object's next state and the states of all that act on it, from the scene graph
+    interaction  an object's next state and the states of all that act on it (`saga_fg.slam.joint.motion`)
     detection    a pose and an object's state              (`factors.relative`), robust
-    stationary   p' - p ~ N(0, standing_drift^2 dt / P),  v' ~ N(0, standing_speed^2 / P), robust
+    stationary   p' - p ~ N(0, stationary_drift^2 dt),  v' ~ N(0, stationary_speed^2)     with probability P
 
-The last one is the hybrid part of the model: with the probability P an object is stationary and a landmark, else it
-moves and the factor is silent (see `saga_fg.slam.joint.stationarity`). A variable is a `gtsam.Pose3` for the vehicle
-and a vector for everything else.
+The last two are the hybrid part of the model. With the probability P (`saga_fg.slam.joint.stationarity`) an object is
+stationary and a landmark, else it moves as its class does and the factor is silent: a mixture (`factors.Mixture`). With
+the probability p (`saga_fg.slam.joint.identity`) a detection is of the object that it is assigned to: it counts for a
+share p of its information. A variable is a `gtsam.Pose3` for the vehicle and a vector for everything else.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from factors import (
     ERROR_DIM,
     Linearisable,
+    Mixture,
     ResidualFactors,
     Robust,
     gaussian_factors,
@@ -30,21 +32,15 @@ from factors import (
     prior_factor,
     relative_detection_factors,
 )
-from saga_fg.errors import InputError
-from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.object_factors import interval_factors
 from saga_fg.graph import EGO_ERROR, OBJECT, key_of
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.motion import NodeType
-from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.joint.record import RecordedEpoch, RecordedObjects, motion_covariances
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.mapping import pose_key
 
-_LIKELY = 0.9  # an object that is stationary with less than this probability gets no such factor
-_SURELY_MOVING = 4.0  # standard deviations from rest at which the loss gives an object up
+_LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
 _ANY_SPEED = 100.0  # m/s, deviation of an unknown velocity
 Record = Sequence[RecordedEpoch]
 
@@ -69,11 +65,10 @@ def start_factors(
     return slow, gtsam.PriorFactorPose3(pose_key(epoch), gtsam.Pose3(world_T_ego), sigma)
 
 
-def linear_factors(now: RecordedEpoch, known: set[int]) -> list[gtsam.JacobianFactor]:
-    """Priors of new objects and interactions; known: ids of the objects of the epoch before, none at the first one."""
+def new_object_factors(now: RecordedEpoch, known: set[int]) -> list[gtsam.JacobianFactor]:
+    """Priors of new objects; known: ids of the objects of the epoch before."""
     new = np.flatnonzero(~np.isin(now.objects.id, np.array(sorted(known), dtype=np.int64)))
-    priors = _priors(now.epoch, now.objects.select(new))
-    return priors + _motions(now.epoch, now.transition) if known and now.transition is not None else priors
+    return _priors(now.epoch, now.objects.select(new))
 
 
 def odometry(record: Record, settings: JointSettings) -> list[Linearisable]:
@@ -107,24 +102,14 @@ def _priors(k: int, new: RecordedObjects) -> list[gtsam.JacobianFactor]:
     return factors
 
 
-def _motions(k: int, transition: Transition) -> list[gtsam.JacobianFactor]:
-    """Motion and interactions from the epoch before."""
-    nodes = transition.nodes.tolist()
-    layout = StateLayout(nodes, transition.graph.dims)
-    before, now = ({name: object_key(at, name) for name in nodes} for at in (k - 1, k))
-    interval = IntervalDynamics(transition)
-    if not interval.linear:
-        raise InputError("motion: expected linear motion and interactions of objects beside a vehicle's path")
-    return interval_factors(interval, layout, np.zeros(layout.size), before, now)[0]
-
-
 def detections(record: Record, settings: JointSettings) -> list[Linearisable]:
     """Detections of objects, from the vehicle's pose."""
     robust = None if np.isinf(settings.outlier_scale) else Robust("cauchy", settings.outlier_scale)
     collected: dict[NodeType, list[tuple[int, int, FloatArray, FloatArray]]] = {}
     for now in record:
         types = dict(zip(now.objects.id.tolist(), now.objects.types, strict=True))
-        for name, z, R in zip(now.seen.id.tolist(), now.seen.z, now.seen.R, strict=True):
+        R_weighed = now.seen.R / now.seen.probability[:, None, None]
+        for name, z, R in zip(now.seen.id.tolist(), now.seen.z, R_weighed, strict=True):
             collected.setdefault(types[name], []).append((pose_key(now.epoch), object_key(now.epoch, name), z, R))
     factors: list[Linearisable] = []
     for node_type, rows in collected.items():
@@ -136,29 +121,28 @@ def detections(record: Record, settings: JointSettings) -> list[Linearisable]:
 
 
 def stationary_factors(record: Record, stationary: Sequence[FloatArray], settings: JointSettings) -> list[Linearisable]:
-    """Between two epochs of an object that is probably stationary at both; stationary: probabilities (n,) of each."""
-    collected: dict[NodeType, list[tuple[int, int, FloatArray]]] = {}
+    """Between two epochs of an object that may be stationary at both; stationary: probabilities (n,) of each."""
+    collected: dict[NodeType, list[tuple[int, int, float, float]]] = {}
     for (before, p_before), (now, p_now) in pairwise(zip(record, stationary, strict=True)):
         names, here, there = np.intersect1d(now.objects.id, before.objects.id, return_indices=True)
         p = np.minimum(p_now[here], p_before[there])
-        dt = now.time - before.time
-        variances = np.array([settings.stationary_drift**2 * dt] * 2 + [settings.stationary_speed**2] * 2)
         for row in np.flatnonzero(p > _LIKELY).tolist():
             name, node_type = int(names[row]), now.objects.types[int(here[row])]
             keys = object_key(before.epoch, name), object_key(now.epoch, name)
-            collected.setdefault(node_type, []).append((*keys, variances / p[row]))
+            collected.setdefault(node_type, []).append((*keys, float(p[row]), now.time - before.time))
     factors: list[Linearisable] = []
     for node_type, rows in collected.items():
         model = _StationaryResidual(node_type.dim, tuple(node_type.index(POSITION)), tuple(node_type.index(VELOCITY)))
-        first, second, R = (np.array(column) for column in zip(*rows, strict=True))
+        first, second, p, dt = (np.array(column) for column in zip(*rows, strict=True))
+        drift, speed = settings.stationary_drift**2 * dt, np.full(len(dt), settings.stationary_speed**2)
         factors.append(
             ResidualFactors(
                 np.column_stack([first, second]).astype(np.uint64),
                 (node_type.dim, node_type.dim),
                 model.residual,
-                R[:, :, None] * np.eye(4),
+                np.stack([drift, drift, speed, speed], axis=1)[:, :, None] * np.eye(4),
                 model.jacobians,
-                Robust("geman-mcclure", _SURELY_MOVING),
+                Mixture(p),
                 name="stationary objects",
             )
         )

@@ -1,6 +1,7 @@
 """Path, landmarks and objects online: the running graph of the last seconds, with a joint prior for all before.
 
-Each frame adds an epoch to the window. The stationarity of objects follows from the window, landmarks are associated by
+Each frame adds an epoch to the window. The stationarity of objects follows from the window, the identity of detections
+from the objects after it, landmarks are associated by
 the joint Gaussian of the new pose and the landmarks (`saga_fg.slam.mapping.associate`), vehicles are assigned to lanes
 by the present pose (`saga_fg.slam.joint.lanes`), and iSAM2 solves the window with the new factors. Epochs older than
 `lag` leave, and landmarks last observed from them (`saga_fg.slam.joint.window`). With a lag longer than the recording
@@ -22,6 +23,7 @@ from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform
 from saga_fg.slam.joint.batch import checked_landmarks
 from saga_fg.slam.joint.estimate import JointEstimate, read_estimate
+from saga_fg.slam.joint.identity import with_identities
 from saga_fg.slam.joint.landmarks import Observations, WindowLandmarks
 from saga_fg.slam.joint.lanes import LaneAssociation
 from saga_fg.slam.joint.odometry import OdometryIncrements
@@ -33,6 +35,8 @@ from saga_fg.slam.mapping import MapperSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Landmark, Observation
+
+_DOUBTFUL = 0.9  # probability of an assignment below which its detection is weighed anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +75,10 @@ class OnlineEstimator:
         if not (math.isfinite(lag) and lag >= 0):
             raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
         self._lag, self._settings = lag, settings or JointSettings()
-        self._recorder = EpochRecorder(tracker, self._settings.online_motion_noise)
+        self._recorder = EpochRecorder(tracker)
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._window = Window(self._settings, providers)
+        self._clutter_area = tracker.settings.association.clutter_area
         self._landmarks = WindowLandmarks(mapper or MapperSettings())
         self._lanes = LaneAssociation(self._settings.lanes, [tracker.settings.road_map])
         self._stationary: list[FloatArray] = []
@@ -111,14 +116,19 @@ class OnlineEstimator:
         more: list[FactorProvider] = []
         if observations:
             more.append(self._landmarks.observe(number, solution, observations))
-        if self._lanes.assign(window.record, read_estimate(window.record[-1:], solution), self._stationary[-1:]):
+        last = self._stationary[-1:]
+        newest = read_estimate(window.record[-1:], solution, last)
+        doubtful = with_identities(now, newest.world_T_ego[-1], newest.objects[-1].position, self._clutter_area)
+        if (doubtful.seen.probability < _DOUBTFUL).any():
+            more.append(window.weighed(doubtful))
+        if self._lanes.assign(window.record, newest, last):
             more.append(self._lanes)
         if more:
             self._stationary = self._probabilities(window.record, window.path)
             solution = window.extend(self._stationary, more)
         self._solution = solution
         settled = self._slide(solution)
-        newest = read_estimate(window.record[-1:], solution)
+        newest = read_estimate(window.record[-1:], solution, self._stationary[-1:])
         self._slow = newest.slow_errors
         return OnlineStep(newest, settled)
 
@@ -126,7 +136,7 @@ class OnlineEstimator:
         """The estimate of all epochs in the window. Raises `InputError` before the first frame."""
         if self._solution is None:
             raise InputError("expected a frame before the estimate is asked for")
-        return read_estimate(self._window.record, self._solution)
+        return read_estimate(self._window.record, self._solution, self._stationary)
 
     def landmarks(self) -> list[Landmark]:
         """All landmarks so far: those in the window, and others in their last state."""
@@ -142,8 +152,9 @@ class OnlineEstimator:
         count = window.older_than(window.record[-1].time - self._lag)
         if not count:
             return None
-        settled = read_estimate(window.record[:count], solution)
+        settled = read_estimate(window.record[:count], solution, self._stationary[:count])
         first = window.record[count].epoch
+        self._stationary = self._stationary[count:]
         window.leave(count, [*self._landmarks.forget(first, solution), *self._lanes.forget(first)])
         return settled
 

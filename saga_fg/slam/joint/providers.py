@@ -20,15 +20,18 @@ from saga_fg.slam.joint.graph import (
     Record,
     detections,
     error_key,
-    linear_factors,
+    new_object_factors,
     object_key,
     odometry,
     start_factors,
     stationary_factors,
 )
+from saga_fg.slam.joint.motion import motion_factors, new_streams
+from saga_fg.slam.joint.record import RecordedEpoch
 from saga_fg.slam.joint.settings import JointSettings
 
 _SAME = 1e-3  # probability
+_VEHICLE_AND_OBJECTS = "vehicle and objects"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,7 @@ class VehicleAndObjects:
     path: Sequence[FloatArray] | FloatArray
     settings: JointSettings
     known: int = 0
-    name: str = "vehicle and objects"
+    name: str = _VEHICLE_AND_OBJECTS
 
     def factors(self, view: GraphView) -> Additions:
         row = view.epoch - self.record[0].epoch
@@ -61,13 +64,34 @@ class VehicleAndObjects:
             if name in seen:
                 state[kind.index(POSITION)] = seen[name]
             new.append(NewVariable(OBJECT, name, state, label=label))
-        factors: list[Factor] = [*linear_factors(now, before)]
+        factors: list[Factor] = [*new_object_factors(now, before)]
+        named: dict[Hashable, Factors] = {}
+        if before:
+            new += new_streams(now)
+            factors += motion_factors(now)
         if k == 0:
             factors += start_factors(k, pose, self.settings)
         if row + 1 == len(self.record):
             factors += odometry(self.record[max(self.known - 1, 0) :], self.settings)
-            factors += detections(self.record[self.known :], self.settings)
-        return Additions(new, factors)
+            named[detections_name(now)] = detections(self.record[self.known :], self.settings)
+        return Additions(new, factors, named=named)
+
+
+def detections_name(now: RecordedEpoch) -> Hashable:
+    """Name of the detections up to an epoch among the factors of `VehicleAndObjects`."""
+    return ("detections", now.epoch)
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Replace the detections of an epoch that `VehicleAndObjects` has added alone."""
+
+    now: RecordedEpoch
+    settings: JointSettings
+    name: str = _VEHICLE_AND_OBJECTS
+
+    def factors(self, view: GraphView) -> Additions:
+        return Additions(named={detections_name(self.now): detections([self.now], self.settings)})
 
 
 class StationaryPairs:

@@ -7,17 +7,18 @@ the vehicle's frame, where they do not depend on the path.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.model.motion import NodeType
 from saga_fg.model.sensor import Sensor
 from saga_fg.model.transition import Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint.odometry import OdometryIncrements
 from saga_fg.slam.joint.settings import JointSettings
@@ -25,15 +26,22 @@ from saga_fg.tracking import Tracker
 from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedDetections:
-    """Detections assigned to objects: id (m,); z (m, 3), m, in the vehicle's frame; R (m, 2, 2), m^2, in its axes."""
+    """Detections assigned to objects: id (m,); z (m, 3), m, in the vehicle's frame; R (m, 2, 2), m^2, in its axes.
+
+    probability  (m,) that the detection is of this object
+    row          (m,) of the detection in the frame
+    """
 
     id: IntArray
     z: FloatArray
     R: FloatArray
+    probability: FloatArray
+    row: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +70,7 @@ class RecordedEpoch:
     seen        detections of them
     transition  of the objects that the epoch before has as well; None if there are none
     covariance  (6, 6) of a_T_b, as in `OdometryIncrements`, where the device states one
+    headings    of vehicles at the epoch before by id, rad from the vehicle's heading
     """
 
     epoch: int
@@ -71,16 +80,17 @@ class RecordedEpoch:
     seen: RecordedDetections
     transition: Transition | None
     covariance: FloatArray | None = None
+    headings: Mapping[int, float] = field(default_factory=dict)
 
 
 class EpochRecorder:
-    """Record one frame after the other with a tracker; motion_noise: factor on the process noise of the objects."""
+    """Record one frame after the other with a tracker."""
 
-    def __init__(self, tracker: Tracker, motion_noise: float = 1.0) -> None:
+    def __init__(self, tracker: Tracker) -> None:
         self._tracker = tracker
-        self._motion_noise = motion_noise
         self._types: dict[str, NodeType] = {}
         self._last: RecordedEpoch | None = None
+        self._headings: Mapping[int, float] = {}
 
     def add(
         self, epoch: int, frame: Frame, world_T_ego: FloatArray, a_T_b: FloatArray, covariance: FloatArray | None = None
@@ -94,17 +104,17 @@ class EpochRecorder:
             raise InputError(f"frame at {frame.timestamp:.6f} s: expected one after {last.time:.6f} s")
         detections = in_ego(frame, tracker.sensor(frame.sensor))
         before = tracker.graph
-        tracker.step(Frame(frame.timestamp, frame.sensor, detections, world_T_ego, "ego"))
+        tracks = tracker.step(Frame(frame.timestamp, frame.sensor, detections, world_T_ego, "ego"))
         seen, label = self._seen(frame, detections)
         objects, transition = self._objects(seen, label), None
         if last is not None and tracker.graph is not None and tracker.graph is not before:
             graph = tracker.graph.only(last.objects.id)
-            graph = replace(graph, diffusion_scale=self._motion_noise * graph.diffusion_scale)
             stay = np.isin(last.objects.id, graph.nodes)
             objects = _joined(last.objects.select(np.flatnonzero(stay)), objects)
             if len(graph):
                 transition = discretise(graph, frame.timestamp - last.time)
-        self._last = RecordedEpoch(epoch, frame.timestamp, a_T_b, objects, seen, transition, covariance)
+        headings, self._headings = self._headings, _headings(tracks, world_T_ego)
+        self._last = RecordedEpoch(epoch, frame.timestamp, a_T_b, objects, seen, transition, covariance, headings)
         return self._last
 
     def _seen(self, frame: Frame, detections: Detections) -> tuple[RecordedDetections, list[str]]:
@@ -116,7 +126,8 @@ class EpochRecorder:
         ids = tracker.assignment.id[mine]
         order = np.argsort(ids)
         rows = rows[order]
-        seen = RecordedDetections(ids[order], measurements.boxes.position[rows], measurements.R[rows, :2, :2])
+        z, R = measurements.boxes.position[rows], measurements.R[rows, :2, :2]
+        seen = RecordedDetections(ids[order], z, R, np.ones(len(rows)), measurements.row[rows])
         return seen, measurements.boxes.label[rows].tolist()
 
     def _objects(self, seen: RecordedDetections, label: list[str]) -> RecordedObjects:
@@ -132,13 +143,12 @@ def record_epochs(
     world_T_ego: FloatArray,
     odometry: OdometryIncrements,
     tracker: Tracker,
-    motion_noise: float = 1.0,
 ) -> list[RecordedEpoch]:
     """The record of `frames` (n) along a path (n, 4, 4), with odometry between them.
 
     An object belongs to all epochs from its first to its last detection.
     """
-    recorder = EpochRecorder(tracker, motion_noise)
+    recorder = EpochRecorder(tracker)
     steps = [np.eye(4), *odometry.a_T_b]
     covariances = [None] * len(steps) if odometry.covariances is None else [None, *odometry.covariances]
     inputs = zip(range(len(frames)), frames, world_T_ego, steps, covariances, strict=True)
@@ -182,6 +192,13 @@ def in_ego(frame: Frame, sensor: Sensor) -> Detections:
             f"frame at {frame.timestamp:.6f} s: expected a pose, or detections in ego or sensor coordinates"
         )
     return frame.detections.transformed(inverse_transform(frame.world_T_ego))
+
+
+def _headings(tracks: Tracks, world_T_ego: FloatArray) -> dict[int, float]:
+    """Headings of vehicles from that of the vehicle, rad."""
+    yaw = tracks.boxes.yaw - np.arctan2(world_T_ego[1, 0], world_T_ego[0, 0])
+    known = of_classes(tracks.boxes.label, VEHICLES) & np.isfinite(yaw)
+    return dict(zip(tracks.id[known].tolist(), yaw[known].tolist(), strict=True))
 
 
 def _joined(before: RecordedObjects, seen: RecordedObjects) -> RecordedObjects:

@@ -67,12 +67,6 @@ class JointSettings(Settings):
         0.1,
         "standard deviation of the velocity of a stationary object, m/s; higher: slow objects are taken for stationary",
     )
-    motion_noise: Positive = setting(
-        1000.0, "factor on the process noise of objects; high, since traffic brakes and turns as one"
-    )
-    online_motion_noise: Positive = setting(
-        1.0, "factor on the process noise of objects online; higher: better paths, worse velocities"
-    )
     outlier_scale: PositiveOrInf = setting(
         3.0,
         "residual from which the Cauchy loss discounts a detection, standard deviations; usual 2 to 5; "
@@ -90,7 +84,7 @@ class JointSettings(Settings):
         0.15, "skip frames that follow a keyframe within this time, s; higher: faster, coarser"
     )
     passes: PositiveInt = setting(
-        2, "passes of associating objects along the latest path; usual 1 to 3; higher: slower"
+        3, "most passes of associating objects along the latest path; they end when associations repeat; higher: slower"
     )
     max_iterations: PositiveInt = setting(
         30, "largest number of linearisations in each pass; usual 10 to 50; higher: slower where they do not converge"

@@ -18,7 +18,8 @@ from saga_fg.graph import FactorProvider, GraphError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.slam.joint.graph import error_key, object_key
-from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects
+from saga_fg.slam.joint.motion import stream_keys
+from saga_fg.slam.joint.providers import Detections, StationaryPairs, VehicleAndObjects
 from saga_fg.slam.joint.record import RecordedEpoch
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.mapping import pose_key
@@ -72,6 +73,11 @@ class Window:
         self._smoother.extend([*providers, self._stationary.with_probabilities(self.record, stationary)])
         return self._smoother.solution()
 
+    def weighed(self, now: RecordedEpoch) -> Detections:
+        """The detections of the newest epoch with other probabilities, as a provider for `extend`."""
+        self.record[-1] = now
+        return Detections(now, self._settings)
+
     def older_than(self, time: float) -> int:
         """Number of epochs that may leave so that one at `time` or before still stays, if there is one."""
         return sum(now.time <= time for now in self.record[1:])
@@ -85,4 +91,5 @@ class Window:
 def _keys(now: RecordedEpoch) -> list[int]:
     """The variables of an epoch."""
     k = now.epoch
-    return [pose_key(k), error_key(k), *(object_key(k, name) for name in now.objects.id.tolist())]
+    objects = [object_key(k, name) for name in now.objects.id.tolist()]
+    return [pose_key(k), error_key(k), *objects, *stream_keys(now)]

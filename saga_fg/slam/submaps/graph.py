@@ -76,12 +76,16 @@ class SubmapSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class AnchorLoop:
-    """The anchor of submap `second` seen from that of `first` (4, 4), and the covariance (6, 6) of its tangent."""
+    """The anchor of submap `second` seen from that of `first` (4, 4), and the covariance (6, 6) of its tangent.
+
+    confirmed: by another loop, against the odometry; it is under no robust loss
+    """
 
     first: int
     second: int
     first_T_second: FloatArray
     covariance: FloatArray
+    confirmed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +325,10 @@ class _Loops:
 
     def factors(self, view: GraphView) -> Additions:
         keys = [(pose_key(self.anchors[one.first]), pose_key(self.anchors[one.second])) for one in self.loops]
-        pairs = zip(keys, self.loops, strict=True)
+        losses = [None if one.confirmed else self.robust for one in self.loops]
         return Additions(
-            factors=[between_factor(*pair, one.first_T_second, one.covariance, self.robust) for pair, one in pairs]
+            factors=[
+                between_factor(*pair, one.first_T_second, one.covariance, loss)
+                for pair, one, loss in zip(keys, self.loops, losses, strict=True)
+            ]
         )

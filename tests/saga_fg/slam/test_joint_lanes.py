@@ -109,7 +109,7 @@ def test_a_vehicle_keeps_the_lane_that_it_surely_drives_along() -> None:
     lanes = known_lanes([None, RoadMap(lanes=(Lane("a", ((0, 0), (90, 0))), Lane("b", ((90, 3.5), (0, 3.5)))))])
     place = np.array([[10.0, 0.2], [20.0, 3.4], [30.0, 3.4], [40.0, 1.75], [-9.0, 0.0], [50.0, 0.0], [60.0, 0.1]])
     velocity = np.array([[9.0, 0], [9.0, 0], [-9.0, 0], [9.0, 0], [9.0, 0], [9.0, 0], [9.0, 2.0]])
-    cars = ObjectStates(np.arange(7), ("car",) * 5 + ("pedestrian", "car"), place, velocity)
+    cars = ObjectStates(np.arange(7), ("car",) * 5 + ("pedestrian", "car"), place, velocity, np.zeros(7))
     stands = np.array([0.0, 0, 0.5, 0, 0, 0, 0])
 
     def found(sideways: float, seen: FloatArray | None = None) -> dict[int, tuple[int, float]]:

@@ -1,4 +1,4 @@
-"""`python -m benchmarks joint`: joint against decoupled estimation, in batch and online."""
+"""`saga-fg bench joint`: joint against decoupled estimation, in batch and online."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.app import app
-from benchmarks.joint import JointBench, bench_joint
-from benchmarks.joint_online import bench_online
-from benchmarks.simulated_poles import observe_poles
 from data_tools.simulator import simulate_scene
+from pipelines.bench.joint import JointBench, bench_joint
+from pipelines.bench.joint_online import bench_online
+from pipelines.bench.simulated_poles import observe_poles
+from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.slam.joint import run_joint, street
 from saga_fg import InputError
@@ -44,7 +44,7 @@ def test_the_benchmark_pools_recordings_and_compares_the_same_odometry() -> None
 
 
 def test_options_of_the_benchmark_go_together() -> None:
-    done = CliRunner().invoke(app, ["joint", "--dataroot", "somewhere"])
+    done = CliRunner().invoke(app, ["bench", "joint", "--dataroot", "somewhere"])
     assert done.exit_code != 0
     assert "expected both --dataroot and --detections" in done.output
 
@@ -56,26 +56,34 @@ def test_online_objects_are_scored_where_both_report_them() -> None:
     for scene, row in zip(scenes, result.rows, strict=True):
         run = run_joint(scene, config, JointSettings(), "lidar", 0, lag=1.0)
         assert row.ate == (run.errors()["odometry"].ate, run.errors()["online"].ate)
-        assert row.pairs > 20
-        assert 0 < row.median_velocity[1] < row.velocity[1] < 5
-        assert 0 < row.position[1] < 2
-    squares = np.array([np.square(row.position) * row.pairs for row in result.rows]).sum(axis=0)
-    assert result.position.estimate == pytest.approx(np.sqrt(squares[1] / squares[0]) - 1)
+        assert {(one.contender, one.moving) for one in row.objects} == {
+            (name, moving) for name in ("decoupled", "joint") for moving in (True, False)
+        }
+        for one in row.objects:
+            assert one.pairs > 5
+            assert 0 < one.rmse[1] < 5
+            assert 0 < one.rmse[2] < 1
+    moving = [one for row in result.rows for one in row.objects if one.moving]
+    squares = {
+        name: sum(x.pairs * x.rmse[0] ** 2 for x in moving if x.contender == name) for name in ("decoupled", "joint")
+    }
+    change = next(one for one in result.objects if one.moving)
+    assert change.changes[0].estimate == pytest.approx(np.sqrt(squares["joint"] / squares["decoupled"]) - 1)
 
 
 def test_the_online_benchmark_prints_both_and_wants_the_truth() -> None:
     scene = replace(simulate_scene(SHORT, 1), ground_truth=None)
     with pytest.raises(InputError, match="expected ground truth"):
         bench_online([scene], load_config("simulated"), [0], lag=1.0)
-    done = CliRunner().invoke(app, ["joint", "--online", "--poles"])
+    done = CliRunner().invoke(app, ["bench", "joint", "--online", "--poles"])
     assert "--online: expected neither --poles nor --lanes" in done.output
 
 
 def test_the_command_prints_and_writes_the_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.joint.street", lambda parked, mapped: SHORT)
-    for option, expected in (("--poles", "ATE, with poles against without"), ("--online", "pooled, 95 % interval")):
+    monkeypatch.setattr("pipelines.slam.joint.street", lambda parked, mapped: SHORT)
+    for option, expected in (("--poles", "joint against held"), ("--online", "pooled, 95 % interval")):
         file = tmp_path / f"{option}.json"
-        done = CliRunner().invoke(app, ["joint", "--scenes", "2", option, "--json", str(file)])
+        done = CliRunner().invoke(app, ["bench", "joint", "--scenes", "2", option, "--json", str(file)])
         assert done.exit_code == 0, done.output
         assert expected in done.stdout
         assert len(json.loads(file.read_text())["rows"]) == 2

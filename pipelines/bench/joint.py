@@ -1,9 +1,10 @@
-"""`python -m benchmarks joint`: the vehicle and the objects around it estimated together, with poor odometry.
+"""The vehicle and the objects around it estimated together, with poor odometry, from whole recordings.
 
-Decoupled: the odometry's path. Joint: odometry and objects in one graph. Both know the same odometry, degraded by
-errors sampled with a seed. The absolute trajectory error (ATE) of a path is measured after the path is aligned with the
-true one. Intervals are paired bootstraps over recordings, the seeds of one recording taken together, of the change of
-the pooled ATE.
+Decoupled: the odometry's path, and the tracker along it. Joint: odometry and objects in one graph. Held: objects by the
+same graph, with past and future, the path held where the odometry has it. All know the same odometry, degraded by
+errors sampled with a seed. Errors of objects are those of `pipelines.bench.joint_objects`. The absolute trajectory
+error (ATE) of a path is measured after the path is aligned with the true one. Intervals are paired bootstraps over
+recordings, the seeds of one recording taken together, of the change of the pooled error.
 """
 
 from __future__ import annotations
@@ -11,27 +12,31 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
-from benchmarks.joint_online import bench_online, online_table
-from benchmarks.simulated_poles import poles_at
-from data_tools.datasets.kitti import KittiTracking
-from data_tools.figures import FigureTable, cell, percent, write_figures
+from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, paired_bootstrap
-from data_tools.simulator import simulate_scene
-from pipelines.cli.console import progress_bar
-from pipelines.cli.options import Config, Verbose
-from pipelines.cli.tables import JsonFile, report
-from pipelines.config import TrackConfig, load_config
-from pipelines.slam.joint import JointRun, run_joint, street
+from pipelines.bench.joint_objects import (
+    HeldPath,
+    ObjectChange,
+    ObjectErrors,
+    ObjectRow,
+    by_recording,
+    object_changes,
+    object_rows,
+    object_tables,
+    true_objects,
+    true_speeds,
+)
+from pipelines.bench.simulated_poles import poles_at
+from pipelines.config import TrackConfig
+from pipelines.slam.joint import JointRun, path_tracker, run_joint
 from pipelines.tracking import Progress
-from saga_fg.errors import InputError
-from saga_fg.slam.joint import JointSettings, LaneSettings
+from saga_fg.slam.joint import JointSettings, LaneSettings, estimate_jointly
+from saga_fg.slam.joint.record import in_ego
 from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,7 @@ class JointRow:
     joint_in_map         RMS distance from the truth without alignment, m
     lanes_in_map         RMS distance with vehicles drawn to the lanes of a map; NaN without a map
     lanes_ate            ATE with lanes
+    objects              errors of objects; none without ground truth
     """
 
     scene: str
@@ -56,6 +62,7 @@ class JointRow:
     joint_in_map: float
     lanes_in_map: float
     lanes_ate: float
+    objects: tuple[ObjectRow, ...]
 
 
 @dataclass(frozen=True)
@@ -65,12 +72,14 @@ class JointBench:
     change     of joint against decoupled
     landmarks  of joint with poles against joint without; None without poles
     lanes      of joint with lanes against joint without, of the error in the map; None without lanes
+    objects    of errors of objects, joint against the others
     """
 
     rows: tuple[JointRow, ...]
     change: Interval
     landmarks: Interval | None
     lanes: Interval | None
+    objects: tuple[ObjectChange, ...]
 
 
 def bench_joint(
@@ -117,6 +126,7 @@ def bench_joint(
                     _in_map(run),
                     float("nan") if on_lanes is None else _in_map(on_lanes),
                     float("nan") if on_lanes is None else on_lanes.errors()["joint"].ate,
+                    score_objects(run, scene, config, settings),
                 )
             )
             if progress is not None:
@@ -124,6 +134,43 @@ def bench_joint(
             if so_far is not None:
                 so_far(_judged(rows, poles, lanes))
     return _judged(rows, poles, lanes)
+
+
+def score_objects(run: JointRun, scene: Scene, config: TrackConfig, settings: JointSettings) -> tuple[ObjectRow, ...]:
+    """Errors of the objects of a run; none without ground truth."""
+    if scene.ground_truth is None:
+        return ()
+    driven, true = run.odometry.world_T_ego, run.truth.world_T_ego
+    held = estimate_jointly(
+        run.frames,
+        run.increments,
+        partial(path_tracker, config),
+        replace(settings, passes=1),
+        driven[0],
+        new_providers=lambda: [HeldPath(driven)],
+    )
+    tracker = path_tracker(config)
+    errors = {name: ObjectErrors() for name in ("decoupled", "held", "joint")}
+    labelled = []
+    for k, frame in enumerate(run.frames):
+        moment = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
+        detections = in_ego(frame, tracker.sensor(frame.sensor))
+        tracks = tracker.step(Frame(frame.timestamp, frame.sensor, detections, driven[k], "ego"))
+        if abs(scene.timestamps[moment] - frame.timestamp) > 1e-3:
+            continue
+        truth = scene.ground_truth[moment]
+        labelled.append((k, truth))
+        objects = true_objects(detections, frame.world_T_ego, truth)
+        boxes = np.concatenate([tracks.boxes.position[:, :2], tracks.boxes.velocity], axis=1)
+        found = {"decoupled": (tracks.id, boxes, driven[k], tracker.assignment)}
+        for name, one in (("held", held), ("joint", run.estimate)):
+            now = one.objects[k]
+            states = np.concatenate([now.position, now.velocity], axis=1)
+            found[name] = now.id, states, one.world_T_ego[k], one.assignment(k)
+        for name, (ids, states, pose, assignment) in found.items():
+            detected = zip(assignment.id.tolist(), assignment.detection.tolist(), strict=True)
+            errors[name].add(k, ids, states, (pose, true[k]), detected, objects, truth)
+    return object_rows(errors, true_speeds(labelled))
 
 
 def _in_map(run: JointRun) -> float:
@@ -135,7 +182,9 @@ def _judged(rows: Sequence[JointRow], poles: bool, lanes: bool) -> JointBench:
     change = _change(rows, lambda row: row.joint_ate, lambda row: row.decoupled_ate)
     landmarks = _change(rows, lambda row: row.landmarks_ate, lambda row: row.joint_ate) if poles else None
     in_lanes = _change(rows, lambda row: row.lanes_in_map, lambda row: row.joint_in_map) if lanes else None
-    return JointBench(tuple(rows), change, landmarks, in_lanes)
+    recordings = by_recording((row.scene, row.objects) for row in rows)
+    objects = object_changes(recordings, "joint", ("decoupled", "held")) if any(row.objects for row in rows) else ()
+    return JointBench(tuple(rows), change, landmarks, in_lanes, objects)
 
 
 def _change(rows: Sequence[JointRow], a: Callable[[JointRow], float], b: Callable[[JointRow], float]) -> Interval:
@@ -149,74 +198,7 @@ def _change(rows: Sequence[JointRow], a: Callable[[JointRow], float], b: Callabl
     return paired_bootstrap(sums(a), sums(b))
 
 
-def joint(
-    dataroot: Annotated[
-        Path | None, typer.Option("--dataroot", help="KITTI tracking; without it, simulated streets.")
-    ] = None,
-    detections: Annotated[
-        Path | None, typer.Option("--detections", help="Folder of a detector: Car/, Pedestrian/, Cyclist/.")
-    ] = None,
-    sequences: Annotated[str | None, typer.Option("--sequences", help="KITTI sequences, by commas; all.")] = None,
-    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
-    first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first simulated scene.")] = 0,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
-    poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False,
-    lanes: Annotated[
-        bool, typer.Option("--lanes", help="Simulated: once more with vehicles drawn to the lanes of a map.")
-    ] = False,
-    parked: Annotated[
-        bool, typer.Option("--parked/--no-parked", help="Simulated: cars parked on both sides, or none.")
-    ] = True,
-    online: Annotated[
-        bool, typer.Option("--online", help="In a running graph, frame by frame; objects are scored too.")
-    ] = False,
-    lag: Annotated[float, typer.Option("--lag", min=0.0, help="Of the running graph, s.")] = 3.0,
-    json_file: JsonFile = None,
-    config: Config = None,
-    verbose: Verbose = False,
-) -> None:
-    """Joint against decoupled estimation with degraded odometry: the error of the path, online also of the objects.
-
-    The odometry has noise, a scale error and a bias of the yaw rate, all wandering, sampled anew for every seed. The
-    figures so far are written to the file of --json after every run.
-
-    \b
-    Examples:
-      python -m benchmarks joint --scenes 10 --poles
-      python -m benchmarks joint --scenes 10 --lanes --no-parked
-      python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
-      python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
-    """
-    if (dataroot is None) != (detections is None):
-        raise InputError("expected both --dataroot and --detections, or neither")
-    if dataroot is not None and (poles or lanes or not parked):
-        raise InputError("--poles, --lanes and --no-parked: expected with simulated streets only")
-    if online and (poles or lanes):
-        raise InputError("--online: expected neither --poles nor --lanes")
-    if dataroot is None:
-        many = [simulate_scene(street(parked, mapped=lanes), seed) for seed in range(first, first + scenes)]
-        settings = load_config("simulated", config)
-    else:
-        kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","), online)
-        many = [kitti.scene(name) for name in kitti.scenes]
-        settings = load_config("kitti", config)
-
-    def so_far(result: object) -> None:
-        if json_file is not None:
-            write_figures(json_file, result)
-
-    with progress_bar(unit="runs") as progress:
-        if online:
-            on = bench_online(many, settings, range(seeds), lag, progress=progress, so_far=so_far)
-            report([online_table(on)], on, json_file)
-        else:
-            found = bench_joint(
-                many, settings, range(seeds), poles=poles, lanes=lanes, progress=progress, so_far=so_far
-            )
-            report(_tables(found), found, json_file)
-
-
-def _tables(result: JointBench) -> list[FigureTable]:
+def joint_tables(result: JointBench) -> list[FigureTable]:
     rows = []
     for name in dict.fromkeys(row.scene for row in result.rows):
         mine = [row for row in result.rows if row.scene == name]
@@ -242,4 +224,5 @@ def _tables(result: JointBench) -> list[FigureTable]:
     return [
         FigureTable("error of the vehicle's path, medians over samples", columns, tuple(rows)),
         FigureTable("changes of pooled errors", ("error", "change, 95 % interval", "lower in runs"), changes),
+        *object_tables(by_recording((row.scene, row.objects) for row in result.rows), result.objects),
     ]

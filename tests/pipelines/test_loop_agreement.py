@@ -1,0 +1,49 @@
+"""Loops that wait for another: two that close a chain are believed, and one that does not is forgotten."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import pytest
+
+from pipelines.slam.loop_agreement import Agreement, deviation
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform, yaw_transform
+from saga_fg.numerics.planar_poses import transform
+from saga_fg.slam.pose_graph.distances import shortest_ways
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    first: int
+    second: int
+    first_T_second: FloatArray
+
+
+def test_deviation_is_the_same_in_the_plane_and_in_space() -> None:
+    np.testing.assert_allclose(deviation(transform(np.array([3.0, 4.0, -0.5]))), [5.0, 0.5])
+    pose = gtsam.Pose3(gtsam.Rot3.Rodrigues(np.array([0.3, 0.0, 0.4])), np.array([0.0, 0.0, 2.0])).matrix()
+    np.testing.assert_allclose(deviation(pose), [2.0, 0.5])
+    np.testing.assert_allclose(deviation(np.eye(4)), [0.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("off", "later", "believed"), [(0.1, 4, 2), (0.8, 4, 0), (0.1, 9, 0), (0.1, 1, 0)])
+def test_a_loop_is_believed_when_another_agrees(off: float, later: int, believed: int) -> None:
+    """Poses 10 m apart along a line; two loops from 20 on to 0 on, the second off by `off` m, `later` poses on."""
+    poses = [yaw_transform(x=10.0 * k) for k in range(40)]
+    agreement: Agreement[Loop] = Agreement(np.array([0.3, 0.05]), np.zeros(2), patience=80.0, apart=15.0)
+    loops = [Loop(0, 20, yaw_transform(5.0)), Loop(2, 20 + later, yaw_transform(5.0 + 10.0 * (later - 2) + off))]
+    found = [
+        agreement.confirmed(loop, lambda a, b: inverse_transform(poses[a]) @ poses[b], lambda k: 10.0 * k)
+        for loop in loops
+    ]
+    assert len(found[0]) == 0
+    assert len(found[1]) == believed
+
+
+def test_ways_take_the_shortest_measurements() -> None:
+    first, second = np.array([0, 1, 2, 0, 0]), np.array([1, 2, 3, 3, 1])
+    length = np.array([5.0, 5.0, 5.0, 1.0, 7.0])
+    np.testing.assert_allclose(shortest_ways(first, second, length, 5, 0), [0.0, 5.0, 6.0, 1.0, np.inf])

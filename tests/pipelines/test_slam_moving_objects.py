@@ -1,0 +1,69 @@
+"""Moving objects leave the map, parked ones stay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_tools.lidar import constant_velocity
+from data_tools.simulator.scanner import StaticWorld, simulate_scan
+from data_tools.simulator.street import SMALL, SimulatedScans
+from pipelines.config import load_config
+from pipelines.slam.joint import path_tracker
+from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
+from saga_fg import Boxes, Detections, Frame, InputError
+from saga_fg.numerics.geometry import inverse_transform, transform_points
+
+START, SPEED = np.array([5.0, 1.5, 0.75]), 7.0  # m, m/s, of a car that drives ahead
+SIZE = np.array([4.4, 1.8, 1.5])
+
+
+def drive_behind_a_car(count: int = 24) -> tuple[SimulatedScans, list[Frame], np.ndarray]:
+    """Scans of a street in which a car drives, frames with all cars, and the places of the moving one."""
+    scans = SimulatedScans(1, count)
+    rng, still = np.random.default_rng(0), scans.world
+    parked = still.boxes.select(still.boxes.label == "car")
+    places, frames = START + np.outer(scans.timestamps, [SPEED, 0, 0]), []
+    for k, (time, pose) in enumerate(zip(scans.timestamps.tolist(), scans.world_T_ego, strict=True)):
+        mover = Boxes.of(["car"], places[[k]], SIZE[None], [0.0], [[0.0, 0.0]])
+        world = StaticWorld(Boxes.concatenate([still.boxes, mover]), still.poles)
+        a = min(k, count - 2)
+        motion = constant_velocity(inverse_transform(scans.world_T_ego[a]) @ scans.world_T_ego[a + 1], SMALL.period)
+        scans._scans[k] = simulate_scan(world, pose, rng, SMALL, motion)
+        cars = Boxes.concatenate([parked, mover])
+        near = cars.select(np.linalg.norm(cars.position - pose[:3, 3], axis=1) < 30)
+        seen = Boxes.of(near.label.tolist(), near.position, near.size, near.yaw).transformed(inverse_transform(pose))
+        frames.append(Frame(time, "lidar", Detections(seen, np.full(len(seen), 3.0)), np.eye(4), "ego"))
+    return scans, frames, places
+
+
+def points_on(result: LidarSlamResult, places: np.ndarray, size: np.ndarray = SIZE) -> int:
+    """Number of points of the map in boxes along x, above the ground."""
+    cloud = np.concatenate(
+        [
+            transform_points(T, one.points.astype(float))
+            for T, one in zip(result.world_T_submap, result.submaps, strict=True)
+        ]
+    )
+    inside = [(np.abs(cloud - place) < size / 2).all(axis=1) & (cloud[:, 2] > 0.3) for place in places]
+    return int(np.any(inside, axis=0).sum())
+
+
+def test_the_trail_of_a_moving_car_is_not_in_the_map() -> None:
+    scans, frames, places = drive_behind_a_car()
+    settings = LidarSlamSettings(loop_closures=False, landmarks=False)
+    before = lidar_slam(scans, "lidar", settings)
+    after = lidar_slam(scans, "lidar", settings, frames=frames, tracker=path_tracker(load_config("kitti")))
+    assert points_on(before, places[5:]) > 200
+    assert points_on(after, places[5:]) < 0.05 * points_on(before, places[5:])
+    parked = scans.world.boxes.select(scans.world.boxes.label == "car").position
+    near = parked[np.abs(parked[:, 0] - scans.world_T_ego[len(frames) // 2, 0, 3]) < 15]
+    assert len(near) >= 3
+    kept, there = (points_on(one, near, SIZE + 0.4) for one in (after, before))
+    assert kept > 0.9 * there > 100
+
+
+def test_a_scan_needs_its_frame() -> None:
+    scans, frames, _ = drive_behind_a_car(4)
+    with pytest.raises(InputError, match=r"expected one of detections at 0\.300 s, the time of a scan"):
+        lidar_slam(scans, frames=frames[:-1], tracker=path_tracker(load_config("kitti")))
