@@ -20,7 +20,16 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import Linearisable, OrientedPlane, PlanarPose, ResidualFactor, ResidualFactors, SpatialPose, Vector
+from factors import (
+    Linearisable,
+    OrientedPlane,
+    PlanarPose,
+    ResidualFactor,
+    ResidualFactors,
+    SpatialPose,
+    Vector,
+    unwrapped_angles,
+)
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.factor_groups import (
     CustomGroup,
@@ -29,6 +38,7 @@ from saga_fg.graph.factor_groups import (
     NativeGroup,
     SingleGroup,
     StackedGroup,
+    first_residual,
     members,
 )
 from saga_fg.graph.keys import described
@@ -119,6 +129,19 @@ def _check_variables(provider: str, group: FactorGroup, variables: Mapping[int, 
         if wrong:
             names = ", ".join(map(str, mine))
             raise GraphError(f"provider {provider}: {group.name} on {names}: {wrong}")
+
+
+def check_angles(
+    provider: str, group: FactorGroup, variables: Mapping[int, GraphVariable], values: gtsam.Values
+) -> None:
+    """Raise `GraphError` if the first residual of a group has an angle that nobody wraps."""
+    factor = first_residual(group)
+    if factor is not None and (angles := unwrapped_angles(factor, factor.states(values))):
+        named = ", ".join(str(variables[key]) for key in factor.keys)
+        raise GraphError(
+            f"provider {provider}: {factor.name} on {named}: component {angles[0]} of the residual jumps by 2 pi while "
+            f"the pose turns; expected angles={factor.angles + angles} in the factor"
+        )
 
 
 def _misfit(group: FactorGroup, row: int, variables: Sequence[GraphVariable]) -> str:

@@ -23,11 +23,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import FactorError, Solution, SolverSettings, marginal_factors, solve, unwrapped_angles
+from factors import FactorError, Solution, SolverSettings, marginal_factors, solve
 from factors.marginal import Elimination
 from saga_fg.graph.condensation import Condensation
 from saga_fg.graph.errors import GraphError
-from saga_fg.graph.factor_checks import Factor, grouped
+from saga_fg.graph.factor_checks import Factor, check_angles, grouped
 from saga_fg.graph.factor_groups import (
     ActiveRows,
     FactorEntry,
@@ -36,7 +36,6 @@ from saga_fg.graph.factor_groups import (
     LinearGroup,
     NativeGroup,
     PriorGroup,
-    first_residual,
 )
 from saga_fg.graph.keys import VariableKind, described, key_of
 from saga_fg.graph.linearisation_point import LinearisationPoint
@@ -165,7 +164,9 @@ class SceneFactorGraph:
         point = self.point()
         linear = [self.linearised(one, one.rows, point) for one in held]
         for one in held:
-            self._check_angles(one)
+            if (kind := (provider, one.factors.name)) not in self._angles_checked:  # one of each will do
+                check_angles(provider, one.factors, self._variables, self._values)
+                self._angles_checked.add(kind)
         if name is not None:
             for number in self._named.get((provider, name), ()):
                 self._drop(number)
@@ -175,19 +176,6 @@ class SceneFactorGraph:
                 self._fresh[number] = factors_there
                 if name is not None:
                     self._named[provider, name] = (*self._named.get((provider, name), ()), number)
-
-    def _check_angles(self, held: HeldGroup) -> None:
-        """Refuse residuals with angles that nobody wraps, at the first factor of each kind."""
-        factor = first_residual(held.factors)
-        if factor is None or (kind := (held.provider, factor.name)) in self._angles_checked:
-            return
-        self._angles_checked.add(kind)
-        if angles := unwrapped_angles(factor, factor.states(self._values)):
-            named = ", ".join(str(self._variables[key]) for key in factor.keys)
-            raise GraphError(
-                f"provider {held.provider}: {factor.name} on {named}: component {angles[0]} of the residual jumps by "
-                f"2 pi while the pose turns; expected angles={factor.angles + angles} in the factor"
-            )
 
     def marginalise(self, keys: Iterable[int], into: Condensation | None = None) -> None:
         """Integrate variables out; their information on the others stays, in the factors that `into` makes of it."""
