@@ -16,7 +16,8 @@ import numpy as np
 from data_tools.lidar import Scan
 from data_tools.simulator.course import SimulatedCourse, revisits
 from data_tools.trajectories import Trajectory, degraded_odometry, trajectory_errors
-from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
-from pipelines.slam.lidar_slam import LidarSlamResult
+from pipelines.slam.lidar_slam_types import LidarSlamResult
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import PoseGraph
 from saga_fg.types.landmark import Landmark

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from factors import Robust, between_factor
-from pipelines.slam.lidar_slam import LidarSlamResult
+from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.loop_closures import LoopClosure
 from saga_fg.graph import Additions, GraphView
 from saga_fg.slam.mapping import LandmarkObservations, pose_key

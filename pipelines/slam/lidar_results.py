@@ -36,7 +36,7 @@ from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.drive import KeyframeClouds
 from pipelines.slam.graph_export import pose_graph_of, write_landmark_table
-from pipelines.slam.lidar_slam import LidarSlamResult
+from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.results import landmark_rows, object_paths, write_covariances, write_objects
 from pipelines.slam.scan_landmarks import GROUND, LINE, WALL

@@ -17,7 +17,7 @@ Odometry is that of the LiDAR, or the recording's own poses, for comparison and 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -29,6 +29,7 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, motion
+from pipelines.slam.lidar_slam_types import LidarSlamResult, SlamStep
 from pipelines.slam.loop_closures import LoopClosure, LoopSettings, PlaceLoops
 from pipelines.slam.moving_objects import MovingObjects, frames_at
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
@@ -39,17 +40,16 @@ from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
-from saga_fg.slam.mapping import AssociatedObservation, MapperSettings
+from saga_fg.slam.mapping import MapperSettings
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers
 from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.landmark import Landmark
 
 _LOG = logging.getLogger(__name__)
 OdometrySource = Literal["lidar", "oxts"]
@@ -89,63 +89,6 @@ class LidarSlamSettings(Settings):
     oxts_translation: Positive = setting(
         0.03, "standard deviation of the translation of a GPS/IMU increment between scans, m"
     )
-
-
-@dataclass(frozen=True, eq=False)
-class SlamStep:
-    """One scan placed.
-
-    world_T_lidar  (4, 4) the sensor's pose now, in the map
-    covariance     (6, 6) of that, (rotation, translation) in the sensor's frame, rad^2, m^2
-    odometry       what the odometry said of the scan
-    keyframe       number of the keyframe that the scan became, None for none
-    submap         the one that it closed, None for none
-    loops          those found in it, between keyframes
-    """
-
-    world_T_lidar: FloatArray
-    covariance: FloatArray
-    odometry: OdometryStep
-    keyframe: int | None
-    submap: Submap | None
-    loops: tuple[LoopClosure, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class LidarSlamResult:
-    """Result for K scans, M of them keyframes, in S submaps, in the world of the first pose.
-
-    drive          the odometry; keyframes (M,) are rows among the scans
-    odometry       (K) poses of the vehicle by odometry alone; trajectory (K): by the graph; online (K): as estimated
-                   when the scan came
-    covariances    (M, 6, 6) of the keyframes' poses, (rotation, translation) in the sensor's frame, rad^2, m^2
-    landmarks      of the map, those seen more than once
-    observations   of landmarks, with the landmark and the keyframe of each
-    loops          that were closed, between keyframes
-    degenerate     (K) motions that each scan left open, in words
-    misfits        what does not fit of the vehicle's sensors, in words, by their names
-    submaps        S, and world_T_submap (S, 4, 4) their places
-    world_T_lidar  (M, 4, 4) poses of the keyframes
-    """
-
-    drive: Drive
-    odometry: Trajectory
-    trajectory: Trajectory
-    online: Trajectory
-    covariances: FloatArray
-    landmarks: Sequence[Landmark]
-    observations: Sequence[AssociatedObservation]
-    loops: Sequence[LoopClosure]
-    degenerate: Sequence[tuple[str, ...]]
-    misfits: Mapping[str, str]
-    submaps: Sequence[Submap]
-    world_T_submap: FloatArray
-    world_T_lidar: FloatArray
-
-    @property
-    def keyframes(self) -> IntArray:
-        """(M,) rows of the keyframes among the scans."""
-        return np.array(self.drive.keyframes, dtype=np.int64)
 
 
 class LidarSlam:

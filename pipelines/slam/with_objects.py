@@ -17,7 +17,8 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
 from pipelines.slam.known_providers import known_providers
-from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings
+from pipelines.slam.lidar_slam import LidarSlamSettings
+from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.moving_objects import frames_at
 from pipelines.slam.submaps import world_T_submap
 from saga_fg.graph import FactorProvider

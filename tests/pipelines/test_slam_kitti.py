@@ -15,7 +15,8 @@ from data_tools.simulator.street import CURB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
 from pipelines.slam.lidar_results import covered_spans, write_lidar_slam
-from pipelines.slam.lidar_slam import LidarSlam, LidarSlamResult, LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.loop_closures import LoopSettings
 from pipelines.slam.scan_landmarks import LINE, POLE
 from saga_fg.errors import InputError

@@ -10,7 +10,8 @@ from data_tools.simulator.scanner import StaticWorld, simulate_scan
 from data_tools.simulator.street import SMALL, SimulatedScans
 from pipelines.config import load_config
 from pipelines.slam.joint import path_tracker
-from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam_types import LidarSlamResult
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 
