@@ -127,7 +127,7 @@ def kitti(
         )
     if objects:
         with working("objects"):
-            together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers)
+            together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers, log)
             figures = write_lidar_slam(output, together, recorded)
     else:
         figures = write_lidar_slam(output, result, recorded)
