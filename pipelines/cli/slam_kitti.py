@@ -114,7 +114,8 @@ def kitti(
     if known_map is not None:
         _localise(recorded, known_map, guess, slam.localisation, output)
         return
-    log = sensor_log(training / "oxts" / f"{sequence}.txt", sensors, sensor_logs or (), seed)
+    records = training / "oxts" / f"{sequence}.txt"
+    log = sensor_log(records, sensors, sensor_logs or (), seed, recorded.timestamps)
     with progress_bar() as progress:
         lidar = replace(
             slam.lidar,
