@@ -13,7 +13,7 @@ landmarks.ply               points along the poles and on the observed pieces of
 tracks.csv                  objects, where there are any
 above.png                   map, paths, landmarks and the objects' tracks from above
 metrics.json                errors of the trajectories against the recording's own poses, the map's sharpness, scans
-                            that left motions open, and sensors that do not fit
+                            that left motions open, and sensors that do not fit or measured too little to tell
 
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
@@ -63,6 +63,7 @@ def metrics(result: LidarSlamResult, scans: ScanSequence) -> dict[str, Any]:
         "submaps": len(result.submaps),
         "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
         "misfits": dict(result.misfits),
+        "unjudged": dict(result.unjudged),
         "scan_to_map_residual": _residual(result, scans),
         **{
             name: asdict(trajectory_errors(getattr(result, name), truth, "start"))

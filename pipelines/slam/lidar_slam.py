@@ -45,7 +45,7 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import MapperSettings
-from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers
+from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers, unjudged
 from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
@@ -200,7 +200,8 @@ class LidarSlam:
             self._close(poses)
         solved = self._graph.finish()
         unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
-        for text in unfit.values():
+        unknown = unjudged(solved.graph, self._sensors, self.settings.sensors)
+        for text in (*unfit.values(), *unknown.values()):
             _LOG.warning(text)
         drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
         anchors = solved.world_T_pose[[submap.anchor for submap in self._submaps]]
@@ -216,6 +217,7 @@ class LidarSlam:
             self._closed,
             self._degenerate,
             unfit,
+            unknown,
             self._submaps,
             np.array([world_T_submap(*each) for each in zip(self._submaps, anchors, strict=True)]),
             solved.world_T_pose,

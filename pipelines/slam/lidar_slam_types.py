@@ -50,6 +50,7 @@ class LidarSlamResult:
     loops          that were closed, between keyframes
     degenerate     (K) motions that each scan left open, in words
     misfits        what does not fit of the vehicle's sensors, in words, by their names
+    unjudged       sensors that have measured too little to tell, likewise
     submaps        S, and world_T_submap (S, 4, 4) their places
     world_T_lidar  (M, 4, 4) poses of the keyframes
     """
@@ -64,6 +65,7 @@ class LidarSlamResult:
     loops: Sequence[LoopClosure]
     degenerate: Sequence[tuple[str, ...]]
     misfits: Mapping[str, str]
+    unjudged: Mapping[str, str]
     submaps: Sequence[Submap]
     world_T_submap: FloatArray
     world_T_lidar: FloatArray

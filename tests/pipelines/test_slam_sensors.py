@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ def test_in_a_tunnel_the_wheels_say_how_far() -> None:
     ends = [np.linalg.norm(one.trajectory.positions[-1] - scans.world_T_ego[-1, :3, 3]) for one in (alone, helped)]
     assert ends[1] < 0.5 < 2.0 < ends[0]
     figures = metrics(helped, scans)
-    assert figures["misfits"] == {}
+    assert figures["misfits"] == figures["unjudged"] == {}
     last = figures["degenerate"][-1]
     assert "along the road" in last["motions"]
     assert last["last"] == len(speed) - 1
@@ -78,6 +79,11 @@ def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) 
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert figures["degenerate"] == []
     assert figures["trajectory"]["ate"] < 0.5
+    assert figures["misfits"] == {}
+    assert set(figures["unjudged"]) == {"gps", "imu", "wheels"}
+    assert re.search(
+        r"gps: too few measurements to judge whether it fits: \d, 15 are needed", figures["unjudged"]["gps"]
+    )
 
 
 def test_sensors_that_are_not_there_are_refused(tmp_path: Path) -> None:
