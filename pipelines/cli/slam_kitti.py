@@ -129,9 +129,9 @@ def kitti(
     if objects:
         with working("objects"):
             together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers, log)
-            figures = write_lidar_slam(output, together, recorded)
+            figures = write_lidar_slam(output, together, recorded, odometry=lidar.odometry)
     else:
-        figures = write_lidar_slam(output, result, recorded)
+        figures = write_lidar_slam(output, result, recorded, odometry=lidar.odometry)
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
     counts.append(counted(figures["loops"], "loop"))

@@ -11,11 +11,13 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan, constant_velocity, deskewed
+from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
 from pipelines.slam.odometry import OdometrySettings, OdometryStep
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.types.boxes import Boxes
 
 LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: the best accuracy of a registration, rad and m
 
@@ -97,14 +99,18 @@ def still(scan: Scan, row: int, poses: FloatArray, timestamps: FloatArray, setti
 
 
 class KeyframeClouds(Sequence[FloatArray]):
-    """Points (N, 3) of keyframes in the frame of the sensor, without skew by `drive`, read from the recording again."""
+    """Points (N, 3) of keyframes in the frame of the sensor, without skew by `drive`, read from the recording again.
 
-    def __init__(self, scans: ScanSequence, drive: Drive, settings: OdometrySettings) -> None:
-        self._scans, self._drive, self._settings = scans, drive, settings
+    moving: (K) boxes of moving objects in the frame of each scan, which are left out
+    """
+
+    def __init__(self, scans: ScanSequence, drive: Drive, settings: OdometrySettings, moving: Sequence[Boxes]) -> None:
+        self._scans, self._drive, self._settings, self._moving = scans, drive, settings, moving
 
     def __len__(self) -> int:
         return len(self._drive.keyframes)
 
     def __getitem__(self, k: Any) -> Any:
         row = self._drive.keyframes[k]
-        return still(self._scans[row], row, self._drive.poses, self._scans.timestamps, self._settings).points
+        scan = without_objects(self._scans[row], self._moving[row])
+        return still(scan, row, self._drive.poses, self._scans.timestamps, self._settings).points

@@ -25,6 +25,7 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan, Submap, voxel_downsample
+from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
@@ -48,6 +49,7 @@ from saga_fg.slam.mapping import MapperSettings
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers, unjudged
 from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 from saga_fg.types.frame import Detections, Frame
 
@@ -132,11 +134,9 @@ class LidarSlam:
         self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
         self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
-        self._closed: list[LoopClosure] = []
-        self._degenerate = list[tuple[str, ...]]()
-        self._imu: list[ImuSamples] = []  # since the last keyframe
-        self._wheels: list[WheelSpeed] = []  # likewise
-        self._covariance = _START  # of the last keyframe's pose
+        self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
+        self._imu, self._wheels = list[ImuSamples](), list[WheelSpeed]()  # since the last keyframe
+        self._closed, self._covariance = list[LoopClosure](), _START  # of the last keyframe's pose
 
     @property
     def graph(self) -> SubmapGraph:
@@ -166,14 +166,17 @@ class LidarSlam:
             raise InputError(f"time: expected one after {self._times[-1]:.6f} s, got {time:.6f} s")
         if not self._times and not len(scan) and isinstance(self._odometry, LidarOdometry):
             raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
+        moving = Boxes.empty()
         if self._moving is not None and detections is not None:
-            scan = self._moving.without(scan, time, detections, self._expected(time))
+            moving = self._moving.boxes(time, detections, self._expected(time))
+            scan = without_objects(scan, moving)
         if wheels is not None and isinstance(self._odometry, LidarOdometry):
             ahead = self._ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]
             placed = self._odometry.step(scan, time, np.concatenate([np.full(3, np.nan), ahead]))
         else:
             placed = self._odometry.step(scan, time)
         self._degenerate.append(placed.degenerate)
+        self._boxes.append(moving)
         self._times.append(time)
         self._poses.append(self._start @ placed.map_T_lidar)
         self._covariances.append(placed.covariance + LEAST)
@@ -196,8 +199,7 @@ class LidarSlam:
         if not self._times:
             raise InputError("expected at least one scan before the end")
         if len(self._builder):
-            poses = self._graph.poses()
-            self._close(poses)
+            self._close(self._graph.poses())
         solved = self._graph.finish()
         unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
         unknown = unjudged(solved.graph, self._sensors, self.settings.sensors)
@@ -216,6 +218,7 @@ class LidarSlam:
             self._graph.observations(),
             self._closed,
             self._degenerate,
+            self._boxes,
             unfit,
             unknown,
             self._submaps,
