@@ -30,7 +30,7 @@ from data_tools.lidar import (
 from data_tools.lidar.overlap import Structure
 from data_tools.lidar.places import PlaceImage, PlaceIndex
 from factors import Robust, pose_prior_factor
-from pipelines.slam.drive import LEAST, motion
+from pipelines.slam.drive import motion, shared
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.slam.slam_map import SlamMap
 from saga_fg.errors import InputError
@@ -110,7 +110,8 @@ class Localiser:
         """Place the next scan. Raises `InputError` for one that is not later than the one before."""
         placed = self._odometry.step(scan, time)
         self._poses.append(placed.map_T_lidar)
-        self._covariances.append(placed.covariance + LEAST)
+        covariances = shared(self._poses, placed)
+        self._covariances[len(self._poses) - len(covariances) :] = covariances
         row = len(self._poses) - 1
         if row:
             self._way += float(np.linalg.norm((inverse_transform(self._poses[-2]) @ self._poses[-1])[:3, 3]))
@@ -216,7 +217,7 @@ class Localiser:
         given: list[FactorProvider] = [measured]
         if found is not None:
             lost = found.observed.lost / found.observed.scale
-            covariance = found.covariance + _ACCURACY + s.odometry.lost_deviation**2 * lost.T @ lost
+            covariance = found.covariance + _ACCURACY + s.odometry.lost_translation**2 * lost.T @ lost
             given.append(_MeasuredPose(found.map_T_scan, covariance, Robust("cauchy", s.robust_scale)))
             self._fitted = self._way
         self._smoother.step(time, given)
