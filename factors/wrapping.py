@@ -1,7 +1,8 @@
 r"""Angles in a residual that nobody wraps.
 
-An angle has a branch cut: while a pose turns once round, a component that is one jumps by 2 pi somewhere. Where the
-jump goes from pi to -pi, the residual wraps the angle itself; elsewhere a small deviation is taken for a full turn.
+An angle has a branch cut: while a pose turns once round, a component that is one jumps by 2 pi somewhere (in degrees,
+by 360). Where the jump goes from pi to -pi, the residual wraps the angle itself, or the measured angle is 0; elsewhere
+a small deviation is taken for a full turn.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from factors.variables import PlanarPose, SpatialPose
 
 _STEPS = 16  # of a full turn
 _HALVINGS = 24  # of a step, which leave 2e-8 rad
-_SAME = 1e-4  # rad
+_FULL = np.array([2 * np.pi, 360.0])
+_SAME = 1e-4  # of a full turn
 
 
 def unwrapped_angles(factor: ResidualFactor, states: Sequence[Any]) -> tuple[int, ...]:
@@ -39,7 +41,7 @@ def unwrapped_angles(factor: ResidualFactor, states: Sequence[Any]) -> tuple[int
 
 
 def _jumps(factor: ResidualFactor, states: Sequence[Any], place: int) -> set[int]:
-    """Components that jump by a full turn, not from pi to -pi, while one pose turns."""
+    """Components that jump by a full turn, not from half of one to minus half, while one pose turns."""
     turns = np.linspace(0.0, 2 * np.pi, _STEPS + 1)
     residuals = [_turned(factor, states, place, turn) for turn in turns]
     found = set()
@@ -54,8 +56,9 @@ def _jumps(factor: ResidualFactor, states: Sequence[Any], place: int) -> set[int
                     high, ends = middle, (ends[0], at)
                 else:
                     low, ends = middle, (at, ends[1])
-            whole = abs(abs(ends[1] - ends[0]) - 2 * np.pi) < _SAME
-            if whole and abs(abs(ends[0]) - np.pi) > _SAME:
+            jump = abs(ends[1] - ends[0])
+            whole = (np.abs(jump / _FULL - 1) < _SAME).any()
+            if whole and abs(abs(ends[0]) / jump - 0.5) > _SAME:
                 found.add(component)
     return found
 

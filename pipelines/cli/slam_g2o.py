@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pipelines.slam.pose_graph_baselines import FromStart
     from saga_fg.numerics.arrays import IntArray
 
+_ROUNDING = 1e-9  # an error that counts as none: all measurements agree
 Loss = Literal["consensus", "huber", "cauchy", "geman-mcclure", "tukey"]
 
 
@@ -114,7 +115,11 @@ def g2o(
         typer.echo(f"chordal cost {minimum.cost:.8g}, {proven}: no poses below {minimum.bound:.8g}")
     for name, error in errors.items():
         if name.startswith("GTSAM"):
-            typer.echo(f"{name}: error {error:.6g}, ours is {optimised.error / error:.4f} times that")
+            least = max(error, optimised.error)  # a graph that all measurements agree on is met but for rounding
+            ours = (
+                "both 0" if least < _ROUNDING else f"ours is {optimised.error / max(error, _ROUNDING):.4f} times that"
+            )
+            typer.echo(f"{name}: error {error:.6g}, {ours}")
     for row in compared:
         typer.echo(
             f"CPU time from the {row.start}: {row.seconds:.2f} s, {row.seconds / row.gtsam_seconds:.2f} times that of "

@@ -139,8 +139,8 @@ def check_angles(
     if factor is not None and (angles := unwrapped_angles(factor, factor.states(values))):
         named = ", ".join(str(variables[key]) for key in factor.keys)
         raise GraphError(
-            f"provider {provider}: {factor.name} on {named}: component {angles[0]} of the residual jumps by 2 pi while "
-            f"the pose turns; expected angles={factor.angles + angles} in the factor"
+            f"provider {provider}: {factor.name} on {named}: component {angles[0]} of the residual jumps by a full "
+            f"turn while the pose turns; expected rad, and angles={factor.angles + angles} in the factor"
         )
 
 

@@ -44,6 +44,7 @@ from saga_fg.graph.variables import GraphVariable, NewVariable, insert_state, va
 from saga_fg.numerics.arrays import IntArray
 
 _MARGINALS = "marginals"
+_FEW = 5  # factors of a kind whose angles are checked: a measured angle of 0 tells nothing
 _WIDE = 64  # dimensions that hang together, from which QR takes many times as long as Cholesky
 
 
@@ -63,7 +64,7 @@ class SceneFactorGraph:
         self.elimination: Elimination = elimination
         self._fresh: dict[int, list[gtsam.JacobianFactor]] = {}  # as linearised when they were added
         self._count = 0
-        self._angles_checked: set[tuple[str, str]] = set()
+        self._angles_checked: dict[tuple[str, str], int] = {}
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
         self._newest: tuple[int, ...] = ()
         self.carried_over: Mapping[int, int] = {}  # variables of earlier epochs that are those of this one, too
@@ -164,9 +165,10 @@ class SceneFactorGraph:
         point = self.point()
         linear = [self.linearised(one, one.rows, point) for one in held]
         for one in held:
-            if (kind := (provider, one.factors.name)) not in self._angles_checked:  # one of each will do
+            kind = (provider, one.factors.name)
+            if (checked := self._angles_checked.get(kind, 0)) < _FEW:
                 check_angles(provider, one.factors, self._variables, self._values)
-                self._angles_checked.add(kind)
+                self._angles_checked[kind] = checked + 1
         if name is not None:
             for number in self._named.get((provider, name), ()):
                 self._drop(number)

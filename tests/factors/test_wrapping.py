@@ -32,6 +32,7 @@ def wrapped(pose: gtsam.Pose2) -> np.ndarray:
         (seen, (1,), ()),
         (wrapped, (), ()),
         (lambda pose: [pose.theta() - 1.0], (), (0,)),
+        (lambda pose: [np.rad2deg(pose.theta()) - 40.0], (), (0,)),
         (lambda pose: pose.transformTo(POINT), (), ()),
         (lambda pose: [1e3 * (pose.transformTo(POINT)[0] > 0)], (), ()),  # a jump, but not by a full turn
     ],

@@ -98,6 +98,7 @@ def test_landmarks_and_priors_are_compared_with_gtsams_own_factors(tmp_path: Pat
         assert errors[f"GTSAM Levenberg-Marquardt from the {start}"] == pytest.approx(0, abs=1e-6)
     assert "GTSAM iSAM2 (QR)" not in errors
     assert "times that of GTSAM Levenberg-Marquardt" in result.stdout
+    assert "both 0" in result.stdout
 
 
 def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:

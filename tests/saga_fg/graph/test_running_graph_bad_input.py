@@ -334,14 +334,14 @@ class Bearings:
 
     name = "radar"
 
-    def __init__(self, angles):
-        self.angles = angles
+    def __init__(self, angles, measured=3.1):
+        self.angles, self.measured = angles, measured
 
     def factors(self, view):
         key, post = view.key(EGO_POSE, 0), view.key(LANDMARK, 5, static=True)
 
         def bearing(pose, place):
-            return [np.arctan2(*pose.transformTo(place)[::-1]) - 3.1]
+            return [np.arctan2(*pose.transformTo(place)[::-1]) - self.measured]
 
         seen = ResidualFactor(
             (key, post), (PlanarPose(), Vector(2)), bearing, [[1e-4]], angles=self.angles, name="bearing"
@@ -352,6 +352,22 @@ class Bearings:
 
 
 def test_an_angle_that_nobody_wraps_is_refused_with_what_it_takes():
-    with pytest.raises(GraphError, match=r"provider radar: bearing on .*0.40 s.*5.* jumps by 2 pi .*angles=\(0,\)"):
+    with pytest.raises(GraphError, match=r"radar: bearing on .*0.40 s.*5.* jumps by a full turn .*angles=\(0,\)"):
         IncrementalSmoother(providers=[Bearings(())]).step(0.4)
     IncrementalSmoother(providers=[Bearings((0,))]).step(0.4)
+
+
+def test_a_first_angle_of_zero_does_not_hide_that_nobody_wraps():
+    graph, radar = SceneFactorGraph(), Bearings((), measured=0.0)
+    for epoch, measured in enumerate((0.0, 0.0, 0.2)):
+        graph.advance(float(epoch))
+        keys = graph.add_variables("radar", [NewVariable(EGO_POSE, 0, gtsam.Pose2(0, 0, 3.0))])
+        radar.measured = measured
+        factor = ResidualFactor(
+            tuple(keys), (PlanarPose(),), lambda pose: [pose.theta() - radar.measured], [[1e-4]], name="compass"
+        )
+        if measured:
+            with pytest.raises(GraphError, match="jumps by a full turn"):
+                graph.add_factors("radar", [factor])
+        else:
+            graph.add_factors("radar", [factor])
