@@ -121,7 +121,8 @@ def kitti(
     if known_map is not None:
         _localise(recorded, known_map, guess, slam.localisation, output)
         return
-    log = sensor_log(training / "oxts" / f"{sequence}.txt", sensors, sensor_logs or (), seed or 0)
+    records = training / "oxts" / f"{sequence}.txt"
+    log = sensor_log(records, sensors, sensor_logs or (), seed or 0, recorded.timestamps)
     with progress_bar() as progress:
         lidar = replace(
             slam.lidar,
@@ -134,10 +135,10 @@ def kitti(
         )
     if objects:
         with working("objects"):
-            together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers)
-            figures = write_lidar_slam(output, together, recorded)
+            together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers, log)
+            figures = write_lidar_slam(output, together, recorded, odometry=lidar.odometry)
     else:
-        figures = write_lidar_slam(output, result, recorded)
+        figures = write_lidar_slam(output, result, recorded, odometry=lidar.odometry)
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
     counts.append(counted(figures["loops"], "loop"))

@@ -33,7 +33,7 @@ from data_tools.lidar import (
 )
 from data_tools.lidar.overlap import Structure
 from factors import Robust, pose_prior_factor
-from pipelines.slam.drive import LEAST, motion
+from pipelines.slam.drive import motion, shared
 from pipelines.slam.map_places import MapPlaces
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.slam.place_proof import SURFEL
@@ -118,7 +118,8 @@ class Localiser:
         """Place the next scan. Raises `InputError` for one that is not later than the one before."""
         placed = self._odometry.step(scan, time)
         self._poses.append(placed.map_T_lidar)
-        self._covariances.append(placed.covariance + LEAST)
+        covariances = shared(self._poses, placed)
+        self._covariances[len(self._poses) - len(covariances) :] = covariances
         row = len(self._poses) - 1
         if row:
             self._way += float(np.linalg.norm((inverse_transform(self._poses[-2]) @ self._poses[-1])[:3, 3]))
@@ -244,7 +245,7 @@ class Localiser:
         given: list[FactorProvider] = [measured]
         if found is not None:
             lost = found.observed.lost / found.observed.scale
-            covariance = found.covariance + _ACCURACY + s.odometry.lost_deviation**2 * lost.T @ lost
+            covariance = found.covariance + _ACCURACY + s.odometry.lost_translation**2 * lost.T @ lost
             given.append(_MeasuredPose(found.map_T_scan, covariance, Robust("cauchy", s.robust_scale)))
             self._fitted = self._way
             self._fits.add(row)
