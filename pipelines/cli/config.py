@@ -29,7 +29,7 @@ FIRST = {
     "slam": (
         "slam.joint.odometry.distance_noise",
         "slam.lidar.odometry.surfel_size",
-        "slam.lidar.loops.max_distance",
+        "slam.lidar.loops.drift",
         "slam.lidar.landmarks",
         "slam.lidar.loop_closures",
     ),

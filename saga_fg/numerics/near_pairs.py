@@ -25,7 +25,7 @@ def near_pairs(
 
     a (n, 2), b (m, 2), reach (n,) and further (m,) in m; where one of these is NaN there is no pair
     """
-    further = np.broadcast_to(further, len(b))
+    reach, further = np.asarray(reach, dtype=np.float64), np.broadcast_to(np.asarray(further, dtype=np.float64), len(b))
     if compiled_kernels() and len(a) * len(b) <= MOST_LOOPED:
         return compared_pairs(a, b, reach, further)
     if len(a) * len(b) <= MOST_COMPARED:

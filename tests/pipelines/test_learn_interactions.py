@@ -46,7 +46,7 @@ def scenes():
 def with_template(monkeypatch, *rules, fit=None):
     """Learning finds these rules, whatever the recordings say."""
     monkeypatch.setattr(learned_module, "TEMPLATE", rules)
-    found = fit or (lambda sample, settings, template: FittedInteractions(tuple(template), 0.0))
+    found = fit or (lambda sample, settings, template, most: FittedInteractions(tuple(template), 0.0))
     monkeypatch.setattr(learned_module, "fit_interactions", found)
 
 
@@ -105,7 +105,7 @@ def test_the_base_motion_is_the_tracker_that_is_written_if_no_form_helps(monkeyp
 def test_a_search_begins_with_the_rules_of_an_earlier_result(monkeypatch, scenes):
     begun = []
 
-    def fit(sample, settings, template):
+    def fit(sample, settings, template, most):
         begun.append(tuple(template))
         return FittedInteractions(tuple(template), 0.0)
 

@@ -50,3 +50,10 @@ def test_a_place_is_near_itself(seed, reach):
     places = np.random.default_rng(seed).normal(scale=1e4, size=(310, 2))
     i, j = near_pairs(places, places, np.full(len(places), reach))
     assert set(zip(range(310), range(310), strict=True)) <= set(zip(i.tolist(), j.tolist(), strict=True))
+
+
+def test_reaches_may_be_whole_numbers() -> None:
+    a = np.array([[0.0, 0.0], [10.0, 0.0]])
+    rows, columns = near_pairs(a, a[:1] + 1.0, np.full(2, 2), 0)
+    assert rows.tolist() == [0]
+    assert columns.tolist() == [0]
