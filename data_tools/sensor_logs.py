@@ -6,9 +6,9 @@ A file begins with a line of columns, each a name and its unit in brackets, in a
     wheels   time [s], speed [m/s]
     gps      time [s], x [m], y [m], z [m];  or  latitude [deg], longitude [deg], altitude [m]
 
-Units: s, ms, us, ns; m/s^2, g; rad/s, deg/s; m/s, km/h, mph; m, km, ft; deg, rad. Rows are in order of time. Latitude
-and longitude become metres east and north of an origin, by the Mercator projection at its scale (as KITTI's
-development kit does). Accelerations are specific forces: (0, 0, 9.81) at rest.
+Commas or semicolons separate columns. Units: s, ms, us, ns; m/s^2, g; rad/s, deg/s; m/s, km/h, mph; m, km, ft; deg,
+rad. Rows are in order of time. Latitude and longitude become metres east and north of an origin, by the Mercator
+projection at its scale (as KITTI's development kit does). Accelerations are specific forces: (0, 0, 9.81) at rest.
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ def read_sensor_log(
     lines = [(number, line) for number, line in enumerate(read_lines(path), start=1) if line.strip()]
     if not lines:
         raise InputError(f"{path}: expected a line of columns, the file is empty")
-    titles = [_HEADER.fullmatch(title) for title in lines[0][1].split(",")]
+    header = lines[0][1].removeprefix("\ufeff")  # byte-order mark
+    separator = ";" if ";" in header else ","
+    titles = [_HEADER.fullmatch(title) for title in header.split(separator)]
     found = {title[1]: (column, title[2]) for column, title in enumerate(titles) if title is not None}
     names = _GEODETIC if sensor == "gps" and "latitude" in found else _COLUMNS[sensor]
     wanted = ("time", *names)
@@ -76,7 +78,7 @@ def read_sensor_log(
             raise InputError(
                 f"{path}: line {lines[0][0]}: {name}: expected one of {known}, got {found[name][1][:20]!r}"
             )
-    rows = [(number, line.split(",")) for number, line in lines[1:]]
+    rows = [(number, line.split(separator)) for number, line in lines[1:]]
     for number, row in rows:
         if len(row) != len(titles):
             raise InputError(f"{path}: line {number}: expected {len(titles)} columns, got {len(row)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_tools.lidar.scan import Scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, checked
 from saga_fg.numerics.geometry import yaw_transform
@@ -34,6 +35,11 @@ def on_moving_objects(
         local = (places[near] - boxes.position[row]) @ yaw_transform(yaw=float(boxes.yaw[row]))[:3, :3]
         result[near[_within(local, half)]] = True
     return result
+
+
+def without_objects(scan: Scan, boxes: Boxes) -> Scan:
+    """The scan without points inside boxes, all in one frame."""
+    return scan.select(~on_moving_objects(scan.points, boxes, np.ones(len(boxes)))) if len(boxes) else scan
 
 
 def _within(offset: FloatArray, half: FloatArray) -> BoolArray:

@@ -39,13 +39,24 @@ class Structure:
 
     def shared(self, other: Structure, self_T_other: FloatArray) -> float:
         """Share of the points of each that lie on the other, where that one has seen: the smaller one; 0: too few."""
-        return min(self._share(other.points, self_T_other), other._share(self.points, inverse_transform(self_T_other)))
+        return min(share or 0.0 for share in self._shares(other, self_T_other))
 
-    def _share(self, points: FloatArray, T: FloatArray) -> float:
+    def agreement(self, other: Structure, self_T_other: FloatArray) -> float | None:
+        """Mean of the two shares: for a scan, which sees too little of the other to have most of it; None: too few."""
+        told = [share for share in self._shares(other, self_T_other) if share is not None]
+        return float(np.mean(told)) if told else None
+
+    def _shares(self, other: Structure, T: FloatArray) -> tuple[float | None, float | None]:
+        return self._share(other.points, T), other._share(self.points, inverse_transform(T))
+
+    def _share(self, points: FloatArray, T: FloatArray) -> float | None:
+        """Share of the points that lie on this structure where it has seen; None: too few there."""
         moved = transform_points(T, points)
         distance, _ = self.seen.query(moved[:, :2], distance_upper_bound=_SEEN)
         moved = moved[np.isfinite(distance)]
-        if len(moved) < _FEWEST or not len(self.points):
+        if len(moved) < _FEWEST:
+            return None
+        if not len(self.points):
             return 0.0
         distance, _ = self.tree.query(moved, distance_upper_bound=_NEAR)
         return float(np.isfinite(distance).mean())

@@ -51,7 +51,7 @@ class RegistrationSettings(Settings):
     """Method and convergence criteria of the registration."""
 
     method: Literal["gauss-newton", "open3d"] = setting(
-        "gauss-newton", "our own iterations, or Open3D's tensor ICP on the same surfels"
+        "gauss-newton", "our own iterations, or Open3D's tensor ICP on the same surfels; loops are registered by ours"
     )
     max_iterations: PositiveInt = setting(30, "largest number of iterations")
     translation_tolerance: Positive = setting(1e-3, "largest translation of the last step, m")

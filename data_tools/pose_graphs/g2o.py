@@ -73,7 +73,18 @@ def read_g2o(path: str | Path) -> PoseGraph:
         graph = PoseGraph(ids, poses, first, second, between, weights, priors=priors)
     else:
         graph = PoseGraph.of_measurements(ids, first, second, between, weights, priors)
-    return graph.with_landmarks(_landmarks(tables, graph, whole))
+    marks = _landmarks(tables, graph, whole)
+    _warn_of_unseen(file, tables, d, marks)
+    return graph.with_landmarks(marks)
+
+
+def _warn_of_unseen(file: Path, tables: Tables, d: int, marks: PointLandmarks | None) -> None:
+    """Warn once of landmarks that no measurement is of."""
+    if (tag := _LANDMARK[d]) not in tables:
+        return
+    unseen = np.setdiff1d(_unique_ids(tables[tag])[0], [] if marks is None else marks.ids)
+    if len(unseen):
+        log.warning("%s: %s %d is left out, no measurement is of it (%d so)", file, tag, unseen[0], len(unseen))
 
 
 def _warn_of_fixed(file: Path, fixed: Sequence[int], ids: IntArray, priors: PosePriors | None) -> None:

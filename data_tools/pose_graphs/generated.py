@@ -45,8 +45,10 @@ def torus(poses: int, seed: int, windings: int = 20, noise: float = 0.05) -> tup
     """A graph of a torus, and its true poses (N, 4, 4); noise: m and rad. Raises `InputError`."""
     _check(poses, noise)
     per_winding = poses // windings
-    if windings < 2 or per_winding < 4:
-        raise InputError(f"windings: expected at least 2, of at least 4 of the {poses} poses, got {windings}")
+    if windings < 2:
+        raise InputError(f"windings: expected at least 2, got {windings}")
+    if per_winding < 4:
+        raise InputError(f"poses: expected at least {4 * windings}, 4 for each of {windings} windings, got {poses}")
     rng = np.random.default_rng(seed)
     round_tube = 2 * np.pi * np.arange(poses + 1) / per_winding
     round_hole = round_tube / windings

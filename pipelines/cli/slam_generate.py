@@ -35,8 +35,12 @@ def generate(
       saga-fg slam g2o city.g2o --output city --compare
     """
     from data_tools.pose_graphs import city, torus, write_g2o
+    from saga_fg.errors import InputError
 
-    graph, _ = (city if shape is Shape.CITY else torus)(poses, seed, noise=noise)
+    try:
+        graph, _ = (city if shape is Shape.CITY else torus)(poses, seed, noise=noise)
+    except InputError as error:
+        raise InputError(f"--{error}") from None
     write_g2o(output, graph)
     residuals, free = graph.information.shape[1] * len(graph.first), graph.information.shape[1] * (len(graph) - 1)
     typer.echo(

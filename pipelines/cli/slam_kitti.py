@@ -52,14 +52,18 @@ def kitti(
         list[str] | None,
         typer.Option("--sensor-log", help="A table of your own in their place: gps=FILE, imu=FILE or wheels=FILE."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of the noise of --sensors.")] = 0,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of the noise of --sensors; 0 if not given.")] = None,
     known_map: Annotated[
         Path | None,
         typer.Option("--map", help="Localise in the map of an earlier run, its output folder, in place of SLAM."),
     ] = None,
     guess: Annotated[
         str | None,
-        typer.Option("--guess", help="x,y,z,yaw of the vehicle at the first scan in that map, m and rad."),
+        typer.Option(
+            "--guess",
+            help="x,y,z,yaw of the vehicle at the first scan in that map, m and rad, good to a metre or two and "
+            "0.1 rad; the place is looked for without it, and where the scans do not fit the map there.",
+        ),
     ] = None,
     online: Online = False,
     lag: Lag = None,
@@ -99,8 +103,11 @@ def kitti(
         raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
     if known_map is None and guess is not None:
         raise InputError("--guess: expected with --map only")
-    if known_map is not None and (objects or sensors or sensor_logs or odometry == "oxts"):
-        raise InputError("--map: expected without --objects, --sensors, --sensor-log and --odometry oxts")
+    not_localised = objects or sensors or sensor_logs or odometry == "oxts" or seed is not None or not landmarks
+    if known_map is not None and not_localised:
+        raise InputError(
+            "--map: expected without --objects, --sensors, --sensor-log, --seed, --no-landmarks and --odometry oxts"
+        )
     window = online_window(online, lag)
     check_writable_folder(output)
     frames, settings = [], load_slam_config("kitti", config)
@@ -114,7 +121,8 @@ def kitti(
     if known_map is not None:
         _localise(recorded, known_map, guess, slam.localisation, output)
         return
-    log = sensor_log(training / "oxts" / f"{sequence}.txt", sensors, sensor_logs or (), seed)
+    records = training / "oxts" / f"{sequence}.txt"
+    log = sensor_log(records, sensors, sensor_logs or (), seed or 0, recorded.timestamps)
     with progress_bar() as progress:
         lidar = replace(
             slam.lidar,
@@ -127,10 +135,10 @@ def kitti(
         )
     if objects:
         with working("objects"):
-            together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers)
-            figures = write_lidar_slam(output, together, recorded)
+            together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers, log)
+            figures = write_lidar_slam(output, together, recorded, odometry=lidar.odometry)
     else:
-        figures = write_lidar_slam(output, result, recorded)
+        figures = write_lidar_slam(output, result, recorded, odometry=lidar.odometry)
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
     counts.append(counted(figures["loops"], "loop"))

@@ -11,11 +11,13 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan, constant_velocity, deskewed
+from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
-from pipelines.slam.odometry import OdometrySettings, OdometryStep
+from pipelines.slam.odometry import OdometrySettings, OdometryStep, moved_on
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics.geometry import checked_transform, inverse_transform
+from saga_fg.types.boxes import Boxes
 
 LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: the best accuracy of a registration, rad and m
 
@@ -39,9 +41,10 @@ class Drive:
         return [motion(self.poses[a : b + 1], self.covariances[a + 1 : b + 1]) for a, b in pairwise(rows)]
 
     def carried(self, world_T_lidar: FloatArray, rows: Sequence[int] | None = None) -> FloatArray:
-        """Return poses (K, 4, 4) of all scans, given some, by default the keyframes: each fixed to the one before."""
+        """Return poses (K, 4, 4) of all scans, given some, by default the keyframes: each fixed to the one before,
+        or to the first."""
         known = np.array(self.keyframes if rows is None else rows)
-        of = np.searchsorted(known, np.arange(len(self.poses)), side="right") - 1
+        of = np.maximum(np.searchsorted(known, np.arange(len(self.poses)), side="right") - 1, 0)
         return np.asarray(world_T_lidar[of] @ inverse_transform(self.poses[known[of]]) @ self.poses)
 
 
@@ -57,6 +60,35 @@ def motion(
         Ad = gtsam.Pose3(last @ pose).AdjointMap()
         total += Ad @ covariance @ Ad.T
     return inverse_transform(poses[0]) @ poses[-1], (total + total.T) / 2
+
+
+def shared(poses: Sequence[FloatArray], step: OdometryStep) -> list[FloatArray]:
+    """Covariances (6, 6) of the motions to a scan, the last of `poses`, and to the `step.lost` scans before it.
+
+    They have equal shares of that of the whole motion, which registration in the map knows; `motion` adds them up.
+    """
+    lost = min(step.lost, len(poses) - 1)
+    share, found = (step.covariance + LEAST) / (lost + 1), list[FloatArray]()
+    for pose in poses[len(poses) - 1 - lost :]:
+        Ad = gtsam.Pose3(inverse_transform(pose) @ poses[-1]).AdjointMap()
+        found.append(Ad @ share @ Ad.T)
+    return found
+
+
+def checked_step(step: object) -> OdometryStep:
+    """The step of an odometry, as it is; raises `InputError` for what is no pose, covariance or scan."""
+    if not isinstance(step, OdometryStep):
+        raise InputError(f"odometry: expected an OdometryStep, got {type(step).__name__}")
+    if not isinstance(step.scan, Scan):
+        raise InputError(f"odometry: scan: expected a Scan, got {type(step.scan).__name__}")
+    if not (isinstance(step.lost, int) and step.lost >= 0):
+        raise InputError(f"odometry: lost: expected a number of scans, got {step.lost!r}")
+    checked_transform("odometry: map_T_lidar", step.map_T_lidar)
+    P = checked("odometry: covariance", step.covariance, (6, 6))
+    size = float(np.abs(P).max())
+    if np.abs(P - P.T).max() > 1e-9 * size or np.linalg.eigvalsh((P + P.T) / 2)[0] < -1e-9 * size:
+        raise InputError("odometry: covariance: expected a symmetric matrix without negative eigenvalues")
+    return step
 
 
 class Odometry(Protocol):
@@ -80,7 +112,7 @@ class RecordedOdometry:
         if k == len(self._times) or timestamp != self._times[k]:
             raise InputError(f"timestamp: expected that of scan {k} of the recording, got {timestamp:.6f} s")
         moved = inverse_transform(self._poses[self._keyframe]) @ self._poses[k]
-        keyframe = k == 0 or bool(np.linalg.norm(moved[:3, 3]) >= s.keyframe_distance)
+        keyframe = k == 0 or moved_on(moved, s)
         self._row, self._keyframe = k, k if keyframe else self._keyframe
         scan = still(scan, k, self._poses, self._times, s)
         placed = inverse_transform(self._poses[0]) @ self._poses[k]
@@ -97,14 +129,18 @@ def still(scan: Scan, row: int, poses: FloatArray, timestamps: FloatArray, setti
 
 
 class KeyframeClouds(Sequence[FloatArray]):
-    """Points (N, 3) of keyframes in the frame of the sensor, without skew by `drive`, read from the recording again."""
+    """Points (N, 3) of keyframes in the frame of the sensor, without skew by `drive`, read from the recording again.
 
-    def __init__(self, scans: ScanSequence, drive: Drive, settings: OdometrySettings) -> None:
-        self._scans, self._drive, self._settings = scans, drive, settings
+    moving: (K) boxes of moving objects in the frame of each scan, which are left out
+    """
+
+    def __init__(self, scans: ScanSequence, drive: Drive, settings: OdometrySettings, moving: Sequence[Boxes]) -> None:
+        self._scans, self._drive, self._settings, self._moving = scans, drive, settings, moving
 
     def __len__(self) -> int:
         return len(self._drive.keyframes)
 
     def __getitem__(self, k: Any) -> Any:
         row = self._drive.keyframes[k]
-        return still(self._scans[row], row, self._drive.poses, self._scans.timestamps, self._settings).points
+        scan = without_objects(self._scans[row], self._moving[row])
+        return still(scan, row, self._drive.poses, self._scans.timestamps, self._settings).points

@@ -13,7 +13,7 @@ landmarks.ply               points along the poles and on the observed pieces of
 tracks.csv                  objects, where there are any
 above.png                   map, paths, landmarks and the objects' tracks from above
 metrics.json                errors of the trajectories against the recording's own poses, the map's sharpness, scans
-                            that left motions open, and sensors that do not fit
+                            that left motions open, and sensors that do not fit or measured too little to tell
 
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
@@ -52,8 +52,11 @@ _LINED = (WALL.name, LINE.name)
 POLE_COLOUR, WALL_COLOUR, LINE_COLOUR = (255, 127, 14), (214, 39, 40), (148, 103, 189)
 
 
-def metrics(result: LidarSlamResult, scans: ScanSequence) -> dict[str, Any]:
-    """Errors (start aligned) of the three trajectories against the recording's poses, residuals, and counts."""
+def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySettings | None = None) -> dict[str, Any]:
+    """Errors (start aligned) of the three trajectories against the recording's poses, residuals, and counts.
+
+    odometry: settings of the run
+    """
     truth = Trajectory(scans.timestamps, scans.world_T_ego)
     kinds = [landmark.kind.name for landmark in result.landmarks]
     return {
@@ -63,7 +66,8 @@ def metrics(result: LidarSlamResult, scans: ScanSequence) -> dict[str, Any]:
         "submaps": len(result.submaps),
         "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
         "misfits": dict(result.misfits),
-        "scan_to_map_residual": _residual(result, scans),
+        "unjudged": dict(result.unjudged),
+        "scan_to_map_residual": _residual(result, scans, odometry or OdometrySettings()),
         **{
             name: asdict(trajectory_errors(getattr(result, name), truth, "start"))
             for name in ("odometry", "online", "trajectory")
@@ -83,24 +87,32 @@ def degenerate_spans(times: FloatArray, degenerate: Sequence[tuple[str, ...]]) -
     return spans
 
 
-def _residual(result: LidarSlamResult, scans: ScanSequence) -> float:
+def _residual(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySettings) -> float:
     """Mean scan-to-map residual, m, of some forty keyframes at most, whose scans are read again; NaN without points."""
     if not any(len(submap.points) for submap in result.submaps):
         return float("nan")
-    clouds = KeyframeClouds(scans, result.drive, OdometrySettings())
+    clouds = KeyframeClouds(scans, result.drive, odometry, result.moving)
     return scan_to_map_residual(clouds, result.world_T_lidar, every=max(5, len(clouds) // 40))
 
 
 def write_lidar_slam(
-    output: Path, found: LidarSlamResult | SlamWithObjects, scans: ScanSequence, spacing: float = 0.2
+    output: Path,
+    found: LidarSlamResult | SlamWithObjects,
+    scans: ScanSequence,
+    spacing: float = 0.2,
+    odometry: OdometrySettings | None = None,
 ) -> dict[str, Any]:
-    """Write all files of a run to a folder, or none; returns the metrics. `spacing` of the map's points, m."""
+    """Write all files of a run to a folder, or none; returns the metrics.
+
+    spacing: of the map's points, m; odometry: settings of the run
+    """
     result, objects = (found, None) if isinstance(found, LidarSlamResult) else (found.slam, found.estimate)
     points = accumulated_map(result, spacing)
-    figures = metrics(result, scans)
+    figures = metrics(result, scans, odometry)
     if isinstance(found, SlamWithObjects):
         figures["objects"] = len(object_paths(found.estimate))
-        figures["without_objects"] = metrics(found.alone, scans)["trajectory"]
+        truth = Trajectory(scans.timestamps, scans.world_T_ego)
+        figures["without_objects"] = asdict(trajectory_errors(found.alone.trajectory, truth, "start"))
     with atomic_directory(output) as folder:
         write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
         for name, trajectory in (

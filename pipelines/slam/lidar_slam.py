@@ -18,17 +18,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan, Submap, voxel_downsample
+from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
-from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, motion
+from pipelines.slam.between_keyframes import BetweenKeyframes
+from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, checked_step, motion, shared
 from pipelines.slam.lidar_slam_types import LidarSlamResult, SlamStep
 from pipelines.slam.loop_closures import LoopClosure, LoopSettings, PlaceLoops
 from pipelines.slam.moving_objects import MovingObjects, frames_at
@@ -45,9 +48,10 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import MapperSettings
-from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers
+from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers, unjudged
 from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 from saga_fg.types.frame import Detections, Frame
 
@@ -126,17 +130,18 @@ class LidarSlam:
         self._sensors, self._moving = tuple(sensors), moving
         lidar_T_ego = inverse_transform(self._ego_T_lidar)
         of_sensors = sensor_providers(s.sensors, sensors, lidar_T_ego)
-        self._graph = SubmapGraph(self._start, _START, s.submaps, [*of_sensors, *providers])
+        self._providers = tuple(providers)
+        self._new_graph = partial(SubmapGraph, settings=s.submaps, providers=[*of_sensors, *providers])
+        self._graph = self._new_graph(self._start, _START)
         self._detectors = tuple(detectors)
         self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
         self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
         self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
-        self._closed: list[LoopClosure] = []
-        self._degenerate = list[tuple[str, ...]]()
-        self._imu: list[ImuSamples] = []  # since the last keyframe
-        self._wheels: list[WheelSpeed] = []  # likewise
-        self._covariance = _START  # of the last keyframe's pose
+        self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
+        self._measured = BetweenKeyframes(self._sensors, bool(self._providers), s.sensors.wheels.deviation)
+        self._finished = False
+        self._closed, self._covariance = list[LoopClosure](), _START  # of the last keyframe's pose
 
     @property
     def graph(self) -> SubmapGraph:
@@ -155,34 +160,46 @@ class LidarSlam:
         """Place the next scan, taken at `time`, s.
 
         imu: samples since the scan before; gps: a fix at this scan; detections: of objects, in the sensor's frame;
-        wheels: speed since the scan before, which also predicts the motion. The providers read them from `view.frame`;
-        fixes and detections of scans between keyframes are left out.
-        Raises `InputError` for a scan that is not later than the one before, and for a first scan without points. A
-        later one without points lies where it was predicted, with the deviation that the settings say.
+        wheels: speed since the scan before, which also predicts the motion. The providers read them from `view.frame`.
+        A keyframe has the newest fix since the one before, with its age; detections of other scans are left out.
+        Raises `InputError` for a scan that is not later than the one before, for a first scan without points, for one
+        of the vehicle's sensors that nothing reads, and after `finish`. A later scan without points lies where it was
+        predicted, with the deviation that the settings say, until one is registered again.
         """
-        if not np.isfinite(time):
+        if self._finished:
+            raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
+        if not isinstance(scan, Scan):
+            raise InputError(f"scan: expected a Scan, got {type(scan).__name__}")
+        if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
             raise InputError(f"time: expected a finite number of seconds, got {time!r}")
+        measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
+        self._measured.check(measured)
         if self._times and not time > self._times[-1]:
             raise InputError(f"time: expected one after {self._times[-1]:.6f} s, got {time:.6f} s")
         if not self._times and not len(scan) and isinstance(self._odometry, LidarOdometry):
             raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
+        moving = Boxes.empty()
         if self._moving is not None and detections is not None:
-            scan = self._moving.without(scan, time, detections, self._expected(time))
-        if wheels is not None and isinstance(self._odometry, LidarOdometry):
+            moving = self._moving.boxes(time, detections, self._expected(time))
+            scan = without_objects(scan, moving)
+        if wheels is not None and "wheels" in self._sensors and isinstance(self._odometry, LidarOdometry):
             ahead = self._ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]
             placed = self._odometry.step(scan, time, np.concatenate([np.full(3, np.nan), ahead]))
         else:
-            placed = self._odometry.step(scan, time)
+            placed = checked_step(self._odometry.step(scan, time))
+        if not self._keyframes:
+            placed = replace(placed, keyframe=True)
         self._degenerate.append(placed.degenerate)
+        self._boxes.append(moving)
         self._times.append(time)
         self._poses.append(self._start @ placed.map_T_lidar)
-        self._covariances.append(placed.covariance + LEAST)
-        self._imu += [] if imu is None else [imu]
-        self._wheels += [] if wheels is None else [wheels]
+        covariances = shared(self._poses, placed)
+        self._covariances[len(self._poses) - len(covariances) :] = covariances
+        self._measured.add(time, measured)
         self._online.append(self._poses[-1])
         row, submap, found = len(self._poses) - 1, None, list[LoopClosure]()
         if placed.keyframe:
-            submap, found = self._add_keyframe(row, placed, gps, detections)
+            submap, found = self._add_keyframe(row, placed, detections)
         last = self._keyframes[-1]
         since, covariance = motion(self._poses[last:], self._covariances[last + 1 :])
         Ad = gtsam.Pose3(inverse_transform(since)).AdjointMap()
@@ -193,14 +210,17 @@ class LidarSlam:
 
     def finish(self) -> LidarSlamResult:
         """Close the last submap, and solve everything together."""
-        if not self._times:
-            raise InputError("expected at least one scan before the end")
+        if self._finished:
+            raise InputError("finish: expected to be called once")
+        if not self._keyframes:
+            raise InputError("expected at least one scan before the end, and a keyframe")
         if len(self._builder):
-            poses = self._graph.poses()
-            self._close(poses)
+            self._close(self._graph.poses())
         solved = self._graph.finish()
+        self._finished = True
         unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
-        for text in unfit.values():
+        unknown = unjudged(solved.graph, self._sensors, self.settings.sensors)
+        for text in (*unfit.values(), *unknown.values()):
             _LOG.warning(text)
         drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
         anchors = solved.world_T_pose[[submap.anchor for submap in self._submaps]]
@@ -215,7 +235,9 @@ class LidarSlam:
             self._graph.observations(),
             self._closed,
             self._degenerate,
+            self._boxes,
             unfit,
+            unknown,
             self._submaps,
             np.array([world_T_submap(*each) for each in zip(self._submaps, anchors, strict=True)]),
             solved.world_T_pose,
@@ -231,7 +253,7 @@ class LidarSlam:
         return expected
 
     def _add_keyframe(
-        self, row: int, placed: OdometryStep, gps: GpsFix | None, detections: Detections | None
+        self, row: int, placed: OdometryStep, detections: Detections | None
     ) -> tuple[Submap | None, list[LoopClosure]]:
         s, points = self.settings, placed.scan.points
         seen = observe_landmarks(points, s.observations, self._detectors) if s.landmarks else []
@@ -239,9 +261,11 @@ class LidarSlam:
         if self._keyframes:
             last = self._keyframes[-1]
             moved = motion(self._poses[last:], self._covariances[last + 1 :])
-        frame = _frame(self._times[row], self._imu, self._wheels, gps, detections)
+        elif row:  # a detector or provider raised at the scans before
+            self._graph = self._new_graph(self._poses[row], _START + motion(self._poses, self._covariances[1:])[1])
+        frame = self._measured.frame(self._times[row], detections)
         closes = self._graph.append(self._times[row], moved, seen, frame)
-        self._imu, self._wheels = [], []
+        self._measured.clear()
         self._keyframes.append(row)
         submap, found = None, list[LoopClosure]()
         if closes:
@@ -314,31 +338,3 @@ def lidar_slam(
         if progress is not None:
             progress("slam", k + 1, len(scans))
     return slam.finish()
-
-
-def _frame(
-    time: float,
-    imu: Sequence[ImuSamples],
-    wheels: Sequence[WheelSpeed],
-    gps: GpsFix | None,
-    detections: Detections | None,
-) -> Frame | None:
-    """What a keyframe brings besides its scan, for providers."""
-    if not imu and not wheels and gps is None and detections is None:
-        return None
-    samples, speed = None, None
-    if imu:
-        samples = ImuSamples(
-            *(np.concatenate([getattr(one, name) for one in imu]) for name in ("dt", "acceleration", "angular_rate"))
-        )
-    if wheels:
-        total = sum(one.dt for one in wheels)
-        speed = WheelSpeed(sum(one.speed * one.dt for one in wheels) / total, total)
-    return Frame(
-        time,
-        "lidar",
-        Detections.empty() if detections is None else detections,
-        None,
-        "ego",
-        ego=EgoMeasurements(gps=gps, imu=samples, wheels=speed),
-    )

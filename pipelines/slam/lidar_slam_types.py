@@ -14,6 +14,7 @@ from pipelines.slam.loop_closures import LoopClosure
 from pipelines.slam.odometry import OdometryStep
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.mapping import AssociatedObservation
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.landmark import Landmark
 
 
@@ -49,7 +50,9 @@ class LidarSlamResult:
     observations   of landmarks, with the landmark and the keyframe of each
     loops          that were closed, between keyframes
     degenerate     (K) motions that each scan left open, in words
+    moving         (K) boxes of moving objects that were left out of each scan, in its frame
     misfits        what does not fit of the vehicle's sensors, in words, by their names
+    unjudged       sensors that have measured too little to tell, likewise
     submaps        S, and world_T_submap (S, 4, 4) their places
     world_T_lidar  (M, 4, 4) poses of the keyframes
     """
@@ -63,7 +66,9 @@ class LidarSlamResult:
     observations: Sequence[AssociatedObservation]
     loops: Sequence[LoopClosure]
     degenerate: Sequence[tuple[str, ...]]
+    moving: Sequence[Boxes]
     misfits: Mapping[str, str]
+    unjudged: Mapping[str, str]
     submaps: Sequence[Submap]
     world_T_submap: FloatArray
     world_T_lidar: FloatArray

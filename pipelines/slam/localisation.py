@@ -2,12 +2,16 @@
 
     odometry      LiDAR odometry, scan by scan, as in SLAM
     where first   a guess, or place recognition: the points of the first metres, as a submap, are looked for among the
-                  submaps of the map; the best that passes registration and shares enough structure is the place
+                  submaps of the map; the one that passes registration and shares enough structure is the place, if no
+                  other does nearly as well
     thereafter    each keyframe is registered with the submaps around it. In a graph of keyframes, which marginalises
                   what is older than `lag`, the result is a measured pose under a robust loss, beside odometry
 
-Where a scan leaves motions open in the map, the measured pose is wide there. After `lost_after` m without a keyframe
-that fits, the place is looked for again. Poses before the first place is known follow from it backwards by odometry.
+Where a scan leaves motions open in the map, the measured pose is wide there. Ground and parallel walls fit elsewhere as
+well: so at the guess, and every few metres from then on, what stands above the ground is compared with the map. Where
+too little of it is the same, and after `lost_after` m without a keyframe that fits, the place is looked for again, and
+poses since the last comparison are given up. Poses without a known place follow by odometry from the nearest before
+them, those at the start backwards from the first.
 """
 
 from __future__ import annotations
@@ -28,26 +32,25 @@ from data_tools.lidar import (
     voxel_downsample,
 )
 from data_tools.lidar.overlap import Structure
-from data_tools.lidar.places import PlaceImage, PlaceIndex
 from factors import Robust, pose_prior_factor
-from pipelines.slam.drive import LEAST, motion
+from pipelines.slam.drive import motion, shared
+from pipelines.slam.map_places import MapPlaces
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
+from pipelines.slam.place_proof import SURFEL
 from pipelines.slam.slam_map import SlamMap
 from saga_fg.errors import InputError
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import checked_transform, inverse_transform, transform_points, yaw_transform
 from saga_fg.settings import Fraction, NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import MeasuredMotion
 
 _LOG = logging.getLogger(__name__)
-_FEWEST = 200  # points of a submap that shows a place
-_COMPARED, _REGISTERED = 12, 6  # places for each search
-_SURFEL = 1.0  # m, of the map
 _GUESSED = np.diag([0.02, 0.02, 0.1, 1.0, 1.0, 0.5]) ** 2  # of a pose that was given or recognised
 _ACCURACY = np.diag([1e-3] * 3 + [0.03] * 3) ** 2  # of the map, rad and m
 _RELOADED = 15.0  # m of way after which the surfels around are taken anew
+_COMPARED, _WINDOW = 5.0, 10.0  # m of way between comparisons of the structure, and of the scans compared
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class LocaliserSettings(Settings):
         15.0, "way whose points are looked for in the map, m; higher: surer, and later; usual 10 to 30"
     )
     min_overlap: Fraction = setting(
-        0.5, "share of what stands above the ground that they and the map have in common; higher: surer"
+        0.5, "share of what stands above the ground that scans and map have in common, else lost; higher: surer"
     )
     radius: Positive = setting(80.0, "distance of the submaps that scans are registered with, m; higher: slower")
     scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
@@ -93,38 +96,47 @@ class Localiser:
         self, slam_map: SlamMap, guess: FloatArray | None = None, settings: LocaliserSettings | None = None
     ) -> None:
         self.settings = settings or LocaliserSettings()
-        self._map = slam_map
         self._odometry = LidarOdometry(self.settings.odometry)
         self._guess = None if guess is None else checked_transform("guess", guess)
-        self._index: PlaceIndex | None = None
+        s = self.settings
+        self._places = MapPlaces(slam_map, s.radius, s.min_overlap, s.scan_spacing, s.odometry.registration)
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry
         self._found: dict[int, FloatArray] = {}  # map_T_lidar of keyframes, as estimated when they came
-        self._clouds: list[tuple[int, FloatArray]] = []  # that are looked for, with their rows
-        self._searched = 0.0  # m, way of the last search
+        self._fits = set[int]()  # keyframes registered with the map
+        self._unproved = list[int]()  # keyframes since the structure was compared
+        self._clouds: list[tuple[int, FloatArray]] = []  # of the last keyframes, thinned, with their rows
+        self._ways, self._time = list[float](), 0.0  # of each scan, m; of the last keyframe
+        self._searched, self._proved = 0.0, 0.0  # m, way of the last search, and of the last comparison
+        self._ambiguous = False
         self._smoother: IncrementalSmoother | None = None
         self._last, self._way, self._fitted = 0, 0.0, 0.0  # keyframe in the graph; m
         self._pose, self._covariance = np.eye(4), _GUESSED  # of that keyframe
-        self._surfels, self._centre = SurfelMap(_SURFEL, np.inf), np.full(3, np.inf)
+        self._surfels, self._centre = SurfelMap(SURFEL, np.inf), np.full(3, np.inf)
+        self._structure, self._structure_frame = Structure.of(np.zeros((1, 3))), np.eye(4)
 
     def step(self, scan: Scan, time: float) -> LocalisedStep:
         """Place the next scan. Raises `InputError` for one that is not later than the one before."""
         placed = self._odometry.step(scan, time)
         self._poses.append(placed.map_T_lidar)
-        self._covariances.append(placed.covariance + LEAST)
+        covariances = shared(self._poses, placed)
+        self._covariances[len(self._poses) - len(covariances) :] = covariances
         row = len(self._poses) - 1
         if row:
             self._way += float(np.linalg.norm((inverse_transform(self._poses[-2]) @ self._poses[-1])[:3, 3]))
-        points, registered = placed.scan.points, False
+        self._ways.append(self._way)
+        points = placed.scan.points
         if placed.keyframe:
+            self._time = time
+            self._clouds.append((row, points[voxel_downsample(points, 0.5)] if len(points) else points))
             if self._smoother is None:
-                self._look_for(row, points)
-            if self._smoother is not None:
-                registered = self._add(row, points, time)
+                self._look_for(row, points, time)
+            if self._smoother is not None and self._last != row:
+                self._add(row, points, time)
         if self._smoother is None:
             return LocalisedStep(None, None, False)
         since, covariance = motion(self._poses[self._last :], self._covariances[self._last + 1 :])
         Ad = gtsam.Pose3(inverse_transform(since)).AdjointMap()
-        return LocalisedStep(self._pose @ since, Ad @ self._covariance @ Ad.T + covariance, registered)
+        return LocalisedStep(self._pose @ since, Ad @ self._covariance @ Ad.T + covariance, row in self._fits)
 
     def path(self) -> FloatArray | None:
         """map_T_lidar (K, 4, 4) of all scans so far; None if no place has been found.
@@ -138,68 +150,85 @@ class Localiser:
         found = np.array([self._found[row] for row in rows.tolist()])
         return np.asarray(found[of] @ inverse_transform(odometry[rows[of]]) @ odometry)
 
-    def _look_for(self, row: int, points: FloatArray) -> None:
+    @property
+    def registered(self) -> BoolArray:
+        """Whether each scan (K,) so far was registered with the map, at a place that has not been given up since."""
+        return np.isin(np.arange(len(self._poses)), sorted(self._fits))
+
+    @property
+    def way(self) -> float:
+        """Way so far by odometry, m."""
+        return self._way
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the points looked for last fit several places of the map."""
+        return self._ambiguous
+
+    def finish(self) -> None:
+        """After the last scan: look for the place with the points there are, or compare the last ones with the map."""
+        if self._smoother is not None:
+            self._compare()
+        if self._smoother is None and self._clouds and self._way > self._searched:
+            self._search(*self._clouds[-1], self._time)
+
+    def _look_for(self, row: int, points: FloatArray, time: float) -> None:
         """Begin the graph where the guess says, or at a place that the points since the last search resemble."""
-        s = self.settings
         if self._guess is not None:
-            self._begin(self._guess @ inverse_transform(self._poses[0]) @ self._poses[row])
-            self._guess = None
-            return
-        self._clouds.append((row, points[voxel_downsample(points, 0.5)]))
-        if self._way - self._searched < s.search_way:
-            return
+            guess, self._guess = self._guess, None
+            self._begin(guess @ inverse_transform(self._poses[0]) @ self._poses[row])
+            if self._add(row, points, time):
+                self._compare()
+            else:
+                self._give_up("the first scan does not fit the map at the guess")
+        elif self._way - self._searched >= self.settings.search_way:
+            self._search(row, points, time)
+
+    def _search(self, row: int, points: FloatArray, time: float) -> None:
+        """Look for the points of the last keyframes in the map, and begin there."""
+        query, frame = self._seen()
+        map_T_frame = self._places.recognised(query[voxel_downsample(query, 0.5)])
+        self._ambiguous, self._searched = self._places.ambiguous, self._way
+        if map_T_frame is None:
+            self._clouds = self._clouds[len(self._clouds) // 2 :]
+        else:
+            self._begin(map_T_frame @ inverse_transform(frame) @ self._poses[row])
+            self._add(row, points, time)
+
+    def _seen(self) -> tuple[FloatArray, FloatArray]:
+        """Points (N, 3) of the last keyframes, level, and their frame (4, 4) by odometry."""
         middle = self._poses[self._clouds[len(self._clouds) // 2][0]]
         frame = middle @ upright(middle)  # level as far as the first scan was
         inverse = inverse_transform(frame)
-        query = np.concatenate([transform_points(inverse @ self._poses[k], cloud) for k, cloud in self._clouds])
-        map_T_frame = self._recognised(query[voxel_downsample(query, 0.5)])
-        self._searched, self._clouds = self._way, self._clouds[len(self._clouds) // 2 :]
-        if map_T_frame is not None:
-            self._begin(map_T_frame @ inverse @ self._poses[row])
-            self._clouds = []
+        return np.concatenate([transform_points(inverse @ self._poses[k], cloud) for k, cloud in self._clouds]), frame
 
     def _begin(self, map_T_lidar: FloatArray) -> None:
         _LOG.info("place found at %s m", map_T_lidar[:3, 3].round(1).tolist())
         self._smoother, self._fitted = IncrementalSmoother(lag=self.settings.lag), self._way
         self._pose, self._covariance = map_T_lidar, _GUESSED
+        self._proved, self._ambiguous = self._way, False
 
-    def _recognised(self, query: FloatArray) -> FloatArray | None:
-        """map_T_query (4, 4) of the place that points (N, 3), z up, show, None for none."""
-        if len(query) < _FEWEST:
-            return None
-        if self._index is None:
-            self._index = PlaceIndex()
-            for number, cloud in enumerate(self._map.points):
-                if len(cloud) >= _FEWEST:
-                    self._index.add(number, PlaceImage.of(cloud.astype(np.float64)))
-        best, shared = None, self.settings.min_overlap
-        mine, criteria = Structure.of(query), self.settings.odometry.registration
-        points = query[voxel_downsample(query, self.settings.scan_spacing)]
-        for match in self._index.candidates(PlaceImage.of(query), None, _COMPARED)[:_REGISTERED]:
-            around, frame = self._points_around(self._map.map_T_submap[match.number][:3, 3], match.number)
-            surfels = SurfelMap(_SURFEL, np.inf)
-            surfels.add(around, np.zeros(3))
-            try:
-                rough = register(points, surfels, match.place_T_query, 3 * _SURFEL, 1.0, criteria)
-                fine = register(points, surfels, rough.map_T_scan, _SURFEL, 0.1, criteria)
-            except RegistrationError:
-                continue
-            overlap = Structure.of(around).shared(mine, fine.map_T_scan)
-            if fine.converged and overlap > shared:
-                best, shared = frame @ fine.map_T_scan, overlap
-        return best
+    def _compare(self) -> None:
+        """Give the place up if what stands above the ground around the last keyframes is not what the map has."""
+        query, frame = self._seen()
+        if not len(query):
+            return
+        map_T_frame = self._pose @ inverse_transform(self._poses[self._last]) @ frame
+        near_T_frame = inverse_transform(self._structure_frame) @ map_T_frame
+        share = self._structure.agreement(Structure.of(query), near_T_frame)
+        self._proved = self._way
+        if share is not None and share < self.settings.min_overlap:
+            self._give_up(f"{100 * share:.0f} % of what stands above the ground is as in the map")
+        elif share is not None:
+            self._unproved = []
 
-    def _points_around(self, centre: FloatArray, number: int) -> tuple[FloatArray, FloatArray]:
-        """Points (N, 3) of the submaps around a place, in the frame of one of them, and that frame (4, 4)."""
-        frame = self._map.map_T_submap[number]
-        near = np.linalg.norm(self._map.map_T_submap[:, :3, 3] - centre, axis=1) <= self.settings.radius
-        near[number] = True
-        inverse = inverse_transform(frame)
-        moved = [
-            transform_points(inverse @ self._map.map_T_submap[k], self._map.points[k].astype(np.float64))
-            for k in np.flatnonzero(near).tolist()
-        ]
-        return np.concatenate(moved), frame
+    def _give_up(self, why: str) -> None:
+        _LOG.warning("at %.1f m: %s; the place is looked for", self._way, why)
+        for row in self._unproved:
+            self._found.pop(row, None)
+            self._fits.discard(row)
+        self._unproved, self._smoother = [], None
+        self._searched = self._ways[self._clouds[0][0]]
 
     def _add(self, row: int, points: FloatArray, time: float) -> bool:
         """Add a keyframe to the graph, registered with the map where it fits; returns whether it does."""
@@ -216,9 +245,10 @@ class Localiser:
         given: list[FactorProvider] = [measured]
         if found is not None:
             lost = found.observed.lost / found.observed.scale
-            covariance = found.covariance + _ACCURACY + s.odometry.lost_deviation**2 * lost.T @ lost
+            covariance = found.covariance + _ACCURACY + s.odometry.lost_translation**2 * lost.T @ lost
             given.append(_MeasuredPose(found.map_T_scan, covariance, Robust("cauchy", s.robust_scale)))
             self._fitted = self._way
+            self._fits.add(row)
         self._smoother.step(time, given)
         (pose,) = self._smoother.graph().of(EGO_POSE, self._smoother.graph().epoch).values()
         self._pose, self._covariance = (
@@ -226,13 +256,13 @@ class Localiser:
             self._smoother.covariance(pose.key),
         )
         self._last = row
-        if found is not None or self._way - self._fitted <= s.lost_after:
-            self._found[row] = self._pose
-        else:
-            _LOG.warning(
-                "scan at %.2f s: no scan has fitted the map for %.0f m; the place is looked for", time, s.lost_after
-            )
-            self._smoother, self._searched = None, self._way
+        self._found[row] = self._pose
+        self._unproved.append(row)
+        if self._way - self._fitted > s.lost_after:
+            self._give_up(f"no scan has fitted the map for {s.lost_after:.0f} m")
+        elif self._way - self._proved >= _COMPARED:
+            self._clouds = [one for one in self._clouds if self._way - self._ways[one[0]] <= _WINDOW]
+            self._compare()
         return found is not None
 
     def _registered(self, points: FloatArray, predicted: FloatArray, rough: bool) -> Registration | None:
@@ -244,19 +274,19 @@ class Localiser:
         criteria, start = s.odometry.registration, predicted
         try:
             if rough:
-                start = register(thin, self._surfels, start, 3 * _SURFEL, 1.0, criteria, "hold").map_T_scan
-            found = register(thin, self._surfels, start, 1.5 * _SURFEL, 0.1, criteria, "hold")
+                start = register(thin, self._surfels, start, 3 * SURFEL, 1.0, criteria, "hold").map_T_scan
+            found = register(thin, self._surfels, start, 1.5 * SURFEL, 0.1, criteria, "hold")
         except RegistrationError:
             return None
         fits = found.converged and found.pairs >= s.min_pairs * len(thin) and found.residual <= s.max_residual
         return found if fits else None
 
     def _load(self, centre: FloatArray) -> None:
-        """Take the surfels around a place."""
-        nearest = int(np.argmin(np.linalg.norm(self._map.map_T_submap[:, :3, 3] - centre, axis=1)))
-        points, frame = self._points_around(centre, nearest)
-        self._surfels, self._centre = SurfelMap(_SURFEL, np.inf), centre
+        """Take the surfels and the structure around a place."""
+        points, frame = self._places.around(self._places.nearest(centre), centre)
+        self._surfels, self._centre = SurfelMap(SURFEL, np.inf), centre
         self._surfels.add(transform_points(frame, points), centre)
+        self._structure, self._structure_frame = Structure.of(points), frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,18 +46,30 @@ def localise(
 ) -> LocalisedDrive:
     """Localise a recording in a map.
 
-    guess: map_T_ego (4, 4) of the vehicle at the first scan, None: it is looked for. Of the recording's poses none is
-    used. Raises `InputError` where no place of the map was found.
+    guess: map_T_ego (4, 4) of the vehicle at the first scan, good to a metre or two and 0.1 rad. None: it is looked
+    for, as it is where the scans do not fit the map at the guess. Of the recording's poses none is used. Raises
+    `InputError` where no place of the map was found, or several, and where no scan fits the map.
     """
     localiser = Localiser(slam_map, None if guess is None else guess @ scans.ego_T_lidar, settings)
-    registered: BoolArray = np.zeros(len(scans), dtype=np.bool_)
     for k, time in enumerate(scans.timestamps.tolist()):
-        registered[k] = localiser.step(scans[k], time).registered
+        localiser.step(scans[k], time)
         if progress is not None:
             progress("localising", k + 1, len(scans))
-    path = localiser.path()
-    if path is None:
-        raise InputError("map: expected one that shows a place of this drive, none was found; a guess may help")
+    localiser.finish()
+    path, registered = localiser.path(), localiser.registered
+    if path is None or not registered.any():
+        if localiser.ambiguous:
+            raise InputError(
+                "map: expected one that shows the place of this drive once, it is ambiguous: several places of the map "
+                "look like it; a longer drive or a guess may help"
+            )
+        where = (
+            "none was found" if guess is None else "the scans do not fit it at the guess, and elsewhere none was found"
+        )
+        raise InputError(
+            f"map: expected one that shows a place of this drive, {where} in {localiser.way:.0f} m of way; a longer "
+            "drive, or a guess good to a metre or two and 0.1 rad, may help"
+        )
     return LocalisedDrive(Trajectory(scans.timestamps, path @ inverse_transform(scans.ego_T_lidar)), registered)
 
 

@@ -17,32 +17,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from data_tools.lidar import (
-    RegistrationError,
-    RegistrationSettings,
-    Submap,
-    SurfelMap,
-    register,
-    voxel_downsample,
-)
+from data_tools.lidar import RegistrationSettings, Submap, voxel_downsample
 from data_tools.lidar.overlap import Structure
 from data_tools.lidar.places import PlaceImage, PlaceIndex, PlaceMatch
 from pipelines.slam.loop_agreement import Agreement, deviation
+from pipelines.slam.place_proof import COMPARED, FEWEST, SAME, SPACING, agreeing, fits_otherwise, registered
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
 from saga_fg.slam.pose_graph.distances import shortest_ways
 
-_FEWEST = 200  # points of a submap that shows a place
-_COMPARED, _REGISTERED, _TAKEN = 12, 4, 2  # places for each submap
+_REGISTERED, _TAKEN = 4, 2  # places for each submap
 _ALIKE = 0.3  # correlation of images from which places are registered
-_SINGLE = 0.8  # share of the correlation that another alignment of the two may have
-_UNIQUE = 0.92  # share of the shared structure that a loop to elsewhere may have
-_SURFEL, _SPACING = 1.0, 1.5  # m: voxels of the map, and spacing of the points registered
 _SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometry, with another that agrees
 _ALONE = 0.85  # and without one, up to twice the drift
 _FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
-_SAME = 4.0  # m that two loops to one place differ by, besides drift
 _OPEN = 0.5  # m, standard deviation of an alignment of images
 _DISTORTION = np.array([2e-3] * 3 + [0.1] * 3) ** 2  # rad^2 and m^2, of submaps that odometry has bent
 
@@ -105,7 +94,7 @@ class PlaceLoops:
         if number:
             self._edges.append((number - 1, number, submap.way[1] - self._submaps[-1].way[1]))
         self._submaps.append(submap)
-        if len(submap.points) < _FEWEST:
+        if len(submap.points) < FEWEST:
             return []
         image = PlaceImage.of(submap.points.astype(np.float64))
         proved = self._proved(number, image, world_T_submap)
@@ -122,10 +111,10 @@ class PlaceLoops:
         apart = np.linalg.norm(frames[older, :3, 3] - frames[number, :3, 3], axis=1)
         length = self._submaps[number].way[1] - self._submaps[number].way[0]
         older = older[apart < self._farthest(way[older]) + 2 * length + 20.0]
-        matches = self._index.candidates(image, older.tolist(), _COMPARED)
+        matches = self._index.candidates(image, older.tolist(), COMPARED)
         found = []
         for match in matches[:_REGISTERED]:
-            if match.score < _ALIKE or match.rival > _SINGLE * match.score:
+            if match.score < _ALIKE or fits_otherwise(match):
                 continue
             loop, overlap = self._registered(match, number)
             if loop is not None and overlap >= self.settings.min_overlap:
@@ -136,16 +125,9 @@ class PlaceLoops:
 
     def _registered(self, match: PlaceMatch, number: int) -> tuple[LoopClosure | None, float]:
         old, new = (self._submaps[n].points.astype(np.float64) for n in (match.number, number))
-        surfels = SurfelMap(_SURFEL, reach=np.inf)
-        surfels.add(old, np.zeros(3))
-        points = new[voxel_downsample(new, _SPACING)]
-        criteria = RegistrationSettings()
-        try:
-            rough = register(points, surfels, match.place_T_query, 3 * _SURFEL, 1.0, criteria, "follow")
-            fine = register(points, surfels, rough.map_T_scan, _SURFEL, 0.1, criteria, "follow")
-        except RegistrationError:
-            return None, 0.0
-        if not fine.converged:
+        points = new[voxel_downsample(new, SPACING)]
+        fine = registered(old, points, match.place_T_query, RegistrationSettings(), "follow")
+        if fine is None:
             return None, 0.0
         overlap = Structure.of(old).shared(Structure.of(new), fine.map_T_scan)
         seen = fine.observed
@@ -159,17 +141,11 @@ class PlaceLoops:
             return []
         trusted = [one for one in found if self._trusted(one)]
         found = sorted(trusted or found, key=lambda one: -one.overlap)
-        best = found[0]
-        at = frames[best.loop.first] @ best.loop.first_T_second
-        same = []
-        for one in found:
-            between = abs(self._submaps[one.loop.first].way[1] - self._submaps[best.loop.first].way[1])
-            other = frames[one.loop.first] @ one.loop.first_T_second
-            if np.linalg.norm(other[:3, 3] - at[:3, 3]) < _SAME + self.settings.drift * between:
-                same.append(one)
-            elif one.overlap > _UNIQUE * best.overlap:
-                return []
-        return same
+        first = found[0].loop.first
+        ways = np.array([abs(self._submaps[one.loop.first].way[1] - self._submaps[first].way[1]) for one in found])
+        places = np.array([(frames[one.loop.first] @ one.loop.first_T_second)[:3, 3] for one in found])
+        overlap = np.array([one.overlap for one in found])
+        return [found[k] for k in agreeing(places, overlap, SAME + self.settings.drift * ways)]
 
     def _believed(self, one: _Proved, frames: FloatArray) -> Sequence[LoopClosure]:
         if self._trusted(one):

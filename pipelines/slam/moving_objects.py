@@ -1,7 +1,8 @@
 """Moving objects in scans: their points are left out before odometry, landmarks and map see the scan.
 
-Objects are tracked along the path so far, at the pose where the next scan is expected. One moves with the probability
-Phi((|v| - 1 m/s) / sigma), sigma the deviation of its speed; new objects, whose velocity nobody knows, stay.
+Objects are tracked along the path so far, at the pose where the next scan is expected. One is faster than 1 m/s with
+the probability Phi((|v| - 1 m/s) / sigma), sigma the deviation of its speed, and leaves the scan where that is at least
+0.9: by 1.3 deviations. So new objects, whose velocity nobody knows, stay.
 """
 
 from __future__ import annotations
@@ -11,16 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import ndtr
 
-from data_tools.lidar.moving import on_moving_objects
-from data_tools.lidar.scan import Scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.joint.record import in_ego
 from saga_fg.tracking import Tracker
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
 
 SAME_TIME = 0.01  # s
 _SPEED = 1.0  # m/s, from which an object moves
+_LIKELY = 0.9  # probability of that, from which its points are left out
 _LEAST_DEVIATION = 0.1  # m/s
 
 
@@ -30,8 +31,8 @@ class MovingObjects:
     def __init__(self, tracker: Tracker) -> None:
         self._tracker = tracker
 
-    def without(self, scan: Scan, time: float, detections: Detections, world_T_lidar: FloatArray) -> Scan:
-        """The scan without points on moving objects; detections in the scanner's frame, world_T_lidar (4, 4) about."""
+    def boxes(self, time: float, detections: Detections, world_T_lidar: FloatArray) -> Boxes:
+        """The detections of moving objects; detections in the scanner's frame, world_T_lidar (4, 4) about."""
         tracks = self._tracker.step(Frame(time, "lidar", detections, world_T_lidar, "ego"))
         assignment = self._tracker.assignment
         _, rows, at = np.intersect1d(assignment.id, tracks.id, return_indices=True)
@@ -39,8 +40,8 @@ class MovingObjects:
         speed = np.linalg.norm(velocity, axis=1)
         along = velocity / np.maximum(speed, 1e-9)[:, None]
         deviation = np.sqrt(np.einsum("ni,nij,nj->n", along, P, along) + _LEAST_DEVIATION**2)
-        seen = detections.boxes.select(assignment.detection[rows])
-        return scan.select(~on_moving_objects(scan.points, seen, ndtr((speed - _SPEED) / deviation)))
+        moving = ndtr((speed - _SPEED) / deviation) >= _LIKELY
+        return detections.boxes.select(assignment.detection[rows][moving])
 
 
 def frames_at(

@@ -42,6 +42,10 @@ from saga_fg.settings import Positive, Settings, setting, settings_group
 
 _LOG = logging.getLogger(__name__)
 _STANDING = 0.5  # m/s, speed from which on the motion says where the road goes
+_SPEED_OFF = 2.0  # m/s that a speed by other sensors may differ from that of the scans, slip and lever arms included
+_ACCELERATION = 10.0  # m/s^2 that a vehicle reaches
+_FASTEST = 70.0  # m/s, of a vehicle whose speed nobody knows yet
+_OUT_OF_RANGE = 5  # scans in a row
 
 
 @dataclass(frozen=True)
@@ -61,10 +65,13 @@ class OdometrySettings(Settings):
         0.5, "distance from the last keyframe that makes a scan the next one, m; lower: a denser graph"
     )
     keyframe_rotation: Positive = setting(0.05, "rotation from the last keyframe that makes a scan the next one, rad")
-    lost_deviation: Positive = setting(
+    lost_translation: Positive = setting(
         1.0,
-        "standard deviation of a motion that was only predicted, m and rad, for want of points, or along a direction "
-        "that they leave open; higher: the graph relies more on other sensors there",
+        "standard deviation of a motion that was only predicted, m, for want of points, or along a direction that they "
+        "leave open; higher: the graph relies more on other sensors there",
+    )
+    lost_rotation: Positive = setting(
+        0.05, "standard deviation of a rotation that was only predicted for want of points, rad"
     )
     registration: RegistrationSettings = settings_group(RegistrationSettings, "registration of a scan in the map")
 
@@ -75,11 +82,13 @@ class OdometryStep:
 
     timestamp    s
     map_T_lidar  (4, 4); the map's frame is the sensor's of the first scan
-    covariance   (6, 6) of the motion since the scan before, (rotation, translation) in the scan's frame, rad^2 and m^2
+    covariance   (6, 6) of the motion since the scan before, (rotation, translation) in the scan's frame, rad^2 and m^2;
+                 after `lost` scans: of the motion since the one before them
     scan         without skew, points too near and too far left out
     keyframe     whether it went into the map
     registration None for the first scan, and for one that could not be registered and lies where it was predicted
     degenerate   motions that the scan leaves open, in words such as "along the road"
+    lost         scans right before it that were only predicted, none of them a keyframe
     """
 
     timestamp: float
@@ -89,6 +98,7 @@ class OdometryStep:
     keyframe: bool
     registration: Registration | None
     degenerate: tuple[str, ...] = ()
+    lost: int = 0
 
 
 class LidarOdometry:
@@ -103,6 +113,11 @@ class LidarOdometry:
         self._squares, self._count = self.settings.first_deviation**2, 1
         self._degenerate: tuple[str, ...] = ()
         self._velocity_known = False  # by a scan that showed the whole motion, or by other sensors
+        self._confirmed: float | None = None  # s, when a scan showed the whole motion, or a speed was taken after one
+        self._registered: OdometryStep | None = None  # the last one that was registered, or the first
+        self._lost = 0  # scans since then
+        self._refused = False  # whether the last velocity by other sensors was
+        self._out_of_range = 0  # scans in a row without a point within range
 
     @property
     def deviation(self) -> float:
@@ -110,31 +125,70 @@ class LidarOdometry:
         return max(self.settings.deviation_floor, float(np.sqrt(self._squares / self._count)))
 
     def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
-        """Place the next scan. Raises `InputError` for one that is not later than the one before.
+        """Place the next scan. Raises `InputError` for one that is not later than the one before, and for a first one
+        or several in a row whose points are all out of range.
 
         velocity: (6,) since then by other sensors, turn rate, rad/s, and velocity, m/s, in the sensor's frame; NaN
-        where they say nothing. It predicts the motion in place of that of the scan before.
+        where they say nothing. It predicts the motion in place of that of the scan before, unless no vehicle can have
+        changed its velocity so much since then.
         """
         s, last = self.settings, self._last
+        if last is not None and not timestamp > last.timestamp:
+            raise InputError(f"timestamp: expected one after {last.timestamp:.6f} s, got {timestamp:.6f} s")
         if velocity is not None:
             velocity = checked("velocity", velocity, (6,), "finite-or-nan")
+        scan = self._within_range(scan, timestamp)
+        if velocity is not None and self._believable(velocity, timestamp):
             self._velocity = np.where(np.isnan(velocity), self._velocity, velocity)
             self._velocity_known = True
-        scan = scan.within(s.min_range, s.max_range)
+            self._confirmed = None if self._confirmed is None else timestamp
         if scan.time is not None:
             scan = deskewed(scan, self._velocity)
         if last is None:
             placed = OdometryStep(timestamp, np.eye(4), np.zeros((6, 6)), scan, True, None)
         else:
-            if not timestamp > last.timestamp:
-                raise InputError(f"timestamp: expected one after {last.timestamp:.6f} s, got {timestamp:.6f} s")
             placed = self._place(last, scan, timestamp)
         self._last = placed
+        if last is None or placed.registration is not None:
+            self._registered, self._lost = placed, 0
+        else:
+            self._lost += 1
         if placed.keyframe:
             self._keyframe = placed.map_T_lidar
             points = scan.points[voxel_downsample(scan.points, s.map_spacing)]
             self._map.add(transform_points(placed.map_T_lidar, points), placed.map_T_lidar[:3, 3])
         return placed
+
+    def _within_range(self, scan: Scan, timestamp: float) -> Scan:
+        s = self.settings
+        near = scan.within(s.min_range, s.max_range)
+        out_of_range = self._out_of_range + 1 if len(scan) and not len(near) else 0
+        if out_of_range and (self._last is None or out_of_range >= _OUT_OF_RANGE):
+            raise InputError(
+                f"scan at {timestamp:.3f} s: expected points in metres, at distances from min_range "
+                f"{s.min_range:g} m to max_range {s.max_range:g} m, got none of {len(scan)}; their median distance is "
+                f"{float(np.median(np.linalg.norm(scan.points, axis=1))):g}"
+            )
+        self._out_of_range = out_of_range
+        return near
+
+    def _believable(self, velocity: FloatArray, timestamp: float) -> bool:
+        """Whether a vehicle can have this velocity, by what it last had for certain; warns where it begins to fail."""
+        said = ~np.isnan(velocity[3:])
+        if self._confirmed is None:
+            off, most = float(np.linalg.norm(velocity[3:][said])), _FASTEST
+        else:
+            off = float(np.linalg.norm((velocity - self._velocity)[3:][said]))
+            most = _SPEED_OFF + _ACCELERATION * (timestamp - self._confirmed)
+        if off > most and not self._refused:
+            _LOG.warning(
+                "scan at %.3f s: a velocity of %.1f m/s by other sensors is refused; by the scans it was %.1f m/s",
+                timestamp,
+                float(np.linalg.norm(velocity[3:][said])),
+                float(np.linalg.norm(self._velocity[3:])),
+            )
+        self._refused = off > most
+        return not self._refused
 
     def _place(self, last: OdometryStep, scan: Scan, timestamp: float) -> OdometryStep:
         s, dt = self.settings, timestamp - last.timestamp
@@ -154,29 +208,39 @@ class LidarOdometry:
             )
         except RegistrationError as error:
             _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, error)
-            return OdometryStep(timestamp, predicted, np.eye(6) * s.lost_deviation**2, scan, False, None)
+            covariance = np.diag([s.lost_rotation] * 3 + [s.lost_translation] * 3) ** 2
+            return OdometryStep(timestamp, predicted, covariance, scan, False, None)
         self._adapt(inverse_transform(predicted) @ found.map_T_scan, points)
-        self._velocity = constant_velocity(inverse_transform(last.map_T_lidar) @ found.map_T_scan, dt)
-        moved = inverse_transform(self._keyframe) @ found.map_T_scan
-        keyframe = bool(
-            np.linalg.norm(moved[:3, 3]) >= s.keyframe_distance or rotation_angle(moved[:3, :3]) >= s.keyframe_rotation
-        )
+        before = self._registered or last
+        since_then = inverse_transform(before.map_T_lidar) @ found.map_T_scan
+        self._velocity = constant_velocity(since_then, timestamp - before.timestamp)
+        keyframe = moved_on(inverse_transform(self._keyframe) @ found.map_T_scan, s)
         names = found.observed.names(self._velocity[3:] if np.linalg.norm(self._velocity[3:]) > _STANDING else None)
         covariance = found.covariance
         self._velocity_known |= not names
-        if names:
+        if not names:
+            self._confirmed = timestamp
+        else:
             open_motions = found.observed.lost / found.observed.scale
-            covariance = covariance + s.lost_deviation**2 * open_motions.T @ open_motions
+            covariance = covariance + s.lost_translation**2 * open_motions.T @ open_motions
         if names != self._degenerate:
             _LOG.warning("scan at %.3f s: %s", timestamp, _said(names))
             self._degenerate = names
-        return OdometryStep(timestamp, found.map_T_scan, covariance, scan, keyframe, found, names)
+        return OdometryStep(timestamp, found.map_T_scan, covariance, scan, keyframe, found, names, self._lost)
 
     def _adapt(self, deviation: FloatArray, points: FloatArray) -> None:
         span = float(np.median(np.linalg.norm(points, axis=1)))
         angle = float(rotation_angle(deviation[:3, :3]))
         self._squares += (float(np.linalg.norm(deviation[:3, 3])) + 2 * span * np.sin(angle / 2)) ** 2
         self._count += 1
+
+
+def moved_on(keyframe_T_scan: FloatArray, settings: OdometrySettings) -> bool:
+    """Whether a scan is so far from the last keyframe, or turned so far, that it is the next one."""
+    return bool(
+        np.linalg.norm(keyframe_T_scan[:3, 3]) >= settings.keyframe_distance
+        or rotation_angle(keyframe_T_scan[:3, :3]) >= settings.keyframe_rotation
+    )
 
 
 def _said(names: tuple[str, ...]) -> str:

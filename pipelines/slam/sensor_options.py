@@ -9,6 +9,7 @@ from typing import cast, get_args
 import numpy as np
 
 from data_tools.datasets.kitti.dataset import FRAME_PERIOD
+from data_tools.datasets.kitti.oxts import read_origin
 from data_tools.sensor_logs import SensorLog, kitti_sensor_log, read_sensor_log
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -17,13 +18,18 @@ from saga_fg.slam.sensors import SensorName
 GPS_NOISE, WHEELS_NOISE = 1.0, 0.05  # m and m/s, of the fixes and speeds made from GPS/IMU records
 
 
-def sensor_log(records: Path, sensors: str, files: Sequence[str], seed: int) -> SensorLog | None:
+def sensor_log(
+    records: Path, sensors: str, files: Sequence[str], seed: int, timestamps: FloatArray
+) -> SensorLog | None:
     """Measurements of the sensors named, like "gps,imu", from KITTI's GPS/IMU records, and of files like "imu=FILE".
 
-    Raises `InputError` for an unknown sensor, and for one that is named twice.
+    timestamps: (K,) s, of the drive. Latitudes and longitudes of files are put where the records begin. Raises
+    `InputError` for an unknown sensor, for one that is named twice, and for a file without a row within the drive.
     """
     named = [one.strip() for one in sensors.split(",") if one.strip()]
     given = [one.partition("=") for one in files]
+    if unfinished := [name for name, _, path in given if not path]:
+        raise InputError(f"--sensor-log: expected SENSOR=FILE, such as imu=imu.csv, got {unfinished[0][:40]!r}")
     known = get_args(SensorName)
     for name in (*named, *(name for name, _, _ in given)):
         if name not in known:
@@ -38,5 +44,15 @@ def sensor_log(records: Path, sensors: str, files: Sequence[str], seed: int) -> 
         chosen = tuple(cast(SensorName, name) for name in named)
         tables |= kitti_sensor_log(records, chosen, FRAME_PERIOD, GPS_NOISE, WHEELS_NOISE, seed).tables
     for name, _, path in given:
-        tables[cast(SensorName, name)] = read_sensor_log(path, cast(SensorName, name))
+        origin = read_origin(records) if name == "gps" else None
+        table = read_sensor_log(path, cast(SensorName, name), origin)
+        _check_times(path, table[:, 0], timestamps)
+        tables[cast(SensorName, name)] = table
     return SensorLog({name: np.asarray(table) for name, table in tables.items()})
+
+
+def _check_times(path: str, times: FloatArray, timestamps: FloatArray) -> None:
+    first, last = float(timestamps[0]), float(timestamps[-1])
+    if not ((times >= first) & (times <= last)).any():
+        got = f"rows from {times[0]:.3f} to {times[-1]:.3f} s" if len(times) else "no rows"
+        raise InputError(f"{path}: time: expected rows within the drive, from {first:.3f} to {last:.3f} s, got {got}")

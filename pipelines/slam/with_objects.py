@@ -3,7 +3,7 @@
 The graph of `pipelines.slam.lidar_slam` (odometry, landmarks, loops) and that of `saga_fg.slam.joint` (detections,
 interactions, stationary objects) are solved as one. Its moments are the keyframes, and scans in between where the
 vehicle is slow, since objects move while it is stationary. Poses are those of the sensor; detections are brought into
-its frame.
+its frame. The vehicle's sensors measure between moments, so their factors are made anew from their log.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_tools.lidar.scan import ScanSequence
+from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
 from pipelines.slam.known_providers import known_providers
@@ -25,6 +26,7 @@ from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import JointEstimate, OdometryIncrements, estimate_jointly, estimate_online
+from saga_fg.slam.sensors import SensorBuffer, sensor_providers
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
@@ -50,11 +52,12 @@ def with_objects(
     settings: LidarSlamSettings | None = None,
     lag: float | None = None,
     new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
+    log: SensorLog | None = None,
 ) -> SlamWithObjects:
     """Solve again with the objects in `frames`, which cover the times of all scans; config: of the tracker.
 
     lag: s, to estimate poses, landmarks and objects online as well, in a window so long; `slam.online` is then by that.
-    new_providers: gives fresh providers of other factors.
+    new_providers: gives fresh providers of other factors; log: of the vehicle's sensors, as of `lidar_slam`.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
@@ -65,6 +68,7 @@ def with_objects(
         return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
 
     seen = frames_at(frames, scans.timestamps[rows], lidar_T_ego, new_tracker())
+    seen = _with_sensors(seen, log)
     motions = result.drive.motions(rows)
     odometry = OdometryIncrements(
         scans.timestamps[rows],
@@ -73,9 +77,11 @@ def with_objects(
     )
     at = np.searchsorted(rows, result.keyframes)
     known = known_providers(result, at.tolist(), s.submaps)
+    named = () if log is None else tuple(log.tables)
+    of_sensors = sensor_providers(s.sensors, named, lidar_T_ego)
     start = result.drive.poses[0]
     estimate = estimate_jointly(
-        seen, odometry, new_tracker, s.objects, start, new_providers=lambda: [*known, *new_providers()]
+        seen, odometry, new_tracker, s.objects, start, new_providers=lambda: [*known, *of_sensors, *new_providers()]
     )
     poses = result.drive.carried(estimate.world_T_ego, rows) @ lidar_T_ego
     placed = estimate.world_T_ego[at]
@@ -92,11 +98,22 @@ def with_objects(
         for one in result.observations:
             observed[at[one.pose]].append(one.observation)
         online = estimate_online(
-            seen, odometry, new_tracker(), lag, s.objects, start, observed, s.mapper, new_providers()
+            seen, odometry, new_tracker(), lag, s.objects, start, observed, s.mapper, [*of_sensors, *new_providers()]
         )
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
         slam = replace(slam, online=Trajectory(scans.timestamps, placed))
     return SlamWithObjects(slam, result, estimate)
+
+
+def _with_sensors(frames: Sequence[Frame], log: SensorLog | None) -> list[Frame]:
+    """The frames, each with what the log has of the time since the one before."""
+    if log is None:
+        return list(frames)
+    fed, buffer, found = SensorLog(log.tables), SensorBuffer(), list[Frame]()
+    for frame in frames:
+        fed.feed(buffer, frame.timestamp)
+        found.append(replace(frame, ego=buffer.take(frame.timestamp)))
+    return found
 
 
 def _moments(keyframes: Sequence[int], timestamps: FloatArray, period: float) -> list[int]:

@@ -124,9 +124,9 @@ class GraphView:
         return self._covariance(key)
 
 
-def ask_all(providers: Iterable[FactorProvider], graph: SceneFactorGraph) -> None:
-    """Add what providers give at the present epoch of a recording that is solved as a whole."""
-    view, asked = GraphView(graph, _unknown, np.zeros(2)), list(providers)
+def ask_all(providers: Iterable[FactorProvider], graph: SceneFactorGraph, frame: Frame | None = None) -> None:
+    """Add what providers give at the present epoch of a recording that is solved as a whole; frame: of that epoch."""
+    view, asked = GraphView(graph, _unknown, np.zeros(2), frame), list(providers)
     for provider in (*predictors(asked), *asked):
         ask(provider, graph, view)
 

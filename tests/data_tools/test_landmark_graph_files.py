@@ -122,6 +122,20 @@ def test_what_is_wrong_is_located(tmp_path: Path, text: str, old: str, new: str,
         read_g2o(written(tmp_path, text.replace(old, new, 1)))
 
 
+def test_landmarks_that_nobody_saw_are_left_out_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    read_g2o(written(tmp_path, PLANAR))
+    assert caplog.text == ""
+    graph = read_g2o(written(tmp_path, PLANAR.replace("VERTEX_XY 11", "VERTEX_XY 12 1 1\nVERTEX_XY 11")))
+    assert graph.landmarks is not None
+    assert graph.landmarks.ids.tolist() == [10, 11]
+    assert "graph.g2o: VERTEX_XY 12 is left out, no measurement is of it (1 so)" in caplog.text
+    alone = "\n".join(line for line in PLANAR.splitlines() if line.startswith(("VERTEX", "EDGE_SE2 ")))
+    assert read_g2o(written(tmp_path, alone)).landmarks is None
+    assert "VERTEX_XY 10 is left out, no measurement is of it (2 so)" in caplog.text
+
+
 def test_a_single_bearing_does_not_determine_a_landmark(tmp_path: Path) -> None:
     lines = [line for line in PLANAR.splitlines() if not line.startswith(("EDGE_BEARING_SE2_XY 2", "VERTEX_XY"))]
     with pytest.raises(InputError, match="landmark 11: expected bearings that cross"):

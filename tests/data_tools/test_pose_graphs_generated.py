@@ -53,7 +53,8 @@ def test_the_same_seed_makes_the_same_graph() -> None:
     [
         (lambda: city(1, 0), "poses: expected at least 2"),
         (lambda: city(10, 0, noise=0.0), "noise"),
-        (lambda: torus(50, 0, windings=20), "windings"),
+        (lambda: torus(50, 0, windings=20), "poses: expected at least 80, 4 for each of 20 windings, got 50"),
+        (lambda: torus(50, 0, windings=1), "windings: expected at least 2"),
     ],
 )
 def test_what_cannot_be_made_is_refused(make: Callable[[], object], message: str) -> None:

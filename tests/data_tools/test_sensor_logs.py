@@ -27,6 +27,11 @@ def test_columns_come_in_any_order_and_unit(tmp_path: Path) -> None:
     np.testing.assert_allclose(table, [[0.5, 0, 0, 9.80665, 0, 0, np.pi]])
 
 
+def test_byte_order_marks_and_semicolons_of_spreadsheets(tmp_path: Path) -> None:
+    path = written(tmp_path, "\ufefftime [s];speed [m/s]\n0.1;2\n")
+    np.testing.assert_allclose(read_sensor_log(path, "wheels"), [[0.1, 2.0]])
+
+
 def test_latitude_and_longitude_become_metres(tmp_path: Path) -> None:
     path = written(
         tmp_path, "time [s],latitude [deg],longitude [deg],altitude [m]\n0,49,8.4,110\n1,49.0001,8.4001,111\n"

@@ -181,3 +181,10 @@ def test_public_graphs_reach_the_lower_of_gtsams_errors(name: str) -> None:
     if name == "MIT":  # where the guess in the file leads astray; elsewhere iSAM2 takes half a minute and finds no more
         assert optimised.error <= 1.01 * isam2(graph)
         assert optimised.errors["guess"] > 10 * optimised.error
+
+
+def test_the_command_that_generates_names_its_option(tmp_path: Path) -> None:
+    arguments = ["slam", "generate", "torus", "--poses", "3", "--output", str(tmp_path / "torus.g2o")]
+    outcome = CliRunner().invoke(app, arguments)
+    assert "--poses: expected at least 80" in str(outcome.exception) + outcome.output
+    assert not (tmp_path / "torus.g2o").exists()

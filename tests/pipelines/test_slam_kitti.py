@@ -14,10 +14,11 @@ from data_tools.lidar import Scan, read_scan
 from data_tools.simulator.street import CURB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
-from pipelines.slam.lidar_results import covered_spans, write_lidar_slam
+from pipelines.slam.lidar_results import covered_spans, metrics, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.loop_closures import LoopSettings
+from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.scan_landmarks import LINE, POLE
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
@@ -162,6 +163,12 @@ def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: Lida
     assert json.loads((folder / "metrics.json").read_text()) == figures
     assert (folder / "above.png").read_bytes().startswith(b"\x89PNG")
     assert sorted(tmp_path.iterdir()) == [folder]
+
+
+def test_the_residual_is_of_the_run_s_ranges(scans: SimulatedScans, result: LidarSlamResult) -> None:
+    near, default = OdometrySettings(max_range=12.0), OdometrySettings()
+    found = [metrics(result, scans, one)["scan_to_map_residual"] for one in (near, default, None)]
+    assert found[0] != found[1] == found[2]
 
 
 @pytest.mark.parametrize("odometry", ["lidar", "oxts"])

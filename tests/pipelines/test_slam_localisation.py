@@ -70,6 +70,68 @@ def test_a_guess_takes_the_place_of_the_search(known: SlamMap, tmp_path: Path) -
     assert registered == 8
 
 
+@pytest.mark.parametrize("ahead", [6.0, 500.0])
+def test_a_wrong_guess_is_noticed_and_the_place_is_looked_for(known: SlamMap, ahead: float) -> None:
+    """Ground and parallel walls fit 6 m ahead as well, what stands there does not; 500 m ahead there is no map."""
+    poses = drive(5.0, 0.5, 25)
+    guess = poses[0] @ yaw_transform(ahead)
+    found = localise(SimulatedScans(3, world_T_lidar=poses), known, guess)
+    assert np.linalg.norm(found.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
+    assert not found.registered[0]
+    assert found.registered.sum() > 5
+
+
+def test_a_wrong_guess_in_another_town_is_an_error(known: SlamMap) -> None:
+    scans = SimulatedScans(8, world_T_lidar=drive(5.0, 0.5, 6))
+    with pytest.raises(InputError, match="the scans do not fit it at the guess, and elsewhere none was found in 5 m"):
+        localise(scans, known, yaw_transform(500.0))
+
+
+def test_a_place_that_turns_out_wrong_is_given_up(known: SlamMap) -> None:
+    """On the way the vehicle is carried 6 m ahead: the poses since the last comparison go, and it is found again."""
+    poses = drive(-8.0, 0.5, 52)
+    poses[12:, 0, 3] += 6.0
+    scans, localiser = SimulatedScans(3, world_T_lidar=poses), Localiser(known, poses[0])
+    lost = [localiser.step(scans[k], time).map_T_lidar is None for k, time in enumerate(scans.timestamps.tolist())]
+    localiser.finish()
+    path = localiser.path()
+    assert path is not None
+    errors = np.linalg.norm((inverse_transform(poses) @ path)[:, :3, 3], axis=1)
+    assert errors[:10].max() < 0.3
+    assert errors[-5:].max() < 0.3
+    assert any(lost)
+    assert not lost[-1]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_of_two_like_streets_none_is_taken(known: SlamMap, turned: bool) -> None:
+    further = known.map_T_submap.copy()
+    further[:, 0, 3] += 300.0
+    both = [known.map_T_submap, further]
+    twice = SlamMap([*known.points, *known.points], np.concatenate(both[::-1] if turned else both))
+    poses = drive(5.0, 0.5, 25)
+    scans = SimulatedScans(3, world_T_lidar=poses)
+    with pytest.raises(InputError, match="it is ambiguous: several places of the map look like it"):
+        localise(scans, twice)
+    told = localise(scans, twice, poses[0])
+    assert np.linalg.norm(told.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
+
+
+def test_a_drive_shorter_than_the_search_is_looked_for_at_its_end(known: SlamMap) -> None:
+    poses = drive(5.0, 0.5, 10)
+    found = localise(SimulatedScans(3, world_T_lidar=poses), known)
+    assert np.linalg.norm(found.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
+    assert found.registered.any()
+
+
+@pytest.mark.parametrize("option", [["--seed", "0"], ["--no-landmarks"]])
+def test_options_that_a_map_has_no_use_for_are_refused(tmp_path: Path, option: list[str]) -> None:
+    command = ["slam", "kitti", "--dataroot", str(tmp_path), "--map", str(tmp_path), "--output", str(tmp_path / "o")]
+    outcome = CliRunner().invoke(app, [*command, *option])
+    assert outcome.exit_code != 0
+    assert "--map: expected without" in outcome.output
+
+
 def test_where_the_map_has_no_such_place_none_is_found(known: SlamMap) -> None:
     scans = SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 24))
     localiser = Localiser(known, settings=LocaliserSettings(search_way=10.0))

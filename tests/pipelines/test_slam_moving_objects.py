@@ -9,9 +9,12 @@ from data_tools.lidar import constant_velocity
 from data_tools.simulator.scanner import StaticWorld, simulate_scan
 from data_tools.simulator.street import SMALL, SimulatedScans
 from pipelines.config import load_config
+from pipelines.slam.drive import KeyframeClouds
 from pipelines.slam.joint import path_tracker
+from pipelines.slam.lidar_results import metrics
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.lidar_slam_types import LidarSlamResult
+from pipelines.slam.moving_objects import MovingObjects
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 
@@ -55,6 +58,9 @@ def test_the_trail_of_a_moving_car_is_not_in_the_map() -> None:
     settings = LidarSlamSettings(loop_closures=False, landmarks=False)
     before = lidar_slam(scans, "lidar", settings)
     after = lidar_slam(scans, "lidar", settings, frames=frames, tracker=path_tracker(load_config("kitti")))
+    clouds = [KeyframeClouds(scans, one.drive, settings.odometry, one.moving) for one in (before, after)]
+    assert len(clouds[1][-1]) < len(clouds[0][-1]) - 20
+    assert metrics(after, scans)["scan_to_map_residual"] < metrics(before, scans)["scan_to_map_residual"]
     assert points_on(before, places[5:]) > 200
     assert points_on(after, places[5:]) < 0.05 * points_on(before, places[5:])
     parked = scans.world.boxes.select(scans.world.boxes.label == "car").position
@@ -68,3 +74,14 @@ def test_a_scan_needs_its_frame() -> None:
     scans, frames, _ = drive_behind_a_car(4)
     with pytest.raises(InputError, match=r"expected one of detections at 0\.300 s, the time of a scan"):
         lidar_slam(scans, frames=frames[:-1], tracker=path_tracker(load_config("kitti")))
+
+
+@pytest.mark.parametrize(("speeds", "moving"), [([4.0] * 2, 0), ([4.0] * 4, 1), ([1.2] * 12, 0)])
+def test_an_object_moves_when_its_speed_is_sure(speeds: list[float], moving: int) -> None:
+    """Speeds above the limit, but by no more than the detections can tell."""
+    objects, x = MovingObjects(path_tracker(load_config("kitti"))), 10.0
+    for k, speed in enumerate(speeds):
+        x += 0.1 * speed
+        seen = Boxes.of(["car"], [[x, 0.0, 0.75]], SIZE[None], [0.0])
+        found = objects.boxes(0.1 * k, Detections(seen, np.array([3.0])), np.eye(4))
+    assert len(found) == moving

@@ -73,7 +73,10 @@ def test_a_scan_without_points_lies_where_it_was_predicted(caplog: pytest.LogCap
     assert "the motion of the one before goes on" in caplog.text
     assert steps[5].registration is None
     assert not steps[5].keyframe
-    assert np.linalg.eigvalsh(steps[5].covariance)[0] > 0.1
+    settings = OdometrySettings()
+    deviations = [settings.lost_rotation] * 3 + [settings.lost_translation] * 3
+    np.testing.assert_allclose(steps[5].covariance, np.diag(np.square(deviations)))
+    assert [step.lost for step in steps] == [0] * 6 + [1, 0]
     estimate = poses[0] @ np.array([step.map_T_lidar for step in steps])
     assert np.linalg.norm(estimate[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform
 
 PERIOD = 0.1
+TIMES = PERIOD * np.arange(10)
 PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False)
 
 
@@ -41,7 +43,7 @@ def test_in_a_tunnel_the_wheels_say_how_far() -> None:
     ends = [np.linalg.norm(one.trajectory.positions[-1] - scans.world_T_ego[-1, :3, 3]) for one in (alone, helped)]
     assert ends[1] < 0.5 < 2.0 < ends[0]
     figures = metrics(helped, scans)
-    assert figures["misfits"] == {}
+    assert figures["misfits"] == figures["unjudged"] == {}
     last = figures["degenerate"][-1]
     assert "along the road" in last["motions"]
     assert last["last"] == len(speed) - 1
@@ -77,11 +79,38 @@ def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) 
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert figures["degenerate"] == []
     assert figures["trajectory"]["ate"] < 0.5
+    assert figures["misfits"] == {}
+    assert set(figures["unjudged"]) == {"gps", "imu", "wheels"}
+    assert re.search(
+        r"gps: too few measurements to judge whether it fits: \d, 15 are needed", figures["unjudged"]["gps"]
+    )
 
 
 def test_sensors_that_are_not_there_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected some of gps, imu, wheels, got 'radar'"):
-        sensor_log(tmp_path, "radar", [], 0)
+        sensor_log(tmp_path, "radar", [], 0, TIMES)
     with pytest.raises(InputError, match="imu: expected either --sensors or --sensor-log, once"):
-        sensor_log(tmp_path, "imu", ["imu=imu.csv"], 0)
-    assert sensor_log(tmp_path, "", [], 0) is None
+        sensor_log(tmp_path, "imu", ["imu=imu.csv"], 0, TIMES)
+    with pytest.raises(InputError, match=r"--sensor-log: expected SENSOR=FILE, such as imu=imu.csv, got 'imu'"):
+        sensor_log(tmp_path, "", ["imu"], 0, TIMES)
+    assert sensor_log(tmp_path, "", [], 0, TIMES) is None
+
+
+@pytest.mark.parametrize(
+    ("rows", "got"), [("", "no rows"), ("1317617735.0,1\n1317617736.0,1\n", r"rows from 1317617735\.000 to 1317617736")]
+)
+def test_a_log_of_another_time_is_refused(tmp_path: Path, rows: str, got: str) -> None:
+    table = tmp_path / "wheels.csv"
+    table.write_text(f"time [s],speed [m/s]\n{rows}")
+    with pytest.raises(InputError, match=rf"wheels\.csv: time: expected rows .* from 0\.000 to 0\.900 s, got {got}"):
+        sensor_log(tmp_path, "", [f"wheels={table}"], 0, TIMES)
+
+
+def test_fixes_are_placed_where_the_recording_begins(tmp_path: Path) -> None:
+    """Not where the log begins."""
+    records, table = tmp_path / "0000.txt", tmp_path / "gps.csv"
+    records.write_text(" ".join(["49.0", "8.4", "100.0", *["0"] * 27]) + "\n")
+    table.write_text("time [s],latitude [deg],longitude [deg],altitude [m]\n0.5,49.0001,8.4,103\n0.6,49.0002,8.4,103\n")
+    log = sensor_log(records, "", [f"gps={table}"], 0, TIMES)
+    assert log is not None
+    np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, 11.132, 3], [0, 22.264, 3]], rtol=1e-3, atol=1e-6)

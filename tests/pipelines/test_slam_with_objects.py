@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from data_tools.sensor_logs import SensorLog
 from data_tools.simulator.street import SimulatedScans
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.cli import app
@@ -19,6 +21,7 @@ from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.with_objects import with_objects
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
+from saga_fg.slam.sensors import SensorName, SensorSettings
 
 MOVER = np.array([8.0, -1.5]), np.array([7.0, 0.0])  # m, m/s
 
@@ -73,6 +76,36 @@ def test_landmarks_and_objects_are_in_one_graph() -> None:
     for with_, without in zip(found.slam.landmarks, alone.landmarks, strict=True):
         assert np.trace(with_.covariance) < 1.05 * np.trace(without.covariance)
         assert np.linalg.norm(with_.kind.variable.local(with_.state, without.state)) < 0.5
+
+
+@pytest.mark.parametrize("sensors", [("gps",), ("gps", "imu", "wheels")])
+def test_the_sensors_of_the_vehicle_are_in_the_same_graph(sensors: tuple[SensorName, ...]) -> None:
+    """Fixes place a vehicle of poor odometry, also where the graph has room for objects."""
+    scans, truth, frames = poor_drive()
+    frames = [replace(frame, detections=Detections.empty()) for frame in frames]
+    rng, times = np.random.default_rng(1), scans.timestamps
+    speed = np.gradient(truth[:, 0, 3], times)
+    rest = np.zeros_like(speed)
+    tables: dict[SensorName, np.ndarray] = {
+        "gps": np.column_stack([times, truth[:, :3, 3] + rng.normal(0, 0.02, (len(times), 3))]),
+        "wheels": np.column_stack([times, speed]),
+        "imu": np.column_stack([times, np.gradient(speed, times), rest, rest + 9.81, rest, rest, rest]),
+    }
+    log = SensorLog({name: tables[name] for name in sensors})
+    gps = replace(SensorSettings().gps, deviation=0.02, height_deviation=0.02)
+    settings = replace(
+        LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05),
+        sensors=replace(SensorSettings(), gps=gps),
+    )
+    alone, config = lidar_slam(scans, "oxts", settings, log=log), load_config("kitti")
+    without, found = (with_objects(alone, scans, frames, config, settings, 1.0, log=one).slam for one in (None, log))
+
+    def error(path: Trajectory) -> float:
+        return float(np.linalg.norm(path.positions - truth[:, :3, 3], axis=1).mean())
+
+    assert error(found.trajectory) < 1.1 * error(alone.trajectory)
+    assert error(found.trajectory) < 0.6 * error(without.trajectory)
+    assert error(found.online) < 0.7 * error(without.online)
 
 
 def test_a_scan_without_a_frame_is_named() -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.text_tables import read_table
+from data_tools.files.text_tables import TextTable, read_table
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 
@@ -26,9 +26,16 @@ EARTH_RADIUS = 6378137.0  # m
 _COLUMNS = ("latitude", "longitude", "altitude", "roll", "pitch", "yaw")
 
 
+def read_origin(path: str | Path) -> tuple[float, float, float]:
+    """Latitude, longitude (deg) and altitude (m) of the first record. Raises `InputError` as `read_poses` does."""
+    read_poses(path)
+    latitude, longitude, altitude = _records(path).numbers(slice(0, 3), _COLUMNS[:3])[0].tolist()
+    return latitude, longitude, altitude
+
+
 def read_poses(path: str | Path) -> FloatArray:
     """world_T_imu (K, 4, 4) of the K records of a sequence. Raises `InputError` for records that are not as above."""
-    table = read_table(Path(path), (30,), "latitude, longitude, altitude, roll, pitch, yaw, ...")
+    table = _records(path)
     if not len(table):
         raise InputError(f"{path}: expected a record per frame, the file is empty")
     latitude, longitude, altitude, roll, pitch, yaw = table.numbers(slice(0, 6), _COLUMNS).T
@@ -68,10 +75,14 @@ class SensorRecords:
 def read_sensors(path: str | Path) -> SensorRecords:
     """Read what the records say of velocity, acceleration and turn rate. Raises `InputError` as `read_poses` does."""
     position = read_poses(path)[:, :3, 3]
-    table = read_table(Path(path), (30,), "latitude, longitude, altitude, roll, pitch, yaw, ...")
+    table = _records(path)
     names = ("vf", "ax", "ay", "az", "wx", "wy", "wz")
     numbers = table.numbers([8, 11, 12, 13, 17, 18, 19], names)
     return SensorRecords(position, numbers[:, 0], numbers[:, 1:4], numbers[:, 4:])
+
+
+def _records(path: str | Path) -> TextTable:
+    return read_table(Path(path), (30,), "latitude, longitude, altitude, roll, pitch, yaw, ...")
 
 
 def _turn(angle: FloatArray, from_axis: int, to_axis: int) -> FloatArray:

@@ -46,9 +46,9 @@ def estimate_jointly(
 
     odometry: between the frames' times; new_tracker: gives a new tracker, which associates detections; start: first
     pose (4, 4), by default the identity; landmarks: observations at each of the n epochs; new_providers: gives new
-    providers of other factors, asked epoch by epoch (`saga_fg.slam.mapping.LandmarkObservations` for landmarks of known
-    identity). Detections are in ego or sensor coordinates, or in those of the world with the pose they were transformed
-    by. Raises `InputError` where frames, odometry and landmarks do not fit together.
+    providers of other factors, asked with each frame (`saga_fg.slam.mapping.LandmarkObservations` for landmarks of
+    known identity). Detections are in ego or sensor coordinates, or in those of the world with the pose they were
+    transformed by. Raises `InputError` where frames, odometry and landmarks do not fit together.
     """
     settings = settings or JointSettings()
     landmarks = checked_landmarks(frames, odometry, landmarks)
@@ -66,7 +66,8 @@ def estimate_jointly(
         seen = nearest_landmarks(landmarks, path, settings.max_landmark_distance)
         clutter = tracker.settings.association.clutter_area
         start_moving = estimate is None
-        estimate = _solve(record, path, slow, start_moving, clutter, lanes, [seen, *new_providers()], settings)
+        providers = [seen, *new_providers()]
+        estimate = _solve(record, frames, path, slow, start_moving, clutter, lanes, providers, settings)
         estimate = replace(estimate, observations=seen)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
@@ -90,6 +91,7 @@ def checked_landmarks(
 
 def _solve(
     record: Record,
+    frames: Sequence[Frame],
     path: FloatArray,
     slow: SlowErrors,
     start_moving: bool,
@@ -104,9 +106,9 @@ def _solve(
     """
     graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=settings.max_iterations, tolerance=TOLERANCE)
     epochs = VehicleAndObjects(record, path, settings)
-    for now in record:
+    for now, frame in zip(record, frames, strict=True):
         graph.advance(now.time)
-        ask_all([epochs, *providers], graph)
+        ask_all([epochs, *providers], graph, frame)
     if start_moving:
         graph.solve(solver)
     probabilities = stationary_probabilities(record, path, slow, settings)

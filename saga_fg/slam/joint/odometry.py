@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from factors import ERROR_DIM
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances
+from saga_fg.numerics.arrays import FloatArray, checked, checked_covariances
 from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting
 
@@ -103,7 +103,3 @@ class OdometryIncrements:
         for increment in self.a_T_b:
             poses.append(poses[-1] @ increment)
         return np.stack(poses)
-
-    def select(self, rows: IntArray) -> Self:
-        """The odometry between some of the epochs, by increasing rows."""
-        return type(self).of(self.timestamps[rows], self.path()[rows])

@@ -58,7 +58,7 @@ class OnlineEstimator:
     lag        s; the window begins at the last epoch that is at least so old
     settings   of the graph; mapper: `gate` of the association of landmarks, `confirm` for observations of a certain one
     start      first pose (4, 4), by default the identity
-    providers  of factors of your own, asked after vehicle and objects of a frame are added
+    providers  of factors of your own, asked with each frame after its vehicle and objects are added
 
     Raises `InputError` for a negative lag, and a first pose that is not rigid.
     """
@@ -112,7 +112,7 @@ class OnlineEstimator:
         self._lanes.add_maps(frame.road_map)
         before = [] if not window.record else list(window.path)
         self._stationary = self._probabilities([*window.record, now], np.stack([*before, pose]))
-        solution = window.add(now, pose, self._stationary)
+        solution = window.add(now, frame, pose, self._stationary)
         more: list[FactorProvider] = []
         if observations:
             more.append(self._landmarks.observe(number, solution, observations))

@@ -17,12 +17,12 @@ from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.graph import FactorProvider, GraphError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.slam.joint.graph import error_key, object_key
-from saga_fg.slam.joint.motion import stream_keys
+from saga_fg.slam.joint.graph import error_key
 from saga_fg.slam.joint.providers import Detections, StationaryPairs, VehicleAndObjects
 from saga_fg.slam.joint.record import RecordedEpoch
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.mapping import pose_key
+from saga_fg.types.frame import Frame
 
 _THRESHOLD = 0.1  # standard deviations that a variable moves before its factors are linearised anew
 
@@ -55,13 +55,18 @@ class Window:
         step[:3, 3] = yaw_transform(yaw=-course)[:3, :3] @ a_T_b[:3, 3] / (1 + scale)
         return np.asarray(self.pose(last.epoch) @ step)
 
-    def add(self, now: RecordedEpoch, pose: FloatArray, stationary: Sequence[FloatArray]) -> GraphSolution:
-        """Add an epoch, whose expected pose is given, and solve; stationary: probabilities, of the new epoch too."""
+    def add(
+        self, now: RecordedEpoch, frame: Frame, pose: FloatArray, stationary: Sequence[FloatArray]
+    ) -> GraphSolution:
+        """Add an epoch, whose expected pose is given, and solve; stationary: probabilities, of the new epoch too.
+
+        frame: of the epoch, for the providers
+        """
         record = [*self.record, now]
         new = VehicleAndObjects(record[-2:], [pose], self._settings, known=len(record[-2:]) - 1)
         given = self._stationary.with_probabilities(record, stationary)
         try:
-            self._smoother.step(now.time, [new, given, *self._smoother.providers])
+            self._smoother.step(now.time, [new, given, *self._smoother.providers], frame)
         except GraphError:
             self._stationary = StationaryPairs(self._settings)  # whose factors are unknown now
             raise
@@ -84,12 +89,6 @@ class Window:
 
     def leave(self, count: int, others: Iterable[int]) -> None:
         """Marginalise the first epochs, and other variables without factors in the rest of the window."""
-        leaving, self.record = self.record[:count], self.record[count:]
-        self._smoother.marginalise({*others, *(key for now in leaving for key in _keys(now))})
-
-
-def _keys(now: RecordedEpoch) -> list[int]:
-    """The variables of an epoch."""
-    k = now.epoch
-    objects = [object_key(k, name) for name in now.objects.id.tolist()]
-    return [pose_key(k), error_key(k), *objects, *stream_keys(now)]
+        leaving, self.record = {now.epoch for now in self.record[:count]}, self.record[count:]
+        variables = self._smoother.graph().variables.values()
+        self._smoother.marginalise({*others, *(one.key for one in variables if one.epoch in leaving)})

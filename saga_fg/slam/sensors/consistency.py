@@ -56,6 +56,17 @@ def misfits(graph: SceneFactorGraph, sensors: Collection[str], settings: SensorS
     return {sensor: text for sensor, (_, text) in sorted(found.items(), key=lambda one: -one[1][0])}
 
 
+def unjudged(graph: SceneFactorGraph, sensors: Collection[str], settings: SensorSettings) -> dict[str, str]:
+    """The sensors, by name, that have measured too little for `misfits` to judge them, in words."""
+    point, found = graph.point(), dict[str, str]()
+    for sensor in sensors:
+        name = getattr(settings, sensor).name
+        count = len(residual_scores(graph, name, point))
+        if count < LEAST:
+            found[sensor] = f"{name}: too few measurements to judge whether it fits: {count}, {LEAST} are needed"
+    return found
+
+
 def residual_scores(graph: SceneFactorGraph, provider: str, point: LinearisationPoint) -> FloatArray:
     """Squared whitened residuals by dimension (n,) of the newest factors of a provider, those of priors left out."""
     scores: list[float] = []
@@ -74,11 +85,6 @@ def residual_scores(graph: SceneFactorGraph, provider: str, point: Linearisation
         if len(scores) >= WINDOW:
             break
     return np.array(scores[:WINDOW])
-
-
-def _at_times(graph: SceneFactorGraph, keys: tuple[int, ...]) -> bool:
-    """Whether a factor is on a variable that is not for all time."""
-    return any(graph.variables[key].time is not None for key in keys)
 
 
 def _bias(graph: SceneFactorGraph, settings: SensorSettings) -> tuple[float, FloatArray]:

@@ -57,6 +57,12 @@ def test_structure_is_shared_with_the_same_place_alone(places: list[FloatArray])
     assert one.shared(other, np.eye(4)) < 0.5
     flat = Structure.of(np.column_stack([np.mgrid[:40, :40].reshape(2, -1).T, np.zeros(1600)]).astype(float))
     assert flat.shared(one, np.eye(4)) == 0.0
+    assert flat.agreement(flat, np.eye(4)) is None
+    same, moved = one.agreement(half, np.eye(4)), one.agreement(half, yaw_transform(y=4.0))
+    assert same is not None
+    assert moved is not None
+    assert same > 0.7
+    assert moved < 0.5
 
 
 def test_no_places_no_points_and_numbers_twice() -> None:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from factors import prior_factor
 from saga_fg import InputError
+from saga_fg.graph import EGO_VELOCITY, Additions, GraphView, NewVariable
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import JointSettings, OnlineEstimator, estimate_jointly, estimate_online
@@ -49,6 +51,27 @@ def test_a_window_of_seconds_is_nearly_the_batch() -> None:
     planar = np.stack([errors[:, 1, 0], errors[:, 0, 3], errors[:, 1, 3]], axis=1)
     squares = [e @ np.linalg.solve(P[2:5, 2:5], e) for e, P in zip(planar, online.covariances, strict=True)]
     assert np.mean(squares[5:]) < chi2.ppf(0.999, 3)
+
+
+def test_variables_of_providers_leave_the_window_with_their_epoch() -> None:
+    frames, odometry, poses, _ = drive(n=12)
+    estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS, start=poses[0], providers=[_Speeds()])
+    for k, frame in enumerate(frames):
+        estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
+    graph, window = estimator._window._smoother.graph(), estimator._window.record
+    assert all(graph.of(EGO_VELOCITY, now.epoch) for now in window)
+    assert not any(graph.of(EGO_VELOCITY, k) for k in range(window[0].epoch))
+
+
+class _Speeds:
+    """A variable of its own at every epoch."""
+
+    name = "speeds"
+
+    def factors(self, view: GraphView) -> Additions:
+        assert view.frame is not None
+        prior = prior_factor(view.key(EGO_VELOCITY, 0), np.zeros(3), np.eye(3))
+        return Additions([NewVariable(EGO_VELOCITY, 0, np.zeros(3))], [prior])
 
 
 def test_what_leaves_the_window_stays_in_the_prior() -> None:

@@ -1,0 +1,227 @@
+"""LiDAR SLAM with scans that are lost, wheels that are wrong, and input that nobody can use."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_tools.lidar import Scan
+from data_tools.simulator.street import SimulatedScans
+from pipelines.slam.between_keyframes import BetweenKeyframes
+from pipelines.slam.drive import RecordedOdometry, motion, shared
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings
+from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
+from saga_fg.errors import InputError
+from saga_fg.graph import Additions, GraphView
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, WheelSpeed
+from saga_fg.types.landmark import Observation
+
+NOTHING = Scan.of(np.empty((0, 3)))
+PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False)
+
+
+class Listener:
+    """A provider that keeps what keyframes bring."""
+
+    name = "listener"
+
+    def __init__(self) -> None:
+        self.heard: list[EgoMeasurements | None] = []
+
+    def factors(self, view: GraphView) -> Additions:
+        self.heard.append(None if view.frame is None else view.frame.ego)
+        return Additions()
+
+
+class Given:
+    """Odometry that says what it is told."""
+
+    def __init__(self, steps: Sequence[object]) -> None:
+        self.steps = iter(steps)
+
+    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
+        return next(self.steps)  # type: ignore[return-value]
+
+
+def placed(x: float = 0.0, keyframe: bool = True, time: float = 0.0) -> OdometryStep:
+    return OdometryStep(time, yaw_transform(x), 1e-4 * np.eye(6), Scan.of(np.ones((1, 3))), keyframe, None)
+
+
+@pytest.fixture(scope="module")
+def scans() -> SimulatedScans:
+    return SimulatedScans(seed=0, count=16)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_lost_scans_leave_the_drive_as_it_was(scans: SimulatedScans, count: int) -> None:
+    slam, deviations = LidarSlam(scans.world_T_ego[0], PLAIN, ego_T_lidar=scans.ego_T_lidar), list[float]()
+    for k, time in enumerate(scans.timestamps.tolist()):
+        step = slam.step(NOTHING if 9 <= k < 9 + count else scans[k], time)
+        deviations.append(float(np.sqrt(step.covariance.diagonal()[3:].max())))
+        assert (step.keyframe is None) == (9 <= k < 9 + count)
+    assert min(deviations[9 : 9 + count]) > 0.5
+    assert deviations[9 + count] < 0.1
+    error = np.linalg.norm(slam.finish().trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1)
+    assert error.max() < 0.15
+
+
+def test_lost_scans_share_the_covariance_of_the_whole_motion() -> None:
+    poses = [yaw_transform(k, 0.1 * k**2, 0.0, 0.2 * k) for k in range(4)]
+    step = replace(placed(), covariance=np.diag([1.0, 2, 3, 4, 5, 6]), lost=2)
+    total = motion(poses, shared(poses, step))[1]
+    np.testing.assert_allclose(total, step.covariance, atol=1e-3)
+    assert len(shared(poses[:1], replace(step, lost=0))) == 1
+
+
+@pytest.mark.parametrize("speed", [100.0, 30.0, -8.0])
+def test_a_speed_that_no_vehicle_can_reach_is_refused(
+    scans: SimulatedScans, speed: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN, ego_T_lidar=scans.ego_T_lidar, sensors=["wheels"])
+    for k, time in enumerate(scans.timestamps.tolist()):
+        slam.step(scans[k], time, wheels=WheelSpeed(speed if k == 10 else 8.0, 0.1))
+    assert caplog.text.count("by other sensors is refused") == 1
+    error = np.linalg.norm(slam.finish().trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1)
+    assert error.max() < 0.15
+
+
+def test_a_speed_predicts_only_where_wheels_are_among_the_sensors(
+    scans: SimulatedScans, caplog: pytest.LogCaptureFixture
+) -> None:
+    without, listening = LidarSlam(settings=PLAIN), LidarSlam(settings=PLAIN, providers=[Listener()])
+    for k, time in enumerate(scans.timestamps[:4].tolist()):
+        alone = without.step(scans[k], time)
+        heard = listening.step(scans[k], time, wheels=WheelSpeed(9.0, 0.1))
+        np.testing.assert_array_equal(alone.odometry.map_T_lidar, heard.odometry.map_T_lidar)
+    assert caplog.text.count("wheels: not among the sensors") == 1
+    with pytest.raises(InputError, match="wheels: expected it among the sensors"):
+        without.step(scans[4], 4.0, wheels=WheelSpeed(9.0, 0.1))
+    with pytest.raises(InputError, match="gps: expected it among the sensors"):
+        without.step(scans[4], 4.0, gps=GpsFix(np.zeros(3)))
+    without.step(scans[4], float(scans.timestamps[4]))
+
+
+def test_after_the_end_nothing_is_taken(scans: SimulatedScans) -> None:
+    slam = LidarSlam(settings=PLAIN)
+    slam.step(scans[0], 0.0)
+    slam.finish()
+    with pytest.raises(InputError, match="expected no scan after finish"):
+        slam.step(scans[1], 0.1)
+    with pytest.raises(InputError, match="finish: expected to be called once"):
+        slam.finish()
+
+
+def test_a_vehicle_that_stands_where_the_first_scan_was_refused(scans: SimulatedScans) -> None:
+    class Detector:
+        calls = 0
+
+        def observations(self, points: np.ndarray) -> list[Observation]:
+            self.calls += 1
+            if self.calls == 1:
+                raise ValueError("no")
+            return []
+
+    slam = LidarSlam(scans.world_T_ego[0], ego_T_lidar=scans.ego_T_lidar, detectors=[Detector()])
+    with pytest.raises(ValueError, match="no"):
+        slam.step(scans[0], 0.0)
+    step = slam.step(scans[0], 0.1)
+    assert step.keyframe == 0
+    np.testing.assert_allclose(slam.finish().trajectory.positions, scans.world_T_ego[[0, 0], :3, 3], atol=0.02)
+
+
+def test_the_first_keyframe_lies_where_odometry_says() -> None:
+    class Provider(Listener):
+        def factors(self, view: GraphView) -> Additions:
+            super().factors(view)
+            if len(self.heard) == 1:
+                raise ValueError("no")
+            return Additions()
+
+    slam = LidarSlam(settings=PLAIN, providers=[Provider()], odometry=Given([placed(), placed(2.0), placed(3.0)]))
+    with pytest.raises(ValueError, match="no"):
+        slam.step(NOTHING, 0.0)
+    for k in (1, 2):
+        slam.step(NOTHING, 0.1 * k)
+    np.testing.assert_allclose(slam.finish().trajectory.positions[:, 0], [0.0, 2.0, 3.0], atol=1e-6)
+
+
+def test_odometry_of_ones_own_is_checked() -> None:
+    slam = LidarSlam(settings=PLAIN, odometry=Given([placed(keyframe=False), placed(0.1, keyframe=False)]))
+    assert slam.step(NOTHING, 0.0).keyframe == 0
+    assert slam.step(NOTHING, 0.1).keyframe is None
+    for step, message in (
+        (None, "odometry: expected an OdometryStep, got NoneType"),
+        (replace(placed(), map_T_lidar=np.diag([2.0, 2.0, 2.0, 1.0])), "odometry: map_T_lidar: expected a rigid"),
+        (replace(placed(), covariance=-np.eye(6)), "odometry: covariance: expected a symmetric"),
+        (replace(placed(), covariance=np.full((6, 6), np.nan)), "odometry: covariance"),
+        (replace(placed(), covariance=np.eye(3)), "odometry: covariance: expected shape"),
+        (replace(placed(), lost=-1), "odometry: lost"),
+        (replace(placed(), scan=np.zeros((1, 3))), "odometry: scan: expected a Scan"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(InputError, match=message):
+            LidarSlam(settings=PLAIN, odometry=Given([step])).step(NOTHING, 0.0)
+
+
+def test_a_fix_between_keyframes_waits_for_the_next() -> None:
+    heard = Listener()
+    steps = [placed(), placed(0.2, keyframe=False), placed(0.4, keyframe=False), placed(0.6)]
+    slam = LidarSlam(settings=PLAIN, providers=[heard], odometry=Given(steps), sensors=["gps"])
+    fixes = {1: GpsFix(np.array([0.1, 0, 0]), age=0.02), 2: GpsFix(np.array([0.4, 0, 0]), age=0.03)}
+    for k in range(4):
+        slam.step(NOTHING, 0.1 * k, gps=fixes.get(k))
+    fix = heard.heard[-1].gps if heard.heard[-1] is not None else None
+    assert fix is not None
+    assert fix.position[0] == 0.4
+    assert fix.age == pytest.approx(0.13)
+
+
+def test_joined_speeds_keep_their_deviation() -> None:
+    def joined(*speeds: WheelSpeed) -> WheelSpeed | None:
+        between = BetweenKeyframes(["wheels"], False, 0.2)
+        for k, speed in enumerate(speeds):
+            between.add(0.1 * k, EgoMeasurements(wheels=speed))
+        frame = between.frame(1.0, None)
+        return None if frame is None or frame.ego is None else frame.ego.wheels
+
+    both = joined(WheelSpeed(1.0, 0.1, 0.3), WheelSpeed(3.0, 0.3, 0.4))
+    assert both is not None
+    assert both.speed == pytest.approx(2.5)
+    assert both.dt == pytest.approx(0.4)
+    assert both.deviation == pytest.approx(np.hypot(0.25 * 0.3, 0.75 * 0.4))
+    mixed, unknown = joined(WheelSpeed(1.0, 0.1), WheelSpeed(1.0, 0.1, 0.4)), joined(WheelSpeed(1.0, 0.1))
+    assert mixed is not None
+    assert mixed.deviation == pytest.approx(0.5 * np.hypot(0.2, 0.4))
+    assert unknown is not None
+    assert unknown.deviation is None
+
+
+def test_scans_in_other_units_are_refused(scans: SimulatedScans) -> None:
+    for scale in (1e3, 1e-3):
+        odometry, other = LidarOdometry(), Scan.of(scans[0].points * scale)
+        with pytest.raises(InputError, match="points in metres, at distances from min_range 3 m to max_range 100 m"):
+            odometry.step(other, 0.0)
+        odometry.step(scans[0], 0.0)
+        for k in range(1, 5):
+            assert odometry.step(other, 0.1 * k).registration is None
+        with pytest.raises(InputError, match="max_range"):
+            odometry.step(other, 0.5)
+        odometry.step(scans[0], 0.6)
+
+
+def test_what_is_no_scan_or_time_is_said(scans: SimulatedScans) -> None:
+    slam = LidarSlam(settings=PLAIN)
+    with pytest.raises(InputError, match="scan: expected a Scan, got ndarray"):
+        slam.step(scans[0].points, 0.0)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="time: expected a finite number of seconds, got None"):
+        slam.step(scans[0], None)  # type: ignore[arg-type]
+
+
+def test_a_turn_on_the_spot_makes_keyframes_of_recorded_poses_too() -> None:
+    scans = SimulatedScans(0, world_T_lidar=np.array([yaw_transform(0, 0, 1.7, 0.02 * k) for k in range(7)]))
+    recorded = RecordedOdometry(scans, 1e-3, 0.03, OdometrySettings(keyframe_rotation=0.05))
+    keyframes = [recorded.step(scans[k], time).keyframe for k, time in enumerate(scans.timestamps.tolist())]
+    assert keyframes == [True, False, False, True, False, False, True]
