@@ -15,17 +15,20 @@ from data_tools.plausibility import (
     Sample,
     doubts_of,
     headings_in_degrees,
+    idle_lanes,
     idle_rules,
     settings_without_data,
 )
 from pipelines.config import TrackConfig
 from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import acting_classes
+from saga_fg.model.motion import Curvilinear
 from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
+from saga_fg.types.road_map import LANE, MAP_CLASSES, STOP_LINE
 from saga_fg.types.track import Tracks
 
 log = logging.getLogger(__name__)
@@ -91,7 +94,7 @@ class Doubts:
     def finish(self) -> None:
         """Warn of rules and settings that met nothing, when all is seen."""
         classes, sensors = self._settings.tracker.classes, self._settings.sensors
-        found = [idle_rules(self._acting, self._classes)]
+        found = [idle_rules(self._acting, self._classes), idle_lanes() if self._lanes_idle() else None]
         if self._detected and self._own_classes - self._detected:
             found.append(settings_without_data("tracker.classes", set(classes) - {DEFAULT}, self._detected))
         if self._sensors and self._own_sensors - self._sensors:
@@ -119,6 +122,19 @@ class Doubts:
     def _note(self, sample: Sample) -> None:
         self._detected.update(np.unique(sample.boxes.label).tolist())
         self._sensors.update(np.unique(sample.sensor).tolist())
+
+    def _lanes_idle(self) -> bool:
+        """True if there are lanes in the settings and nothing else there reads them, in a tracker that could."""
+        tracker = self._settings.tracker
+        if tracker.road_map is None or not tracker.road_map.lanes or not (tracker.edges or tracker.traffic.reach > 0):
+            return False
+        read = {name for rule in tracker.edges for name in getattr(rule, "map_classes", MAP_CLASSES)} & {
+            LANE,
+            STOP_LINE,
+        }
+        motions = [each.motion for each in tracker.classes.values()]
+        courses = any(isinstance(motion, Curvilinear) and motion.course_time > 0 for motion in motions)
+        return not read and not (courses and tracker.traffic.reach > 0)
 
     def _logits(self, sensor: str) -> bool:
         return sensor_model(self._settings.sensors, sensor).score == "logit"

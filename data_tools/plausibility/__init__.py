@@ -11,7 +11,13 @@ from data_tools.plausibility.checks import (
     unlikely_sizes,
     within_a_metre,
 )
-from data_tools.plausibility.class_names import idle_rules, settings_without_data, usual_class, usual_classes
+from data_tools.plausibility.class_names import (
+    idle_lanes,
+    idle_rules,
+    settings_without_data,
+    usual_class,
+    usual_classes,
+)
 from data_tools.plausibility.doubt import FILL_IN, Doubt, Mend
 from data_tools.plausibility.sample import Sample, doubts_of
 
@@ -25,6 +31,7 @@ __all__ = [
     "far_too_fast",
     "frames_taken_for_seconds",
     "headings_in_degrees",
+    "idle_lanes",
     "idle_rules",
     "length_below_width",
     "scores_beyond_one",

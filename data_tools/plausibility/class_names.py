@@ -53,6 +53,12 @@ def idle_rules(acting: Collection[str], classes: Collection[str]) -> Doubt | Non
     return Doubt("edges", what, expected, Mend(classes=meant))
 
 
+def idle_lanes() -> Doubt:
+    """Lanes of `tracker.road_map` where neither a class nor an edge rule reads lanes."""
+    what = "tracker.road_map.lanes: no class follows them (motion.course_time), and no rule of tracker.edges reads them"
+    return Doubt("lanes", what, "set course_time of a curvilinear motion, or add a rule such as in_lane")
+
+
 def settings_without_data(where: str, set_up: Collection[str], there: Collection[str]) -> Doubt | None:
     """Settings at `where` for classes or sensors (`set_up`) that the data lack, while they have others without any."""
     idle, plain = sorted(set(set_up) - set(there)), sorted(set(there) - set(set_up))

@@ -11,10 +11,13 @@ import time
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_info
+
+from saga_fg.kernels.compilation import compiled_kernels
 
 
 def timed(run: Callable[[], Any]) -> float:
@@ -49,4 +52,6 @@ def environment() -> dict[str, str]:
     """Return versions and hardware that the figures depend on."""
     blas = sorted({f"{pool['internal_api']} {pool['version']}" for pool in threadpool_info()})
     packages = {name: version(name) for name in ("saga-fg", "gtsam", "numpy", "scipy")}
-    return {"python": platform.python_version(), "machine": platform.machine(), "blas": ", ".join(blas), **packages}
+    packages["numba"] = version("numba") if find_spec("numba") is not None else "none"
+    machine = {"python": platform.python_version(), "machine": platform.machine(), "blas": ", ".join(blas)}
+    return {**machine, **packages, "kernels": "compiled" if compiled_kernels() else "none"}

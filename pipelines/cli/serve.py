@@ -138,8 +138,10 @@ def _serve(
 ) -> None:
     """Until the source ends or the service is told to stop."""
     from pipelines.serving import SocketServer, parse_address, serve_pipe
+    from saga_fg.kernels.compilation import load_kernels
 
     def ready(address: Address | None = None) -> None:
+        load_kernels()
         if keeper is not None:
             keeper.start()
         if address is not None:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from pipelines.scale_out.job import Job, Outcome, perform
 from saga_fg.errors import InputError
+from saga_fg.kernels.compilation import load_kernels
 
 ATTEMPTS = 2
 
@@ -36,6 +37,7 @@ class LocalPool:
     def outcomes(self, jobs: Iterator[Job], total: int) -> Iterator[Outcome]:
         """Yield the outcomes of `total` jobs as they come; no more jobs are taken than there are idle workers."""
         count = min(self.workers or os.cpu_count() or 1, total)
+        load_kernels()  # compiled once, not by each worker
         idle = [_Worker(self.scratch) for _ in range(count)]
         busy: dict[Connection, _Worker] = {}
         try:

@@ -67,9 +67,8 @@ class BlockGaussian:
         kept = np.flatnonzero(keep)
         old = self.partition
         partition = old.restricted(self.layout.without(rows), kept)
-        if not compiled_kernels() and old.count - partition.count == len(
-            rows
-        ):  # nodes without partners go, all others stay as they are
+        alone = old.count - partition.count == len(rows)  # nodes without partners go, all others stay as they are
+        if alone and not compiled_kernels():
             leaving = [old.row[rows[old.group[rows] == number]] for number in range(len(self.blocks))]
             left = (np.delete(P, of_group, axis=0) for P, of_group in zip(self.blocks, leaving, strict=True))
             blocks = tuple(P for P in left if len(P))
@@ -98,9 +97,8 @@ class BlockGaussian:
             d = int(layout.dims[node[0, 0]])
             if s == d and (node == node[:, :1]).all():  # nodes on their own
                 continue
-            of_nodes = (
-                d if s % d == 0 and (layout.dims[node] == d).all() else 1
-            )  # node by node where all are of one size
+            alike = s % d == 0 and (layout.dims[node] == d).all()  # then node by node
+            of_nodes = d if alike else 1
             chunk = max(1, _IN_CACHE // (s * s))
             tied = [_tied(P[first : first + chunk], tolerance, of_nodes) for first in range(0, c, chunk)]
             node = node[:, ::of_nodes]

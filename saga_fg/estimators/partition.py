@@ -254,7 +254,8 @@ def flattened(blocks: BlockDiagonal) -> FloatArray:
     if len(blocks) == 0:
         return np.empty(0)
     whole, size = blocks[0].base, sum(block.size for block in blocks)
-    if whole is not None and whole.ndim == 1 and whole.size == size and all(block.base is whole for block in blocks):
+    parts = all(block.base is whole for block in blocks)
+    if parts and isinstance(whole, np.ndarray) and whole.ndim == 1 and whole.size == size:  # bytes after unpickling
         return whole
     return np.concatenate([block.ravel() for block in blocks])
 

@@ -1,8 +1,8 @@
 """Compilation of kernels: functions over arrays that Numba compiles at their first call, and keeps on disk.
 
 Compiled code is kept beside the source, or in the cache folder of the user where that is read-only (`NUMBA_CACHE_DIR`
-names another place). Without Numba, or with `NUMBA_DISABLE_JIT=1`, `compiled_kernels` is false: then callers take their
-NumPy versions, and kernels are never called.
+names another place). Without a Numba that works, or with `NUMBA_DISABLE_JIT=1`, `compiled_kernels` is false: then
+callers take their NumPy versions, and kernels are never called.
 """
 
 from __future__ import annotations
@@ -11,22 +11,30 @@ import importlib
 import importlib.util
 import logging
 import os
+import pkgutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import update_wrapper
 from typing import Any, Generic, ParamSpec, TypeVar, cast
+
+import saga_fg.kernels
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 log = logging.getLogger(__name__)
 _SCALARS = {"f": "float64", "i": "int64", "b": "boolean", "u": "uint32"}
-_enabled = importlib.util.find_spec("numba") is not None and os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
-_announced = False
+_kernels: list[Kernel[Any, Any]] = []  # of the modules that were imported
+_enabled: bool | None = None  # None: nobody has asked yet
+_listening = False
+_said: set[str] = set()
 
 
 def compiled_kernels() -> bool:
-    """True where kernels are used, false where NumPy alone is."""
+    """True where kernels are used, false where NumPy alone is; Numba is imported at the first call."""
+    global _enabled
+    if _enabled is None:
+        _enabled = _numba_works()
     return _enabled
 
 
@@ -41,6 +49,26 @@ def only_numpy() -> Iterator[None]:
         _enabled = before
 
 
+def load_kernels() -> None:
+    """Load or compile all kernels, so that no frame waits for it."""
+    if compiled_kernels():
+        for module in pkgutil.iter_modules(saga_fg.kernels.__path__):
+            importlib.import_module(f"saga_fg.kernels.{module.name}")
+        for each in _kernels:
+            each.load()
+
+
+def _numba_works() -> bool:
+    if os.environ.get("NUMBA_DISABLE_JIT") == "1" or importlib.util.find_spec("numba") is None:
+        return False
+    try:
+        numba: Any = importlib.import_module("numba")  # takes as long as all else that a command imports
+    except Exception as error:  # too old for this NumPy, or a library that is missing
+        log.warning("Numba does not work here, NumPy is used instead: %s", error)
+        return False
+    return not numba.config.DISABLE_JIT
+
+
 class Kernel(Generic[P, R]):
     """A function that is compiled when it is first called; `source` is the function itself."""
 
@@ -49,11 +77,16 @@ class Kernel(Generic[P, R]):
         self._arguments = arguments
         self._compiled: Callable[P, R] | None = None
         update_wrapper(self, source)
+        _kernels.append(self)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        return (self._compiled or self.load())(*args, **kwargs)
+
+    def load(self) -> Callable[P, R]:
+        """Compile it, or load it from disk, unless that is done."""
         if self._compiled is None:
             self._compiled = cast(Callable[P, R], _compiled(self.source, self._arguments))
-        return self._compiled(*args, **kwargs)
+        return self._compiled
 
 
 def kernel(arguments: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
@@ -66,15 +99,21 @@ def kernel(arguments: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
 
 
 def _compiled(source: Callable[..., Any], arguments: str) -> Any:
-    numba: Any = importlib.import_module("numba")  # takes as long as all else that a command imports
+    numba: Any = importlib.import_module("numba")
     _announce_compilation()
     signature = tuple(_argument(numba.types, kind) for kind in arguments.split())
     options = {"error_model": "numpy", "nogil": True}
+    function = numba.njit(**options)(source)
     try:
-        return numba.njit(signature, cache=True, **options)(source)
-    except RuntimeError as error:  # no folder to keep it in
-        log.warning("%s: it is compiled anew each time", error)
-        return numba.njit(signature, **options)(source)
+        function.enable_caching()
+        function.compile(signature)
+    except Exception as error:  # no folder to keep it in, a damaged file there, a full disk
+        folder = function.stats.cache_path or "disk"
+        _say_once("kernels cannot be loaded from %s or kept there, and are compiled anew: %s", folder, repr(error))
+        if not function.signatures:
+            return numba.njit(signature, **options)(source)
+    function.disable_compile()
+    return function
 
 
 def _argument(types: Any, kind: str) -> Any:
@@ -84,21 +123,23 @@ def _argument(types: Any, kind: str) -> Any:
     return types.Array(scalar, int(kind[1]), "C" if kind.endswith("c") else "A", readonly=True)
 
 
+def _say_once(message: str, *values: str) -> None:
+    if message not in _said:
+        _said.add(message)
+        log.warning(message, *values)
+
+
 def _announce_compilation() -> None:
     """Say once that kernels are being compiled, which takes seconds, when the first of them is not found on disk."""
-    global _announced
-    if _announced:
+    global _listening
+    if _listening:
         return
-    _announced = True
+    _listening = True
     event: Any = importlib.import_module("numba.core.event")
 
     class Announcement(event.Listener):  # type: ignore[misc]
-        said = False
-
         def on_start(self, event: Any) -> None:
-            if not self.said:
-                self.said = True
-                log.warning("compiling kernels, once for this installation: some seconds")
+            _say_once("compiling kernels, once for this installation: up to twenty seconds")
 
         def on_end(self, event: Any) -> None:
             pass

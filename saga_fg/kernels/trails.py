@@ -12,13 +12,40 @@ from saga_fg.kernels.compilation import kernel
 Paths = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
-@kernel("i1 f2 f1 f1 b1 i1 f2 f1 f1 i i f f f f f f")
+@kernel("f2 f")
+def points_by_cell(points: FloatArray, size: float) -> tuple[IntArray, IntArray]:
+    """Points (n, 2) in lists, by the hash of their cells of `size` m.
+
+    (n, 3) for each point its cell and the one before it in its list, -1 for none; the last point of each list
+    """
+    n, buckets = len(points), 16
+    while buckets < 2 * n:
+        buckets *= 2
+    cells, latest = np.empty((n, 3), dtype=np.int64), np.full(buckets, -1, dtype=np.int64)
+    for p in range(n):
+        ix, iy = math.floor(points[p, 0] / size), math.floor(points[p, 1] / size)
+        bucket = (ix * 73856093 + iy * 19349663) % buckets
+        cells[p, 0], cells[p, 1], cells[p, 2] = ix, iy, latest[bucket]
+        latest[bucket] = p
+    return cells, latest
+
+
+@kernel("i1 f2 f1 f1 b1 i2 i1 i1 f2 f1 f1 b1 i2 i1 i1 f2 f1 f1 i i f f f f f f")
 def trail_paths(
-    of: IntArray,
-    points: FloatArray,
-    headings: FloatArray,
-    speeds: FloatArray,
-    timed: BoolArray,
+    lane_of: IntArray,
+    lane_points: FloatArray,
+    lane_headings: FloatArray,
+    lane_speeds: FloatArray,
+    lane_timed: BoolArray,
+    lane_cells: IntArray,
+    lane_latest: IntArray,
+    trail_of: IntArray,
+    trail_points: FloatArray,
+    trail_headings: FloatArray,
+    trail_speeds: FloatArray,
+    trail_timed: BoolArray,
+    trail_cells: IntArray,
+    trail_latest: IntArray,
     ids: IntArray,
     position: FloatArray,
     heading: FloatArray,
@@ -34,24 +61,18 @@ def trail_paths(
 ) -> Paths:
     """Places (k, steps + 1, 2), courses, typical speeds and weights (k, steps + 1), certainty and disagreement (k,).
 
-    Of n points of trails: their tracks `of` (n,), places (n, 2), headings, speeds and whether these are known (n,); of
-    k tracks: ids (k,), position (k, 2), heading, curvature (k,); most: points compared; length of a step; the rest are
-    the module's scales
+    Of n points of lanes, and of those of trails: their tracks `of` (n,), places (n, 2), headings, speeds and whether
+    these are known (n,), and the result of `points_by_cell` at 2 * reach; of k tracks: ids (k,), position (k, 2),
+    heading, curvature (k,); most: points compared; length of a step; the rest are the module's scales
     """
-    n, k, cell = len(of), len(ids), 2 * reach
-    buckets = 16
-    while buckets < 2 * n:
-        buckets *= 2
-    ix, iy = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
-    latest, before = np.full(buckets, -1, dtype=np.int64), np.empty(n, dtype=np.int64)
-    for p in range(n):  # points by cell, in lists
-        ix[p], iy[p] = math.floor(points[p, 0] / cell), math.floor(points[p, 1] / cell)
-        bucket = (ix[p] * 73856093 + iy[p] * 19349663) % buckets
-        before[p], latest[bucket] = latest[bucket], p
+    of, points, headings = (lane_of, trail_of), (lane_points, trail_points), (lane_headings, trail_headings)
+    speeds, timed = (lane_speeds, trail_speeds), (lane_timed, trail_timed)
+    cells, latest = (lane_cells, trail_cells), (lane_latest, trail_latest)
+    k, cell = len(ids), 2 * reach
     place, course = np.empty((k, steps + 1, 2)), np.empty((k, steps + 1))
     speed, weight = np.zeros((k, steps + 1)), np.zeros((k, steps + 1))
     certainty, disagreement = np.zeros(k), np.zeros(k)
-    near, apart = np.empty(most, dtype=np.int64), np.empty(most)
+    near, side, apart = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty(most)
     share, turns = np.empty(most), np.empty(most)
     for t in range(k):
         x, y, h = position[t, 0], position[t, 1], heading[t]
@@ -64,32 +85,33 @@ def trail_paths(
             cx, cy = math.floor(at_x / cell), math.floor(at_y / cell)
             for jx in range(cx - 1, cx + 2):
                 for jy in range(cy - 1, cy + 2):
-                    p = latest[(jx * 73856093 + jy * 19349663) % buckets]
-                    while p >= 0:
-                        if ix[p] == jx and iy[p] == jy:
-                            d = math.sqrt((points[p, 0] - at_x) ** 2 + (points[p, 1] - at_y) ** 2)
-                            if d < cell and (found < most or d < apart[found - 1]):
-                                q = min(found, most - 1)
-                                while q > 0 and apart[q - 1] > d:
-                                    apart[q], near[q] = apart[q - 1], near[q - 1]
-                                    q -= 1
-                                apart[q], near[q] = d, p
-                                found = min(found + 1, most)
-                        p = before[p]
+                    for s in range(2):
+                        p = latest[s][(jx * 73856093 + jy * 19349663) % len(latest[s])]
+                        while p >= 0:
+                            if cells[s][p, 0] == jx and cells[s][p, 1] == jy:
+                                d = math.sqrt((points[s][p, 0] - at_x) ** 2 + (points[s][p, 1] - at_y) ** 2)
+                                if d < cell and (found < most or d < apart[found - 1]):
+                                    q = min(found, most - 1)
+                                    while q > 0 and apart[q - 1] > d:
+                                        apart[q], near[q], side[q] = apart[q - 1], near[q - 1], side[q - 1]
+                                        q -= 1
+                                    apart[q], near[q], side[q] = d, p, s
+                                    found = min(found + 1, most)
+                            p = cells[s][p, 2]
             total, mean, typical, known = 0.0, 0.0, 0.0, 0.0
             for q in range(found):
-                p = near[q]
+                p, s = near[q], side[q]
                 share[q] = 0.0
-                counts = of[p] != ids[t]
+                counts = of[s][p] != ids[t]
                 for r in range(q):  # of each trail the nearest point
-                    counts = counts and of[near[r]] != of[p]
-                turns[q] = (headings[p] - h - own + math.pi) % (2 * math.pi) - math.pi
+                    counts = counts and of[side[r]][near[r]] != of[s][p]
+                turns[q] = (headings[s][p] - h - own + math.pi) % (2 * math.pi) - math.pi
                 if counts:
                     share[q] = math.exp(-((apart[q] / reach) ** 2 + (turns[q] / turning) ** 2) / 2)
                     total += share[q]
-                    if timed[p]:
+                    if timed[s][p]:
                         known += share[q]
-                        typical += share[q] * speeds[p]
+                        typical += share[q] * speeds[s][p]
             scale = max(total, 1e-9)
             for q in range(found):
                 mean += share[q] / scale * turns[q]

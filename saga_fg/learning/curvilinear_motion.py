@@ -41,10 +41,8 @@ FOLLOWED, SPACING = 1.5, 1.0  # s in view before a gap, and between gaps
 STEP = 0.5  # s, of predictions through a gap
 TAILS = 30.0  # degrees of freedom
 FEWEST = 20  # objects that a fit needs
-MOST, LONGEST = (
-    300,
-    100,
-)  # pieces of objects used of a class, evenly spread; detections of one: side by side they are fast
+MOST = 300  # pieces of objects used of a class, evenly spread
+LONGEST = 100  # detections of a piece: many short pieces are filtered faster than a few long ones
 INDEPENDENT = 10  # objects
 MAJORITY = 0.8  # share of all objects; the motion of all together is that of such a class
 EVALUATIONS = 80

@@ -277,5 +277,4 @@ def _trails(parts: Sequence[RecordedTracks], moments: FloatArray) -> Passages:
         moves = (part.table.last_detected >= -1e-6) & (np.hypot(*now.velocity.T) > MOVING)
         found = Passages.of(part.table.id, part.table.label, now, part.table.box.yaw, moves, float(time))
         traffic.update(found.select(found.moves), float(time))
-    assert traffic.left is not None
     return traffic.left

@@ -11,7 +11,8 @@ graph itself, `saga_fg.smoothing.graph_states`). The edges of an interval follow
 of an earlier, simpler pass. Robust losses (`factors.robust`) are reached by reweighting between passes.
 
 The velocity of a stationary object is zero with the covariance d^2/dt in every interval dt, by which its position
-wanders by d in a second, whatever the rate of frames: as far as the vehicle's own poses drift.
+wanders by d in a second, whatever the rate of frames: as far as the vehicle's own poses drift. A recording of one
+moment has no interval; there dt is a second.
 """
 
 from __future__ import annotations
@@ -118,7 +119,8 @@ def _epochs(
         measured = _measured(evidence, object_of, slice(int(bounds[k]), int(bounds[k + 1])), weight)
         pinned = lifespans.id[present][stationary.at(k, lifespans.id[present])]
         if len(pinned):
-            interval = evidence.times[max(k, 1)] - evidence.times[max(k, 1) - 1]
+            later = max(k, 1)
+            interval = evidence.times[later] - evidence.times[later - 1] if len(evidence.times) > 1 else 1.0
             H, R = types[0].selector(VELOCITY), stationary.settings.position_drift**2 / interval * np.eye(2)
             measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
         gone = lifespans.last[present] == k

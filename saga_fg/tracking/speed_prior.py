@@ -21,9 +21,11 @@ import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.tracking.traffic import Traffic
+from saga_fg.numerics.near_pairs import near_pairs
+from saga_fg.tracking.traffic import Passages, SpeedPriorSettings, Traffic
 
 _FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
+_MOST_PAIRS = 1_000_000  # of new tracks and passages that are compared at a time
 
 
 class SpeedPrior(NamedTuple):
@@ -47,25 +49,17 @@ def speed_prior(
     variance (k,) and probability `stationary` of objects without neighbours
     """
     settings = traffic.settings.speed_prior
-    passages = traffic.passages if settings.weight > 0 and len(label) else None
-    if passages is None or len(passages) == 0:
+    passages = traffic.passages if settings.weight > 0 and len(label) else traffic.left.select(slice(0, 0))
+    if len(passages) == 0:
         return SpeedPrior(np.full(len(label), stationary), np.zeros(len(label)), variance.copy())
     passages = passages.select(passages.variance < settings.max_speed_deviation**2)
-    offset = passages.position - position[:, None]
-    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    ahead, lateral = offset[..., 0] * c + offset[..., 1] * s, offset[..., 1] * c - offset[..., 0] * s
-    turn = wrap_angle(passages.heading - heading[:, None])
-    exponent = (
-        (ahead / settings.ahead_scale) ** 2
-        + (lateral / settings.lateral_scale) ** 2
-        + (turn / settings.heading_scale) ** 2
-    )
-    new, passage = np.nonzero(exponent < _FARTHEST)  # false where the heading is unknown
-    alike = passages.label[passage] == label[new]
-    new, passage = new[alike], passage[alike]
-    k = settings.weight * np.exp(-exponent[new, passage] / 2)
-    nearest = _nearest_of_each(new, passages.id[passage], k)
-    new, k, near = new[nearest], k[nearest], passages.select(passage[nearest])
+    block = max(1, _MOST_PAIRS // max(1, len(passages)))
+    parts = [
+        _neighbours(settings, passages, np.arange(begin, min(begin + block, len(label))), label, position, heading)
+        for begin in range(0, len(label), block)
+    ]
+    new, passage, k = (np.concatenate(column) for column in zip(*parts, strict=True))
+    near = passages.select(passage)
 
     def total(values: FloatArray) -> FloatArray:
         return np.bincount(new, weights=values, minlength=len(label)).astype(np.float64, copy=False)
@@ -76,6 +70,33 @@ def speed_prior(
     mean = total(k * near.speed) / norm
     square = near.speed**2 + near.variance + settings.spread**2
     return SpeedPrior(still, mean, ((1 - stationary) * variance + total(k * square)) / norm - mean**2)
+
+
+def _neighbours(
+    settings: SpeedPriorSettings,
+    passages: Passages,
+    rows: IntArray,
+    label: StrArray,
+    position: FloatArray,
+    heading: FloatArray,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """The new tracks among `rows`, each with the nearest passage of every neighbour and its weight, each (e,)."""
+    farthest = np.sqrt(_FARTHEST) * max(settings.ahead_scale, settings.lateral_scale)
+    reach = np.where(np.isfinite(heading[rows]), farthest, np.nan)
+    new, passage = near_pairs(position[rows], passages.position, reach)
+    new = rows[new]
+    offset, turn = passages.position[passage] - position[new], wrap_angle(passages.heading[passage] - heading[new])
+    c, s = np.cos(heading[new]), np.sin(heading[new])
+    ahead, lateral = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s
+    exponent = (
+        (ahead / settings.ahead_scale) ** 2
+        + (lateral / settings.lateral_scale) ** 2
+        + (turn / settings.heading_scale) ** 2
+    )
+    counts = (exponent < _FARTHEST) & (passages.label[passage] == label[new])
+    new, passage, k = new[counts], passage[counts], settings.weight * np.exp(-exponent[counts] / 2)
+    nearest = _nearest_of_each(new, passages.id[passage], k)
+    return new[nearest], passage[nearest], k[nearest]
 
 
 def _nearest_of_each(new: IntArray, ids: IntArray, k: FloatArray) -> IntArray:

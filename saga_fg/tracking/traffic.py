@@ -9,12 +9,16 @@ go, at no speed, and are never forgotten.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from saga_fg.errors import InputError
+from saga_fg.kernels.trails import points_by_cell
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
@@ -52,7 +56,9 @@ class TrafficSettings(Settings):
     """Memory of where traffic went and how fast, see `saga_fg.tracking.traffic`."""
 
     memory: NonNegative = setting(
-        0.0, "remember where tracks have passed for this long, s; usual 5 to 120; higher: older traffic counts, 0: none"
+        0.0,
+        "remember where tracks have passed for this long, s, for the paths of hidden objects (reach) and the speeds of "
+        "new tracks (speed_prior); usual 5 to 120; higher: older traffic counts, 0: none",
     )
     reach: NonNegative = setting(
         1.5,
@@ -62,6 +68,11 @@ class TrafficSettings(Settings):
     speed_prior: SpeedPriorSettings = settings_group(
         SpeedPriorSettings, "speed of new tracks from the traffic around them"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.speed_prior.weight > 0 and self.memory == 0:
+            raise InputError("speed_prior.weight: expected 0 with a memory of 0 s, which tells no speeds")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +115,12 @@ class Passages(Columns):
         return found if np.isfinite(heading).all() else found.select(np.isfinite(heading))
 
     @classmethod
+    def empty(cls) -> Self:
+        """No passages."""
+        ids, none, moves = np.empty(0, dtype=np.int64), np.empty(0), np.empty(0, dtype=np.bool_)
+        return cls(ids, np.empty(0, dtype="U1"), np.empty((0, 2)), none, none, none, none, none, moves)
+
+    @classmethod
     def of_lane(cls, lane: Lane, ids: int) -> Self:
         """The passages along a lane."""
         centre = np.array(lane.centre)
@@ -118,37 +135,68 @@ class Passages(Columns):
         )
 
 
+class Trails:
+    """Points of trails, found by their places: by a tree, or by cells for kernels. What finds them is no part of a
+    state: it is made at need."""
+
+    def __init__(self, points: Passages) -> None:
+        self.points = points
+        self._cells: tuple[float, IntArray, IntArray] | None = None
+
+    def __reduce__(self) -> tuple[type[Trails], tuple[Passages]]:
+        return Trails, (self.points,)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def timed(self) -> BoolArray:
+        """(n,) whether the speeds are known."""
+        return np.isfinite(self.points.variance)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """A tree of the places."""
+        return cKDTree(self.points.position, balanced_tree=False, compact_nodes=False)
+
+    def cells(self, size: float) -> tuple[IntArray, IntArray]:
+        """The points by cells of this size, m, see `saga_fg.kernels.trails.points_by_cell`."""
+        if self._cells is None or self._cells[0] != size:
+            self._cells = size, *points_by_cell(self.points.position, size)
+        return self._cells[1:]
+
+
 @dataclass(eq=False)
 class Traffic:
     """The passages of the last `memory` seconds: those that tracks have left behind, in the order of time, the
     last of these of each track, by id, and where tracks were last; and those along the lanes of the map."""
 
     settings: TrafficSettings
-    left: Passages | None = None
-    marked: Passages | None = None
-    latest: Passages | None = None
-    lanes: Passages | None = None
-    lane_names: tuple[str, ...] = ()
+    left: Passages = field(default_factory=Passages.empty)
+    marked: Passages = field(default_factory=Passages.empty)
+    latest: Passages = field(default_factory=Passages.empty)
+    lanes: Trails = field(default_factory=lambda: Trails(Passages.empty()))
+    _known: Mapping[str, tuple[tuple[int, Lane], ...]] = field(default_factory=dict)
+    _next_lane: int = FIRST_LANE
     _map: RoadMap | None = None
-    _trails: tuple[Passages, cKDTree] | None = field(default=None, repr=False)
+    _trails: Trails | None = field(default=None, repr=False)
 
     def __copy__(self) -> Traffic:
-        """A memory that changes independently of this one, without the tree, which is no part of a state."""
+        """A memory that changes independently of this one."""
         return replace(self, _trails=None)
 
     @property
-    def passages(self) -> Passages | None:
-        """The passages of tracks, None before the first."""
-        return None if self.left is None or self.latest is None else self.left.append(self.latest)
+    def passages(self) -> Passages:
+        """The passages of tracks."""
+        return self.left.append(self.latest)
 
     def update(self, passing: Passages, time: float) -> None:
         """Remember where tracks are at `time`, s, every `SPACING` m, and forget what is older than `memory`."""
         if self.settings.memory == 0:
             return
-        none, self._trails = passing.select(slice(0, 0)), None
+        self._trails = None
         left, marked, latest = (
-            none if each is None else each.select(each.time >= time - self.settings.memory)
-            for each in (self.left, self.marked, self.latest)
+            each.select(each.time >= time - self.settings.memory) for each in (self.left, self.marked, self.latest)
         )
         new = passing.select(_moved(passing, marked))
         self.left, self.latest = left.append(new), latest.select(~np.isin(latest.id, passing.id)).append(passing)
@@ -156,31 +204,41 @@ class Traffic:
         self.marked = marked.select(np.argsort(marked.id))
 
     def add_lanes(self, road_map: RoadMap) -> None:
-        """Take in the lanes of a map that are not known yet."""
+        """Take in the lanes of a map that are not known yet, by their names and centre lines.
+
+        Map tiles may use a name again. A lane beside a known one of its name is that one corrected, and replaces it.
+        """
         if road_map is self._map or self.settings.reach == 0:
             return
         self._map = road_map
-        new = [lane for lane in road_map.lanes if lane.name not in self.lane_names]
+        known, new, replaced = dict(self._known), [], set[int]()
+        for lane in road_map.lanes:
+            alike = known.get(lane.name, ())
+            if any(lane.centre == other.centre for _, other in alike):
+                continue
+            before = {number for number, other in alike if _beside(lane, other)}
+            replaced |= before
+            kept = tuple(each for each in alike if each[0] not in before)
+            known[lane.name] = (*kept, (self._next_lane, lane))
+            new.append(Passages.of_lane(lane, self._next_lane))
+            self._next_lane -= 1
         if new:
-            first = FIRST_LANE - len(self.lane_names)
-            parts = [Passages.of_lane(lane, first - k) for k, lane in enumerate(new)]
-            self.lanes = Passages.concatenate([*([] if self.lanes is None else [self.lanes]), *parts])
-            self.lane_names, self._trails = self.lane_names + tuple(lane.name for lane in new), None
+            points = self.lanes.points
+            points = points.select(~np.isin(points.id, list(replaced))) if replaced else points
+            self.lanes, self._known = Trails(Passages.concatenate([points, *new])), known
 
-    def trail_points(self) -> Passages | None:
-        """The passages of those that move, and of lanes; None without any."""
-        parts = [each.select(each.moves) for each in (self.left, self.latest, self.lanes) if each is not None]
-        found = Passages.concatenate(parts) if parts else None
-        return None if found is None or len(found) == 0 else found
-
-    def trails(self) -> tuple[Passages, cKDTree] | None:
-        """The passages of those that move, and of lanes, with a tree of their positions; None without any."""
+    def trails(self) -> Trails:
+        """The passages of those that move."""
         if self._trails is None:
-            found = self.trail_points()
-            if found is None:
-                return None
-            self._trails = found, cKDTree(found.position, balanced_tree=False, compact_nodes=False)
+            self._trails = Trails(self.left.select(self.left.moves).append(self.latest.select(self.latest.moves)))
         return self._trails
+
+
+def _beside(a: Lane, b: Lane) -> bool:
+    """True if the middle of each of two lanes is within the width of the other."""
+    p, q = Passages.of_lane(a, FIRST_LANE).position, Passages.of_lane(b, FIRST_LANE).position
+    apart = min(a.width, b.width)
+    return all(np.hypot(*(x - y[len(y) // 2]).T).min() < apart for x, y in ((p, q), (q, p)))
 
 
 def _moved(passing: Passages, marked: Passages) -> BoolArray:

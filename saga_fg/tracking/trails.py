@@ -14,7 +14,7 @@ k_j is the typical speed at each place; lanes tell none.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +22,9 @@ from saga_fg.kernels.compilation import compiled_kernels
 from saga_fg.kernels.trails import trail_paths
 from saga_fg.model.interactions import unit
 from saga_fg.model.paths import Paths
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.tracking.traffic import Traffic
+from saga_fg.tracking.traffic import Passages, Traffic, Trails
 
 STEP = 3.0  # m between the points of a predicted path
 NEAREST = 12  # passages that are compared with a place
@@ -33,7 +33,7 @@ TURN = 0.3  # rad, sigma of the kernel on the difference of headings
 AGREEMENT = 0.2  # rad, deviation of the headings of trails from which they say little
 _BEND = 20.0  # m, along which a curvature of one's own fades
 _LEAST = 1e-9
-_NO_POINTS = (np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0, dtype=bool))
+_NONE = Trails(Passages.empty())
 _NEARER = np.tril(np.ones((NEAREST, NEAREST), dtype=np.bool_), -1)
 
 
@@ -56,14 +56,10 @@ def paths(
     Their steps are `STEP` m long, their rows 0 to n - 1.
     """
     if compiled_kernels():
-        points = traffic.trail_points() if traffic.settings.reach > 0 else None
-        scales = max(traffic.settings.reach, _LEAST), STEP, _BEND, TURN, PRIOR, AGREEMENT
-        known = _NO_POINTS
-        if points is not None:
-            timed = np.isfinite(points.variance)
-            known = points.id, points.position, points.heading, points.speed, timed
-        tracks = ids, position, heading, curvature
-        return Paths(np.arange(len(ids)), *trail_paths(*known, *tracks, steps, NEAREST, *scales))
+        reach = max(traffic.settings.reach, _LEAST)
+        lanes, trails = (_columns(each, 2 * reach) for each in _found(traffic))
+        tracks, scales = (ids, position, heading, curvature), (reach, STEP, _BEND, TURN, PRIOR, AGREEMENT)
+        return Paths(np.arange(len(ids)), *trail_paths(*lanes, *trails, *tracks, steps, NEAREST, *scales))
     place, beside = position, _beside(traffic, ids, position, heading)
     course = heading + beside.certainty * beside.turn
     certainty, disagreement = beside.certainty, beside.variance
@@ -79,19 +75,32 @@ def paths(
     return Paths(np.arange(len(ids)), places, courses, speeds, weights, certainty, disagreement)
 
 
+def _found(traffic: Traffic) -> tuple[Trails, Trails]:
+    """The lanes, and the trails of traffic, that lead others."""
+    return (traffic.lanes, traffic.trails()) if traffic.settings.reach > 0 else (_NONE, _NONE)
+
+
+def _columns(trails: Trails, cell: float) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray, Any, Any]:
+    """What the kernel reads of trails: tracks, places, headings, speeds, whether these are known, and the cells."""
+    points = trails.points
+    return points.id, points.position, points.heading, points.speed, trails.timed, *trails.cells(cell)
+
+
 def _beside(traffic: Traffic, ids: IntArray, position: FloatArray, heading: FloatArray) -> _Beside:
     """The trails beside places (n, 2), world, with headings (n,), rad, without those of the tracks `ids` (n,)."""
-    reach, found = traffic.settings.reach, traffic.trails() if traffic.settings.reach > 0 else None
-    if found is None:
+    reach = traffic.settings.reach
+    found = [_nearest(each, position, 2 * reach) for each in _found(traffic) if len(each)]
+    if not found:
         return _Beside(*np.zeros((5, len(heading))))
-    points, tree = found
-    apart, at = tree.query(position, k=NEAREST, distance_upper_bound=2 * reach)
-    most = int(np.isfinite(apart).sum(axis=1).max(initial=0))
-    apart, at = apart[:, :most], np.minimum(at[:, :most], len(points) - 1)
-    of = points.id[at]
+    apart, of, headings, speeds, known = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
+    most = min(NEAREST, int(np.isfinite(apart).sum(axis=1).max(initial=0)))
+    order = np.argsort(apart, axis=1, kind="stable")[:, :most]
+    apart, of, headings, speeds, known = (
+        np.take_along_axis(each, order, axis=1) for each in (apart, of, headings, speeds, known)
+    )
     again = ((of[:, :, None] == of[:, None]) & _NEARER[:most, :most]).any(axis=2)
     other = np.isfinite(apart) & (of != ids[:, None]) & ~again
-    turn = wrap_angle(points.heading[at] - heading[:, None])
+    turn = wrap_angle(headings - heading[:, None])
     aside = np.where(other, apart, 0.0)
     k = np.exp(-((aside / reach) ** 2 + (turn / TURN) ** 2) / 2) * other
     total = k.sum(axis=1)
@@ -99,7 +108,17 @@ def _beside(traffic: Traffic, ids: IntArray, position: FloatArray, heading: Floa
     mean = (share * turn).sum(axis=1)
     variance = (share * (turn - mean[:, None]) ** 2).sum(axis=1)
     certainty = total / (total + PRIOR) / (1 + variance / AGREEMENT**2)
-    timed = k * np.isfinite(points.variance[at])
+    timed = k * known
     weight = timed.sum(axis=1)
-    speed = (timed * points.speed[at]).sum(axis=1) / np.maximum(weight, _LEAST)
+    speed = (timed * speeds).sum(axis=1) / np.maximum(weight, _LEAST)
     return _Beside(mean, certainty, variance, speed, weight)
+
+
+def _nearest(
+    trails: Trails, position: FloatArray, farthest: float
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
+    """The nearest points of trails to places (n, 2), each (n, NEAREST): distance, m, track, heading, speed, whether
+    this is known."""
+    apart, at = trails.tree.query(position, k=NEAREST, distance_upper_bound=farthest)
+    at, points = np.minimum(at, len(trails) - 1), trails.points
+    return apart, points.id[at], points.heading[at], points.speed[at], trails.timed[at]

@@ -11,9 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.bench.frozen_greedy import FrozenGreedy
+from pipelines.bench.measuring import environment
 from pipelines.bench.speed import FROZEN, METHODS, SpeedBenchSettings, bench_speed
 from pipelines.bench.speed_scenes import speed_config, speed_frames
 from pipelines.cli.commands import app
+from saga_fg.kernels.compilation import only_numpy
 from saga_fg.tracking import GreedySettings, GreedyTracker
 
 
@@ -73,3 +75,10 @@ def test_the_command_writes_figures_and_a_profile(tmp_path: Path) -> None:
     samples, frames = written["profiles"][0]["samples"], written["shared"]["frames"]
     assert len(samples) == len(written["profiles"][0]["weights"])
     assert all(0 <= k < len(frames) for stack in samples for k in stack)
+
+
+def test_the_environment_says_whether_kernels_ran() -> None:
+    assert environment()["kernels"] in ("compiled", "none")
+    with only_numpy():
+        assert environment()["kernels"] == "none"
+    assert "numba" in environment()

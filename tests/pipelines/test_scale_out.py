@@ -18,6 +18,7 @@ from pipelines.scale_out import (
     Manifest,
     RunSummary,
     SceneTask,
+    local_pool,
     perform,
     run_scenes,
 )
@@ -190,3 +191,20 @@ def test_two_runs_do_not_write_to_one_folder(tmp_path: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(InputError, match="another run is writing"):
             run(inputs, output)
+
+
+def test_kernels_are_loaded_before_workers_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else each of them compiles them, and says so."""
+    happened: list[str] = []
+
+    class Worker:
+        def __init__(self, scratch: Path | None) -> None:
+            happened.append("worker")
+
+        def end(self) -> None:
+            pass
+
+    monkeypatch.setattr(local_pool, "_Worker", Worker)
+    monkeypatch.setattr(local_pool, "load_kernels", lambda: happened.append("kernels"))
+    assert list(LocalPool(2).outcomes(iter(()), 2)) == []
+    assert happened == ["kernels", "worker", "worker"]

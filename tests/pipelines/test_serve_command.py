@@ -8,6 +8,7 @@ import signal
 import socket
 import stat
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -151,3 +152,20 @@ def test_endurance_loses_nothing():
     assert bench.out_of_order > 0
     assert bench.broken > 0
     assert set(bench.latency) == {"p50", "p90", "p99", "p99.9"}
+
+
+def test_kernels_are_there_before_the_service_listens():
+    patched = (
+        "import sys\n"
+        "import saga_fg.kernels.compilation as c\n"
+        "c.load_kernels = lambda: print('kernels loaded', file=sys.stderr, flush=True)\n"
+        "from pipelines.cli.main import main; main()\n"
+    )
+    command = [sys.executable, "-c", patched, "serve", "--listen", "127.0.0.1:0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stderr is not None
+            assert server.stderr.readline().strip() == "kernels loaded"
+            assert server.stderr.readline().startswith("listening at ")
+        finally:
+            server.kill()

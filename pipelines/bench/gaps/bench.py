@@ -19,6 +19,7 @@ from pipelines.bench.gaps.situations import situations_of
 from pipelines.bench.variants import Variant
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
+from saga_fg.kernels.compilation import load_kernels
 from saga_fg.model.sensor import Sensor
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
@@ -124,6 +125,7 @@ def _performed(jobs: Sequence[_Job], workers: int) -> Iterator[list[Run]]:
     if workers == 1:
         yield from map(_perform, jobs)
         return
+    load_kernels()  # compiled once, not by each process
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:  # a fork would copy locks of threads
         yield from pool.map(_perform, jobs)
 

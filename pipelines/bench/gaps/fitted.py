@@ -95,7 +95,7 @@ def _judged(
     workers: int,
     progress: Progress | None,
 ) -> list[Run]:
-    """The runs of all; one whose fit came to the settings of another has the runs of that one."""
+    """The runs of all; where two fits give the same settings, the recordings are run once for both."""
     same = {one.name: next((other.name for other in contenders if one.same_as(other)), None) for one in fitted}
     different = [one for one in fitted if same[one.name] is None]
     runs = bench_gaps(source, split.test, [*contenders, *different], settings, workers, progress)

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 import saga_fg
-from saga_fg.kernels.compilation import compiled_kernels, only_numpy
+from saga_fg.kernels import compilation
+from saga_fg.kernels.compilation import compiled_kernels, load_kernels, only_numpy
 
-pytest.importorskip("numba")  # of the extra test
+ROOT = Path(saga_fg.__file__).parents[1]
 LABELS = (
     "import numpy as np; from saga_fg.numerics.arrays import distinct; print(distinct(np.array(['a', 'b', 'a']))[1])"
 )
@@ -34,7 +35,7 @@ def test_kernels_are_used_here_and_can_be_left_out():
 
 @pytest.mark.parametrize(("disabled", "used"), [("1", "False"), ("0", "True"), ("", "True")])
 def test_numba_can_be_switched_off(disabled, used):
-    assert run(USED, Path(saga_fg.__file__).parents[1], NUMBA_DISABLE_JIT=disabled)[0] == used
+    assert run(USED, ROOT, NUMBA_DISABLE_JIT=disabled)[0] == used
 
 
 def test_without_numba_there_are_no_kernels():
@@ -42,8 +43,8 @@ def test_without_numba_there_are_no_kernels():
         "import importlib.util as u; real = u.find_spec\n"
         "u.find_spec = lambda name, *rest: None if name == 'numba' else real(name, *rest)\n"
     )
-    assert run(hidden + USED, Path(saga_fg.__file__).parents[1])[0] == "False"
-    out, _ = run(hidden + LABELS + "; import sys; print('numba' in sys.modules)", Path(saga_fg.__file__).parents[1])
+    assert run(hidden + USED, ROOT)[0] == "False"
+    out, _ = run(hidden + LABELS + "; import sys; print('numba' in sys.modules)", ROOT)
     assert out.split("\n") == ["[0 1 0]", "False"]
 
 
@@ -61,3 +62,45 @@ def test_a_read_only_installation_keeps_its_kernels_in_the_cache_of_the_user(tmp
     out, said = run(LABELS, installed, **environment)
     assert out == "[0 1 0]"
     assert "compiling" not in said
+
+
+def test_a_numba_that_cannot_be_imported_is_told_once_and_numpy_is_used(tmp_path):
+    (tmp_path / "numba.py").write_text("raise ImportError('Numba needs NumPy 2.2 or less')")
+    out, said = run(f"{USED}; {LABELS}", ROOT, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
+    assert out.split("\n") == ["False", "[0 1 0]"]
+    assert said.count("Numba needs NumPy 2.2 or less") == 1
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_a_damaged_file_of_kernels_is_told_with_its_folder(suffix, tmp_path):
+    environment = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    run(LABELS, ROOT, **environment)
+    kept = list(tmp_path.rglob(f"*.{suffix}"))
+    assert kept
+    for path in kept:
+        path.write_bytes(b"")
+    out, said = run(LABELS, ROOT, **environment)
+    assert out == "[0 1 0]"
+    assert said.count(str(kept[0].parent)) == 1
+    assert "Traceback" not in said
+
+
+def test_on_a_full_disk_kernels_are_compiled_once_and_not_kept(tmp_path):
+    full = (
+        "import numba.core.caching as c\n"
+        "def save(*args): raise OSError(28, 'No space left on device')\n"
+        "c.IndexDataCacheFile.save = save\n"
+    )
+    out, said = run(full + LABELS, ROOT, NUMBA_CACHE_DIR=str(tmp_path))
+    assert out == "[0 1 0]"
+    assert said.count("No space left on device") == 1
+    assert str(tmp_path) in said
+
+
+def test_all_kernels_can_be_loaded_before_the_first_frame(monkeypatch):
+    load_kernels()
+    sources = [each.source for each in compilation._kernels]
+    assert {source.__module__.split(".")[-1] for source in sources} >= {"filtering", "labels", "pairs", "trails"}
+    monkeypatch.setattr(compilation, "_compiled", None)  # nothing is left to compile
+    load_kernels()

@@ -156,3 +156,13 @@ def test_an_outlier_counts_little_after_reweighting() -> None:
     middle = [abs(s.mean[5, 0] + evidence.origin[0]) for s in (plain, robust)]
     assert weight.argmin() == 5
     assert middle[1] < 0.5 * middle[0]
+
+
+def test_a_stationary_object_of_a_recording_of_one_moment() -> None:
+    evidence, mine = evidence_of([0.0], [[[3.0, 4.0]]]), np.zeros(1, dtype=np.int64)
+    stands = StationaryStates(StationarySettings(min_time=0.0), mine, mine)
+    lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
+    states = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES, stationary=stands)
+    assert np.allclose(states.mean[0, :2] + evidence.origin, [3.0, 4.0])
+    assert np.allclose(states.mean[0, 2:], 0.0)
+    assert (np.sqrt(np.diag(states.covariance[0])[2:]) <= stands.settings.position_drift).all()

@@ -1,11 +1,14 @@
 """Speeds of new tracks from the traffic around them."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import Tracker, TrackerSettings
+from saga_fg.errors import InputError
 from saga_fg.tracking.speed_prior import speed_prior
 from saga_fg.tracking.traffic import Passages, SpeedPriorSettings, Traffic, TrafficSettings
 from saga_fg.types.track import known_velocities
@@ -72,6 +75,30 @@ def test_a_neighbour_in_the_same_place_gives_the_mean_and_variance_of_the_mixtur
 )
 def test_who_tells_nothing_of_the_speed_leaves_it_unknown(other):
     assert speed_at(remembering(other)) == (pytest.approx(0.0, abs=1e-4), pytest.approx(25.0, abs=1e-3))
+
+
+def test_a_speed_prior_needs_a_memory():
+    with pytest.raises(InputError, match=r"speed_prior.weight: expected 0 with a memory of 0 s"):
+        TrafficSettings(speed_prior=SpeedPriorSettings(weight=5.0))
+
+
+@pytest.mark.parametrize("length", [20.0, 100_000.0], ids=["at one place", "along a road"])
+def test_many_new_tracks_among_many_passages_take_little_memory(length):
+    rng = np.random.default_rng(0)
+    n, new, tracks = 20_000, 300, np.arange(20_000) % 200
+    x = rng.uniform(0, length, n)
+    place = np.stack([x, rng.normal(0, 1, n)], axis=-1)
+    traffic = remembering(passages(place, np.zeros(n), 9 + x / length, ids=tracks))
+    label, at, none = np.full(new, "car"), np.linspace(0, length, new), np.zeros(new)
+    arguments = (label, np.stack([at, none], axis=-1), none, np.full(new, 25.0))
+    tracemalloc.start()
+    together = speed_prior(traffic, *arguments)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 32 * new * n  # bytes: a table of all pairs needs some ten columns of 8
+    for k in range(0, new, 50):
+        alone = speed_prior(traffic, *(each[k : k + 1] for each in arguments))
+        assert [column[k] for column in together] == pytest.approx([column[0] for column in alone], rel=1e-12)
 
 
 def test_neighbours_that_disagree_make_the_speed_uncertain():

@@ -1,6 +1,7 @@
 """Paths along the trails of earlier traffic and lanes, and tracks that follow them unseen."""
 
 import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -71,7 +72,7 @@ def test_points_are_forgotten_while_nobody_moves():
 
 
 def test_without_a_memory_nothing_is_remembered():
-    assert along(*arc(np.arange(-20, 0, 2.0)), settings=TrafficSettings()).passages is None
+    assert len(along(*arc(np.arange(-20, 0, 2.0)), settings=TrafficSettings()).passages) == 0
 
 
 def test_a_path_goes_round_the_bend_of_earlier_traffic():
@@ -177,20 +178,55 @@ def test_oncoming_lanes_lead_nobody():
 
 def test_lanes_are_known_once_and_not_at_a_reach_of_zero():
     traffic = of_map(BEND)
-    known = len(traffic.lanes)
+    known = traffic.lanes
     traffic.add_lanes(RoadMap(lanes=(Lane("lane-0", tuple(map(tuple, BEND.tolist()))),)))
-    assert len(traffic.lanes) == known
+    assert traffic.lanes is known
     off = Traffic(TrafficSettings(reach=0.0))
     off.add_lanes(RoadMap(lanes=(Lane("lane-0", tuple(map(tuple, BEND.tolist()))),)))
-    assert off.lanes is None
+    assert len(off.lanes) == 0
 
 
-def test_a_copy_of_the_memory_has_no_tree():
+def named_lane(centre):
+    return RoadMap(lanes=(Lane("lane-0", tuple(map(tuple, np.asarray(centre).tolist()))),))
+
+
+def test_two_tiles_of_a_map_may_use_the_name_of_a_lane():
+    traffic, whole = of_map(BEND[:6]), path(of_map(BEND))
+    traffic.add_lanes(named_lane(BEND[5:]))
+    assert len(np.unique(traffic.lanes.points.id)) == 2
+    assert path(traffic).position[0] == pytest.approx(whole.position[0], abs=0.3)
+    known = traffic.lanes
+    traffic.add_lanes(named_lane(BEND[:6]))
+    assert traffic.lanes is known
+
+
+def test_a_corrected_lane_replaces_the_one_of_its_name():
+    traffic, moved = of_map(STRAIGHT_ON, BEND + np.array([0.0, 30.0])), STRAIGHT_ON + np.array([0.0, 1.2])
+    traffic.add_lanes(named_lane(moved))
+    of_it = traffic.lanes.points.position[traffic.lanes.points.position[:, 1] < 10]
+    assert (of_it[:, 1] == 1.2).all()
+    assert len(np.unique(traffic.lanes.points.id)) == 2
+
+
+def test_lanes_are_indexed_once_and_what_finds_them_is_no_part_of_a_state():
     traffic = of_map(BEND)
-    assert traffic.trails() is not None
+    path(traffic)
+    found, tree = traffic.lanes, traffic.lanes.tree
+    traffic.update(passing([(0.0, 0.0)], 0.0), 0.0)
     twin = copy.copy(traffic)
-    assert twin._trails is None
-    assert twin.lanes is traffic.lanes
+    assert twin.lanes is traffic.lanes is found
+    assert twin.lanes.tree is tree
+    assert len(pickle.dumps(traffic.lanes)) == len(pickle.dumps(of_map(BEND).lanes))
+    assert path(pickle.loads(pickle.dumps(twin))).position == pytest.approx(path(traffic).position, abs=0)
+
+
+def test_trails_are_found_anew_after_an_update():
+    traffic = along(*arc(np.arange(-20, 0, 2.1)))
+    before = traffic.trails()
+    assert traffic.trails() is before
+    assert copy.copy(traffic)._trails is None
+    traffic.update(passing([(0.0, 0.0)], 0.0, 5.0, [3]), 5.0)
+    assert len(traffic.trails()) > len(before)
 
 
 # tracks
