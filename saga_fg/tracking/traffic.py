@@ -135,13 +135,13 @@ class Passages(Columns):
         )
 
 
+@dataclass(eq=False)
 class Trails:
     """Points of trails, found by their places: by a tree, or by cells for kernels. What finds them is no part of a
     state: it is made at need."""
 
-    def __init__(self, points: Passages) -> None:
-        self.points = points
-        self._cells: tuple[float, IntArray, IntArray] | None = None
+    points: Passages
+    _cells: tuple[float, IntArray, IntArray] | None = field(default=None, init=False, repr=False)
 
     def __reduce__(self) -> tuple[type[Trails], tuple[Passages]]:
         return Trails, (self.points,)
@@ -179,11 +179,11 @@ class Traffic:
     _known: Mapping[str, tuple[tuple[int, Lane], ...]] = field(default_factory=dict)
     _next_lane: int = FIRST_LANE
     _map: RoadMap | None = None
-    _trails: Trails | None = field(default=None, repr=False)
+    _trails: Trails | None = field(default=None, init=False, repr=False)
 
     def __copy__(self) -> Traffic:
         """A memory that changes independently of this one."""
-        return replace(self, _trails=None)
+        return replace(self)
 
     @property
     def passages(self) -> Passages:

@@ -30,7 +30,7 @@ def serving(
         try:
             assert server.stderr is not None
             line = server.stderr.readline().strip()
-            while line.startswith(("compiling kernels", "going on from")):
+            while line.startswith(("WARNING: compiling kernels", "compiling kernels", "going on from")):
                 line = server.stderr.readline().strip()
             assert line.startswith("listening at "), line
             yield parse_address(line.removeprefix("listening at ")), server
