@@ -39,7 +39,7 @@ class StaticWorld:
         object.__setattr__(self, "poles", checked("poles", self.poles, (None, 4)))
 
     def within(self, position: FloatArray, reach: float) -> StaticWorld:
-        """What stands within `reach`, m, of a position (3,), seen from above."""
+        """The surfaces within `reach`, m, of a position (3,), seen from above."""
         boxes, poles = self.boxes, self.poles
         apart = np.linalg.norm(boxes.position[:, :2] - position[:2], axis=1)
         near = apart - np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2 <= reach

@@ -1,4 +1,4 @@
-"""What SLAM costs in the course of a long drive: a keyframe at its end beside one at its beginning, in one run.
+"""Cost of SLAM in the course of a long drive: a keyframe at its end beside one at its beginning, in one run.
 
 The vehicle drives lap after lap through a simulated town. Its odometry, the poles and house fronts that it sees and the
 loops between submaps come straight from the truth, with noise, so that time goes into the running graph alone and none
@@ -24,7 +24,7 @@ from pipelines.slam.scan_landmarks import POLE, WALL
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.slam.submaps import AnchorLoop, SubmapGraph
+from saga_fg.slam.submaps import LoopClosure, SubmapGraph
 from saga_fg.types.landmark import Observation
 
 _START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2
@@ -165,7 +165,7 @@ class _Sights:
         return seen
 
 
-def _loops(graph: SubmapGraph, poses: FloatArray, rng: np.random.Generator) -> list[AnchorLoop]:
+def _loops(graph: SubmapGraph, poses: FloatArray, rng: np.random.Generator) -> list[LoopClosure]:
     """A loop from the newest anchor to the nearest old one, if one is near in truth."""
     places = poses[list(graph.anchors), :2, 3]
     if len(places) <= _APART:
@@ -175,7 +175,7 @@ def _loops(graph: SubmapGraph, poses: FloatArray, rng: np.random.Generator) -> l
     if distance[i] > _NEAR:
         return []
     true = inverse_transform(poses[graph.anchors[i]]) @ poses[graph.anchors[j]]
-    return [AnchorLoop(i, j, _noisy(true, _LOOP, rng), np.diag(_LOOP**2))]
+    return [LoopClosure(i, j, _noisy(true, _LOOP, rng), np.diag(_LOOP**2))]
 
 
 def _noisy(transform: FloatArray, sigma: FloatArray, rng: np.random.Generator) -> FloatArray:

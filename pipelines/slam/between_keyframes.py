@@ -1,4 +1,4 @@
-"""What the vehicle's sensors measured since the last keyframe, joined into what the next one brings."""
+"""Measurements of the vehicle's sensors since the last keyframe, joined for the next one."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class BetweenKeyframes:
             self._fix = time - measured.gps.age, measured.gps
 
     def frame(self, time: float, detections: Detections | None) -> Frame | None:
-        """What a keyframe at `time`, s, brings besides its scan, for providers; the newest fix has its age then."""
+        """The measurements of a keyframe at `time`, s, besides its scan, for providers; the newest fix has its age."""
         if not self._imu and not self._wheels and self._fix is None and detections is None:
             return None
         samples, speed, fix = None, None, None

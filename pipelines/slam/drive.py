@@ -62,6 +62,14 @@ def motion(
     return inverse_transform(poses[0]) @ poses[-1], (total + total.T) / 2
 
 
+def moved_pose(
+    pose: FloatArray, covariance: FloatArray, since: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return a pose (4, 4) and the covariance (6, 6) of its tangent after the motion `since`, as `motion` gives it."""
+    Ad = gtsam.Pose3(inverse_transform(since[0])).AdjointMap()
+    return pose @ since[0], Ad @ covariance @ Ad.T + since[1]
+
+
 def shared(poses: Sequence[FloatArray], step: OdometryStep) -> list[FloatArray]:
     """Covariances (6, 6) of the motions to a scan, the last of `poses`, and to the `step.lost` scans before it.
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from factors import Robust, between_factor
+from factors import Robust
 from pipelines.slam.lidar_slam_types import LidarSlamResult
-from pipelines.slam.loop_closures import LoopClosure
 from saga_fg.graph import Additions, GraphView
-from saga_fg.slam.mapping import LandmarkObservations, pose_key
-from saga_fg.slam.submaps import SubmapSettings
+from saga_fg.slam.mapping import LandmarkObservations
+from saga_fg.slam.submaps import LoopClosure, SubmapSettings, loop_factors
 from saga_fg.types.landmark import Observation
 
 
@@ -25,13 +24,7 @@ class Loops:
 
     def factors(self, view: GraphView) -> Additions:
         mine = [loop for loop in self.loops if self.epochs[loop.second] == view.epoch]
-        pairs = [(pose_key(self.epochs[loop.first]), pose_key(view.epoch)) for loop in mine]
-        return Additions(
-            factors=[
-                between_factor(*pair, loop.first_T_second, loop.covariance, None if loop.confirmed else self.robust)
-                for pair, loop in zip(pairs, mine, strict=True)
-            ]
-        )
+        return Additions(factors=loop_factors(mine, self.epochs, self.robust))
 
 
 def known_providers(

@@ -31,9 +31,9 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.slam.between_keyframes import BetweenKeyframes
-from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, checked_step, motion, shared
+from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, checked_step, motion, moved_pose, shared
 from pipelines.slam.lidar_slam_types import LidarSlamResult, SlamStep
-from pipelines.slam.loop_closures import LoopClosure, LoopSettings, PlaceLoops
+from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.moving_objects import MovingObjects, frames_at
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmarks
@@ -49,7 +49,7 @@ from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import MapperSettings
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers, unjudged
-from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
+from saga_fg.slam.submaps import LoopClosure, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
@@ -201,11 +201,9 @@ class LidarSlam:
         if placed.keyframe:
             submap, found = self._add_keyframe(row, placed, detections)
         last = self._keyframes[-1]
-        since, covariance = motion(self._poses[last:], self._covariances[last + 1 :])
-        Ad = gtsam.Pose3(inverse_transform(since)).AdjointMap()
-        self._online[-1] = self._graph.pose(len(self._graph) - 1) @ since
+        since = motion(self._poses[last:], self._covariances[last + 1 :])
+        self._online[-1], now = moved_pose(self._graph.pose(len(self._graph) - 1), self._covariance, since)
         number = len(self._keyframes) - 1 if placed.keyframe else None
-        now = Ad @ self._covariance @ Ad.T + covariance
         return SlamStep(self._online[-1], now, placed, number, submap, tuple(found))
 
     def finish(self) -> LidarSlamResult:
@@ -292,11 +290,11 @@ class LidarSlam:
         self._closed += closed
         return submap, closed
 
-    def _between_anchors(self, loop: LoopClosure) -> AnchorLoop:
+    def _between_anchors(self, loop: LoopClosure) -> LoopClosure:
         """A loop between frames of submaps as one between their anchors."""
         first, second = (self._submaps[n].anchor_T_submap for n in (loop.first, loop.second))
         Ad = gtsam.Pose3(second).AdjointMap()
-        return AnchorLoop(
+        return LoopClosure(
             loop.first,
             loop.second,
             first @ loop.first_T_second @ inverse_transform(second),

@@ -1,4 +1,4 @@
-"""What LiDAR SLAM gives: of each scan when it comes, and of the whole drive."""
+"""Results of LiDAR SLAM: of each scan when it comes, and of the whole drive."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from data_tools.lidar import Submap
 from data_tools.trajectories import Trajectory
 from pipelines.slam.drive import Drive
-from pipelines.slam.loop_closures import LoopClosure
 from pipelines.slam.odometry import OdometryStep
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.mapping import AssociatedObservation
+from saga_fg.slam.submaps import LoopClosure
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.landmark import Landmark
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from data_tools.lidar import (
@@ -33,7 +32,7 @@ from data_tools.lidar import (
 )
 from data_tools.lidar.overlap import Structure
 from factors import Robust, pose_prior_factor
-from pipelines.slam.drive import motion, shared
+from pipelines.slam.drive import Drive, motion, moved_pose, shared
 from pipelines.slam.map_places import MapPlaces
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.slam.place_proof import SURFEL
@@ -134,9 +133,8 @@ class Localiser:
                 self._add(row, points, time)
         if self._smoother is None:
             return LocalisedStep(None, None, False)
-        since, covariance = motion(self._poses[self._last :], self._covariances[self._last + 1 :])
-        Ad = gtsam.Pose3(inverse_transform(since)).AdjointMap()
-        return LocalisedStep(self._pose @ since, Ad @ self._covariance @ Ad.T + covariance, row in self._fits)
+        since = motion(self._poses[self._last :], self._covariances[self._last + 1 :])
+        return LocalisedStep(*moved_pose(self._pose, self._covariance, since), row in self._fits)
 
     def path(self) -> FloatArray | None:
         """map_T_lidar (K, 4, 4) of all scans so far; None if no place has been found.
@@ -145,10 +143,9 @@ class Localiser:
         """
         if not self._found:
             return None
-        rows, odometry = np.array(sorted(self._found)), np.array(self._poses)
-        of = np.maximum(np.searchsorted(rows, np.arange(len(odometry)), side="right") - 1, 0)
-        found = np.array([self._found[row] for row in rows.tolist()])
-        return np.asarray(found[of] @ inverse_transform(odometry[rows[of]]) @ odometry)
+        rows = sorted(self._found)
+        drive = Drive(np.array(self._poses), np.array(self._covariances), rows)
+        return drive.carried(np.array([self._found[row] for row in rows]))
 
     @property
     def registered(self) -> BoolArray:

@@ -26,6 +26,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
 from saga_fg.slam.pose_graph.distances import shortest_ways
+from saga_fg.slam.submaps import LoopClosure
 
 _REGISTERED, _TAKEN = 4, 2  # places for each submap
 _ALIKE = 0.3  # correlation of images from which places are registered
@@ -50,26 +51,13 @@ class LoopSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class LoopClosure:
-    """`second` seen from `first`, keyframes or submaps: first_T_second (4, 4), covariance (6, 6) of its tangent.
-
-    confirmed: by another loop or by its proof, where odometry says otherwise
-    """
-
-    first: int
-    second: int
-    first_T_second: FloatArray
-    covariance: FloatArray
-    confirmed: bool = False
-
-
-@dataclass(frozen=True, eq=False)
 class _Proved:
-    """A loop with the structure that both ends share, and its distance from the estimate, m."""
+    """A loop with the structure that both ends share, its distance from the estimate, and the way between them, m."""
 
     loop: LoopClosure
     overlap: float
     off: float
+    way: float
 
 
 @dataclass(eq=False)
@@ -120,7 +108,7 @@ class PlaceLoops:
             if loop is not None and overlap >= self.settings.min_overlap:
                 off = _off(frames, loop)
                 if off < self._farthest(way[match.number]):
-                    found.append(_Proved(loop, overlap, off))
+                    found.append(_Proved(loop, overlap, off, float(way[match.number])))
         return self._unrivalled(found, frames)
 
     def _registered(self, match: PlaceMatch, number: int) -> tuple[LoopClosure | None, float]:
@@ -163,8 +151,7 @@ class PlaceLoops:
 
     def _trusted(self, one: _Proved, times: float = 1.0) -> bool:
         """Whether the drift of odometry, or so many times of it, explains the loop."""
-        way = self._ways(one.loop.second)[one.loop.first]
-        return one.off < 1.0 + times * self.settings.drift * float(way)
+        return one.off < 1.0 + times * self.settings.drift * one.way
 
     def _older(self, number: int) -> IntArray:
         """Submaps that ended `min_path` before this one began."""

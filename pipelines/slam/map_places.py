@@ -72,8 +72,9 @@ class MapPlaces:
                 continue
             overlap = Structure.of(around).shared(mine, fine.map_T_scan)
             if overlap > self.min_overlap:
-                otherwise |= fits_otherwise(match)
-                if not fits_otherwise(match):
+                if fits_otherwise(match):
+                    otherwise = True
+                else:
                     found.append((overlap, frame @ fine.map_T_scan))
         found.sort(key=lambda one: -one[0])
         self.ambiguous = otherwise and not found

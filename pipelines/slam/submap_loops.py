@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from data_tools.lidar import Submap
-from pipelines.slam.loop_closures import LoopClosure
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.submaps import LoopClosure
 
 
 class SubmapLoops(Protocol):

@@ -118,7 +118,7 @@ class RawTable:
         return faults
 
     def doubts(self) -> list[Doubt]:
-        """What is doubtful about columns as they are given, which cannot be seen in frames."""
+        """Doubts about columns as they are given, which cannot be seen in frames."""
         doubts = [headings_in_degrees(self.numbers("yaw"))]
         if "timestamp" in self.columns and "time" not in self.how.units and self.clock.unit == "s":
             doubts.append(frames_taken_for_seconds(self.found.names.get("timestamp", ""), self.numbers("timestamp")))

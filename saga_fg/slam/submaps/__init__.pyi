@@ -1,3 +1,4 @@
-from .graph import AnchorLoop, SolvedDrive, SubmapGraph, SubmapSettings
+from .graph import SolvedDrive, SubmapGraph, SubmapSettings
+from .loops import LoopClosure, loop_factors
 
-__all__ = ["AnchorLoop", "SolvedDrive", "SubmapGraph", "SubmapSettings"]
+__all__ = ["LoopClosure", "SolvedDrive", "SubmapGraph", "SubmapSettings", "loop_factors"]

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from factors import Robust, SolverSettings, between_factor
+from factors import Robust, SolverSettings
 from saga_fg.errors import InputError
 from saga_fg.estimators.batch_solver import BatchSolver
 from saga_fg.estimators.graph_solution import GraphSolution
@@ -34,6 +34,7 @@ from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, landmark_key, pose_key
 from saga_fg.slam.submaps.association import SubmapLandmarks
 from saga_fg.slam.submaps.condensing import CondensedSubmap
+from saga_fg.slam.submaps.loops import LoopClosure, loop_factors
 from saga_fg.slam.submaps.recording import recorded
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Landmark, Observation
@@ -72,20 +73,6 @@ class SubmapSettings(Settings):
     def robust_loops(self) -> Robust:
         """The loss of loops."""
         return Robust("cauchy", self.robust_scale)
-
-
-@dataclass(frozen=True, eq=False)
-class AnchorLoop:
-    """The anchor of submap `second` seen from that of `first` (4, 4), and the covariance (6, 6) of its tangent.
-
-    confirmed: by another loop, against the odometry; it is under no robust loss
-    """
-
-    first: int
-    second: int
-    first_T_second: FloatArray
-    covariance: FloatArray
-    confirmed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +120,7 @@ class SubmapGraph:
         self._anchors: list[int] = []
         self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
         self._states: dict[int, Any] = {}  # of landmarks of closed submaps
-        self._loops: list[tuple[int, AnchorLoop]] = []  # with the keyframe at which they came
+        self._loops: list[tuple[int, LoopClosure]] = []  # with the keyframe at which they came
         self._landmarks = SubmapLandmarks(self.settings.gate)
         self._numbers, self._way = 0, 0.0
 
@@ -189,7 +176,7 @@ class SubmapGraph:
         landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
         return begins and k > 0
 
-    def close_loops(self, loops: Sequence[AnchorLoop]) -> None:
+    def close_loops(self, loops: Sequence[LoopClosure]) -> None:
         """Add loops between submaps, by their numbers, and solve."""
         for loop in loops:
             if not 0 <= loop.first < loop.second < len(self._anchors):
@@ -233,7 +220,7 @@ class SubmapGraph:
         """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed."""
         graph, poses = SceneFactorGraph(), self.poses()
         seen = LandmarkObservations(self._confirmed(), self._starts(poses), self.settings.robust)
-        loops: dict[int, list[AnchorLoop]] = {}
+        loops: dict[int, list[LoopClosure]] = {}
         for k, loop in self._loops:
             loops.setdefault(k, []).append(loop)
         for k, (time, motion) in enumerate(zip(self._times, self._motions, strict=True)):
@@ -318,17 +305,10 @@ class SubmapGraph:
 class _Loops:
     """Factors of loops between anchors."""
 
-    loops: Sequence[AnchorLoop]
+    loops: Sequence[LoopClosure]
     anchors: Sequence[int]
     robust: Robust
     name: str = "loops"
 
     def factors(self, view: GraphView) -> Additions:
-        keys = [(pose_key(self.anchors[one.first]), pose_key(self.anchors[one.second])) for one in self.loops]
-        losses = [None if one.confirmed else self.robust for one in self.loops]
-        return Additions(
-            factors=[
-                between_factor(*pair, one.first_T_second, one.covariance, loss)
-                for pair, one, loss in zip(keys, self.loops, losses, strict=True)
-            ]
-        )
+        return Additions(factors=loop_factors(self.loops, self.anchors, self.robust))

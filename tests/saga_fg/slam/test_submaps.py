@@ -19,7 +19,7 @@ from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers.gps import Gps
 from saga_fg.slam.mapping import pose_key
-from saga_fg.slam.submaps import AnchorLoop, SubmapGraph, SubmapSettings
+from saga_fg.slam.submaps import LoopClosure, SubmapGraph, SubmapSettings
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix
 from saga_fg.types.frame import Detections, Frame
 from saga_fg.types.landmark import Observation
@@ -174,7 +174,7 @@ def test_a_loop_moves_submaps_as_a_whole() -> None:
     first, second = graph.anchors[0], graph.anchors[-1]
     seen = inverse_transform(drive.poses[first]) @ drive.poses[second]
     inner = inverse_transform(graph.pose(graph.anchors[3])) @ graph.pose(graph.anchors[3] + 5)
-    graph.close_loops([AnchorLoop(0, len(graph.anchors) - 1, seen, np.diag([1e-3] * 3 + [0.02] * 3) ** 2)])
+    graph.close_loops([LoopClosure(0, len(graph.anchors) - 1, seen, np.diag([1e-3] * 3 + [0.02] * 3) ** 2)])
     assert np.linalg.norm(graph.pose(second)[:3, 3] - drive.poses[second, :3, 3]) < 0.1
     np.testing.assert_allclose(
         inverse_transform(graph.pose(graph.anchors[3])) @ graph.pose(graph.anchors[3] + 5), inner, atol=1e-9
@@ -186,7 +186,7 @@ def test_a_loop_moves_submaps_as_a_whole() -> None:
         < 0.1
     )
     with pytest.raises(InputError, match="loop: expected two submaps in order, got 3 and 3"):
-        graph.close_loops([AnchorLoop(3, 3, seen, Q)])
+        graph.close_loops([LoopClosure(3, 3, seen, Q)])
 
 
 def test_fixes_of_gps_hold_through_closed_submaps() -> None:
