@@ -127,7 +127,7 @@ class PoseGraph:
 
     @property
     def poses_alone(self) -> bool:
-        """Whether there are neither landmarks nor priors."""
+        """True if there are neither landmarks nor priors."""
         return self.landmarks is None and self.priors is None
 
     def with_frame_as_pose(self) -> PoseGraph:
@@ -165,7 +165,7 @@ class PoseGraph:
 
 
 def trusted(graph: PoseGraph) -> BoolArray:
-    """Which measurements (M,) are odometry: they join successive poses."""
+    """Mask (M,) of the measurements that are odometry: between successive poses."""
     return np.asarray(np.abs(graph.second - graph.first) == 1)
 
 
