@@ -149,7 +149,7 @@ class Localiser:
 
     @property
     def registered(self) -> BoolArray:
-        """Whether each scan (K,) so far was registered with the map, at a place that has not been given up since."""
+        """Mask (K,) of the scans so far that were registered with the map, without those withdrawn since."""
         return np.isin(np.arange(len(self._poses)), sorted(self._fits))
 
     @property
@@ -159,7 +159,7 @@ class Localiser:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the points looked for last fit several places of the map."""
+        """True if the last cloud searched for fits several places of the map."""
         return self._ambiguous
 
     def finish(self) -> None:

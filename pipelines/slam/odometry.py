@@ -173,7 +173,7 @@ class LidarOdometry:
         return near
 
     def _believable(self, velocity: FloatArray, timestamp: float) -> bool:
-        """Whether a vehicle can have this velocity, by what it last had for certain; warns where it begins to fail."""
+        """True if a vehicle can reach this velocity from the last certain one; warns at the first failure."""
         said = ~np.isnan(velocity[3:])
         if self._confirmed is None:
             off, most = float(np.linalg.norm(velocity[3:][said])), _FASTEST
@@ -236,7 +236,7 @@ class LidarOdometry:
 
 
 def moved_on(keyframe_T_scan: FloatArray, settings: OdometrySettings) -> bool:
-    """Whether a scan is so far from the last keyframe, or turned so far, that it is the next one."""
+    """True if a scan is far enough from the last keyframe, or turned enough, to be the next one."""
     return bool(
         np.linalg.norm(keyframe_T_scan[:3, 3]) >= settings.keyframe_distance
         or rotation_angle(keyframe_T_scan[:3, :3]) >= settings.keyframe_rotation

@@ -1,4 +1,4 @@
-r"""Which loop closures of a pose graph are true.
+r"""Selection of the true loop closures of a pose graph.
 
 Odometry (between successive poses), priors, known places and landmarks are trusted. First, graduated non-convexity
 with truncated least squares from dead reckoning: in each step of mu one weighted Gauss-Newton step,
@@ -11,12 +11,12 @@ Then data snooping: each loop is judged by the solution without it,
 
     d^2 = r^T ( 1 -+ S )^-1 r,     S = J H^-1 J^T        - for a loop that takes part in H, + for one that does not
 
-whitened. Covariances in files are often far too large, and a false loop then hides in them; so the gate on d^2 is
+whitened. Covariances in files are often far too large and hide false loops; so the gate on d^2 is
 
     min( c'^2, m k c^2 ),     c'^2: 99.9 % quantile,  k = median of d^2 over the loops taken / median of chi^2
 
 with k the variance of unit weight, and m = 8, because the errors of recorded loops have longer tails than a Gaussian.
-The worst loops go, the best of the others come in, until nothing changes.
+The worst loops are removed and the best of the removed ones restored until nothing changes.
 
 Sources: Yang, Antonante, Tzoumas, Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020; Baarda, A
 testing procedure for use in geodetic networks, 1968.

@@ -133,12 +133,12 @@ class PoseGraph:
 
     @property
     def poses_alone(self) -> bool:
-        """Whether there are neither landmarks nor anything known from outside."""
+        """True if there are neither landmarks nor anything known from outside."""
         return self.landmarks is None and not self.anchored
 
     @property
     def anchored(self) -> bool:
-        """Whether priors or places say where the graph is."""
+        """True if priors or places say where the graph is."""
         return self.priors is not None or self.places is not None
 
     def with_frame_as_pose(self) -> PoseGraph:
@@ -184,7 +184,7 @@ class PoseGraph:
 
 
 def trusted(graph: PoseGraph) -> BoolArray:
-    """Which measurements (M,) are odometry: they join successive poses."""
+    """Mask (M,) of the measurements that are odometry: between successive poses."""
     return np.asarray(np.abs(graph.second - graph.first) == 1)
 
 

@@ -152,7 +152,7 @@ class PointLandmarks:
                 raise InputError(f"landmark: expected rows of the {len(ids)} landmarks, from 0")
 
     def at(self, position: FloatArray) -> PointLandmarks:
-        """The same landmarks at other places."""
+        """A copy with the landmarks at other places."""
         return replace(self, position=position)
 
     def placed(self, world_T_pose: FloatArray) -> PointLandmarks:
