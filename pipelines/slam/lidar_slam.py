@@ -48,7 +48,7 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import MapperSettings
-from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers, unjudged
+from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers
 from saga_fg.slam.submaps import LoopClosure, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
@@ -216,8 +216,7 @@ class LidarSlam:
             self._close(self._graph.poses())
         solved = self._graph.finish()
         self._finished = True
-        unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
-        unknown = unjudged(solved.graph, self._sensors, self.settings.sensors)
+        unfit, unknown = misfits(solved.graph, self._sensors, self.settings.sensors)
         for text in (*unfit.values(), *unknown.values()):
             _LOG.warning(text)
         drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
