@@ -38,10 +38,10 @@ import scipy.sparse
 from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import compiled_kernels
 from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise
-from saga_fg.model.motion import NodeType, distinct_types
+from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.transition import Blocks, Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 
 LONGEST = 1e12  # s; longer than any two timestamps are apart
 _TAYLOR_DEGREE = 12
@@ -59,11 +59,12 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         raise InputError(f"dt: expected a finite number of seconds from 0 to {LONGEST:g}, got {dt!r}")
     if len(graph) == 0:
         return Transition(graph, dt, (), np.empty(0), ())
-    kinds, kind = distinct_types(graph.types)
+    kinds, kind = graph.kinds
     coupled = np.zeros(len(graph), dtype=bool)
     for edges in graph.edges:
         coupled[edges.target[edges.rate > 0]] = True
-    offsets = np.concatenate([[0], np.cumsum(graph.dims)])
+    offsets = np.zeros(len(graph) + 1, dtype=np.int64)
+    np.cumsum(graph.dims, out=offsets[1:])
     b = np.zeros(int(offsets[-1]))
     F: list[Blocks] = []
     Q: list[Blocks] = []
@@ -93,7 +94,9 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
                 F.append(_coupling_blocks(edges, dt, M, phi, position, kinds, kind))
     if graph.modes:
         _move_by_modes(graph, dt, F, b, Q, offsets, coupled)
-    return Transition(graph, dt, _merged(F, len(graph)), b, tuple(Q))
+    made = unchecked(Transition, graph=graph, dt=dt, F=_merged(F, len(graph)), b=b, Q=tuple(Q), offsets=offsets)
+    made.check_finite()
+    return made
 
 
 def own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:

@@ -25,11 +25,12 @@ class Kinematics(NamedTuple):
 
     def select(self, rows: IntArray) -> Kinematics:
         """The tracks `rows` (k,)."""
-        return Kinematics._make(column[rows] for column in self)
+        x, v, P, P_v = self
+        return Kinematics(x.take(rows, 0), v.take(rows, 0), P.take(rows, 0), P_v.take(rows, 0))
 
     def append(self, other: Kinematics) -> Kinematics:
         """With the tracks of another after these."""
-        return Kinematics._make(np.concatenate(columns) for columns in zip(self, other, strict=True))
+        return Kinematics(*[np.concatenate(columns) for columns in zip(self, other, strict=True)])
 
     @property
     def speed_deviation(self) -> FloatArray:

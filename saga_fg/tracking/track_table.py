@@ -98,11 +98,11 @@ class TrackTable(Columns):
 
     def coasting(self, now: float) -> FloatArray:
         """(n,) time since the latest detection, s, rounded to the microsecond."""
-        return np.maximum(np.round(now - self.last_detected, 6), 0.0)
+        return np.maximum((now - self.last_detected).round(6), 0.0)
 
     def out_of_view(self, now: float) -> FloatArray:
         """(n,) time since it was last in a sensor's field of view, s, rounded to the microsecond."""
-        return np.asarray(np.round(now - self.last_in_view, 6))
+        return np.asarray((now - self.last_in_view).round(6))
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks at positions (n, 2), world, with velocities (n, 2), which are not checked."""
