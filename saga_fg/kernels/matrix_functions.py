@@ -26,6 +26,7 @@ def phi_and_noise(
     m, d = M.shape[0], M.shape[1]
     phis, noise = np.empty((order + 1, m, d, d)), np.empty((m, d, d))
     Z, product, term, turned = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
+    Q = np.empty((d, d))
     phi, doubled = np.empty((order + 1, d, d)), np.empty((order + 1, d, d))
     for i in range(m):
         largest = 0.0
@@ -45,13 +46,13 @@ def phi_and_noise(
         inverse = 1.0  # 1 / (order + degree)!
         for j in range(2, order + degree + 1):
             inverse /= j
-        phi[order] = 0.0
         for a in range(d):
-            phi[order, a, a] = inverse
+            for b in range(d):
+                phi[order, a, b] = inverse if a == b else 0.0
         for j in range(degree - 1, -order - 1, -1):  # phi_order by Horner's rule, then the lower ones
             k = order + min(j, 0)
             inverse *= order + j + 1
-            source = phi[min(k + 1, order)] if j < 0 else phi[order]
+            above = min(k + 1, order) if j < 0 else order
             for a in range(d):
                 for b in range(d):
                     product[a, b] = 0.0
@@ -59,12 +60,11 @@ def phi_and_noise(
                     z = Z[a, c]
                     if z != 0.0:
                         for b in range(d):
-                            product[a, b] += z * source[c, b]
+                            product[a, b] += z * phi[above, c, b]
                 product[a, a] += inverse
             for a in range(d):
                 for b in range(d):
                     phi[k, a, b] = product[a, b]
-        Q = noise[i]
         for a in range(d):
             for b in range(d):
                 term[a, b] = Qc[i, a, b] * h
@@ -95,7 +95,9 @@ def phi_and_noise(
                     for c in range(d):
                         total += turned[a, c] * phi[0, b, c]
                     product[a, b] = Q[a, b] + total
-            Q[:] = product
+            for a in range(d):
+                for b in range(d):
+                    Q[a, b] = product[a, b]
             for k in range(order + 1):
                 for a in range(d):
                     for b in range(d):
@@ -107,13 +109,15 @@ def phi_and_noise(
                             total += phi[j, a, b] * factor
                             factor /= k - j + 1
                         doubled[k, a, b] = total / 2.0**k
-            phi[:] = doubled
+            for k in range(order + 1):
+                for a in range(d):
+                    for b in range(d):
+                        phi[k, a, b] = doubled[k, a, b]
         for a in range(d):
-            for b in range(a):
-                middle = (Q[a, b] + Q[b, a]) / 2
-                Q[a, b] = middle
-                Q[b, a] = middle
-        phis[:, i] = phi
+            for b in range(d):
+                noise[i, a, b] = (Q[a, b] + Q[b, a]) / 2
+                for k in range(order + 1):
+                    phis[k, i, a, b] = phi[k, a, b]
     return phis, noise
 
 
@@ -150,7 +154,9 @@ def coupling_integrals(
     second, doubled = np.empty((len(A), degree + 1, q, q)), np.empty((len(A), doublings + 1, q, q))
     first, made = np.empty((len(M), doublings + 1, p, p)), np.zeros(len(M), dtype=np.bool_)
     for j in range(len(A)):
-        second[j, degree] = np.eye(q)
+        for a in range(q):
+            for b in range(q):
+                second[j, degree, a, b] = 1.0 if a == b else 0.0
         for t in range(degree, 0, -1):
             for a in range(q):
                 for b in range(q):
@@ -158,7 +164,9 @@ def coupling_integrals(
                     for c in range(q):
                         total += A[j, a, c] * h / t * second[j, t, c, b]
                     second[j, t - 1, a, b] = total
-        doubled[j, 0] = second[j, 0]
+        for a in range(q):
+            for b in range(q):
+                doubled[j, 0, a, b] = second[j, 0, a, b]
         for t in range(doublings):
             for a in range(q):
                 for b in range(q):
@@ -172,7 +180,9 @@ def coupling_integrals(
         i, j = at[e], of[e]
         if doublings > 0 and not made[i]:
             made[i] = True
-            first[i, 0] = np.eye(p)
+            for a in range(p):
+                for b in range(p):
+                    first[i, 0, a, b] = 1.0 if a == b else 0.0
             for t in range(degree, 0, -1):
                 for a in range(p):
                     for b in range(p):
@@ -182,7 +192,9 @@ def coupling_integrals(
                         if z != 0.0:
                             for b in range(p):
                                 square[a, b] += z * first[i, 0, c, b]
-                first[i, 0] = square
+                for a in range(p):
+                    for b in range(p):
+                        first[i, 0, a, b] = square[a, b]
             for t in range(doublings):
                 for a in range(p):
                     for b in range(p):
@@ -190,7 +202,9 @@ def coupling_integrals(
                         for c in range(p):
                             total += first[i, t, a, c] * first[i, t, c, b]
                         first[i, t + 1, a, b] = total
-        corner[:] = 0.0
+        for a in range(p):
+            for b in range(q):
+                corner[a, b] = 0.0
         for t in range(degree, 0, -1):
             for a in range(p):
                 for b in range(q):
@@ -217,6 +231,10 @@ def coupling_integrals(
                     for c in range(q):
                         total += corner[a, c] * doubled[j, t, c, b]
                     product[a, b] = total
-            corner[:] = product
-        result[e] = corner
+            for a in range(p):
+                for b in range(q):
+                    corner[a, b] = product[a, b]
+        for a in range(p):
+            for b in range(q):
+                result[e, a, b] = corner[a, b]
     return result

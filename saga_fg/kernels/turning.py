@@ -1,4 +1,4 @@
-"""Turn rates of tracks (`saga_fg.tracking.turn_rate`), and motions along known courses (`saga_fg.model.known_course`)."""
+"""Turn rates of tracks, see `saga_fg.tracking.turn_rate`, and motions along courses, `saga_fg.model.known_course`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def updated_turning(
         i = rows[e]
         h, p, q, r, s = heading[i], P[i, 0, 0], P[i, 0, 1], P[i, 1, 0], P[i, 1, 1]
         headings[e], rates[e] = h, rate[i]
-        covariance[e] = P[i]
+        covariance[e, 0, 0], covariance[e, 0, 1], covariance[e, 1, 0], covariance[e, 1, 1] = p, q, r, s
         if not math.isfinite(yaw[e]):
             continue
         variance = yaw_noise[e] ** 2

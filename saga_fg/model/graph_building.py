@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -66,10 +65,11 @@ def build_graph(
                     continue
                 ends = {"target": row[t], "source": row[s], "rate": rate[mine]}
                 if isinstance(law, AccelerationLaw):
-                    nonlinear.append(_made(NonlinearEdges, law, law=law, **ends, given=law.given(nodes, t, s)))
+                    ends["given"] = law.given(nodes, t, s)
+                    nonlinear.append(_made(NonlinearEdges, _shipped(law), law=law, **ends))
                 else:
                     triples = law.triples(nodes, t, s)._asdict()
-                    groups.append(_made(Edges, law, interaction=type(law).__name__, **ends, **triples))
+                    groups.append(_made(Edges, _shipped(law), interaction=type(law).__name__, **ends, **triples))
                 np.add.at(total_rate, row[t], rate[mine])
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:
@@ -78,9 +78,9 @@ def build_graph(
     return unchecked(SceneGraph, nodes=graph_nodes.id, types=graph_nodes.types, kinds=types, **parts)
 
 
-def _made(kind: type[E], law: object, **columns: Any) -> E:
-    """Edges, which are checked where the law is a user's."""
-    return unchecked(kind, **columns) if _shipped(law) else kind(**columns)
+def _made(kind: type[E], shipped: bool, **columns: Any) -> E:
+    """Edges, which are checked unless their law is of this package."""
+    return unchecked(kind, **columns) if shipped else kind(**columns)
 
 
 def _pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
@@ -88,14 +88,9 @@ def _pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
     return rule.pairs(nodes) if _shipped(rule) else _checked_pairs(rule, nodes)
 
 
-@cache
-def _shipped_kind(kind: type) -> bool:
-    return kind.__module__.startswith("saga_fg.")
-
-
 def _shipped(part: object) -> bool:
     """True if a rule or law is of this package, and none that was derived from one."""
-    return _shipped_kind(type(part))
+    return type(part).__module__.startswith("saga_fg.")
 
 
 def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:

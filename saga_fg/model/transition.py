@@ -66,8 +66,8 @@ class Transition:
 
     def check_finite(self) -> None:
         """Raise `InputError` unless all numbers are finite."""
-        for name, values in (("b", self.b), *((name, g.values) for name in ("F", "Q") for g in getattr(self, name))):
-            if not np.isfinite(values).all():
+        for name, parts in (("b", [self.b]), ("F", [F.values for F in self.F]), ("Q", [Q.values for Q in self.Q])):
+            if not all(np.isfinite(values).all() for values in parts):
                 raise InputError(f"transition over {self.dt:g} s: {name}: expected finite numbers")
 
     @property

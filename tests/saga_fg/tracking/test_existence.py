@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
-from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.class_belief import ClassGroups
+from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import TrackTable
 from tests.saga_fg.traffic_frames import frame
