@@ -60,16 +60,16 @@ def build_graph(
             for k in np.bincount(pair_kind).nonzero()[0]:
                 mine = (pair_kind == k).nonzero()[0]
                 t, s = target[mine], source[mine]
-                law = rule.interaction
+                law, shipped = rule.interaction, _shipped(rule) and _shipped(rule.interaction)
                 if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
                     continue
                 ends = {"target": row[t], "source": row[s], "rate": rate[mine]}
                 if isinstance(law, AccelerationLaw):
                     ends["given"] = law.given(nodes, t, s)
-                    nonlinear.append(_made(NonlinearEdges, _shipped(law), law=law, **ends))
+                    nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
                 else:
                     triples = law.triples(nodes, t, s)._asdict()
-                    groups.append(_made(Edges, _shipped(law), interaction=type(law).__name__, **ends, **triples))
+                    groups.append(_made(Edges, shipped, interaction=type(law).__name__, **ends, **triples))
                 np.add.at(total_rate, row[t], rate[mine])
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:
@@ -79,7 +79,7 @@ def build_graph(
 
 
 def _made(kind: type[E], shipped: bool, **columns: Any) -> E:
-    """Edges, which are checked unless their law is of this package."""
+    """Edges, which are checked unless their rule and law are of this package."""
     return unchecked(kind, **columns) if shipped else kind(**columns)
 
 
