@@ -203,6 +203,8 @@ class SceneGraph:
 
     def rows(self, nodes: IntArray) -> IntArray:
         """Rows of nodes that are in the graph."""
+        if len(self.nodes) and (self.nodes[1:] > self.nodes[:-1]).all():
+            return np.searchsorted(self.nodes, nodes)
         order = np.argsort(self.nodes)
         return np.asarray(order[np.searchsorted(self.nodes, nodes, sorter=order)])
 
