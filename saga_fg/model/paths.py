@@ -67,7 +67,13 @@ class Paths(Columns):
 
 
 NO_PATHS = Paths(
-    np.empty(0, dtype=np.int64), np.empty((0, 2, 2)), *(np.empty((0, 2)) for _ in range(3)), np.empty(0), np.empty(0)
+    np.empty(0, dtype=np.int64),
+    np.empty((0, 2, 2)),
+    np.empty((0, 2)),
+    np.empty((0, 2)),
+    np.empty((0, 2)),
+    np.empty(0),
+    np.empty(0),
 )
 
 

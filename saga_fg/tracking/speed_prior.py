@@ -24,7 +24,7 @@ from saga_fg.kernels.speed_prior import Prior, prior_of_traffic
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, distinct
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.numerics.near_pairs import near_pairs
-from saga_fg.tracking.traffic import Traffic
+from saga_fg.tracking.traffic import Passages, Traffic
 
 _FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
 _MOST_PAIRS = 1_000_000  # of new tracks and passages that are compared at a time
@@ -54,13 +54,20 @@ def speed_prior(
     if settings.weight == 0 or len(label) == 0 or not any(map(len, sets)):
         return SpeedPrior(np.full(len(label), stationary), np.zeros(len(label)), variance.copy())
     number: dict[str, int] = {}
-    *classes, new_class = (_class_numbers(each, number) for each in (traffic.left.label, traffic.latest.label, label))
-    passages = []
-    for each, of in zip(sets, classes, strict=True):
-        passages += [each.id, of, each.position, each.heading, each.speed, each.variance, each.stationary]
+    left, latest = (_columns(each, number) for each in sets)
+    new = _class_numbers(label, number), position, heading, variance
     scales = settings.weight, settings.ahead_scale, settings.lateral_scale, settings.heading_scale, settings.spread
     limits = settings.max_speed_deviation**2, _FARTHEST
-    return SpeedPrior(*_prior(*passages, new_class, position, heading, variance, stationary, *scales, *limits))
+    return SpeedPrior(*_prior(*left, *latest, *new, stationary, *scales, *limits))
+
+
+_Columns = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def _columns(each: Passages, number: dict[str, int]) -> _Columns:
+    """The columns of passages that the prior is made of, their classes by number."""
+    of = _class_numbers(each.label, number)
+    return each.id, of, each.position, each.heading, each.speed, each.variance, each.stationary
 
 
 def _class_numbers(label: StrArray, number: dict[str, int]) -> IntArray:
@@ -99,10 +106,13 @@ def _prior(
     farthest: float,
 ) -> Prior:
     used = np.concatenate([left_variance, latest_variance]) < most_variance
-    pairs = (left, latest), (left_class, latest_class), (left_position, latest_position), (left_heading, latest_heading)
-    ids, classes, places, headings = (np.concatenate(pair)[used] for pair in pairs)
-    pairs = (left_speed, latest_speed), (left_variance, latest_variance), (left_stationary, latest_stationary)
-    speeds, variances, resting = (np.concatenate(pair)[used] for pair in pairs)
+    ids, classes = np.concatenate([left, latest])[used], np.concatenate([left_class, latest_class])[used]
+    places = np.concatenate([left_position, latest_position])[used]
+    headings = np.concatenate([left_heading, latest_heading])[used]
+    speeds, variances = (
+        np.concatenate(pair)[used] for pair in ((left_speed, latest_speed), (left_variance, latest_variance))
+    )
+    resting = np.concatenate([left_stationary, latest_stationary])[used]
     reach = np.where(np.isfinite(heading), np.sqrt(farthest) * max(ahead_scale, lateral_scale), np.nan)
     block, found = max(1, _MOST_PAIRS // max(1, len(ids))), []
     for begin in range(0, len(heading), block):

@@ -91,6 +91,10 @@ class TrackTable(Columns):
         """A copy that shares no array with this table that can be written."""
         return self.copied()
 
+    def rows(self, ids: IntArray) -> IntArray:
+        """Rows (k,) of tracks that are in the table."""
+        return np.searchsorted(self.id, ids)  # ids count up
+
     @property
     def tentative(self) -> BoolArray:
         """(n,) tracks that may be no object of their own: of too few detections, or unresolved."""
