@@ -45,6 +45,8 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform, tran
 from saga_fg.settings import Fraction, NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import MeasuredMotion
 
+_MAX_RESIDUAL = 0.3  # largest mean distance of the points of a scan from the map, m
+_MIN_PAIRS = 0.4  # least share of the points of a scan that the map must have surfels for
 _LOG = logging.getLogger(__name__)
 _GUESSED = np.diag([0.02, 0.02, 0.1, 1.0, 1.0, 0.5]) ** 2  # of a pose that was given or recognised
 _ACCURACY = np.diag([1e-3] * 3 + [0.03] * 3) ** 2  # of the map, rad and m
@@ -65,8 +67,6 @@ class LocaliserSettings(Settings):
     )
     radius: Positive = setting(80.0, "distance of the submaps that scans are registered with, m; higher: slower")
     scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
-    max_residual: Positive = setting(0.3, "largest mean distance of the points of a scan from the map, m")
-    min_pairs: Fraction = setting(0.4, "least share of the points of a scan that the map must have surfels for")
     lag: NonNegative = setting(2.0, "time over which keyframes are smoothed, s; 0: a filter")
     lost_after: Positive = setting(50.0, "way without a scan that fits after which the place is looked for again, m")
     robust_scale: Positive = setting(3.0, "residual from which the Cauchy loss discounts a measured pose, deviations")
@@ -275,7 +275,7 @@ class Localiser:
             found = register(thin, self._surfels, start, 1.5 * SURFEL, 0.1, criteria, "hold")
         except RegistrationError:
             return None
-        fits = found.converged and found.pairs >= s.min_pairs * len(thin) and found.residual <= s.max_residual
+        fits = found.converged and found.pairs >= _MIN_PAIRS * len(thin) and found.residual <= _MAX_RESIDUAL
         return found if fits else None
 
     def _load(self, centre: FloatArray) -> None:
