@@ -6,8 +6,12 @@
 
 A submap is anchored at its first keyframe. When it is long enough, the keyframe at hand becomes the anchor of the next
 one, and everything in between is eliminated (`condensing`). Landmarks belong to one submap: what is seen on is a
-landmark of the next again, and they are tied through the poses. So the graph grows by one pose and one factor a submap,
-and a keyframe costs as much at the end of a drive as at its beginning.
+landmark of the next again, and they are tied through the poses.
+
+There are two graphs: the running one, of the submap at hand alone, whose anchor has a prior from everything before; and
+that of all anchors, which is solved when a submap is closed, and when loops come. These move the anchor of the running
+submap by another prior; what the running submap says of those before comes when it is closed. So a keyframe costs as
+much at the end of a drive as at its beginning.
 
 The measurements themselves are kept. `finish` solves them all together, nothing condensed, from the running estimate.
 """
@@ -21,13 +25,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from factors import Robust, SolverSettings
+from factors import Robust, SolverSettings, pose, pose_prior_factor
 from saga_fg.errors import InputError
 from saga_fg.estimators.batch_solver import BatchSolver
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
+from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView, NewVariable, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Positive, Range, Settings, setting
@@ -111,15 +115,14 @@ class SubmapGraph:
     ) -> None:
         self.settings = settings or SubmapSettings()
         self._providers = recorded(providers)
-        self._smoother = IncrementalSmoother(
-            lag=None, settings=RelinearisationSettings(self.settings.relinearise_above), elimination="cholesky"
-        )
+        self._smoother = self._new_smoother()
         self._motions: list[tuple[FloatArray, FloatArray]] = [(world_T_first, covariance)]
         self._times: list[float] = []
         self._seen: list[Sequence[tuple[int, Observation]]] = []
         self._anchors: list[int] = []
         self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
-        self._states: dict[int, Any] = {}  # of landmarks of closed submaps
+        self._by_anchors = self._new_smoother()  # one epoch for each anchor, once a submap was closed
+        self._closed: CondensedSubmap | None = None  # the newest one
         self._loops: list[tuple[int, LoopClosure]] = []  # with the keyframe at which they came
         self._landmarks = SubmapLandmarks(self.settings.gate)
         self._numbers, self._way = 0, 0.0
@@ -183,15 +186,16 @@ class SubmapGraph:
                 raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
         if not loops:
             return
-        self._smoother.extend([_Loops(loops, self._anchors, self.settings.robust_loops)], _AFTER_LOOPS)
+        numbers = range(len(self._anchors))
+        self._by_anchors.extend([_Loops(loops, numbers, self.settings.robust_loops)], _AFTER_LOOPS)
         self._loops += [(len(self) - 1, loop) for loop in loops]
-        self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
+        self._move_running()
 
     def pose(self, k: int) -> FloatArray:
         """The present estimate (4, 4) of a keyframe's pose; in a closed submap it goes along with the anchor."""
         if k < len(self._offsets):
-            anchor = self._anchors[int(np.searchsorted(self._anchors, k, side="right")) - 1]
-            return np.asarray(self._running(anchor) @ self._offsets[k])
+            number = int(np.searchsorted(self._anchors, k, side="right")) - 1
+            return np.asarray(self._anchor(number) @ self._offsets[k])
         return self._running(k)
 
     def covariance(self) -> FloatArray:
@@ -200,7 +204,7 @@ class SubmapGraph:
 
     def world_T_anchor(self) -> FloatArray:
         """The present estimates (n, 4, 4) of all anchors."""
-        return np.array([self._running(k) for k in self._anchors])
+        return np.array([self._anchor(number) for number in range(len(self._anchors))])
 
     def poses(self) -> FloatArray:
         """The present estimates (N, 4, 4) of all keyframes."""
@@ -248,9 +252,29 @@ class SubmapGraph:
             solver.graph(),
         )
 
+    def _new_smoother(self) -> IncrementalSmoother:
+        settings = RelinearisationSettings(self.settings.relinearise_above)
+        return IncrementalSmoother(lag=None, settings=settings, elimination="cholesky")
+
     def _running(self, k: int) -> FloatArray:
         state: Any = self._smoother.state(pose_key(k))
         return np.asarray(state.matrix())
+
+    def _anchor(self, number: int) -> FloatArray:
+        if number == len(self._anchors) - 1:
+            return self._running(self._anchors[number])
+        state: Any = self._by_anchors.state(pose_key(number))
+        return np.asarray(state.matrix())
+
+    def _move_running(self) -> None:
+        """Put the anchor of the running submap where the graph of anchors has it."""
+        assert self._closed is not None
+        number = pose_key(len(self._anchors) - 1)
+        state: Any = self._by_anchors.state(number)
+        prior = pose_prior_factor(self._closed.successor, state.matrix(), self._by_anchors.covariance(number))
+        given = Additions(named={self._closed.name: [prior, *self._closed.others]})
+        self._smoother.extend([_Given(given, self._closed.name)], _AFTER_LOOPS)
+        self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
 
     def _associated(
         self,
@@ -267,21 +291,32 @@ class SubmapGraph:
     def _begin_submap(self, k: int) -> None:
         """Close the running submap, if any, and make the keyframe k an anchor."""
         if k:
-            anchor = self._anchors[-1]
-            self._close(anchor, k)
+            self._close(self._anchors[-1], k)
         self._anchors.append(k)
         self._way = 0.0
+        if self._loops:
+            self._move_running()
 
     def _close(self, anchor: int, successor: int) -> None:
-        keep = {pose_key(k) for k in self._anchors} | {pose_key(successor)}
         mine = {n for now in self._seen[anchor:successor] for n, _ in now}
         world = inverse_transform(self._running(anchor))
         self._offsets += [np.eye(4), *(world @ self._running(k) for k in range(anchor + 1, successor))]
-        self._states |= {n: self._smoother.state(landmark_key(n)) for n in mine}
+        begin, moved = self._running(anchor), world @ self._running(successor)
         variables = self._smoother.graph().variables.values()
-        old = [one.key for one in variables if one.epoch is not None and one.epoch < successor and one.key not in keep]
-        into = CondensedSubmap(pose_key(anchor), pose_key(successor))
+        old = [one.key for one in variables if one.epoch is not None and one.epoch < successor]
+        number = len(self._anchors) - 1
+        keys = (pose_key(anchor), pose_key(successor))
+        self._closed = into = CondensedSubmap(*keys, named=(pose_key(number), pose_key(number + 1)))
         self._smoother.marginalise([*old, *map(landmark_key, mine)], into)
+        epochs: list[tuple[float, Sequence[FactorProvider]]] = []
+        if number == 0:
+            epochs.append((self._times[anchor], [_Given(_anchor_pose(begin))]))
+        else:
+            state: Any = self._by_anchors.state(into.named[0])
+            begin = np.asarray(state.matrix())
+        given = [_Given(_anchor_pose(begin @ moved)), _Given(Additions(factors=into.between))]
+        epochs.append((self._times[successor], given))
+        self._by_anchors.steps(epochs)
 
     def _confirmed(self) -> dict[int, Sequence[tuple[int, Observation]]]:
         """Observations of landmarks that were seen often enough, by keyframe."""
@@ -292,9 +327,10 @@ class SubmapGraph:
     def _starts(self, poses: FloatArray) -> Mapping[int, Any]:
         """Where landmarks begin: those of closed submaps anew from their last observation, since anchors have moved."""
         start: dict[int, Any] = {}
+        running = self._smoother.graph().variables
         for k, now in enumerate(self._seen):
             for number, one in now:
-                if number in self._states:
+                if landmark_key(number) not in running:
                     start[number] = one.kind.initialise(poses[k], one.value)
                 elif number not in start:
                     start[number] = self._smoother.state(landmark_key(number))
@@ -312,3 +348,18 @@ class _Loops:
 
     def factors(self, view: GraphView) -> Additions:
         return Additions(factors=loop_factors(self.loops, self.anchors, self.robust))
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """What is known already."""
+
+    added: Additions
+    name: str = "submaps"
+
+    def factors(self, view: GraphView) -> Additions:
+        return self.added
+
+
+def _anchor_pose(world_T_anchor: FloatArray) -> Additions:
+    return Additions([NewVariable(EGO_POSE, 0, pose("world_T_anchor", world_T_anchor), label="anchor")])
