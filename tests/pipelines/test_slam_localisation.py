@@ -17,6 +17,7 @@ from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.localisation import Localiser, LocaliserSettings, guess_of
 from pipelines.slam.localised_drive import localise, write_localised
+from pipelines.slam.saved_graph import read_graph
 from pipelines.slam.slam_map import SlamMap, read_map, write_map
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
@@ -150,6 +151,13 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     np.testing.assert_allclose(graph.world_T_pose, result.world_T_lidar, atol=1e-9)
     settled = result.world_T_lidar[0] @ inverse_transform(graph.world_T_pose[0]) @ optimise_poses(graph).world_T_pose
     assert np.linalg.norm(settled[-1, :3, 3] - result.world_T_lidar[-1, :3, 3]) < 0.5
+    assert graph.landmarks is not None
+    assert len(graph.landmarks.ids) == sum(mark.kind.name == "pole" for mark in result.landmarks)
+    poses, landmarks = read_graph(tmp_path / "first").solved()
+    np.testing.assert_allclose(poses, result.world_T_lidar, atol=1e-4)
+    assert [(mark.number, mark.kind, mark.observations) for mark in landmarks] == [
+        (mark.number, mark.kind, mark.observations) for mark in result.landmarks
+    ]
     header, *rows = (tmp_path / "first" / "landmarks.csv").read_text().splitlines()
     assert header == "number,kind,observations,deviations,geometry"
     assert len(rows) == len(result.landmarks)
@@ -200,3 +208,21 @@ def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
         SlamMap([np.empty((0, 3), dtype=np.float32)], np.eye(4)[None])
     with pytest.raises(InputError, match=r"guess: expected x,y,z,yaw, m and rad, got '1,2'"):
         guess_of("1,2")
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("0,0,tower,1 2 3,1 0 1", "line 2: kind: expected one of wall, pole, road line, ground, got 'tower'"),
+        ("7,0,pole,1 2 3,1 0 1", "line 2: expected numbers of a keyframe of graph.g2o"),
+        ("0,0,pole,1 2 3,1 0", "line 2: expected the numbers of an observation of a pole"),
+        ("0,0,pole", "line 2: expected 5 columns, got 3"),
+    ],
+)
+def test_a_graph_that_is_none_is_named(tmp_path: Path, row: str, message: str) -> None:
+    poses = "".join(f"VERTEX_SE3:QUAT {x} {x} 0 0 0 0 0 1\n" for x in range(2))
+    information = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+    (tmp_path / "graph.g2o").write_text(f"{poses}EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {information}\n")
+    (tmp_path / "observations.csv").write_text(f"keyframe,landmark,kind,value,covariance\n{row}\n")
+    with pytest.raises(InputError, match=message):
+        read_graph(tmp_path)

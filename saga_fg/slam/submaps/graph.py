@@ -13,7 +13,8 @@ that of all anchors, which is solved when a submap is closed, and when loops com
 submap by another prior; what the running submap says of those before comes when it is closed. So a keyframe costs as
 much at the end of a drive as at its beginning.
 
-The measurements themselves are kept. `finish` solves them all together, nothing condensed, from the running estimate.
+The measurements themselves are kept. `finish` chooses the loops that agree (`loop_selection`), and solves everything
+together, nothing condensed, from the running estimate.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, landmark_key, pose_key
 from saga_fg.slam.submaps.association import SubmapLandmarks
 from saga_fg.slam.submaps.condensing import CondensedSubmap
+from saga_fg.slam.submaps.loop_selection import LoopSelection, select_loops
 from saga_fg.slam.submaps.loops import LoopClosure, loop_factors
 from saga_fg.slam.submaps.recording import recorded
 from saga_fg.types.frame import Frame
@@ -83,7 +85,8 @@ class SubmapSettings(Settings):
 class SolvedDrive:
     """Everything solved together: N poses (N, 4, 4), their covariances (N, 6, 6), and the landmarks seen often enough.
 
-    solution: of the whole graph, with all variables; graph: that, at its solution
+    solution: of the whole graph, with all variables; graph: that, at its solution; loops: which of those that came are
+    in it, and with what deviations of odometry
     """
 
     world_T_pose: FloatArray
@@ -91,6 +94,7 @@ class SolvedDrive:
     landmarks: list[Landmark]
     solution: GraphSolution
     graph: SceneFactorGraph
+    loops: LoopSelection
 
 
 class SubmapGraph:
@@ -220,18 +224,26 @@ class SubmapGraph:
         """All observations with their keyframes and landmarks."""
         return [AssociatedObservation(k, one, n) for k, now in enumerate(self._seen) for n, one in now]
 
-    def measurements(self) -> SceneFactorGraph:
-        """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed."""
-        graph, poses = SceneFactorGraph(), self.poses()
+    def select_loops(self) -> LoopSelection:
+        """Judge all loops that came, in this order."""
+        return select_loops(self.world_T_anchor(), self._motions[1:], self._anchors, [loop for _, loop in self._loops])
+
+    def measurements(self, loops: LoopSelection | None = None) -> SceneFactorGraph:
+        """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed.
+
+        loops: by default as `select_loops` has it
+        """
+        graph, poses, chosen = SceneFactorGraph(), self.poses(), self.select_loops() if loops is None else loops
         seen = LandmarkObservations(self._confirmed(), self._starts(poses), self.settings.robust)
-        loops: dict[int, list[LoopClosure]] = {}
-        for k, loop in self._loops:
-            loops.setdefault(k, []).append(loop)
+        came: dict[int, list[LoopClosure]] = {}
+        for (k, loop), kept in zip(self._loops, chosen.kept.tolist(), strict=True):
+            came.setdefault(k, []).extend([loop] if kept else [])
         for k, (time, motion) in enumerate(zip(self._times, self._motions, strict=True)):
             graph.advance(time)
-            own: list[FactorProvider] = [MeasuredMotion(*motion, poses[k]), seen]
-            if k in loops:
-                own.append(_Loops(loops[k], self._anchors, self.settings.robust_loops))
+            covariance = chosen.inflation**2 * motion[1] if k else motion[1]
+            own: list[FactorProvider] = [MeasuredMotion(motion[0], covariance, poses[k]), seen]
+            if came.get(k):
+                own.append(_Loops(came[k], self._anchors, None))
             ask_all([*own, *(again for provider in self._providers for again in provider.again(k))], graph)
         return graph
 
@@ -239,7 +251,8 @@ class SubmapGraph:
         """Solve all measurements together."""
         if not len(self):
             raise InputError("expected at least one keyframe before the end")
-        solver = BatchSolver(graph=self.measurements(), settings=_SOLVER)
+        loops = self.select_loops()
+        solver = BatchSolver(graph=self.measurements(loops), settings=_SOLVER)
         solution = solver.solve()
         keys = [pose_key(k) for k in range(len(self))]
         seen = LandmarkObservations(self._confirmed(), {})
@@ -250,6 +263,7 @@ class SubmapGraph:
             marks,
             solution,
             solver.graph(),
+            loops,
         )
 
     def _new_smoother(self) -> IncrementalSmoother:
@@ -343,7 +357,7 @@ class _Loops:
 
     loops: Sequence[LoopClosure]
     anchors: Sequence[int]
-    robust: Robust
+    robust: Robust | None
     name: str = "loops"
 
     def factors(self, view: GraphView) -> Additions:

@@ -247,3 +247,44 @@ def test_a_keyframe_that_is_refused_leaves_the_graph_as_it_was() -> None:
     assert len(graph) == 6
     with pytest.raises(InputError, match="expected at least one keyframe"):
         started(drive).finish()
+
+
+def looping(Q: np.ndarray = POOR, turn: float = 0.0) -> tuple[Drive, SubmapGraph, list[LoopClosure]]:
+    """Nearly twice round a block, with a true loop at every submap of the second round; odometry turns too much, rad
+    a step."""
+    drive, rng = Drive(square(500), 3, Q, landmarks=False), np.random.default_rng(0)
+    drive.motions[1:] = [(T @ yaw_transform(0.0, yaw=turn), P) for T, P in drive.motions[1:]]
+    graph, loops = started(drive, SubmapSettings(length=15.0)), []
+    R = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
+    for k in range(500):
+        drive.into(graph, range(k, k + 1))
+        number = len(graph.anchors) - 1
+        if graph.anchors[-1] == k and number > 8:
+            places = drive.poses[graph.anchors[:-5], :3, 3]
+            first = int(np.linalg.norm(places - drive.poses[k, :3, 3], axis=1).argmin())
+            true = inverse_transform(drive.poses[graph.anchors[first]]) @ drive.poses[k]
+            seen = gtsam.Pose3(true).retract(rng.normal(size=6) * np.sqrt(np.diag(R))).matrix()
+            loops.append(LoopClosure(first, number, seen, R, confirmed=True))
+            graph.close_loops(loops[-1:])
+    return drive, graph, loops
+
+
+def test_a_false_loop_does_not_bend_the_map() -> None:
+    _, graph, loops = looping()
+    assert len(loops) >= 4
+    clean = graph.finish()
+    assert clean.loops.kept.all()
+    false = LoopClosure(2, len(graph.anchors) - 2, yaw_transform(5.0, 4.0), loops[0].covariance, confirmed=True)
+    graph.close_loops([false])
+    spoilt = graph.finish()
+    np.testing.assert_array_equal(spoilt.loops.kept, [True] * len(loops) + [False])
+    np.testing.assert_allclose(spoilt.world_T_pose, clean.world_T_pose, atol=0.02)
+
+
+def test_drift_beyond_the_noise_does_not_cost_loops() -> None:
+    drive, graph, _ = looping(Q, turn=1e-3)  # twice its deviation, always in one direction
+    found = graph.finish()
+    assert found.loops.kept.all()
+    assert found.loops.inflation > 2.0
+    off = np.linalg.norm(found.world_T_pose[:, :3, 3] - drive.poses[:, :3, 3], axis=1)
+    assert off.max() < 1.0
