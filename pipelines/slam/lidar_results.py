@@ -40,7 +40,7 @@ from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.results import landmark_rows, object_paths, write_covariances, write_objects
 from pipelines.slam.saved_graph import write_graph
 from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
-from pipelines.slam.slam_map import SlamMap, write_map
+from pipelines.slam.slam_map import Origin, SlamMap, write_map
 from pipelines.slam.with_objects import SlamWithObjects
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
@@ -102,10 +102,11 @@ def write_lidar_slam(
     scans: ScanSequence,
     spacing: float = 0.2,
     odometry: OdometrySettings | None = None,
+    origin: Origin | None = None,
 ) -> dict[str, Any]:
     """Write all files of a run to a folder, or none; returns the metrics.
 
-    spacing: of the map's points, m; odometry: settings of the run
+    spacing: of the map's points, m; odometry: settings of the run; origin: of the world, on Earth
     """
     result, objects = (found, None) if isinstance(found, LidarSlamResult) else (found.slam, found.estimate)
     points = accumulated_map(result, spacing)
@@ -124,7 +125,7 @@ def write_lidar_slam(
         if len(points):
             (folder / "map").mkdir()
             clouds = [submap.points for submap in result.submaps]
-            write_map(folder / "map", SlamMap(clouds, result.world_T_submap))
+            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin))
         write_graph(folder, result)
         times = result.trajectory.timestamps[result.keyframes].tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)

@@ -30,7 +30,7 @@ from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
-from pipelines.slam.between_keyframes import BetweenKeyframes
+from pipelines.slam.between_keyframes import BetweenKeyframes, velocity_ahead
 from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, checked_step, motion, moved_pose, shared
 from pipelines.slam.lidar_slam_types import START, LidarSlamResult, SlamStep
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
@@ -182,8 +182,7 @@ class LidarSlam:
             moving = self._moving.boxes(time, detections, self._expected(time))
             scan = without_objects(scan, moving)
         if wheels is not None and "wheels" in self._sensors and isinstance(self._odometry, LidarOdometry):
-            ahead = self._ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]
-            placed = self._odometry.step(scan, time, np.concatenate([np.full(3, np.nan), ahead]))
+            placed = self._odometry.step(scan, time, velocity_ahead(wheels, self._ego_T_lidar))
         else:
             placed = checked_step(self._odometry.step(scan, time))
         if not self._keyframes:

@@ -253,7 +253,7 @@ def looping(Q: np.ndarray = POOR, turn: float = 0.0) -> tuple[Drive, SubmapGraph
     """Nearly twice round a block, with a true loop at every submap of the second round; odometry turns too much, rad
     a step."""
     drive, rng = Drive(square(500), 3, Q, landmarks=False), np.random.default_rng(0)
-    drive.motions[1:] = [(T @ yaw_transform(0.0, yaw=turn), P) for T, P in drive.motions[1:]]
+    drive.motions[1:] = [(moved[0] @ yaw_transform(0.0, yaw=turn), moved[1]) for moved in drive.motions[1:]]
     graph, loops = started(drive, SubmapSettings(length=15.0)), []
     R = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
     for k in range(500):
