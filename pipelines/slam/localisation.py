@@ -51,6 +51,8 @@ from saga_fg.slam.mapping import MeasuredMotion
 from saga_fg.slam.sensors import SensorName, SensorSettings, sensor_providers
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 
+_MAX_RESIDUAL = 0.3  # largest mean distance of the points of a scan from the map, m
+_MIN_PAIRS = 0.4  # least share of the points of a scan that the map must have surfels for
 _LOG = logging.getLogger(__name__)
 _GUESSED = np.diag([0.02, 0.02, 0.1, 1.0, 1.0, 0.5]) ** 2  # of a pose that was given or recognised
 _ACCURACY = np.diag([1e-3] * 3 + [0.03] * 3) ** 2  # of the map, rad and m
@@ -71,8 +73,6 @@ class LocaliserSettings(Settings):
     )
     radius: Positive = setting(80.0, "distance of the submaps that scans are registered with, m; higher: slower")
     scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
-    max_residual: Positive = setting(0.3, "largest mean distance of the points of a scan from the map, m")
-    min_pairs: Fraction = setting(0.4, "least share of the points of a scan that the map must have surfels for")
     lag: NonNegative = setting(2.0, "time over which keyframes are smoothed, s; 0: a filter")
     lost_after: Positive = setting(50.0, "way without a scan that fits after which the place is looked for again, m")
     robust_scale: Positive = setting(3.0, "residual from which the Cauchy loss discounts a measured pose, deviations")
@@ -185,7 +185,7 @@ class Localiser:
 
     @property
     def registered(self) -> BoolArray:
-        """Whether each scan (K,) so far was registered with the map, at a place that has not been given up since."""
+        """Mask (K,) of the scans so far that were registered with the map, without those withdrawn since."""
         return np.isin(np.arange(len(self._poses)), sorted(self._fits))
 
     @property
@@ -195,7 +195,7 @@ class Localiser:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the points looked for last fit several places of the map."""
+        """True if the last cloud searched for fits several places of the map."""
         return self._ambiguous
 
     def finish(self) -> None:
@@ -318,7 +318,7 @@ class Localiser:
             found = register(thin, self._surfels, start, 1.5 * SURFEL, 0.1, criteria, "hold")
         except RegistrationError:
             return None
-        fits = found.converged and found.pairs >= s.min_pairs * len(thin) and found.residual <= s.max_residual
+        fits = found.converged and found.pairs >= _MIN_PAIRS * len(thin) and found.residual <= _MAX_RESIDUAL
         return found if fits else None
 
     def _load(self, centre: FloatArray) -> None:

@@ -1,8 +1,8 @@
 """A record of epochs, with the filter over them, on which the smoothers are built.
 
-Told of the past, the filter's pass is done again from there. Where something is nonlinear or robust, everything
-recorded is linearised again at the smoothed means until they stand still, which is Gauss-Newton over the recording
-(Bell, The iterated Kalman smoother as a Gauss-Newton method, SIAM J. Optimization 4, 1994).
+A measurement of the past repeats the filter's pass from its time on. Where something is nonlinear or robust, all
+of the record is linearised again at the smoothed means until they converge: Gauss-Newton over the recording (Bell,
+The iterated Kalman smoother as a Gauss-Newton method, SIAM J. Optimization 4, 1994).
 """
 
 from __future__ import annotations

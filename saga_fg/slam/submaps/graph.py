@@ -339,7 +339,7 @@ class SubmapGraph:
         return {k: [(n, one) for n, one in now if n in often] for k, now in enumerate(self._seen)}
 
     def _starts(self, poses: FloatArray) -> Mapping[int, Any]:
-        """Where landmarks begin: those of closed submaps anew from their last observation, since anchors have moved."""
+        """Initial values of landmarks; in closed submaps from the last observation, since anchors have moved."""
         start: dict[int, Any] = {}
         running = self._smoother.graph().variables
         for k, now in enumerate(self._seen):
