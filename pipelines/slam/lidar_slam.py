@@ -134,7 +134,8 @@ class LidarSlam:
         self._graph = self._new_graph(self._start, START)
         self._detectors = tuple(detectors)
         self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
-        self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
+        self._builder = SubmapBuilder(s.map_spacing, straighten=not isinstance(self._odometry, LidarOdometry))
+        self._submaps = list[Submap]()
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
         self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
@@ -233,7 +234,7 @@ class LidarSlam:
             self._graph.observations(),
             [loop for loop, kept in zip(self._closed, chosen, strict=True) if kept],
             [loop for loop, kept in zip(self._closed, chosen, strict=True) if not kept],
-            solved.loops.inflation,
+            solved.loops,
             self._degenerate,
             self._boxes,
             unfit,
