@@ -48,7 +48,15 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import MapperSettings
-from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers, unjudged
+from saga_fg.slam.sensors import (
+    SensorBuffer,
+    SensorName,
+    SensorSettings,
+    false_fixes,
+    misfits,
+    sensor_providers,
+    unjudged,
+)
 from saga_fg.slam.submaps import LoopClosure, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
@@ -180,6 +188,7 @@ class LidarSlam:
             raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
         moving = Boxes.empty()
         if self._moving is not None and detections is not None:
+            self._moving.check(scan, detections)
             moving = self._moving.boxes(time, detections, self._expected(time))
             scan = without_objects(scan, moving)
         if wheels is not None and "wheels" in self._sensors and isinstance(self._odometry, LidarOdometry):
@@ -219,7 +228,8 @@ class LidarSlam:
             _LOG.warning("%d of %d loops contradict the others, and are left out", chosen.count(False), len(chosen))
         unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
         unknown = unjudged(solved.graph, self._sensors, self.settings.sensors)
-        for text in (*unfit.values(), *unknown.values()):
+        far = false_fixes(solved.graph, self.settings.sensors) if "gps" in self._sensors else ""
+        for text in filter(None, (*unfit.values(), *unknown.values(), far)):
             _LOG.warning(text)
         drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
         anchors = solved.world_T_pose[[submap.anchor for submap in self._submaps]]
