@@ -37,7 +37,7 @@ def slam(
         int | None,
         typer.Option("--dense", min=2, help="Instead: SLAM all in on so many simulated scans of full density."),
     ] = None,
-    columns: Annotated[
+    firings: Annotated[
         int, typer.Option("--columns", min=100, help="With --dense: points of a beam; 2000 are full density.")
     ] = 2000,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of --drive and --dense.")] = 0,
@@ -67,7 +67,7 @@ def slam(
     if drive is not None:
         _drive(drive, seed, json_file)
     elif dense is not None:
-        _dense(dense, columns, seed, json_file)
+        _dense(dense, firings, seed, json_file)
     if dataroot is None:
         return
     with progress_bar() as progress:
@@ -117,13 +117,13 @@ def _all_in(cost: AllIn) -> FigureTable:
     )
 
 
-def _dense(scans: int, columns: int, seed: int, json_file: Path | None) -> None:
+def _dense(scans: int, firings: int, seed: int, json_file: Path | None) -> None:
     """Scans as those of 64 beams."""
     from data_tools.simulator.course import SimulatedCourse
     from data_tools.simulator.scanner import ScannerSettings
     from pipelines.bench.slam_all_in import bench_all_in
 
-    course = SimulatedCourse(seed, 0.8 * scans, settings=ScannerSettings(rings=64, columns=columns))
+    course = SimulatedCourse(seed, 0.8 * scans, settings=ScannerSettings(rings=64, columns=firings))
     with progress_bar() as progress:
         cost = bench_all_in(f"simulated, seed {seed}", course, progress)
     report([_all_in(cost)], [cost], json_file)

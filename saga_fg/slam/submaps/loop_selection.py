@@ -131,4 +131,4 @@ def _inflation(graph: PoseGraph, steps: Sequence[_Step], inflation: FloatArray) 
             V = step.parts[g]
             squares[g] += s**4 * (inverse @ v) @ V @ (inverse @ v)
             redundancy[g] += s**2 * np.trace(left @ V)
-    return np.maximum(1.0, np.sqrt(squares / np.maximum(redundancy, 1.0)))
+    return np.asarray(np.maximum(1.0, np.sqrt(squares / np.maximum(redundancy, 1.0))))
