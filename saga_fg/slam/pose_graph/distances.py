@@ -10,7 +10,7 @@ _SHORTEST = 1e-6  # m: a sparse matrix takes 0 for no measurement
 
 
 def shortest_paths(first: IntArray, second: IntArray, length: FloatArray, poses: int, row: int) -> FloatArray:
-    """Length (poses,) of the shortest path from a pose to each along measurements (M,) of these lengths; infinite where none leads."""
+    """Lengths (poses,) of shortest paths from a pose along measurements (M,) of these lengths; infinite without one."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
