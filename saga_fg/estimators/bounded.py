@@ -253,7 +253,7 @@ def propagated(
     size = partition.layout.size
     inner = scipy.sparse.csr_array((rows.data, columns, rows.indptr), shape=(size, size))
     mean = np.asarray(inner @ x.mean + dynamics.b[states])
-    noise = _noise(x, clusters, dynamics)
+    noise = _noise(clusters, dynamics)
     if len(outside):
         row = np.repeat(np.arange(size), np.diff(rows.indptr))[outside] - partition.layout.offsets[target[outside]]
         _add_outer(noise, x, clusters, target[outside], node[outside], row, within[outside], rows.data[outside])
@@ -278,7 +278,7 @@ def propagated(
     return BlockGaussian(partition, mean, tuple(blocks))
 
 
-def _noise(x: BlockGaussian, clusters: OverlappingClusters, dynamics: Dynamics) -> FloatArray:
+def _noise(clusters: OverlappingClusters, dynamics: Dynamics) -> FloatArray:
     """Q of every copy, (M, d, d) with the largest d."""
     d = int(clusters.layout.dims.max(initial=0))
     Q = np.zeros((len(clusters.layout), d, d))

@@ -1,4 +1,4 @@
-"""Gauss-Newton over a recording: linearised at the smoothed means, until they stand still.
+"""Gauss-Newton over a recording: linearised at the smoothed means until they converge.
 
 Source: Bell, The iterated Kalman smoother as a Gauss-Newton method, SIAM J. Optimization 4 (1994).
 """

@@ -1,7 +1,7 @@
 """A record of epochs, with the filter over them, on which the smoothers are built.
 
-Told of the past, the filter's pass is done again from there. Where something is nonlinear or robust, everything
-recorded is linearised again (`saga_fg.estimators.gauss_newton`).
+A measurement of the past repeats the filter's pass from its time on. Where something is nonlinear or robust, all
+of the record is linearised again (`saga_fg.estimators.gauss_newton`).
 """
 
 from __future__ import annotations

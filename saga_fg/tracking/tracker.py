@@ -87,7 +87,7 @@ class Tracker:
         self._last_step_failed = False
 
     def __repr__(self) -> str:
-        """How many tracks there are, and the settings that differ from the defaults."""
+        """The number of tracks, and the settings that differ from the defaults."""
         sensors = ", ".join(self.sensors) or "by the defaults"
         usual = TrackerSettings()
         named = [item.name for item in fields(self.settings) if item.name not in ("estimator", "edges")]
