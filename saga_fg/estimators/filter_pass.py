@@ -1,12 +1,13 @@
 """The filter's pass over epochs: forwards, and backwards in bounded memory.
 
 Smoothing reads the pass from its end. A step takes the square of its components, so that a long recording, or one with
-many tracks, does not keep them all: the priors of stretches are found first, and each stretch is filtered again when
-its turn comes, with the same result to the last digit.
+many tracks, does not keep them all: the priors of a few stretches are found first, and each stretch is filtered again
+when its turn comes, itself in stretches if need be, with the same result to the last digit.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -15,6 +16,8 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Epoch, FilterStep, initial_step
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.numerics.arrays import FloatArray
+
+_PARTS = 4  # stretches
 
 
 def dead_reckoned(prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[StateLayout]) -> list[FloatArray]:
@@ -65,21 +68,19 @@ def step_at(prior: BlockGaussian, epochs: Sequence[Epoch], k: int) -> FilterStep
 
 
 def filter_backwards(prior: BlockGaussian, epochs: Sequence[Epoch], most: int) -> Iterator[FilterStep]:
-    """The steps from the last to the first, no more of them at a time than those of a stretch of `most` bytes."""
-    priors, ends, size, steps = [prior], [0], 0, list[FilterStep]()
-    for k, (step, after) in enumerate(_filtered(prior, epochs)):
-        steps.append(step)
-        size += step.size
-        if size >= most and k + 1 < len(epochs):
-            priors.append(after)
-            ends.append(k + 1)
-            size, steps = 0, []
-    while steps:
-        yield steps.pop()
-    for number in range(len(ends) - 2, -1, -1):
-        steps = filter_epochs(priors.pop(number), epochs[ends[number] : ends[number + 1]])
+    """The steps from the last to the first, of which about `most` bytes are kept, and a few priors."""
+    steps = filter_epochs(prior, epochs) if len(epochs) == 1 else completed_within([], prior, epochs, most)
+    if steps is not None:
         while steps:
             yield steps.pop()
+        return
+    length = math.ceil(len(epochs) / _PARTS)
+    begins, priors = range(0, len(epochs), length), [prior]
+    for k, (_, after) in enumerate(_filtered(prior, epochs[: begins[-1]])):
+        if k + 1 in begins:
+            priors.append(after)
+    for begin in reversed(begins):
+        yield from filter_backwards(priors.pop(), epochs[begin : begin + length], most)
 
 
 def _continued(steps: list[FilterStep], prior: BlockGaussian, epochs: Sequence[Epoch]) -> Iterator[FilterStep]:

@@ -225,7 +225,7 @@ class Recording:
             steps = completed_within(self._steps, self._prior, self._epochs, MOST_KEPT)
             if steps is None:
                 self._steps = []
-                return filter_backwards(self._prior, self._epochs, MOST_KEPT // 2)
+                return filter_backwards(self._prior, self._epochs, MOST_KEPT)
             self._steps = steps
         return reversed(self.steps)
 

@@ -39,7 +39,7 @@ from saga_fg.smoothing.stationarity import StationaryStates
 from saga_fg.types.by_class import class_settings
 
 LONG_RECORDING = 120.0  # s from which it is smoothed in windows
-MOST_JOINT = 128  # objects that are smoothed jointly; of more, a matrix of an epoch takes megabytes
+MOST_JOINT = 64  # objects that are smoothed jointly: their covariance takes half a megabyte
 UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of an object, m
 LEAST_WEIGHT = 1e-4  # of a detection; at zero its noise would be infinite
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -208,14 +209,14 @@ def test_one_process_of_a_node_compiles_kernels_while_the_others_wait(
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         happened.append("kernels")
 
-    monkeypatch.setattr(ray_pool.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr(ray_pool, "load_kernels", load)
     monkeypatch.setattr(ray_pool, "perform", lambda job: happened.append(job))
     for job in ("first", "second"):
         ray_pool.perform_on_node(job)  # type: ignore[arg-type]
     assert happened == ["kernels", "first", "kernels", "second"]
     assert len(set(held)) == 1
-    monkeypatch.setattr(ray_pool.tempfile, "gettempdir", lambda: str(tmp_path / "missing"))
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path / "missing"))
     monkeypatch.setattr(ray_pool, "load_kernels", lambda: happened.append("alone"))
     ray_pool.perform_on_node("third")  # type: ignore[arg-type]
     assert happened[-2:] == ["alone", "third"]
