@@ -40,7 +40,7 @@ from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmark
 from pipelines.slam.submap_loops import SubmapLoops
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.tracking import Progress
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray
@@ -167,8 +167,7 @@ class LidarSlam:
         """
         if self._finished:
             raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
-        if not isinstance(scan, Scan):
-            raise InputError(f"scan: expected a Scan, got {type(scan).__name__}")
+        require_type("scan", scan, Scan)
         if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
             raise InputError(f"time: expected a finite number of seconds, got {time!r}")
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)

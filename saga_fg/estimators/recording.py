@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.backward import (
     MarginalCovariances,
     SmoothedCovariance,
@@ -36,7 +36,6 @@ from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
 from saga_fg.estimators.object_factors import recording_graph
-from saga_fg.estimators.protocol import require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray, checked
 
@@ -87,7 +86,7 @@ class Recording:
         )
 
     def restore(self, state: RecordingState) -> None:
-        require_kind("state", state, RecordingState)
+        require_type("state", state, RecordingState)
         self._prior, self._converged = state.prior, state.converged
         self._epochs, self._layouts, self._steps = list(state.epochs), list(state.layouts), list(state.steps)
         self._nonlinear = not all(epoch.linear for epoch in state.epochs)
