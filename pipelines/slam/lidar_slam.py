@@ -30,9 +30,9 @@ from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
-from pipelines.slam.between_keyframes import BetweenKeyframes
+from pipelines.slam.between_keyframes import BetweenKeyframes, velocity_ahead
 from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, checked_step, motion, moved_pose, shared
-from pipelines.slam.lidar_slam_types import LidarSlamResult, SlamStep
+from pipelines.slam.lidar_slam_types import START, LidarSlamResult, SlamStep
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.moving_objects import MovingObjects, frames_at
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
@@ -40,7 +40,7 @@ from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmark
 from pipelines.slam.submap_loops import SubmapLoops
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.tracking import Progress
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray
@@ -48,7 +48,14 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import MapperSettings
-from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers
+from saga_fg.slam.sensors import (
+    SensorBuffer,
+    SensorName,
+    SensorSettings,
+    false_fixes,
+    misfits,
+    sensor_providers,
+)
 from saga_fg.slam.submaps import LoopClosure, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
@@ -57,7 +64,6 @@ from saga_fg.types.frame import Detections, Frame
 
 _LOG = logging.getLogger(__name__)
 OdometrySource = Literal["lidar", "oxts"]
-_START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
 CALIBRATED = OdometryNoise(
     turn_noise=1e-3,
@@ -132,16 +138,17 @@ class LidarSlam:
         of_sensors = sensor_providers(s.sensors, sensors, lidar_T_ego)
         self._providers = tuple(providers)
         self._new_graph = partial(SubmapGraph, settings=s.submaps, providers=[*of_sensors, *providers])
-        self._graph = self._new_graph(self._start, _START)
+        self._graph = self._new_graph(self._start, START)
         self._detectors = tuple(detectors)
         self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
-        self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
+        self._builder = SubmapBuilder(s.map_spacing, straighten=not isinstance(self._odometry, LidarOdometry))
+        self._submaps = list[Submap]()
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
         self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
         self._measured = BetweenKeyframes(self._sensors, bool(self._providers), s.sensors.wheels.deviation)
         self._finished = False
-        self._closed, self._covariance = list[LoopClosure](), _START  # of the last keyframe's pose
+        self._closed, self._covariance = list[LoopClosure](), START  # of the last keyframe's pose
 
     @property
     def graph(self) -> SubmapGraph:
@@ -168,8 +175,7 @@ class LidarSlam:
         """
         if self._finished:
             raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
-        if not isinstance(scan, Scan):
-            raise InputError(f"scan: expected a Scan, got {type(scan).__name__}")
+        require_type("scan", scan, Scan)
         if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
             raise InputError(f"time: expected a finite number of seconds, got {time!r}")
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
@@ -180,11 +186,11 @@ class LidarSlam:
             raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
         moving = Boxes.empty()
         if self._moving is not None and detections is not None:
+            self._moving.check(scan, detections)
             moving = self._moving.boxes(time, detections, self._expected(time))
             scan = without_objects(scan, moving)
         if wheels is not None and "wheels" in self._sensors and isinstance(self._odometry, LidarOdometry):
-            ahead = self._ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]
-            placed = self._odometry.step(scan, time, np.concatenate([np.full(3, np.nan), ahead]))
+            placed = self._odometry.step(scan, time, velocity_ahead(wheels, self._ego_T_lidar))
         else:
             placed = checked_step(self._odometry.step(scan, time))
         if not self._keyframes:
@@ -215,9 +221,12 @@ class LidarSlam:
         if len(self._builder):
             self._close(self._graph.poses())
         solved = self._graph.finish()
-        self._finished = True
+        self._finished, chosen = True, solved.loops.kept.tolist()
+        if not all(chosen):
+            _LOG.warning("%d of %d loops contradict the others, and are left out", chosen.count(False), len(chosen))
         unfit, unknown = misfits(solved.graph, self._sensors, self.settings.sensors)
-        for text in (*unfit.values(), *unknown.values()):
+        far = false_fixes(solved.graph, self.settings.sensors) if "gps" in self._sensors else ""
+        for text in filter(None, (*unfit.values(), *unknown.values(), far)):
             _LOG.warning(text)
         drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
         anchors = solved.world_T_pose[[submap.anchor for submap in self._submaps]]
@@ -230,7 +239,9 @@ class LidarSlam:
             solved.covariances,
             solved.landmarks,
             self._graph.observations(),
-            self._closed,
+            [loop for loop, kept in zip(self._closed, chosen, strict=True) if kept],
+            [loop for loop, kept in zip(self._closed, chosen, strict=True) if not kept],
+            solved.loops,
             self._degenerate,
             self._boxes,
             unfit,
@@ -259,7 +270,7 @@ class LidarSlam:
             last = self._keyframes[-1]
             moved = motion(self._poses[last:], self._covariances[last + 1 :])
         elif row:  # a detector or provider raised at the scans before
-            self._graph = self._new_graph(self._poses[row], _START + motion(self._poses, self._covariances[1:])[1])
+            self._graph = self._new_graph(self._poses[row], START + motion(self._poses, self._covariances[1:])[1])
         frame = self._measured.frame(self._times[row], detections)
         closes = self._graph.append(self._times[row], moved, seen, frame)
         self._measured.clear()

@@ -25,7 +25,7 @@ from pipelines.slam.place_proof import COMPARED, FEWEST, SAME, SPACING, agreeing
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
-from saga_fg.slam.pose_graph.distances import shortest_ways
+from saga_fg.slam.pose_graph.distances import shortest_paths
 from saga_fg.slam.submaps import LoopClosure
 
 _REGISTERED, _TAKEN = 4, 2  # places for each submap
@@ -34,7 +34,7 @@ _SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometr
 _ALONE = 0.85  # and without one, up to twice the drift
 _FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
 _OPEN = 0.5  # m, standard deviation of an alignment of images
-_DISTORTION = np.array([2e-3] * 3 + [0.1] * 3) ** 2  # rad^2 and m^2, of submaps that odometry has bent
+_DISTORTION = np.array([1e-3] * 3 + [0.05] * 3) ** 2  # rad^2 and m^2, of submaps, which are never quite straight
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class PlaceLoops:
         if not self._edges:
             return np.zeros(len(self._submaps))
         first, second, length = (np.array(column) for column in zip(*self._edges, strict=True))
-        return shortest_ways(first, second, length, len(self._submaps), number)
+        return shortest_paths(first, second, length, len(self._submaps), number)
 
     @staticmethod
     def _farthest(way: FloatArray) -> FloatArray:

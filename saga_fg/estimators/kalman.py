@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.bounds import ComponentBounds
 from saga_fg.estimators.compiled_filter import corrected, predicted
@@ -27,7 +27,7 @@ from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.object_factors import prior_graph
-from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
+from saga_fg.estimators.protocol import LatestMarginals, Measurements
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.kernels.compilation import compiled_kernels
@@ -90,7 +90,12 @@ class JointKalmanFilter(LatestMarginals):
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
     ) -> None:
-        mean, covariance = checked_prior(nodes, means, covariances)
+        self.extend(nodes, *checked_prior(nodes, means, covariances), labels)
+
+    def extend(
+        self, nodes: ArrayLike, mean: FloatArray, covariance: FloatArray, labels: Mapping[int, str] | None = None
+    ) -> None:
+        """As `add`, of numbers that were checked where they came in."""
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
         if self.providers:
             self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})
@@ -131,10 +136,10 @@ class JointKalmanFilter(LatestMarginals):
 
     def update(self, measurements: Measurements | Observations) -> float:
         recorded = RecordedMeasurements(measurements)
-        recorded.check(self._state.layout)
-        if len(measurements) == 0:
+        rows = recorded.check(self._state.layout)
+        if len(rows) == 0:
             return 0.0
-        seen = recorded.linearised(self._state.layout, self._state.mean)
+        seen = recorded.linearised(self._state.layout, self._state.mean, rows)
         if compiled_kernels():
             self._state, log_likelihood = corrected(self._state, seen)
         else:
@@ -173,7 +178,7 @@ class JointKalmanFilter(LatestMarginals):
 
     def restore(self, state: KalmanState) -> None:
         """Continue from a snapshot, bit-identically."""
-        require_kind("state", state, KalmanState)
+        require_type("state", state, KalmanState)
         self._state, self._predictions, self._time = state.x, state.predictions, state.time
         self._auxiliary = state.auxiliary or AuxiliaryVariables()
 

@@ -16,10 +16,20 @@ from saga_fg.graph.linearisation_point import LinearisationPoint
 
 
 class Condensation(Protocol):
-    """Makes factors of the marginal that eliminated variables leave; `name` is their provider's in messages."""
+    """Makes factors of the marginal that eliminated variables leave; `name` is their provider's, and theirs."""
 
     @property
     def name(self) -> str: ...
 
-    def factors(self, marginal: Sequence[gtsam.JacobianFactor], point: LinearisationPoint) -> Sequence[Factor]:
-        """Return factors in place of the marginal, which is on increments from the base, linearised at `point`."""
+    @property
+    def anchor(self) -> int:
+        """A variable that leaves with the others, but is in the marginal. What a condensation of this name gave for it
+        earlier is handed over apart."""
+
+    def factors(
+        self,
+        marginal: Sequence[gtsam.JacobianFactor],
+        earlier: Sequence[gtsam.JacobianFactor],
+        point: LinearisationPoint,
+    ) -> Sequence[Factor]:
+        """Return factors in place of both, which are on increments from the base, linearised at `point`."""

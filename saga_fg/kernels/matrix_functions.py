@@ -12,7 +12,61 @@ import math
 import numpy as np
 
 from saga_fg.kernels.array_types import FloatArray, IntArray
-from saga_fg.kernels.compilation import kernel
+from saga_fg.kernels.compilation import kernel, kernel_part
+
+
+@kernel_part
+def _add_product(out: FloatArray, A: FloatArray, B: FloatArray) -> None:
+    """Add A B to `out`."""
+    for a in range(A.shape[0]):
+        for c in range(A.shape[1]):
+            z = A[a, c]
+            if z != 0.0:
+                for b in range(B.shape[1]):
+                    out[a, b] += z * B[c, b]
+
+
+@kernel_part
+def _set_product(out: FloatArray, A: FloatArray, B: FloatArray) -> None:
+    """Set `out` to A B."""
+    for a in range(out.shape[0]):
+        for b in range(out.shape[1]):
+            out[a, b] = 0.0
+    _add_product(out, A, B)
+
+
+@kernel_part
+def _set_scaled(out: FloatArray, A: FloatArray, factor: float) -> None:
+    """Set `out` to A times a number: by loops, which compile in a tenth of the time of assigned slices."""
+    for a in range(out.shape[0]):
+        for b in range(out.shape[1]):
+            out[a, b] = A[a, b] * factor
+
+
+@kernel_part
+def _add_scaled(out: FloatArray, A: FloatArray, factor: float) -> None:
+    """Add A times a number to `out`."""
+    for a in range(out.shape[0]):
+        for b in range(out.shape[1]):
+            out[a, b] += A[a, b] * factor
+
+
+@kernel_part
+def _largest_row(M: FloatArray) -> float:
+    """Norm of M: the largest sum of magnitudes of a row."""
+    largest = 0.0
+    for a in range(M.shape[0]):
+        total = 0.0
+        for b in range(M.shape[1]):
+            total += abs(M[a, b])
+        largest = max(largest, total)
+    return largest
+
+
+@kernel_part
+def _halvings(norm: float, radius: float) -> int:
+    """Number of halvings after which a norm is at most `radius`."""
+    return math.ceil(math.log2(norm / radius)) if radius < norm < math.inf else 0
 
 
 @kernel("f3 f3 f i i i f")
@@ -28,93 +82,76 @@ def phi_and_noise(
     Z, product, term, turned = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
     phi, doubled = np.empty((order + 1, d, d)), np.empty((order + 1, d, d))
     for i in range(m):
-        largest = 0.0
-        for a in range(d):
-            total = 0.0
-            for b in range(d):
-                total += abs(M[i, a, b])
-            largest = max(largest, total)
-        doublings = 0
-        norm = largest * dt
-        if norm > radius and norm < math.inf:
-            doublings = math.ceil(math.log2(norm / radius))
+        doublings = _halvings(_largest_row(M[i]) * dt, radius)
         h = dt / 2.0**doublings
-        for a in range(d):
-            for b in range(d):
-                Z[a, b] = M[i, a, b] * h
+        _set_scaled(Z, M[i], h)
         inverse = 1.0  # 1 / (order + degree)!
         for j in range(2, order + degree + 1):
             inverse /= j
-        phi[order] = 0.0
         for a in range(d):
-            phi[order, a, a] = inverse
+            for b in range(d):
+                phi[order, a, b] = inverse if a == b else 0.0
         for j in range(degree - 1, -order - 1, -1):  # phi_order by Horner's rule, then the lower ones
             k = order + min(j, 0)
             inverse *= order + j + 1
-            source = phi[min(k + 1, order)] if j < 0 else phi[order]
+            _set_product(product, Z, phi[min(k + 1, order)] if j < 0 else phi[order])
             for a in range(d):
-                for b in range(d):
-                    product[a, b] = 0.0
-                for c in range(d):
-                    z = Z[a, c]
-                    if z != 0.0:
-                        for b in range(d):
-                            product[a, b] += z * source[c, b]
                 product[a, a] += inverse
-            for a in range(d):
-                for b in range(d):
-                    phi[k, a, b] = product[a, b]
+            _set_scaled(phi[k], product, 1.0)
         Q = noise[i]
-        for a in range(d):
-            for b in range(d):
-                term[a, b] = Qc[i, a, b] * h
-                Q[a, b] = term[a, b]
+        _set_scaled(term, Qc[i], h)
+        _set_scaled(Q, term, 1.0)
         for j in range(2, noise_degree + 1):
-            for a in range(d):
-                for b in range(d):
-                    product[a, b] = 0.0
-                for c in range(d):
-                    z = Z[a, c]
-                    if z != 0.0:
-                        for b in range(d):
-                            product[a, b] += z * term[c, b]
+            _set_product(product, Z, term)
             for a in range(d):
                 for b in range(d):
                     term[a, b] = (product[a, b] + product[b, a]) / j
                     Q[a, b] += term[a, b]
         for _ in range(doublings):
-            for a in range(d):  # Q + phi_0 Q phi_0^T
-                for b in range(d):
-                    total = 0.0
-                    for c in range(d):
-                        total += phi[0, a, c] * Q[c, b]
-                    turned[a, b] = total
             for a in range(d):
                 for b in range(d):
-                    total = 0.0
-                    for c in range(d):
-                        total += turned[a, c] * phi[0, b, c]
-                    product[a, b] = Q[a, b] + total
-            Q[:] = product
+                    term[a, b] = phi[0, b, a]
+            _set_product(turned, phi[0], Q)
+            _add_product(Q, turned, term)  # Q + phi_0 Q phi_0^T
             for k in range(order + 1):
-                for a in range(d):
-                    for b in range(d):
-                        total = 0.0
-                        for c in range(d):
-                            total += phi[0, a, c] * phi[k, c, b]
-                        factor = 1.0
-                        for j in range(k, 0, -1):  # phi_j / (k - j)!
-                            total += phi[j, a, b] * factor
-                            factor /= k - j + 1
-                        doubled[k, a, b] = total / 2.0**k
-            phi[:] = doubled
+                _set_product(product, phi[0], phi[k])
+                factor = 1.0
+                for j in range(k, 0, -1):  # phi_j / (k - j)!
+                    _add_scaled(product, phi[j], factor)
+                    factor /= k - j + 1
+                _set_scaled(doubled[k], product, 1 / 2.0**k)
+            for k in range(order + 1):
+                _set_scaled(phi[k], doubled[k], 1.0)
         for a in range(d):
             for b in range(a):
                 middle = (Q[a, b] + Q[b, a]) / 2
                 Q[a, b] = middle
                 Q[b, a] = middle
-        phis[:, i] = phi
+        for k in range(order + 1):
+            _set_scaled(phis[k, i], phi[k], 1.0)
     return phis, noise
+
+
+@kernel_part
+def _exponential_series(out: FloatArray, M: FloatArray, h: float) -> None:
+    """Taylor series of exp(M h) by Horner's rule into `out` (degree + 1, d, d): from its innermost bracket, last, to
+    the whole."""
+    degree, d, Z = out.shape[0] - 1, M.shape[0], np.empty(M.shape)
+    for t in range(degree, -1, -1):
+        for a in range(d):
+            for b in range(d):
+                out[t, a, b] = 1.0 if a == b else 0.0
+        if t < degree:
+            _set_scaled(Z, M, h / (t + 1))
+            _add_product(out[t], Z, out[t + 1])
+
+
+@kernel_part
+def _squares(out: FloatArray, M: FloatArray) -> None:
+    """M, M^2, M^4, ... into `out` (count + 1, d, d)."""
+    _set_scaled(out[0], M, 1.0)
+    for t in range(out.shape[0] - 1):
+        _set_product(out[t + 1], out[t], out[t])
 
 
 @kernel("f3 i1 f3 f3 i1 f i f")
@@ -131,92 +168,39 @@ def coupling_integrals(
             for b in range(p):
                 rows[i, a] += abs(M[i, a, b])
     for j in range(len(A)):
-        for a in range(q):
-            total = 0.0
-            for b in range(q):
-                total += abs(A[j, a, b])
-            largest = max(largest, total)
+        largest = max(largest, _largest_row(A[j]))
     for e in range(m):
         for a in range(p):
             total = rows[at[e], a]
             for b in range(q):
                 total += abs(C[e, a, b])
             largest = max(largest, total)
-    doublings, norm = 0, largest * dt
-    if norm > radius and norm < math.inf:
-        doublings = math.ceil(math.log2(norm / radius))
+    doublings = _halvings(largest * dt, radius)
     h = dt / 2.0**doublings
     # second[j, t]: what the series of exp(A_j h) has come to; then the squares of both exponentials
     second, doubled = np.empty((len(A), degree + 1, q, q)), np.empty((len(A), doublings + 1, q, q))
     first, made = np.empty((len(M), doublings + 1, p, p)), np.zeros(len(M), dtype=np.bool_)
     for j in range(len(A)):
-        second[j, degree] = np.eye(q)
-        for t in range(degree, 0, -1):
-            for a in range(q):
-                for b in range(q):
-                    total = 1.0 if a == b else 0.0
-                    for c in range(q):
-                        total += A[j, a, c] * h / t * second[j, t, c, b]
-                    second[j, t - 1, a, b] = total
-        doubled[j, 0] = second[j, 0]
-        for t in range(doublings):
-            for a in range(q):
-                for b in range(q):
-                    total = 0.0
-                    for c in range(q):
-                        total += doubled[j, t, a, c] * doubled[j, t, c, b]
-                    doubled[j, t + 1, a, b] = total
+        _exponential_series(second[j], A[j], h)
+        _squares(doubled[j], second[j, 0])
     result = np.empty((m, p, q))
-    corner, product, square = np.empty((p, q)), np.empty((p, q)), np.empty((p, p))
+    corner, product, own = np.empty((p, q)), np.empty((p, q)), np.empty((degree + 1, p, p))
     for e in range(m):
         i, j = at[e], of[e]
         if doublings > 0 and not made[i]:
             made[i] = True
-            first[i, 0] = np.eye(p)
-            for t in range(degree, 0, -1):
-                for a in range(p):
-                    for b in range(p):
-                        square[a, b] = 1.0 if a == b else 0.0
-                    for c in range(p):
-                        z = M[i, a, c] * h / t
-                        if z != 0.0:
-                            for b in range(p):
-                                square[a, b] += z * first[i, 0, c, b]
-                first[i, 0] = square
-            for t in range(doublings):
-                for a in range(p):
-                    for b in range(p):
-                        total = 0.0
-                        for c in range(p):
-                            total += first[i, t, a, c] * first[i, t, c, b]
-                        first[i, t + 1, a, b] = total
-        corner[:] = 0.0
+            _exponential_series(own, M[i], h)
+            _squares(first[i], own[0])
+        _set_scaled(corner, C[e], 0.0)
         for t in range(degree, 0, -1):
-            for a in range(p):
-                for b in range(q):
-                    product[a, b] = 0.0
-                for c in range(p):
-                    z = M[i, a, c]
-                    if z != 0.0:
-                        for b in range(q):
-                            product[a, b] += z * corner[c, b]
-                for c in range(q):
-                    z = C[e, a, c]
-                    if z != 0.0:
-                        for b in range(q):
-                            product[a, b] += z * second[j, t, c, b]
+            _set_product(product, M[i], corner)
+            _add_product(product, C[e], second[j, t])
             for a in range(p):
                 for b in range(q):
                     corner[a, b] = product[a, b] * h / t
         for t in range(doublings):
-            for a in range(p):
-                for b in range(q):
-                    total = 0.0
-                    for c in range(p):
-                        total += first[i, t, a, c] * corner[c, b]
-                    for c in range(q):
-                        total += corner[a, c] * doubled[j, t, c, b]
-                    product[a, b] = total
-            corner[:] = product
-        result[e] = corner
+            _set_product(product, first[i, t], corner)
+            _add_product(product, corner, doubled[j, t])
+            _set_scaled(corner, product, 1.0)
+        _set_scaled(result[e], corner, 1.0)
     return result

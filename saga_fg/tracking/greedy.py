@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.errors import InputError
-from saga_fg.model.sensor import Sensor, sensor_model
+from saga_fg.errors import require_type
+from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
@@ -80,8 +81,9 @@ class GreedyTracker:
     """Same methods as `saga_fg.tracking.Tracker`; a frame that comes late, up to `max_delay`, is used as a new one."""
 
     def __init__(self, settings: GreedySettings | None = None, sensors: Mapping[str, Sensor] | None = None) -> None:
-        self.settings = settings or GreedySettings()
-        self.sensors = dict(sensors or {})
+        self.settings = GreedySettings() if settings is None else settings
+        require_type("settings", self.settings, GreedySettings)
+        self.sensors = checked_sensors(sensors)
         self.time_verdict: TimeVerdict = "accepted"  # of the latest frame
         self._clock = Clock()
         self._next_id = 1
@@ -97,8 +99,7 @@ class GreedyTracker:
 
         Raises `InputError` for a frame that can't be used; the tracker is then as it was before.
         """
-        if not isinstance(frame, Frame):
-            raise InputError(f"frame: expected a Frame, got {type(frame).__name__}")
+        require_type("frame", frame, Frame)
         sensor = sensor_model(self.sensors, frame.sensor)
         detections = sensor.in_world(frame)
         settings, timestamp = self.settings, frame.timestamp + sensor.time_offset
@@ -164,6 +165,7 @@ class GreedyTracker:
 
     def restore(self, snapshot: GreedySnapshot) -> None:
         """Continue from a snapshot of a tracker of the same settings."""
+        require_type("snapshot", snapshot, GreedySnapshot)
         self._memory, self._next_id, self._clock = snapshot.memory, snapshot.next_id, snapshot.clock
         self.time_verdict = snapshot.time_verdict
 
@@ -174,15 +176,18 @@ class GreedyTracker:
         if len(memory.id) == 0 or len(boxes) == 0:
             return match
         projected = memory.position[:, :2] + memory.velocity * (now - memory.last_seen)[:, None]
-        distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - projected[None], -1, 0))
         limit = class_numbers(self.settings.max_distance, lambda: GreedySettings().max_distance[DEFAULT], boxes.label)
-        possible = (boxes.label[:, None] == memory.label[None]) & (distance <= limit[:, None])
-        distance = np.where(possible, distance, np.inf)
-        for d in np.argsort(-p, kind="stable"):
-            t = int(distance[d].argmin())
-            if np.isfinite(distance[d, t]):
-                match[d] = t
-                distance[:, t] = np.inf
+        d, t = near_pairs(boxes.position[:, :2], projected, limit * (1 + 1e-9))
+        distance = np.hypot(*(boxes.position[d, :2] - projected[t]).T)
+        possible = (boxes.label[d] == memory.label[t]) & (distance <= limit[d])
+        d, t, distance = d[possible], t[possible], distance[possible]
+        free = np.ones(len(memory.id), dtype=bool)
+        turn = np.empty(len(boxes), dtype=np.int64)
+        turn[np.argsort(-p, kind="stable")] = np.arange(len(boxes))
+        order = np.lexsort((t, distance, turn[d]))
+        for one, other in zip(d[order].tolist(), t[order].tolist(), strict=True):
+            if match[one] < 0 and free[other]:
+                match[one], free[other] = other, False
         return match
 
 

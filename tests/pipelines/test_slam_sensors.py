@@ -51,7 +51,7 @@ def test_in_a_tunnel_the_wheels_say_how_far() -> None:
     assert helped.covariances[-1, 3, 3] < 0.1
 
 
-def test_over_a_field_gps_and_wheels_carry_the_pose() -> None:
+def test_over_a_field_gps_and_wheels_carry_the_pose(caplog: pytest.LogCaptureFixture) -> None:
     scans, speed = braking_drive(open_field())
     rng, times = np.random.default_rng(1), PERIOD * np.arange(len(speed))
     fixes = scans.world_T_ego[:, :3, 3] + rng.normal(0, 0.5, (len(speed), 3))
@@ -59,6 +59,7 @@ def test_over_a_field_gps_and_wheels_carry_the_pose() -> None:
     log = SensorLog({"gps": np.column_stack([times, fixes]), "wheels": np.column_stack([times, speed])})
     found = lidar_slam(scans, settings=PLAIN, log=log)
     assert np.linalg.norm(found.trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1).max() < 1.0
+    assert re.search(r"gps: 1 of \d+ fixes lie more than 9 deviations off, and hardly count", caplog.text)
     assert all("across the road" in motions for motions in found.degenerate[1:])
     assert found.misfits == {}
 
@@ -114,3 +115,11 @@ def test_fixes_are_placed_where_the_recording_begins(tmp_path: Path) -> None:
     log = sensor_log(records, "", [f"gps={table}"], 0, TIMES)
     assert log is not None
     np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, 11.132, 3], [0, 22.264, 3]], rtol=1e-3, atol=1e-6)
+    of_map = (49.001, 8.4, 90.0)  # 111 m north of the records, 10 m below
+    log = sensor_log(records, "", [f"gps={table}"], 0, TIMES, of_map)
+    assert log is not None
+    np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, -100.19, 13], [0, -89.06, 13]], rtol=1e-3, atol=1e-6)
+    records.write_text(11 * records.read_text())
+    from_records = sensor_log(records, "gps", [], 0, TIMES, of_map)
+    assert from_records is not None
+    np.testing.assert_allclose(from_records.tables["gps"][:, 1:].mean(axis=0), [0, -111.32, 10], atol=2.0)

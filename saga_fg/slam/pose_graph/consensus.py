@@ -57,9 +57,10 @@ class Consensus:
     kept: BoolArray
 
 
-def consensus(graph: PoseGraph) -> Consensus:
+def consensus(graph: PoseGraph, too_wide: bool = True) -> Consensus:
     """The graph without false loops; priors and observations of landmarks are trusted, as odometry is.
 
+    too_wide: covariances may be far too large, as in files; else the gate is c' alone.
     Raises `InputError` for a graph that measurements between poses do not connect.
     """
     apart = graph.components() != 0
@@ -73,7 +74,7 @@ def consensus(graph: PoseGraph) -> Consensus:
     problem = _Problem.of(graph)
     values = graph_values(placed(graph, _spanning_start(graph, ~loop)))
     values, weights = _graduated(problem, values, loop)
-    values, kept = _snooped(problem, values, loop, weights > 0.5)
+    values, kept = _snooped(problem, values, loop, weights > 0.5, too_wide)
     return Consensus(chosen_edges(solved_graph(graph, values), kept), kept)
 
 
@@ -188,7 +189,7 @@ def _graduated(problem: _Problem, values: gtsam.Values, loop: BoolArray) -> tupl
 
 
 def _snooped(
-    problem: _Problem, values: gtsam.Values, loop: BoolArray, kept: BoolArray
+    problem: _Problem, values: gtsam.Values, loop: BoolArray, kept: BoolArray, too_wide: bool
 ) -> tuple[gtsam.Values, BoolArray]:
     """Take loops out and in, until all that are in pass the gate, and none besides."""
     rows = np.flatnonzero(loop)
@@ -201,7 +202,7 @@ def _snooped(
         squares[judged] = _judged(problem, values, rows[judged], kept)
         inside = kept[rows]
         gate = float(chi2.ppf(_CERTAIN, problem.k))
-        if inside.sum() >= _FEWEST:
+        if too_wide and inside.sum() >= _FEWEST:
             k = float(np.median(squares[inside])) / float(chi2.median(problem.k))
             gate = min(gate, _TAILS * k * problem.gate)
         judged = inside | (squares < 10 * problem.gate)  # the others stay far out
