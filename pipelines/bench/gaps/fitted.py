@@ -74,6 +74,7 @@ def bench_splits(
     scikit-learn.
     """
     runs: list[Run] = []
+    settings = replace(settings, real=settings.real and not source.complete)
     for split in splits:
         fitted: list[Contender] = []
         if split.train and "noise" in fits:
