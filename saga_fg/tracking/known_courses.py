@@ -100,9 +100,7 @@ def typical_speed(paths: Paths, way: FloatArray) -> tuple[FloatArray, FloatArray
     return _at(paths.weight * paths.speed, way) / np.maximum(weight, _LEAST), weight
 
 
-def _across(
-    paths: Paths, speed: FloatArray, unseen: FloatArray, course_time: float
-) -> tuple[FloatArray, FloatArray]:
+def _across(paths: Paths, speed: FloatArray, unseen: FloatArray, course_time: float) -> tuple[FloatArray, FloatArray]:
     """Rate (k,), 1/s, with which the velocity across paths settles, and its variance (k,), (m/s)^2.
 
     It is that within the path, of the correlation time `course_time`, and that of those that have begun to turn off
