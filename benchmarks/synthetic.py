@@ -97,7 +97,7 @@ CONTENDERS: Mapping[str, Callable[[SceneSettings, Sequence[Scene]], TrackConfig]
     GRAPH: lambda settings, scenes: sampled_config(settings).with_association("graph"),
     LEARNED: _learned,
 }
-"""How each contender tracks a cell, given scenes of it, of other seeds, to learn from."""
+"""Contenders by name: a tracker for a cell, given scenes of the cell with other seeds to learn from."""
 
 COMPARISONS = (
     *((SAGA, KF, figure) for figure in FIGURES),
@@ -112,7 +112,7 @@ SUMS: Mapping[str, Sums] = {
     "MOTP": lambda m: (float(m.position.values.sum()), float(len(m.position))),
     "IDS": lambda m: (float(m.switches), 1.0),
 }
-"""Of each figure, the sums over scenes whose ratio it is; identity switches are per scene."""
+"""The two sums over scenes whose ratio is each figure; identity switches are per scene."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,13 @@ class InputError(SagaError, ValueError):
     """A value, file or record is not what was expected; the text names where, which field, and what was expected."""
 
 
+def require_type(name: str, value: object, *types: type) -> None:
+    """Raise `InputError` unless `value` is an instance of one of `types`."""
+    if not isinstance(value, types):
+        wanted = " or ".join(each.__name__ for each in types)
+        raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}")
+
+
 class UnknownNodeError(SagaError, KeyError):
     """A node was named that the estimator or graph does not hold."""
 

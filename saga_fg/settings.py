@@ -14,9 +14,10 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from numbers import Real
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 
 
 @dataclass(frozen=True)
@@ -63,26 +64,36 @@ NonNegativeInt = Annotated[int, Range(0)]
 
 
 class Settings:
-    """Base of settings dataclasses: construction raises `InputError` for values outside their ranges and choices."""
+    """Base of settings dataclasses: construction raises `InputError` for values of other types, ranges and choices."""
 
     def __post_init__(self) -> None:
         cls: Any = type(self)
         for name, allowed in _allowed(cls):
             given = getattr(self, name)
-            if isinstance(allowed, Range) and allowed.ascending and list(given) != sorted(given):
-                raise InputError(f"{name}: expected ascending numbers, got {given!r}")
             for where, value in _values(name, given):
-                if isinstance(allowed, Range) and value not in allowed:
+                if isinstance(allowed, type):
+                    require_type(where, value, allowed)
+                if isinstance(allowed, Range) and not (isinstance(value, Real) and float(value) in allowed):
                     raise InputError(f"{where}: expected a {allowed}, got {value!r}")
                 if isinstance(allowed, tuple) and value not in allowed:
                     raise InputError(f"{where}: expected one of {', '.join(allowed)}, got {value!r}")
+            if isinstance(allowed, Range) and allowed.ascending and list(given) != sorted(given):
+                raise InputError(f"{name}: expected ascending numbers, got {given!r}")
 
 
 @cache
-def _allowed(cls: type) -> list[tuple[str, Range | tuple[str, ...]]]:
-    """The range or the choices of each field that has some."""
-    found = [(name, range_of(hint)) for name, hint in get_type_hints(cls, include_extras=True).items()]
+def _allowed(cls: type) -> list[tuple[str, Range | tuple[str, ...] | type]]:
+    """The range, the choices or the settings class of each field that has one."""
+    hints = get_type_hints(cls, include_extras=True).items()
+    found = [(name, range_of(hint) or _settings_class(hint)) for name, hint in hints]
     return [(name, allowed) for name, allowed in found if allowed is not None]
+
+
+def _settings_class(hint: Any) -> type | None:
+    """The settings class of a type hint or of the entries of its mapping; None where there is none, or a choice."""
+    if get_origin(hint) is Mapping:
+        hint = get_args(hint)[1]
+    return hint if isinstance(hint, type) and issubclass(hint, Settings) else None
 
 
 def range_of(hint: Any) -> Range | tuple[str, ...] | None:

@@ -93,7 +93,7 @@ class DetectionFileSource(DatasetSource):
 
     @property
     def how(self) -> TableImport:
-        """How the table of detections is read."""
+        """Options for reading the table of detections."""
         own = TableImport(
             pairs("--columns", self.columns),
             pairs("--classes", self.classes),

@@ -148,7 +148,7 @@ class DatasetSource(ABC):
 
     @property
     def title(self) -> str:
-        """What the recordings are called above a report."""
+        """Title of the recordings in reports."""
         return self.name
 
     @property
@@ -177,7 +177,7 @@ class DatasetSource(ABC):
         return ""
 
     def kept(self) -> Mapping[str, Any]:
-        """What a result has to say on how its recordings were read: values of JSON."""
+        """Options that a result keeps about how its recordings were read: values of JSON."""
         return {}
 
     def with_kept(self, kept: Mapping[str, Any]) -> Self:

@@ -54,7 +54,7 @@ class OccupancyGrid:
 
     @property
     def seen(self) -> FloatArray:
-        """How often a ray met each cell (W, H)."""
+        """Number of rays that met each cell (W, H)."""
         return self.hits + self.misses
 
     @property

@@ -26,6 +26,7 @@ from saga_fg.settings import Positive, PositiveInt, Settings, setting, settings_
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections
 
+_MAX_FOOT_HEIGHT = 0.6  # largest height above the ground of an object's lowest point, m
 _HEADINGS = np.radians(np.arange(0.0, 90.0, 2.0))
 _CLOSE = 0.1  # m, d0
 
@@ -56,7 +57,6 @@ class ClusterSettings(Settings):
     min_height: Positive = setting(0.25, "lowest height above the ground of clustered points, m")
     max_height: Positive = setting(2.6, "largest height above the ground of an object, m")
     max_range: Positive = setting(40.0, "largest distance from the sensor, m")
-    max_foot_height: Positive = setting(0.6, "largest height above the ground of an object's lowest point, m")
     min_points: PositiveInt = setting(10, "fewest points of an object")
     classes: Mapping[str, ObjectSize] = settings_group(_sizes, "sizes by class")
 
@@ -71,7 +71,7 @@ def detect_clusters(points: FloatArray, settings: ClusterSettings | None = None)
     candidates = [
         _detection(points[rows], float(height[rows].max()), s)
         for rows in clusters_from_above(points, s.cell)
-        if len(rows) >= s.min_points and height[rows].max() <= s.max_height and height[rows].min() <= s.max_foot_height
+        if len(rows) >= s.min_points and height[rows].max() <= s.max_height and height[rows].min() <= _MAX_FOOT_HEIGHT
     ]
     found = [candidate for candidate in candidates if candidate is not None]
     if not found:

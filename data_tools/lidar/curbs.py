@@ -24,14 +24,15 @@ import numpy as np
 
 from data_tools.lidar.voxels import cell_order_statistics
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.settings import Positive, PositiveInt, Range, Settings, setting
+from saga_fg.settings import Positive, Range, Settings, setting
+
+_SECTORS = 180  # number of sectors around the sensor
 
 
 @dataclass(frozen=True)
 class CurbSettings(Settings):
     """Detection of points on curbs."""
 
-    sectors: PositiveInt = setting(180, "number of sectors around the sensor")
     spacing: Positive = setting(0.25, "spacing of the height profile, m")
     min_range: Positive = setting(2.5, "nearest distance from the sensor, m")
     max_range: Positive = setting(20.0, "largest distance from the sensor, limited by the spacing of the rings, m")
@@ -52,11 +53,11 @@ def extract_curbs(points: FloatArray, height: FloatArray, settings: CurbSettings
         return np.empty((0, 3))
     steps = int(np.ceil((s.max_range - s.min_range) / s.spacing))
     turn = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
-    sector = (turn * s.sectors).astype(np.int64) % s.sectors
+    sector = (turn * _SECTORS).astype(np.int64) % _SECTORS
     bin_ = sector * steps + ((distance - s.min_range) / s.spacing).astype(np.int64)
-    profile = cell_order_statistics(points[:, 2], bin_, s.sectors * steps, 2).reshape(s.sectors, steps)
+    profile = cell_order_statistics(points[:, 2], bin_, _SECTORS * steps, 2).reshape(_SECTORS, steps)
     row, step = _first_steps(profile, s)
-    angle = ((row + 0.5) / s.sectors - 0.5) * 2 * np.pi
+    angle = ((row + 0.5) / _SECTORS - 0.5) * 2 * np.pi
     out = s.min_range + (step + 0.5) * s.spacing
     return np.column_stack([out * np.cos(angle), out * np.sin(angle), profile[row, step]])
 

@@ -27,7 +27,7 @@ AXES = ("roll", "pitch", "heading", "along the road", "across the road", "vertic
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """Which motions of a scan the map determines.
+    """Motions of a scan that the map determines.
 
     surfels      (6,) number of surfels that face each of six orthogonal motions, ascending
     needed       number that a motion needs to be determined

@@ -1,4 +1,4 @@
-"""How much of what stands above the ground two registered submaps share: the proof of a place.
+"""Share of the structure above the ground that two registered submaps have in common: the proof of a place.
 
 Ground lies on ground everywhere, so it proves nothing; and what only one of the two has seen says nothing either.
 """

@@ -24,7 +24,11 @@ from scipy.spatial import cKDTree
 from data_tools.lidar.surfels import surfels_of
 from data_tools.lidar.voxels import voxel_downsample
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.settings import Positive, PositiveInt, Settings, setting
+from saga_fg.settings import Positive, Settings, setting
+
+_MIN_COSINE = 0.97  # least cosine between normals of one wall
+_MAX_THICKNESS = 0.15  # largest distance of a surfel from the plane of its wall, m
+_MIN_SURFELS = 8  # fewest surfels of a wall
 
 
 @dataclass(frozen=True)
@@ -34,10 +38,7 @@ class PlaneSettings(Settings):
     surfel_size: Positive = setting(1.0, "voxel size of the surfels, m")
     max_range: Positive = setting(50.0, "largest distance from the sensor, m")
     max_tilt: Positive = setting(0.15, "largest z component of the normal of a wall")
-    min_cosine: Positive = setting(0.97, "least cosine between normals of one wall")
-    max_thickness: Positive = setting(0.15, "largest distance of a surfel from the plane of its wall, m")
     max_gap: Positive = setting(3.0, "largest gap within a wall, m")
-    min_surfels: PositiveInt = setting(8, "fewest surfels of a wall")
     min_length: Positive = setting(3.0, "least length of a wall, m")
     noise: Positive = setting(0.03, "standard deviation of surfels across their wall, m")
     ground_noise: Positive = setting(0.02, "standard deviation of surfels of the ground, m")
@@ -94,7 +95,7 @@ def fit_ground(ground: FloatArray, settings: PlaneSettings | None = None, reach:
     near = ground[np.hypot(ground[:, 0], ground[:, 1]) <= reach]
     near = near[voxel_downsample(near, s.surfel_size)]
     for _ in range(3):
-        if len(near) < 3 * s.min_surfels:
+        if len(near) < 3 * _MIN_SURFELS:
             return None
         plane = fit_plane(near, s.ground_noise)
         off = np.abs(near @ plane.coefficients[:3] + plane.coefficients[3])
@@ -109,19 +110,19 @@ def extract_walls(points: FloatArray, settings: PlaneSettings | None = None) -> 
     surfels = surfels_of(points, s.surfel_size)
     surfels = surfels.select(surfels.flat & (np.abs(surfels.normal[:, 2]) <= s.max_tilt))
     mean, normal = surfels.mean, surfels.normal
-    coplanar = np.abs(normal @ normal.T) >= s.min_cosine
+    coplanar = np.abs(normal @ normal.T) >= _MIN_COSINE
     across = np.abs(normal @ mean.T - np.einsum("ni,ni->n", normal, mean)[:, None])
-    coplanar &= (across <= s.max_thickness) & (s.max_thickness >= across.T)
+    coplanar &= (across <= _MAX_THICKNESS) & (_MAX_THICKNESS >= across.T)
     walls: list[Plane] = []
     left = np.ones(len(mean), dtype=np.bool_)
     while left.any():
         support = coplanar[:, left].sum(axis=1) * left
         best = int(support.argmax())
-        if support[best] < s.min_surfels:
+        if support[best] < _MIN_SURFELS:
             break
         rows = _connected(mean, np.flatnonzero(coplanar[best] & left), best, s.max_gap)
         left[rows] = left[best] = False
-        if len(rows) < s.min_surfels:
+        if len(rows) < _MIN_SURFELS:
             continue
         wall = fit_plane(mean[rows], s.noise)
         if np.hypot(*(wall.extent[1] - wall.extent[0])[:2]) >= s.min_length and abs(wall.coefficients[2]) <= s.max_tilt:

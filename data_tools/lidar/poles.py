@@ -19,6 +19,10 @@ from data_tools.lidar.voxels import clusters_from_above
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
+_MIN_FILLED = 0.5  # least share of half-metre steps of the height that contain points
+_CLEAR_RADIUS = 0.6  # radius around the axis without other objects, m
+_DEPTH_NOISE = 0.1  # standard deviation along the line of sight, from the unknown radius, m
+
 
 @dataclass(frozen=True)
 class PoleSettings(Settings):
@@ -30,14 +34,11 @@ class PoleSettings(Settings):
     min_length: Positive = setting(1.2, "least height from the lowest to the highest point, m")
     max_width: Positive = setting(0.6, "largest horizontal extent, m")
     min_points: PositiveInt = setting(8, "fewest points")
-    min_filled: Positive = setting(0.5, "least share of half-metre steps of the height that contain points")
-    clear_radius: Positive = setting(0.6, "radius around the axis without other objects, m")
     clear_share: Positive = setting(
         0.1, "the same radius as a share of the range, against columns of walls at grazing angles"
     )
     noise: Positive = setting(0.05, "standard deviation of the axis, m")
     bearing_noise: Positive = setting(0.006, "standard deviation across the line of sight, rad")
-    depth_noise: Positive = setting(0.1, "standard deviation along the line of sight, from the unknown radius, m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ def extract_poles(
     for candidate in slender:
         pole = _pole(candidate, s)
         around = everything[
-            tree.query_ball_point(pole.foot[:2], max(s.clear_radius, s.clear_share * float(np.hypot(*pole.foot[:2]))))
+            tree.query_ball_point(pole.foot[:2], max(_CLEAR_RADIUS, s.clear_share * float(np.hypot(*pole.foot[:2]))))
         ]
         level = (around[:, 2] >= pole.foot[2]) & (around[:, 2] <= pole.top)
         if level.sum() <= 1.2 * len(candidate):
@@ -89,12 +90,12 @@ def _slender(points: FloatArray, clusters: Sequence[IntArray], s: PoleSettings) 
     low, high = np.minimum.reduceat(grouped, start), np.maximum.reduceat(grouped, start)
     size = high - low
     thin = (count >= s.min_points) & (size[:, :2].max(axis=1) <= s.max_width) & (size[:, 2] >= s.min_length)
-    return [clusters[k] for k in np.flatnonzero(thin).tolist() if _filled(points[clusters[k], 2], s)]
+    return [clusters[k] for k in np.flatnonzero(thin).tolist() if _filled(points[clusters[k], 2])]
 
 
-def _filled(height: FloatArray, s: PoleSettings) -> bool:
+def _filled(height: FloatArray) -> bool:
     steps = np.floor((height - height.min()) / 0.5)
-    return bool(len(np.unique(steps)) >= s.min_filled * np.ceil(np.ptp(height) / 0.5))
+    return bool(len(np.unique(steps)) >= _MIN_FILLED * np.ceil(np.ptp(height) / 0.5))
 
 
 def _pole(points: FloatArray, s: PoleSettings) -> Pole:
@@ -106,5 +107,5 @@ def _pole(points: FloatArray, s: PoleSettings) -> Pole:
     axis = mean + np.pi / 4 * radius * sight
     covariance = np.cov(points[:, :2].T) / len(points) + s.noise**2 * np.eye(2)
     covariance += (s.bearing_noise * float(np.hypot(*mean))) ** 2 * np.outer(aside, aside)
-    covariance += s.depth_noise**2 * np.outer(sight, sight)
+    covariance += _DEPTH_NOISE**2 * np.outer(sight, sight)
     return Pole(np.append(axis, points[:, 2].min()), float(points[:, 2].max()), radius, covariance)

@@ -33,8 +33,10 @@ from data_tools.lidar.surfels import SurfelMap, Surfels
 from saga_fg.errors import SagaError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import transform_points
-from saga_fg.settings import Positive, PositiveInt, Settings, setting
+from saga_fg.settings import PositiveInt, Settings, setting
 
+_TRANSLATION_TOLERANCE = 1e-3  # largest translation of the last step, m
+_ROTATION_TOLERANCE = 1e-4  # largest rotation of the last step, rad
 LEAST_PAIRS = 12  # twice the unknowns
 UNCONSTRAINED = 1e-3  # least ratio of the smallest to the largest eigenvalue of the information
 
@@ -54,8 +56,6 @@ class RegistrationSettings(Settings):
         "gauss-newton", "our own iterations, or Open3D's tensor ICP on the same surfels; loops are registered by ours"
     )
     max_iterations: PositiveInt = setting(30, "largest number of iterations")
-    translation_tolerance: Positive = setting(1e-3, "largest translation of the last step, m")
-    rotation_tolerance: Positive = setting(1e-4, "largest rotation of the last step, rad")
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,10 +148,7 @@ def _refined(
         if x is None:
             raise _UnconstrainedError(observability(points[rows], paired, J[:, 3:], w))
         T = _rigid(T @ gtsam.Pose3.Expmap(x).matrix())
-        converged = bool(
-            np.linalg.norm(x[3:]) < settings.translation_tolerance
-            and np.linalg.norm(x[:3]) < settings.rotation_tolerance
-        )
+        converged = bool(np.linalg.norm(x[3:]) < _TRANSLATION_TOLERANCE and np.linalg.norm(x[:3]) < _ROTATION_TOLERANCE)
     return _assessed(points[rows], paired, T, scale, free, step, converged)
 
 

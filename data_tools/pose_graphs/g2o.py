@@ -3,9 +3,9 @@
 The records are those of `data_tools.pose_graphs.g2o_records`. A measurement is first_T_second; landmarks are measured
 in the frame of the pose, and ids of poses and landmarks are of one numbering. g2o means the vector part of a quaternion
 by a rotation in space; like GTSAM, which everybody compares with, we read the matrix as that of a rotation vector.
-Offsets of sensors (PARAMS_SE3OFFSET) are taken into the measurements. FIX names poses to hold; the first pose is
-always held unless there are priors, and others are not: reading warns of them. Empty lines and those that begin with #
-are left out.
+Offsets of sensors (PARAMS_SE3OFFSET) are taken into the measurements, but for EDGE_SE3_XYZ_PRIOR: g2o means it of the
+pose itself. FIX names poses to hold; the first pose is always held unless there are priors, and others are not: reading
+warns of them. Empty lines and those that begin with # are left out.
 """
 
 from __future__ import annotations
@@ -23,12 +23,20 @@ from data_tools.pose_graphs.g2o_records import RECORDS, information, read_record
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import rotation_quaternion
-from saga_fg.slam.pose_graph import LandmarkObservations, ObservationKind, PointLandmarks, PoseGraph, PosePriors
+from saga_fg.slam.pose_graph import (
+    LandmarkObservations,
+    ObservationKind,
+    PointLandmarks,
+    PoseGraph,
+    PosePriors,
+    PositionPriors,
+)
 
 Tables = Mapping[str, TextTable]
 _POSE = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 _EDGE = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 _PRIOR = {2: "EDGE_PRIOR_SE2", 3: "EDGE_SE3_PRIOR"}
+_PLACE = {2: "EDGE_PRIOR_SE2_XY", 3: "EDGE_SE3_XYZ_PRIOR"}
 _LANDMARK = {2: "VERTEX_XY", 3: "VERTEX_TRACKXYZ"}
 _OBSERVED: dict[str, ObservationKind] = {
     "EDGE_SE2_XY": "point",
@@ -66,13 +74,13 @@ def read_g2o(path: str | Path) -> PoseGraph:
     first, second = (_rows(edges, named, name, ids) for named, name in zip(ends, ("first", "second"), strict=True))
     if (first == second).any():
         raise edges.fault(int(np.argmax(first == second)), "second: expected another pose than the first")
-    priors = _priors(tables, d, ids)
-    _warn_of_fixed(file, fixed, ids, priors)
+    priors, places = _priors(tables, d, ids), _places(tables, d, ids)
+    _warn_of_fixed(file, fixed, ids, priors is not None or places is not None)
     if whole:
         poses = transforms(tables[_POSE[d]], RECORDS[_POSE[d]])[order]
-        graph = PoseGraph(ids, poses, first, second, between, weights, priors=priors)
+        graph = PoseGraph(ids, poses, first, second, between, weights, priors=priors, places=places)
     else:
-        graph = PoseGraph.of_measurements(ids, first, second, between, weights, priors)
+        graph = PoseGraph.of_measurements(ids, first, second, between, weights, priors, places)
     marks = _landmarks(tables, graph, whole)
     _warn_of_unseen(file, tables, d, marks)
     return graph.with_landmarks(marks)
@@ -87,11 +95,11 @@ def _warn_of_unseen(file: Path, tables: Tables, d: int, marks: PointLandmarks | 
         log.warning("%s: %s %d is left out, no measurement is of it (%d so)", file, tag, unseen[0], len(unseen))
 
 
-def _warn_of_fixed(file: Path, fixed: Sequence[int], ids: IntArray, priors: PosePriors | None) -> None:
+def _warn_of_fixed(file: Path, fixed: Sequence[int], ids: IntArray, anchored: bool) -> None:
     """Warn once of poses that the file holds and we do not."""
-    held = [int(ids[0])] if priors is None else []
+    held = [] if anchored else [int(ids[0])]
     if others := [named for named in fixed if named not in held]:
-        holds = "the priors hold the graph" if priors is not None else f"pose {held[0]}, the first, is held"
+        holds = "the priors hold the graph" if anchored else f"pose {held[0]}, the first, is held"
         log.warning("%s: FIX %d has no effect, as %s (%d poses so)", file, others[0], holds, len(others))
 
 
@@ -106,6 +114,14 @@ def _priors(tables: Tables, d: int, ids: IntArray) -> PosePriors | None:
         adjoint = np.stack([gtsam.Pose3(T).AdjointMap() for T in sensor_T_pose])
         poses, weights = poses @ sensor_T_pose, adjoint.swapaxes(1, 2) @ weights @ adjoint
     return PosePriors(rows, poses, weights)
+
+
+def _places(tables: Tables, d: int, ids: IntArray) -> PositionPriors | None:
+    if (tag := _PLACE[d]) not in tables:
+        return None
+    table, record = tables[tag], RECORDS[tag]
+    rows = _rows(table, table.integers(0, "pose", 0, _LARGEST_ID), "pose", ids)
+    return PositionPriors(rows, record_values(table, record), information(table, record))
 
 
 def _landmarks(tables: Tables, graph: PoseGraph, guessed: bool) -> PointLandmarks | None:
@@ -175,7 +191,7 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
         lines += [
             f"{_LANDMARK[d]} {id_} {_numbers(row)}" for id_, row in zip(marks.ids.tolist(), marks.position, strict=True)
         ]
-    if d == 3 and (marks is not None or priors is not None):
+    if d == 3 and not graph.poses_alone:
         lines.append(f"{_OFFSET} 0 0 0 0 0 0 0 1")
     ends = np.stack([names[graph.first], names[graph.second]], axis=1)
     lines += _lines(_EDGE[d], ends, _columns(graph.first_T_second), _upper(graph.information, d))
@@ -183,6 +199,10 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
         pose = names[priors.pose][:, None]
         pose = pose if d == 2 else np.column_stack([pose, np.zeros_like(pose)])
         lines += _lines(_PRIOR[d], pose, _columns(priors.world_T_pose), _upper(priors.information, d))
+    if (places := graph.places) is not None:
+        pose = np.column_stack([names[places.pose], np.zeros_like(places.pose)])[:, : d - 1]
+        i, j = np.triu_indices(d)
+        lines += _lines(_PLACE[d], pose, places.position, places.information[:, i, j])
     if marks is not None:
         lines += [line for seen in marks.observations for line in _observation_lines(seen, names, marks.ids, d)]
     write_text(path, "\n".join(lines) + "\n")

@@ -3,6 +3,7 @@
     VERTEX_SE2 id x y heading                            VERTEX_SE3:QUAT id x y z qx qy qz qw
     EDGE_SE2 first second x y heading I                  EDGE_SE3:QUAT first second x y z qx qy qz qw I
     EDGE_PRIOR_SE2 pose x y heading I                    EDGE_SE3_PRIOR pose offset x y z qx qy qz qw I
+    EDGE_PRIOR_SE2_XY pose x y I                         EDGE_SE3_XYZ_PRIOR pose offset x y z I
     VERTEX_XY id x y                                     VERTEX_TRACKXYZ id x y z
     EDGE_SE2_XY pose landmark x y I                      EDGE_SE3_TRACKXYZ pose landmark offset x y z I
     EDGE_BEARING_SE2_XY pose landmark bearing I          PARAMS_SE3OFFSET id x y z qx qy qz qw
@@ -64,6 +65,8 @@ RECORDS = {
     "EDGE_SE3:QUAT": Record(3, ("first", "second"), _SE3, "information"),
     "EDGE_PRIOR_SE2": Record(2, ("pose",), _SE2, "information"),
     "EDGE_SE3_PRIOR": Record(3, ("pose", "offset"), _SE3, "information"),
+    "EDGE_PRIOR_SE2_XY": Record(2, ("pose",), _SE2[:2], "information"),
+    "EDGE_SE3_XYZ_PRIOR": Record(3, ("pose", "offset"), _SE3[:3], "information"),
     "VERTEX_XY": Record(2, ("id",), _SE2[:2]),
     "VERTEX_TRACKXYZ": Record(3, ("id",), _SE3[:3]),
     "EDGE_SE2_XY": Record(2, _OBSERVED, _SE2[:2], "information"),

@@ -150,7 +150,7 @@ def _walk(rng: np.random.Generator) -> IntArray:
 
 
 def _is_varied(nodes: IntArray, headings: list[int]) -> bool:
-    """Whether two stretches are passed twice, one of them in the opposite direction, none three times."""
+    """True if two stretches are passed twice, one of them in the opposite direction, and none three times."""
     first: dict[tuple[int, ...], int] = {}
     again = []
     for k, (a, b) in enumerate(zip(nodes[:-1].tolist(), nodes[1:].tolist(), strict=True)):

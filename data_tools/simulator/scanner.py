@@ -114,7 +114,7 @@ def _shorten(nearest: FloatArray, column: IntArray, distance: FloatArray) -> Non
 
 
 def _in_sight(centre: FloatArray, radius: FloatArray, origin: FloatArray, direction: FloatArray) -> BoolArray:
-    """Which circles (M, 2) rays of each origin can meet, seen from above (C, M)."""
+    """Mask (C, M) of the circles (M, 2) that rays of each origin can meet, seen from above."""
     bearing = np.arctan2(direction[..., 1], direction[..., 0])
     middle = np.arctan2(direction[..., 1].sum(axis=1), direction[..., 0].sum(axis=1))
     width = np.abs(wrap_angle(bearing - middle[:, None])).max(axis=1)

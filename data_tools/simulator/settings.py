@@ -135,11 +135,6 @@ class SurroundingSettings(Settings):
 
     parking_probability: Fraction = setting(0.35, "share of roadsides with a strip of parked cars")
     parking_occupancy: Fraction = setting(0.5, "share of parking places taken")
-    hedge_length: PositiveSpan = setting((4.0, 14.0), "length of a hedge, m")
-    hedge_gap: PositiveSpan = setting((5.0, 18.0), "gap between hedges, m")
-    hedge_height: Positive = setting(2.2, "height of a hedge, m")
-    building_length: PositiveSpan = setting((10.0, 30.0), "length of a building, m")
-    building_gap: PositiveSpan = setting((2.0, 25.0), "gap between buildings, m")
 
 
 @dataclass(frozen=True)

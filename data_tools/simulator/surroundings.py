@@ -14,6 +14,11 @@ from data_tools.simulator.settings import RoadworkSettings, SurroundingSettings
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 
+_HEDGE_LENGTH = (4.0, 14.0)  # length of a hedge, m
+_HEDGE_GAP = (5.0, 18.0)  # gap between hedges, m
+_HEDGE_HEIGHT = 2.2  # height of a hedge, m
+_BUILDING_LENGTH = (10.0, 30.0)  # length of a building, m
+_BUILDING_GAP = (2.0, 25.0)  # gap between buildings, m
 PARKING_WIDTH = 2.4  # m
 PAVEMENT_WIDTH = 3.5  # m
 SEGMENT = 8.0  # m, longest straight segment of a hedge
@@ -45,10 +50,10 @@ def sample_surroundings(
             pavements.append((min(inner, outer), max(inner, outer)))
         border += PAVEMENT_WIDTH
         depth = 10.0
-        intervals = _intervals(window, settings.building_length, settings.building_gap, rng)
+        intervals = _intervals(window, _BUILDING_LENGTH, _BUILDING_GAP, rng)
         occluders.append(_row(road, intervals, side * (border + depth / 2), depth, 9.0, "building"))
     if layout.hedge is not None:
-        intervals = _intervals(window, settings.hedge_length, settings.hedge_gap, rng)
+        intervals = _intervals(window, _HEDGE_LENGTH, _HEDGE_GAP, rng)
         pieces = [
             piece
             for start, end in intervals
@@ -56,7 +61,7 @@ def sample_surroundings(
                 np.linspace(start, end, int(np.ceil((end - start) / SEGMENT)) + 1), 2
             )
         ]
-        occluders.append(_row(road, np.array(pieces), layout.hedge, 1.0, settings.hedge_height, "hedge"))
+        occluders.append(_row(road, np.array(pieces), layout.hedge, 1.0, _HEDGE_HEIGHT, "hedge"))
     return Surroundings(Boxes.concatenate(parked), Boxes.concatenate(occluders), pavements)
 
 

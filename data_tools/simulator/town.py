@@ -54,7 +54,7 @@ class Town:
         return cls(crossings, world, np.concatenate(present))
 
     def at(self, time: float) -> StaticWorld:
-        """What stands there at a time, in laps."""
+        """The static world at a time, in laps: boxes present then, and all poles."""
         there = (self.present[:, 0] <= time) & (time < self.present[:, 1])
         return replace(self.world, boxes=self.world.boxes.select(there))
 

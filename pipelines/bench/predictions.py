@@ -1,4 +1,4 @@
-r"""How good predictions are: of objects that are detected now, at fixed horizons, against where they were then.
+r"""Errors of predictions at fixed horizons, of objects that are detected when they are predicted.
 
     error     |x - m|, m
     NLL       -log N(x; m, P) = (nees + log det(2 pi P)) / 2

@@ -65,7 +65,7 @@ class Score:
     cluster: tuple[str, ...] = ()
 
     def with_hota(self) -> Score:
-        """The same score, with HOTA of cars among the headline figures where it is known."""
+        """A copy with HOTA of cars among the headline figures, if it is known."""
         if self.hota_of is None:
             return self
         hota, others = self.hota_of(), self.figures_of

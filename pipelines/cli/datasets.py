@@ -65,7 +65,7 @@ def dataset_commands(
 
 
 def _without_dataset(verb: str, place: str) -> str:
-    """What to say where a file, or the folder of a bag, stands in the place of a dataset."""
+    """Error message for a file or folder given in place of a dataset's name."""
     path = Path(place)
     bag = path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file()
     if path.is_dir() and not bag:

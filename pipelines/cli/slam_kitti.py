@@ -13,7 +13,9 @@ from pipelines.cli.summary import counted
 
 if TYPE_CHECKING:
     from data_tools.lidar.scan import ScanSequence
+    from data_tools.sensor_logs import SensorLog
     from pipelines.slam.localisation import LocaliserSettings
+    from pipelines.slam.slam_map import SlamMap
 
 
 def kitti(
@@ -88,12 +90,14 @@ def kitti(
     from dataclasses import replace
 
     from data_tools.datasets.kitti import KittiScans, KittiTracking
+    from data_tools.datasets.kitti.oxts import read_origin
     from data_tools.files.atomic_files import check_writable_folder
     from pipelines.slam.configuration import load_slam_config
     from pipelines.slam.joint import path_tracker
     from pipelines.slam.lidar_results import write_lidar_slam
     from pipelines.slam.lidar_slam import lidar_slam
     from pipelines.slam.sensor_options import sensor_log
+    from pipelines.slam.slam_map import read_map
     from pipelines.slam.with_objects import with_objects
     from saga_fg.errors import InputError
 
@@ -103,11 +107,10 @@ def kitti(
         raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
     if known_map is None and guess is not None:
         raise InputError("--guess: expected with --map only")
-    not_localised = objects or sensors or sensor_logs or odometry == "oxts" or seed is not None or not landmarks
-    if known_map is not None and not_localised:
-        raise InputError(
-            "--map: expected without --objects, --sensors, --sensor-log, --seed, --no-landmarks and --odometry oxts"
-        )
+    if known_map is not None and (objects or odometry == "oxts" or not landmarks):
+        raise InputError("--map: expected without --objects, --no-landmarks and --odometry oxts")
+    if seed is not None and not sensors:
+        raise InputError("--seed: expected with --sensors only")
     window = online_window(online, lag)
     check_writable_folder(output)
     frames, settings = [], load_slam_config("kitti", config)
@@ -118,11 +121,15 @@ def kitti(
     training = dataroot / "training" if (dataroot / "training").is_dir() else dataroot
     blind = objects and odometry == "oxts" and not (training / "velodyne" / sequence).is_dir()
     recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans, blind=blind)
-    if known_map is not None:
-        _localise(recorded, known_map, guess, slam.localisation, output)
-        return
     records = training / "oxts" / f"{sequence}.txt"
-    log = sensor_log(records, sensors, sensor_logs or (), seed or 0, recorded.timestamps)
+    slam_map = None if known_map is None else read_map(known_map)
+    origin = None if slam_map is None else slam_map.origin
+    log = sensor_log(records, sensors, sensor_logs or (), seed or 0, recorded.timestamps, origin)
+    if slam_map is not None:
+        if origin is None and log is not None and "gps" in log.tables:
+            raise InputError(f"{known_map}: expected a map with origin.csv, its place on Earth, as fixes are given")
+        _localise(recorded, slam_map, guess, slam.localisation, output, log)
+        return
     with progress_bar() as progress:
         lidar = replace(
             slam.lidar,
@@ -136,9 +143,9 @@ def kitti(
     if objects:
         with working("objects"):
             together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers, log)
-            figures = write_lidar_slam(output, together, recorded, odometry=lidar.odometry)
+            figures = write_lidar_slam(output, together, recorded, odometry=lidar.odometry, origin=read_origin(records))
     else:
-        figures = write_lidar_slam(output, result, recorded, odometry=lidar.odometry)
+        figures = write_lidar_slam(output, result, recorded, odometry=lidar.odometry, origin=read_origin(records))
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
     counts.append(counted(figures["loops"], "loop"))
@@ -158,14 +165,19 @@ def kitti(
         typer.echo(f"mean scan-to-map residual: {1e3 * figures['scan_to_map_residual']:.1f} mm")
 
 
-def _localise(scans: ScanSequence, folder: Path, guess: str | None, settings: LocaliserSettings, output: Path) -> None:
+def _localise(
+    scans: ScanSequence,
+    slam_map: SlamMap,
+    guess: str | None,
+    settings: LocaliserSettings,
+    output: Path,
+    log: SensorLog | None,
+) -> None:
     from pipelines.slam.localisation import guess_of
     from pipelines.slam.localised_drive import localise, write_localised
-    from pipelines.slam.slam_map import read_map
 
-    slam_map = read_map(folder)
     with progress_bar() as progress:
-        found = localise(scans, slam_map, None if guess is None else guess_of(guess), settings, progress)
+        found = localise(scans, slam_map, None if guess is None else guess_of(guess), settings, progress, log)
     figures = write_localised(output, found, scans, slam_map)
     registered = (
         f"{figures['registered']} registered with the map, the first of them scan {figures['first_registered']}"

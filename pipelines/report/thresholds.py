@@ -12,7 +12,7 @@ from data_tools.evaluation.score_sweep import best_thresholds, score_sweep
 from pipelines.report.scenes import ReportScene
 
 PLAIN = 0.3
-"""Where there is no ground truth, or no score with which tracks are better than none."""
+"""Threshold without ground truth, or where no score makes tracks better than none."""
 
 
 def start_thresholds(scenes: Sequence[ReportScene]) -> dict[str, float]:

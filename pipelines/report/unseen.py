@@ -1,4 +1,4 @@
-"""How long tracks were not detected, for results that do not tell."""
+"""Time since each track's last detection, computed for results that do not hold it."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ class SmoothTask:
 
 
 def _reading(source: DatasetSource) -> str:
-    """How recordings are read, as a comment; empty where they say it themselves."""
+    """Options of reading recordings, as a comment; empty where recordings need none."""
     kept = source.kept()
     return f"# recordings read with {json.dumps(kept, sort_keys=True)}\n" if kept else ""
 

@@ -256,7 +256,7 @@ def _plain_rows(rows: Sequence[Any]) -> tuple[list[str], FloatArray] | None:
 
 
 def _checked_rows(rows: Sequence[Any]) -> tuple[list[str], FloatArray]:
-    """The same row by row; raises `InputError` for the first that is not as it should be."""
+    """Check row by row; raises `InputError` for the first bad one."""
     numbers = np.empty((len(rows), len(MEASURED)))
     labels = []
     for k, row in enumerate(rows):

@@ -1,7 +1,8 @@
 """The keyframes of LiDAR SLAM as a pose graph for other tools (g2o), and its landmarks as a table.
 
-The pose graph holds odometry and loops, and the poses as they were estimated; landmarks and sensors of the vehicle,
-which g2o has no records for, are left out: its own optimum is that of odometry and loops alone.
+The pose graph holds the first pose as a prior, odometry and loops as they were in the solution, the poses as estimated,
+and poles as points whose height is open. Walls, the ground and curbs, which its format has no records for, are in a
+table of all observations beside it (`pipelines.slam.saved_graph`). The vehicle's sensors are left out.
 """
 
 from __future__ import annotations
@@ -13,15 +14,19 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
-from pipelines.slam.lidar_slam_types import LidarSlamResult
+from pipelines.slam.lidar_slam_types import START, LidarSlamResult
+from pipelines.slam.scan_landmarks import POLE
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.pose_graph import PoseGraph
+from saga_fg.numerics.geometry import transform_points
+from saga_fg.slam.pose_graph import LandmarkObservations, PointLandmarks, PoseGraph, PosePriors
 from saga_fg.types.landmark import Landmark
+
+_HEIGHT = 100.0  # m, standard deviation of the height of an observed pole
 
 
 def pose_graph_of(result: LidarSlamResult) -> PoseGraph:
-    """Keyframes 0 .. M - 1 with the odometry between them and the loops; M > 1."""
-    odometry = result.drive.motions(result.drive.keyframes)
+    """Keyframes 0 .. M - 1 with the odometry between them and the loops, and poles from M on; M > 1."""
+    odometry = result.motions(result.drive.keyframes)
     pairs = [*pairwise(range(len(result.keyframes))), *((loop.first, loop.second) for loop in result.loops)]
     measured = [*(T for T, _ in odometry), *(loop.first_T_second for loop in result.loops)]
     covariances = np.array([*(P for _, P in odometry), *(loop.covariance for loop in result.loops)])
@@ -34,7 +39,29 @@ def pose_graph_of(result: LidarSlamResult) -> PoseGraph:
         second,
         np.array(measured),
         (information + information.swapaxes(1, 2)) / 2,
+        _poles(result),
+        PosePriors(np.zeros(1, dtype=np.int64), result.drive.poses[:1], np.linalg.inv(START)[None]),
     )
+
+
+def _poles(result: LidarSlamResult) -> PointLandmarks | None:
+    marks = {mark.number: mark for mark in result.landmarks if mark.kind == POLE}
+    seen = [one for one in result.observations if one.landmark in marks]
+    if not seen:
+        return None
+    numbers = np.array(sorted(marks), dtype=np.int64)
+    pose, landmark = (np.array([getattr(one, end) for one in seen], dtype=np.int64) for end in ("pose", "landmark"))
+    z, information = np.array([one.observation.value for one in seen]), np.zeros((len(seen), 3, 3))
+    information[:, :2, :2] = np.linalg.inv([one.observation.covariance for one in seen])
+    information[:, 2, 2] = _HEIGHT**-2
+    row = np.searchsorted(numbers, landmark)
+    height = np.zeros(len(numbers))
+    heights = [transform_points(result.world_T_lidar[k], point[None])[0, 2] for k, point in zip(pose, z, strict=True)]
+    np.add.at(height, row, heights)
+    height /= np.bincount(row, minlength=len(numbers))
+    places = np.column_stack([np.array([marks[number].state for number in numbers.tolist()]), height])
+    observed = LandmarkObservations("point", pose, row, z, information)
+    return PointLandmarks(len(result.keyframes) + numbers, (observed,), places)
 
 
 def write_landmark_table(path: Path, landmarks: Iterable[Landmark], pieces: Mapping[int, FloatArray]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from factors import Robust
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from saga_fg.graph import Additions, GraphView
 from saga_fg.slam.mapping import LandmarkObservations
@@ -19,12 +18,11 @@ class Loops:
 
     loops: Sequence[LoopClosure]
     epochs: Sequence[int]
-    robust: Robust
     name: str = "loops"
 
     def factors(self, view: GraphView) -> Additions:
         mine = [loop for loop in self.loops if self.epochs[loop.second] == view.epoch]
-        return Additions(factors=loop_factors(mine, self.epochs, self.robust))
+        return Additions(factors=loop_factors(mine, self.epochs, None))
 
 
 def known_providers(
@@ -36,4 +34,4 @@ def known_providers(
     for one in result.observations:
         if one.landmark in start:
             seen.setdefault(epochs[one.pose], []).append((one.landmark, one.observation))
-    return LandmarkObservations(seen, start, settings.robust), Loops(result.loops, epochs, settings.robust_loops)
+    return LandmarkObservations(seen, start, settings.robust), Loops(result.loops, epochs)

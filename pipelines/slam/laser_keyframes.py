@@ -40,7 +40,7 @@ def measured_by(first: int, second: int, fit: Fit) -> Measured:
 
 
 def determined(information: FloatArray) -> bool:
-    """Whether a registration tells the place in all directions: not along a bare corridor."""
+    """True if a registration determines the place in all directions: not along a bare corridor."""
     values = np.linalg.eigvalsh(information[:2, :2])
     return bool(values[0] > _DETERMINED * values[1])
 

@@ -30,6 +30,7 @@ from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
 from saga_fg.slam.pose_graph.running import RunningPoseGraph, way_along
 
+_SCAN_STEP = 0.1  # m: scans that moved less, and turned less than 3 degrees, are not registered
 _LEAST_POINTS = 20  # of a scan that is registered
 _WIDEST = 3.0  # m, half width of the search where wheels slipped: its time and memory grow with the square
 _POOR = 0.8  # share of a scan that lies on the local map, below which the pose is searched
@@ -46,7 +47,6 @@ class LaserSettings(Settings):
     largest_speed: Positive = setting(
         3.0, "m/s: steps of the wheels that are faster, and 1 m longer, count as standing still; raise for vehicles"
     )
-    scan_step: Positive = setting(0.1, "m: scans that moved less, and turned less than 3 degrees, are not registered")
     keyframe_step: Positive = setting(0.5, "m between keyframes, 0.2 to 2; smaller costs time")
     keyframe_turn: Positive = setting(0.5, "rad between keyframes")
     local_map: Positive = setting(10.0, "m of way whose keyframes scans are registered with")
@@ -104,7 +104,7 @@ class LaserSlam:
             return self._at
         way, turn = np.hypot(step[0, 2], step[1, 2]), abs(heading(step))
         predicted = self._at @ step
-        if (way < self.settings.scan_step and turn < np.deg2rad(3)) or len(points) < _LEAST_POINTS:
+        if (way < _SCAN_STEP and turn < np.deg2rad(3)) or len(points) < _LEAST_POINTS:
             self._matched.append(predicted)
             return self._now(predicted)
         self._at, self._odometry = self._registered(points, predicted, way, turn), wheels

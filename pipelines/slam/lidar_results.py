@@ -7,7 +7,7 @@ covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
 reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
 map/                        the points of each submap and its place, to localise in (`pipelines.slam.slam_map`)
-graph.g2o                   keyframes, odometry and loops
+graph.g2o, observations.csv keyframes, odometry, loops, landmarks: the whole graph (`pipelines.slam.saved_graph`)
 landmarks.json              each landmark; landmarks.csv: the same as a table, with shapes as WKT
 landmarks.ply               points along the poles and on the observed pieces of the walls
 tracks.csv                  objects, where there are any
@@ -32,15 +32,15 @@ from data_tools.files.atomic_files import atomic_directory, write_bytes
 from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_cloud
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
-from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.drive import KeyframeClouds
-from pipelines.slam.graph_export import pose_graph_of, write_landmark_table
+from pipelines.slam.graph_export import write_landmark_table
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.results import landmark_rows, object_paths, write_covariances, write_objects
+from pipelines.slam.saved_graph import write_graph
 from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
-from pipelines.slam.slam_map import SlamMap, write_map
+from pipelines.slam.slam_map import Origin, SlamMap, write_map
 from pipelines.slam.with_objects import SlamWithObjects
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
@@ -63,6 +63,7 @@ def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySett
         "keyframes": len(result.keyframes),
         "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
         "loops": len(result.loops),
+        "false_loops": len(result.false_loops),
         "submaps": len(result.submaps),
         "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
         "misfits": dict(result.misfits),
@@ -101,10 +102,11 @@ def write_lidar_slam(
     scans: ScanSequence,
     spacing: float = 0.2,
     odometry: OdometrySettings | None = None,
+    origin: Origin | None = None,
 ) -> dict[str, Any]:
     """Write all files of a run to a folder, or none; returns the metrics.
 
-    spacing: of the map's points, m; odometry: settings of the run
+    spacing: of the map's points, m; odometry: settings of the run; origin: of the world, on Earth
     """
     result, objects = (found, None) if isinstance(found, LidarSlamResult) else (found.slam, found.estimate)
     points = accumulated_map(result, spacing)
@@ -123,9 +125,8 @@ def write_lidar_slam(
         if len(points):
             (folder / "map").mkdir()
             clouds = [submap.points for submap in result.submaps]
-            write_map(folder / "map", SlamMap(clouds, result.world_T_submap))
-        if len(result.keyframes) > 1:
-            write_g2o(folder / "graph.g2o", pose_graph_of(result))
+            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin))
+        write_graph(folder, result)
         times = result.trajectory.timestamps[result.keyframes].tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
         write_cloud(folder / "map.ply", points)

@@ -30,9 +30,9 @@ from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
-from pipelines.slam.between_keyframes import BetweenKeyframes
+from pipelines.slam.between_keyframes import BetweenKeyframes, velocity_ahead
 from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, checked_step, motion, moved_pose, shared
-from pipelines.slam.lidar_slam_types import LidarSlamResult, SlamStep
+from pipelines.slam.lidar_slam_types import START, LidarSlamResult, SlamStep
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.moving_objects import MovingObjects, frames_at
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
@@ -40,7 +40,7 @@ from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmark
 from pipelines.slam.submap_loops import SubmapLoops
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.tracking import Progress
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray
@@ -57,7 +57,6 @@ from saga_fg.types.frame import Detections, Frame
 
 _LOG = logging.getLogger(__name__)
 OdometrySource = Literal["lidar", "oxts"]
-_START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
 CALIBRATED = OdometryNoise(
     turn_noise=1e-3,
@@ -132,7 +131,7 @@ class LidarSlam:
         of_sensors = sensor_providers(s.sensors, sensors, lidar_T_ego)
         self._providers = tuple(providers)
         self._new_graph = partial(SubmapGraph, settings=s.submaps, providers=[*of_sensors, *providers])
-        self._graph = self._new_graph(self._start, _START)
+        self._graph = self._new_graph(self._start, START)
         self._detectors = tuple(detectors)
         self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
         self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
@@ -141,7 +140,7 @@ class LidarSlam:
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
         self._measured = BetweenKeyframes(self._sensors, bool(self._providers), s.sensors.wheels.deviation)
         self._finished = False
-        self._closed, self._covariance = list[LoopClosure](), _START  # of the last keyframe's pose
+        self._closed, self._covariance = list[LoopClosure](), START  # of the last keyframe's pose
 
     @property
     def graph(self) -> SubmapGraph:
@@ -168,8 +167,7 @@ class LidarSlam:
         """
         if self._finished:
             raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
-        if not isinstance(scan, Scan):
-            raise InputError(f"scan: expected a Scan, got {type(scan).__name__}")
+        require_type("scan", scan, Scan)
         if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
             raise InputError(f"time: expected a finite number of seconds, got {time!r}")
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
@@ -183,8 +181,7 @@ class LidarSlam:
             moving = self._moving.boxes(time, detections, self._expected(time))
             scan = without_objects(scan, moving)
         if wheels is not None and "wheels" in self._sensors and isinstance(self._odometry, LidarOdometry):
-            ahead = self._ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]
-            placed = self._odometry.step(scan, time, np.concatenate([np.full(3, np.nan), ahead]))
+            placed = self._odometry.step(scan, time, velocity_ahead(wheels, self._ego_T_lidar))
         else:
             placed = checked_step(self._odometry.step(scan, time))
         if not self._keyframes:
@@ -215,7 +212,9 @@ class LidarSlam:
         if len(self._builder):
             self._close(self._graph.poses())
         solved = self._graph.finish()
-        self._finished = True
+        self._finished, chosen = True, solved.loops.kept.tolist()
+        if not all(chosen):
+            _LOG.warning("%d of %d loops contradict the others, and are left out", chosen.count(False), len(chosen))
         unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
         unknown = unjudged(solved.graph, self._sensors, self.settings.sensors)
         for text in (*unfit.values(), *unknown.values()):
@@ -231,7 +230,9 @@ class LidarSlam:
             solved.covariances,
             solved.landmarks,
             self._graph.observations(),
-            self._closed,
+            [loop for loop, kept in zip(self._closed, chosen, strict=True) if kept],
+            [loop for loop, kept in zip(self._closed, chosen, strict=True) if not kept],
+            solved.loops.inflation,
             self._degenerate,
             self._boxes,
             unfit,
@@ -260,7 +261,7 @@ class LidarSlam:
             last = self._keyframes[-1]
             moved = motion(self._poses[last:], self._covariances[last + 1 :])
         elif row:  # a detector or provider raised at the scans before
-            self._graph = self._new_graph(self._poses[row], _START + motion(self._poses, self._covariances[1:])[1])
+            self._graph = self._new_graph(self._poses[row], START + motion(self._poses, self._covariances[1:])[1])
         frame = self._measured.frame(self._times[row], detections)
         closes = self._graph.append(self._times[row], moved, seen, frame)
         self._measured.clear()

@@ -17,6 +17,8 @@ from saga_fg.slam.submaps import LoopClosure
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.landmark import Landmark
 
+START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
+
 
 @dataclass(frozen=True, eq=False)
 class SlamStep:
@@ -48,7 +50,9 @@ class LidarSlamResult:
     covariances    (M, 6, 6) of the keyframes' poses, (rotation, translation) in the sensor's frame, rad^2, m^2
     landmarks      of the map, those seen more than once
     observations   of landmarks, with the landmark and the keyframe of each
-    loops          that were closed, between keyframes
+    loops          that were closed and agree with each other, between keyframes
+    false_loops    those that do not, and are left out of the solution
+    inflation       deviations of odometry in it to those stated, as loops demand; at least 1
     degenerate     (K) motions that each scan left open, in words
     moving         (K) boxes of moving objects that were left out of each scan, in its frame
     misfits        what does not fit of the vehicle's sensors, in words, by their names
@@ -65,6 +69,8 @@ class LidarSlamResult:
     landmarks: Sequence[Landmark]
     observations: Sequence[AssociatedObservation]
     loops: Sequence[LoopClosure]
+    false_loops: Sequence[LoopClosure]
+    inflation: float
     degenerate: Sequence[tuple[str, ...]]
     moving: Sequence[Boxes]
     misfits: Mapping[str, str]
@@ -72,6 +78,10 @@ class LidarSlamResult:
     submaps: Sequence[Submap]
     world_T_submap: FloatArray
     world_T_lidar: FloatArray
+
+    def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
+        """Motions (4, 4) between scans by odometry, as `Drive.motions`, with the covariances of the solution."""
+        return [(T, self.inflation**2 * P) for T, P in self.drive.motions(rows)]
 
     @property
     def keyframes(self) -> IntArray:

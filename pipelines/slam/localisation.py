@@ -4,8 +4,10 @@
     where first   a guess, or place recognition: the points of the first metres, as a submap, are looked for among the
                   submaps of the map; the one that passes registration and shares enough structure is the place, if no
                   other does nearly as well
+                  A fix by GPS, in a map whose place on Earth is known, says around where
     thereafter    each keyframe is registered with the submaps around it. In a graph of keyframes, which marginalises
-                  what is older than `lag`, the result is a measured pose under a robust loss, beside odometry
+                  what is older than `lag`, the result is a measured pose under a robust loss, beside odometry and
+                  what the vehicle's sensors say
 
 Where a scan leaves motions open in the map, the measured pose is wide there. Ground and parallel walls fit elsewhere as
 well: so at the guess, and every few metres from then on, what stands above the ground is compared with the map. Where
@@ -17,6 +19,7 @@ them, those at the start backwards from the first.
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +35,7 @@ from data_tools.lidar import (
 )
 from data_tools.lidar.overlap import Structure
 from factors import Robust, pose_prior_factor
+from pipelines.slam.between_keyframes import BetweenKeyframes, velocity_ahead
 from pipelines.slam.drive import Drive, motion, moved_pose, shared
 from pipelines.slam.map_places import MapPlaces
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
@@ -44,7 +48,11 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import checked_transform, inverse_transform, transform_points, yaw_transform
 from saga_fg.settings import Fraction, NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import MeasuredMotion
+from saga_fg.slam.sensors import SensorName, SensorSettings, sensor_providers
+from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 
+_MAX_RESIDUAL = 0.3  # largest mean distance of the points of a scan from the map, m
+_MIN_PAIRS = 0.4  # least share of the points of a scan that the map must have surfels for
 _LOG = logging.getLogger(__name__)
 _GUESSED = np.diag([0.02, 0.02, 0.1, 1.0, 1.0, 0.5]) ** 2  # of a pose that was given or recognised
 _ACCURACY = np.diag([1e-3] * 3 + [0.03] * 3) ** 2  # of the map, rad and m
@@ -65,11 +73,10 @@ class LocaliserSettings(Settings):
     )
     radius: Positive = setting(80.0, "distance of the submaps that scans are registered with, m; higher: slower")
     scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
-    max_residual: Positive = setting(0.3, "largest mean distance of the points of a scan from the map, m")
-    min_pairs: Fraction = setting(0.4, "least share of the points of a scan that the map must have surfels for")
     lag: NonNegative = setting(2.0, "time over which keyframes are smoothed, s; 0: a filter")
     lost_after: Positive = setting(50.0, "way without a scan that fits after which the place is looked for again, m")
     robust_scale: Positive = setting(3.0, "residual from which the Cauchy loss discounts a measured pose, deviations")
+    sensors: SensorSettings = settings_group(SensorSettings, "GPS, IMU and wheels of the vehicle")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,16 +95,29 @@ class LocalisedStep:
 class Localiser:
     """Takes the scans of a drive in order of time, and says where they are in a map.
 
-    guess: map_T_lidar (4, 4) of the first scan, good to a metre or two and a tenth of a radian; None: it is looked for
+    guess       map_T_lidar (4, 4) of the first scan, good to a metre or two and a tenth of a radian; None: it is
+                looked for
+    sensors     of the vehicle whose measurements `step` gets, fixes in the map's frame
+    ego_T_lidar (4, 4) pose of the scanner on the vehicle
     """
 
     def __init__(
-        self, slam_map: SlamMap, guess: FloatArray | None = None, settings: LocaliserSettings | None = None
+        self,
+        slam_map: SlamMap,
+        guess: FloatArray | None = None,
+        settings: LocaliserSettings | None = None,
+        sensors: Collection[SensorName] = (),
+        ego_T_lidar: FloatArray | None = None,
     ) -> None:
         self.settings = settings or LocaliserSettings()
         self._odometry = LidarOdometry(self.settings.odometry)
         self._guess = None if guess is None else checked_transform("guess", guess)
         s = self.settings
+        self._sensors = tuple(sensors)
+        self._ego_T_lidar = np.eye(4) if ego_T_lidar is None else checked_transform("ego_T_lidar", ego_T_lidar)
+        self._of_sensors = self._new_providers()
+        self._measured = BetweenKeyframes(self._sensors, False, s.sensors.wheels.deviation)
+        self._fix: FloatArray | None = None  # the newest
         self._places = MapPlaces(slam_map, s.radius, s.min_overlap, s.scan_spacing, s.odometry.registration)
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry
         self._found: dict[int, FloatArray] = {}  # map_T_lidar of keyframes, as estimated when they came
@@ -113,9 +133,24 @@ class Localiser:
         self._surfels, self._centre = SurfelMap(SURFEL, np.inf), np.full(3, np.inf)
         self._structure, self._structure_frame = Structure.of(np.zeros((1, 3))), np.eye(4)
 
-    def step(self, scan: Scan, time: float) -> LocalisedStep:
-        """Place the next scan. Raises `InputError` for one that is not later than the one before."""
-        placed = self._odometry.step(scan, time)
+    def step(
+        self,
+        scan: Scan,
+        time: float,
+        imu: ImuSamples | None = None,
+        gps: GpsFix | None = None,
+        wheels: WheelSpeed | None = None,
+    ) -> LocalisedStep:
+        """Place the next scan; measurements of the vehicle's sensors as of `LidarSlam.step`.
+
+        Raises `InputError` for a scan that is not later than the one before, and for a sensor that was not named.
+        """
+        measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
+        self._measured.check(measured)
+        ahead = None if wheels is None else velocity_ahead(wheels, self._ego_T_lidar)
+        placed = self._odometry.step(scan, time, ahead)
+        self._measured.add(time, measured)
+        self._fix = self._fix if gps is None else gps.position
         self._poses.append(placed.map_T_lidar)
         covariances = shared(self._poses, placed)
         self._covariances[len(self._poses) - len(covariances) :] = covariances
@@ -131,6 +166,7 @@ class Localiser:
                 self._look_for(row, points, time)
             if self._smoother is not None and self._last != row:
                 self._add(row, points, time)
+            self._measured.clear()
         if self._smoother is None:
             return LocalisedStep(None, None, False)
         since = motion(self._poses[self._last :], self._covariances[self._last + 1 :])
@@ -149,7 +185,7 @@ class Localiser:
 
     @property
     def registered(self) -> BoolArray:
-        """Whether each scan (K,) so far was registered with the map, at a place that has not been given up since."""
+        """Mask (K,) of the scans so far that were registered with the map, without those withdrawn since."""
         return np.isin(np.arange(len(self._poses)), sorted(self._fits))
 
     @property
@@ -159,7 +195,7 @@ class Localiser:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the points looked for last fit several places of the map."""
+        """True if the last cloud searched for fits several places of the map."""
         return self._ambiguous
 
     def finish(self) -> None:
@@ -184,7 +220,10 @@ class Localiser:
     def _search(self, row: int, points: FloatArray, time: float) -> None:
         """Look for the points of the last keyframes in the map, and begin there."""
         query, frame = self._seen()
-        map_T_frame = self._places.recognised(query[voxel_downsample(query, 0.5)])
+        thin = query[voxel_downsample(query, 0.5)]
+        map_T_frame = None if self._fix is None else self._places.recognised(thin, self._fix)
+        if map_T_frame is None:
+            map_T_frame = self._places.recognised(thin)
         self._ambiguous, self._searched = self._places.ambiguous, self._way
         if map_T_frame is None:
             self._clouds = self._clouds[len(self._clouds) // 2 :]
@@ -202,8 +241,12 @@ class Localiser:
     def _begin(self, map_T_lidar: FloatArray) -> None:
         _LOG.info("place found at %s m", map_T_lidar[:3, 3].round(1).tolist())
         self._smoother, self._fitted = IncrementalSmoother(lag=self.settings.lag), self._way
+        self._of_sensors = self._new_providers()
         self._pose, self._covariance = map_T_lidar, _GUESSED
         self._proved, self._ambiguous = self._way, False
+
+    def _new_providers(self) -> list[FactorProvider]:
+        return sensor_providers(self.settings.sensors, self._sensors, inverse_transform(self._ego_T_lidar))
 
     def _compare(self) -> None:
         """Give the place up if what stands above the ground around the last keyframes is not what the map has."""
@@ -246,7 +289,7 @@ class Localiser:
             given.append(_MeasuredPose(found.map_T_scan, covariance, Robust("cauchy", s.robust_scale)))
             self._fitted = self._way
             self._fits.add(row)
-        self._smoother.step(time, given)
+        self._smoother.step(time, [*given, *self._of_sensors], self._measured.frame(time, None))
         (pose,) = self._smoother.graph().of(EGO_POSE, self._smoother.graph().epoch).values()
         self._pose, self._covariance = (
             self._smoother.graph().state(pose.key).matrix(),
@@ -275,7 +318,7 @@ class Localiser:
             found = register(thin, self._surfels, start, 1.5 * SURFEL, 0.1, criteria, "hold")
         except RegistrationError:
             return None
-        fits = found.converged and found.pairs >= s.min_pairs * len(thin) and found.residual <= s.max_residual
+        fits = found.converged and found.pairs >= _MIN_PAIRS * len(thin) and found.residual <= _MAX_RESIDUAL
         return found if fits else None
 
     def _load(self, centre: FloatArray) -> None:

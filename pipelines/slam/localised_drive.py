@@ -20,6 +20,7 @@ from data_tools.files.atomic_files import atomic_directory, write_bytes
 from data_tools.lidar import voxel_downsample
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
+from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.localisation import Localiser, LocaliserSettings
 from pipelines.slam.slam_map import SlamMap
@@ -27,6 +28,7 @@ from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.slam.sensors import SensorBuffer
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +45,22 @@ def localise(
     guess: FloatArray | None = None,
     settings: LocaliserSettings | None = None,
     progress: Progress | None = None,
+    log: SensorLog | None = None,
 ) -> LocalisedDrive:
     """Localise a recording in a map.
 
     guess: map_T_ego (4, 4) of the vehicle at the first scan, good to a metre or two and 0.1 rad. None: it is looked
-    for, as it is where the scans do not fit the map at the guess. Of the recording's poses none is used. Raises
+    for, as it is where the scans do not fit the map at the guess. log: of the vehicle's sensors, fixes in the map's
+    frame. Of the recording's poses none is used. Raises
     `InputError` where no place of the map was found, or several, and where no scan fits the map.
     """
-    localiser = Localiser(slam_map, None if guess is None else guess @ scans.ego_T_lidar, settings)
+    log, buffer = log or SensorLog({}), SensorBuffer()
+    start = None if guess is None else guess @ scans.ego_T_lidar
+    localiser = Localiser(slam_map, start, settings, tuple(log.tables), scans.ego_T_lidar)
     for k, time in enumerate(scans.timestamps.tolist()):
-        localiser.step(scans[k], time)
+        log.feed(buffer, time)
+        ego = buffer.take(time)
+        localiser.step(scans[k], time, ego.imu, ego.gps, ego.wheels)
         if progress is not None:
             progress("localising", k + 1, len(scans))
     localiser.finish()

@@ -1,7 +1,7 @@
-"""What decides whether a loop is believed, for the planar laser and the LiDAR alike: loops that wait for another.
+"""Acceptance of loop closures by agreement of several, for the planar laser and the LiDAR.
 
-A loop that the drift of odometry explains is believed at once. One that lies further off waits until another one, found
-from elsewhere on the way, agrees with it: the two, joined by odometry at both ends, make a closed chain.
+A loop within the drift of odometry is accepted at once. Any other waits for a second one, found from another place on
+the way, that agrees with it: both loops and the odometry between their ends compose to the identity.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ def deviation(T: FloatArray) -> FloatArray:
 
 @dataclass(eq=False)
 class Agreement(Generic[Loop]):
-    """Loops that wait.
+    """Loops that wait for another one that agrees with them.
 
-    within    (2,) m and rad that two which agree may differ by, and `drift` (2,), m and rad for each m between them
+    within    largest difference of two loops that agree (2,), m and rad; `drift` (2,) more for each m between them
     patience  m of way that a loop waits
-    apart     m of way between the places that two are found from
+    apart     least way between the places that the two are found from, m
     """
 
     within: FloatArray

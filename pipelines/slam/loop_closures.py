@@ -150,7 +150,7 @@ class PlaceLoops:
         return [replace(loop, confirmed=True) for loop in agreed]
 
     def _trusted(self, one: _Proved, times: float = 1.0) -> bool:
-        """Whether the drift of odometry, or so many times of it, explains the loop."""
+        """True if the loop deviates from odometry by no more than its drift, or so many times of it."""
         return one.off < 1.0 + times * self.settings.drift * one.way
 
     def _older(self, number: int) -> IntArray:

@@ -52,8 +52,11 @@ class MapPlaces:
         """The submap whose frame is nearest to a point (3,) of the map."""
         return int(np.argmin(np.linalg.norm(self.slam_map.map_T_submap[:, :3, 3] - centre, axis=1)))
 
-    def recognised(self, query: FloatArray) -> FloatArray | None:
-        """map_T_query (4, 4) of the one place that points (N, 3), z up, show, None for none and for several."""
+    def recognised(self, query: FloatArray, near: FloatArray | None = None) -> FloatArray | None:
+        """map_T_query (4, 4) of the one place that points (N, 3), z up, show, None for none and for several.
+
+        near: a place (2,) or (3,) in the map; places farther than the radius from it are left out
+        """
         self.ambiguous = False
         if len(query) < FEWEST:
             return None
@@ -65,7 +68,11 @@ class MapPlaces:
         mine, points = Structure.of(query), query[voxel_downsample(query, self.spacing)]
         found: list[tuple[float, FloatArray]] = []
         otherwise = False
-        for match in self._index.candidates(PlaceImage.of(query), None, COMPARED)[:_REGISTERED]:
+        older = None
+        if near is not None:
+            off = np.linalg.norm(self.slam_map.map_T_submap[:, :2, 3] - near[:2], axis=1)
+            older = np.flatnonzero(off <= self.radius).tolist()
+        for match in self._index.candidates(PlaceImage.of(query), older, COMPARED)[:_REGISTERED]:
             around, frame = self.around(match.number)
             fine = registered(around, points, match.place_T_query, self.registration)
             if fine is None:

@@ -40,6 +40,8 @@ from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.settings import Positive, Settings, setting, settings_group
 
+_FIRST_DEVIATION = 1.0  # standard deviation of the first motion, m
+_DEVIATION_FLOOR = 0.1  # least standard deviation of the prediction, m; higher: a wider search for pairs
 _LOG = logging.getLogger(__name__)
 _STANDING = 0.5  # m/s, speed from which on the motion says where the road goes
 _SPEED_OFF = 2.0  # m/s that a speed by other sensors may differ from that of the scans, slip and lever arms included
@@ -57,10 +59,6 @@ class OdometrySettings(Settings):
     surfel_size: Positive = setting(1.0, "voxel size of the local map, m; usual 0.5 to 1")
     map_spacing: Positive = setting(0.25, "spacing of the points that enter the map, m")
     scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
-    first_deviation: Positive = setting(1.0, "standard deviation of the first motion, m")
-    deviation_floor: Positive = setting(
-        0.1, "least standard deviation of the prediction, m; higher: a wider search for pairs"
-    )
     keyframe_distance: Positive = setting(
         0.5, "distance from the last keyframe that makes a scan the next one, m; lower: a denser graph"
     )
@@ -110,7 +108,7 @@ class LidarOdometry:
         self._last: OdometryStep | None = None
         self._keyframe = np.eye(4)
         self._velocity = np.zeros(6)  # rad/s, m/s, in the sensor's frame
-        self._squares, self._count = self.settings.first_deviation**2, 1
+        self._squares, self._count = _FIRST_DEVIATION**2, 1
         self._degenerate: tuple[str, ...] = ()
         self._velocity_known = False  # by a scan that showed the whole motion, or by other sensors
         self._confirmed: float | None = None  # s, when a scan showed the whole motion, or a speed was taken after one
@@ -122,7 +120,7 @@ class LidarOdometry:
     @property
     def deviation(self) -> float:
         """Sigma: typical distance of a point from its prediction by constant velocity, m."""
-        return max(self.settings.deviation_floor, float(np.sqrt(self._squares / self._count)))
+        return max(_DEVIATION_FLOOR, float(np.sqrt(self._squares / self._count)))
 
     def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
         """Place the next scan. Raises `InputError` for one that is not later than the one before, and for a first one
@@ -173,7 +171,7 @@ class LidarOdometry:
         return near
 
     def _believable(self, velocity: FloatArray, timestamp: float) -> bool:
-        """Whether a vehicle can have this velocity, by what it last had for certain; warns where it begins to fail."""
+        """True if a vehicle can reach this velocity from the last certain one; warns at the first failure."""
         said = ~np.isnan(velocity[3:])
         if self._confirmed is None:
             off, most = float(np.linalg.norm(velocity[3:][said])), _FASTEST
@@ -236,7 +234,7 @@ class LidarOdometry:
 
 
 def moved_on(keyframe_T_scan: FloatArray, settings: OdometrySettings) -> bool:
-    """Whether a scan is so far from the last keyframe, or turned so far, that it is the next one."""
+    """True if a scan is far enough from the last keyframe, or turned enough, to be the next one."""
     return bool(
         np.linalg.norm(keyframe_T_scan[:3, 3]) >= settings.keyframe_distance
         or rotation_angle(keyframe_T_scan[:3, :3]) >= settings.keyframe_rotation

@@ -42,7 +42,7 @@ def registered(
 
 
 def fits_otherwise(match: PlaceMatch) -> bool:
-    """Whether another alignment of the two is nearly as good."""
+    """True if another alignment of the two is nearly as good."""
     return match.rival > _SINGLE * match.score
 
 

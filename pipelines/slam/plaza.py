@@ -32,6 +32,7 @@ from saga_fg.numerics.planar_poses import transforms
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import MeasuredMotion, landmark_key, pose_key
 
+_LEAST_NOISE = 0.005  # least standard deviation of a step, ahead and sideways, m
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)
 _START = 1e-8  # variance of the first pose, m^2 and rad^2
 _RANGES = 10  # at least, to place a beacon by
@@ -43,7 +44,6 @@ class PlazaSettings(Settings):
     """Noise of odometry and ranges."""
 
     distance_noise: Positive = setting(0.05, "standard deviation of the distance of a step, as a share of it")
-    least_noise: Positive = setting(0.005, "least standard deviation of a step, ahead and sideways, m")
     turn_noise: Positive = setting(0.01, "standard deviation of the heading change of a step, rad")
     range_noise: Positive = setting(0.5, "standard deviation of a range, m")
     robust: Positive = setting(2.0, "residual from which the Cauchy loss discounts a range, standard deviations")
@@ -77,10 +77,10 @@ def map_beacons(drive: BeaconRanges, settings: PlazaSettings | None = None) -> B
     at = np.clip(np.searchsorted(drive.time, drive.measured), 0, len(drive.time) - 1)
     end = int(np.searchsorted(np.cumsum(np.abs(drive.distance)), settings.beginning)) + 1
     graph, numbers = SceneFactorGraph(), np.unique(drive.beacon).tolist()
-    along = np.maximum(settings.distance_noise * np.abs(drive.distance), settings.least_noise)
+    along = np.maximum(settings.distance_noise * np.abs(drive.distance), _LEAST_NOISE)
     while graph.epoch + 1 < len(reckoned):
         for row in range(graph.epoch + 1, min(end, len(reckoned))):
-            noise = np.diag([along[row], settings.least_noise, settings.turn_noise]) ** 2
+            noise = np.diag([along[row], _LEAST_NOISE, settings.turn_noise]) ** 2
             first = MeasuredMotion(np.eye(3), _START * np.eye(3))
             graph.advance(max(drive.time[row], np.nextafter(graph.time, np.inf)))  # rows may have one time
             ask_all([MeasuredMotion(steps[row], noise) if row else first], graph)

@@ -9,7 +9,7 @@ from typing import cast, get_args
 import numpy as np
 
 from data_tools.datasets.kitti.dataset import FRAME_PERIOD
-from data_tools.datasets.kitti.oxts import read_origin
+from data_tools.datasets.kitti.oxts import read_origin, world_position
 from data_tools.sensor_logs import SensorLog, kitti_sensor_log, read_sensor_log
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -19,11 +19,17 @@ GPS_NOISE, WHEELS_NOISE = 1.0, 0.05  # m and m/s, of the fixes and speeds made f
 
 
 def sensor_log(
-    records: Path, sensors: str, files: Sequence[str], seed: int, timestamps: FloatArray
+    records: Path,
+    sensors: str,
+    files: Sequence[str],
+    seed: int,
+    timestamps: FloatArray,
+    origin: tuple[float, float, float] | None = None,
 ) -> SensorLog | None:
     """Measurements of the sensors named, like "gps,imu", from KITTI's GPS/IMU records, and of files like "imu=FILE".
 
-    timestamps: (K,) s, of the drive. Latitudes and longitudes of files are put where the records begin. Raises
+    timestamps: (K,) s, of the drive; origin: latitude, longitude (deg) and altitude (m) of the world's origin, by
+    default where the records begin. Raises
     `InputError` for an unknown sensor, for one that is named twice, and for a file without a row within the drive.
     """
     named = [one.strip() for one in sensors.split(",") if one.strip()]
@@ -43,9 +49,13 @@ def sensor_log(
     if named:
         chosen = tuple(cast(SensorName, name) for name in named)
         tables |= kitti_sensor_log(records, chosen, FRAME_PERIOD, GPS_NOISE, WHEELS_NOISE, seed).tables
+        if origin is not None and "gps" in tables:
+            latitude, longitude, altitude = (np.array([value]) for value in read_origin(records))
+            off = world_position(latitude, longitude, altitude, np.array(origin))[0]
+            tables["gps"] = tables["gps"] + np.concatenate([[0.0], off])
     for name, _, path in given:
-        origin = read_origin(records) if name == "gps" else None
-        table = read_sensor_log(path, cast(SensorName, name), origin)
+        begin = (origin or read_origin(records)) if name == "gps" else None
+        table = read_sensor_log(path, cast(SensorName, name), begin)
         _check_times(path, table[:, 0], timestamps)
         tables[cast(SensorName, name)] = table
     return SensorLog({name: np.asarray(table) for name, table in tables.items()})

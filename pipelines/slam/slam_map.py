@@ -2,6 +2,7 @@
 
 submaps.csv   number, file, x, y, z (m) and qx, qy, qz, qw of each submap's frame in the map
 0000.ply ..   points of submap 0 .., m, in its own frame, z up; or 0000.pcd ..
+origin.csv    latitude [deg], longitude [deg], altitude [m] of the map's origin, if known; its x is east, its y north
 
 A submap moves as a whole when its place is estimated anew. Any viewer of point clouds opens the files.
 """
@@ -26,14 +27,20 @@ from saga_fg.numerics.geometry import quaternion_rotation, rotation_quaternion
 _COLUMNS = ("number", "file", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # that the norm of a quaternion may be off 1
 CloudFormat = Literal["ply", "pcd"]
+Origin = tuple[float, float, float]
+_ORIGIN = ("latitude [deg]", "longitude [deg]", "altitude [m]")
 
 
 @dataclass(frozen=True, eq=False)
 class SlamMap:
-    """S submaps: points (N, 3) float32 of each in its frame, z up, and map_T_submap (S, 4, 4)."""
+    """S submaps: points (N, 3) float32 of each in its frame, z up, and map_T_submap (S, 4, 4).
+
+    origin: latitude and longitude, deg, and altitude, m, of the map's origin, its x east and its y north
+    """
 
     points: Sequence[npt.NDArray[np.float32]]
     map_T_submap: FloatArray
+    origin: Origin | None = None
 
     def __post_init__(self) -> None:
         if self.map_T_submap.shape != (len(self.points), 4, 4):
@@ -52,6 +59,9 @@ def write_map(folder: Path, slam_map: SlamMap, form: CloudFormat = "ply") -> Non
         w, x, y, z = rotation_quaternion(pose[:3, :3])
         rows.append(",".join([str(number), name, *(f"{value:.9f}" for value in (*pose[:3, 3], x, y, z, w))]))
     write_text(folder / "submaps.csv", "\n".join(rows) + "\n")
+    if slam_map.origin is not None:
+        numbers = ",".join(f"{value:.12g}" for value in slam_map.origin)
+        write_text(folder / "origin.csv", f"{','.join(_ORIGIN)}\n{numbers}\n")
 
 
 def read_map(folder: str | Path) -> SlamMap:
@@ -82,4 +92,15 @@ def read_map(folder: str | Path) -> SlamMap:
         if Path(name).name != name:
             raise table.fault(at, f"file: expected a file beside {path.name}, got {name[:40]!r}")
         points.append(read_scan(folder / name).points.astype(np.float32))
-    return SlamMap(points, poses)
+    return SlamMap(points, poses, _read_origin(folder / "origin.csv"))
+
+
+def _read_origin(path: Path) -> Origin | None:
+    if not path.is_file():
+        return None
+    lines = [line.split(",") for line in read_lines(path) if line.strip()]
+    if len(lines) != 2 or tuple(lines[0]) != _ORIGIN or len(lines[1]) != len(_ORIGIN):
+        raise InputError(f"{path}: expected a line of columns, {','.join(_ORIGIN)}, and a line of numbers")
+    table = TextTable.of(path, lines[1:], [2])
+    latitude, longitude, altitude = table.numbers(slice(0, 3), _ORIGIN, (85.0, 180.0, 1e5))[0].tolist()
+    return latitude, longitude, altitude

@@ -69,7 +69,7 @@ def with_objects(
 
     seen = frames_at(frames, scans.timestamps[rows], lidar_T_ego, new_tracker())
     seen = _with_sensors(seen, log)
-    motions = result.drive.motions(rows)
+    motions = result.motions(rows)
     odometry = OdometryIncrements(
         scans.timestamps[rows],
         np.array([motion for motion, _ in motions]).reshape(-1, 4, 4),

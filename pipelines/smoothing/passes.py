@@ -48,6 +48,8 @@ from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
 
+_REWEIGHTINGS = 1  # repetitions of loss weights and edges at the final states
+_ASSOCIATION_GATE = 0.95  # gate probability of detections without a track; higher: more are added, right and wrong
 WEAK_SCORE = 0.05  # of a tracklet, below which it is not stitched and takes no detections from others
 MAX_FREE_DISTANCE = 3.0  # between a state and a free detection assigned to it, m
 UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps by other models of the noise
@@ -138,9 +140,7 @@ def smooth_objects(
     joined = lifespans_of(object_of, label, moment)
     states = passes.alone(joined, object_of, settings.extension)
     states = passes.coupled(joined, object_of, settings.extension, states)
-    object_of = assign_free_detections(
-        evidence, object_of, joined, states, settings.association_gate, MAX_FREE_DISTANCE
-    )
+    object_of = assign_free_detections(evidence, object_of, joined, states, _ASSOCIATION_GATE, MAX_FREE_DISTANCE)
     track_of = np.where(strong | (object_of < 0), track_of, -1)
     object_of = np.where(object_of < 0, track_of, object_of)
     states = states.merged(alone.select(~is_strong))
@@ -217,7 +217,7 @@ class _Passes:
         self, lifespans: Lifespans, object_of: IntArray, states: StateTable, stationary: StationaryStates
     ) -> StateTable:
         """States with everything, from first to last detection; edges at first from `states` of an earlier pass."""
-        for _ in range(self.settings.reweightings + 1 if self.settings.robust else 1):
+        for _ in range(_REWEIGHTINGS + 1 if self.settings.robust else 1):
             edges = self._edges(lifespans, object_of, states.within(lifespans)) if self.tracker.edges else no_edges
             loss = self.settings.robust
             weight = None if loss is None else robust_weights(self.evidence, object_of, states, loss)

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors import FactorError, Robust
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_solution import NoSolution
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
-from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
 from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
 from saga_fg.estimators.sparse_elimination import Order, SparseSolution, cheapest_order
@@ -147,7 +147,7 @@ class BatchSmoother(RecordedSmoother):
 
     def restore(self, state: BatchState) -> None:
         """Continue from a snapshot, bit-identically."""
-        require_kind("state", state, BatchState)
+        require_type("state", state, BatchState)
         self._recording.restore(state.recording)
         self._graduated = state.graduated
         self._clear_cache()

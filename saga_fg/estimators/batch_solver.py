@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from factors import FactorError, SolverSettings, linearised
-from saga_fg.errors import InputError
+from saga_fg.errors import require_type
 from saga_fg.estimators.graduated import solve_graduated
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.graph.errors import GraphError
@@ -118,8 +118,7 @@ class BatchSolver:
 
     def restore(self, graph: SceneFactorGraph) -> None:
         """Continue from a graph, of whichever back end."""
-        if not isinstance(graph, SceneFactorGraph):
-            raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
+        require_type("graph", graph, SceneFactorGraph)
         self._replace_graph(graph.copy())
 
     def _ask(self, time: float | None, providers: Sequence[FactorProvider], frame: Frame | None = None) -> None:

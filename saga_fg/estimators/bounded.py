@@ -33,7 +33,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import Gain, correct, rank
 from saga_fg.estimators.dynamics import Dynamics
@@ -42,7 +42,7 @@ from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.overlapping_clusters import ClusterBounds, OverlappingClusters, adjacency
 from saga_fg.estimators.partition import Partition, regrouped
-from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
+from saga_fg.estimators.protocol import LatestMarginals, Measurements
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -117,7 +117,7 @@ class BoundedKalmanFilter(LatestMarginals):
         self._time += transition.dt
 
     def update(self, measurements: Measurements) -> float:
-        require_kind("measurements", measurements, Measurements)
+        require_type("measurements", measurements, Measurements)
         if len(measurements) == 0:
             return 0.0
         clusters, m = self._clusters, measurements
@@ -171,7 +171,7 @@ class BoundedKalmanFilter(LatestMarginals):
 
     def restore(self, state: BoundedState) -> None:
         """Continue from a snapshot, bit-identically."""
-        require_kind("state", state, BoundedState)
+        require_type("state", state, BoundedState)
         self._clusters, self._state, self._time = state.clusters, state.x, state.time
 
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
@@ -253,7 +253,7 @@ def propagated(
     size = partition.layout.size
     inner = scipy.sparse.csr_array((rows.data, columns, rows.indptr), shape=(size, size))
     mean = np.asarray(inner @ x.mean + dynamics.b[states])
-    noise = _noise(x, clusters, dynamics)
+    noise = _noise(clusters, dynamics)
     if len(outside):
         row = np.repeat(np.arange(size), np.diff(rows.indptr))[outside] - partition.layout.offsets[target[outside]]
         _add_outer(noise, x, clusters, target[outside], node[outside], row, within[outside], rows.data[outside])
@@ -278,7 +278,7 @@ def propagated(
     return BlockGaussian(partition, mean, tuple(blocks))
 
 
-def _noise(x: BlockGaussian, clusters: OverlappingClusters, dynamics: Dynamics) -> FloatArray:
+def _noise(clusters: OverlappingClusters, dynamics: Dynamics) -> FloatArray:
     """Q of every copy, (M, d, d) with the largest d."""
     d = int(clusters.layout.dims.max(initial=0))
     Q = np.zeros((len(clusters.layout), d, d))

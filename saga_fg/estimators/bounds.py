@@ -21,7 +21,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class ComponentBounds:
-    """Which nodes become, or stay, one component.
+    """Nodes that become, or remain, one component.
 
     tolerance  correlation up to which nodes count as independent
     most       largest number of nodes of a component; the strongest ties come first

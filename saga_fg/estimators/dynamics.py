@@ -13,11 +13,10 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition
-from saga_fg.estimators.protocol import require_kind
 from saga_fg.model.transition import Blocks, Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -37,7 +36,7 @@ class Dynamics:
     @staticmethod
     def of(transition: Transition, layout: StateLayout) -> Dynamics:
         """Dynamics of a transition over exactly the nodes of `layout`; raises `InputError` for any other."""
-        require_kind("transition", transition, Transition)
+        require_type("transition", transition, Transition)
         rows = layout.rows(transition.nodes)
         if len(rows) != len(layout):
             raise InputError(f"transition: expected {len(layout)} nodes, got {len(rows)}")

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from saga_fg.errors import require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
@@ -21,7 +22,7 @@ from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_p
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
-from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
+from saga_fg.estimators.protocol import LatestMarginals, Measurements
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -122,7 +123,7 @@ class GraphFilter(LatestMarginals):
         self._layout, self._keys = layout, {**self._keys, **keys}
 
     def predict(self, transition: Transition) -> None:
-        require_kind("transition", transition, Transition)
+        require_type("transition", transition, Transition)
         interval = IntervalDynamics(transition)
         interval.check(self._layout)
         x, nodes = self.posterior(), self._layout.nodes
@@ -146,7 +147,7 @@ class GraphFilter(LatestMarginals):
             smoother.forget(keys.values())
 
     def update(self, measurements: Measurements | Observations) -> float:
-        require_kind("measurements", measurements, Measurements, Observations)
+        require_type("measurements", measurements, Measurements, Observations)
         recorded = RecordedMeasurements(measurements)
         recorded.check(self._layout)
         if len(measurements) == 0:
@@ -180,7 +181,7 @@ class GraphFilter(LatestMarginals):
 
     def restore(self, state: GraphState) -> None:
         """Continue from a snapshot."""
-        require_kind("state", state, GraphState)
+        require_type("state", state, GraphState)
         self._smoother_to_change().restore(state.graph)
         self._layout, self._keys, self._auxiliary = state.layout, state.keys, state.auxiliary
 

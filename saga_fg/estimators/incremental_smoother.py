@@ -21,7 +21,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 import numpy as np
 
 from factors.marginal import Elimination
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
@@ -179,8 +179,7 @@ class IncrementalSmoother:
 
     def restore(self, graph: SceneFactorGraph) -> None:
         """Continue from a snapshot; iSAM2 is built anew."""
-        if not isinstance(graph, SceneFactorGraph):
-            raise InputError(f"graph: expected a SceneFactorGraph, got {type(graph).__name__}")
+        require_type("graph", graph, SceneFactorGraph)
         self._graph, self._engine = graph.copy(), None
         times = {one.time for one in graph.variables.values() if one.time is not None}
         self._times = sorted(times | ({graph.time} if graph.epoch >= 0 else set()))

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.backward import smoothed_means
 from saga_fg.estimators.bayes_tree import BayesTree
 from saga_fg.estimators.block_gaussian import BlockGaussian
@@ -31,7 +31,7 @@ from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened
 from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.estimators.partition import Partition
-from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
+from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import IntArray
@@ -169,7 +169,7 @@ class IncrementalFilter(LatestMarginals):
 
     def restore(self, state: IncrementalState) -> None:
         """Continue from a snapshot."""
-        require_kind("state", state, IncrementalState)
+        require_type("state", state, IncrementalState)
         self._state = _State(state.x.layout, None, state.x, state.x, (Epoch(state.time),))
 
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:

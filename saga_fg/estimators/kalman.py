@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.bounds import ComponentBounds
 from saga_fg.estimators.compiled_filter import corrected, predicted
@@ -27,7 +27,7 @@ from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.object_factors import prior_graph
-from saga_fg.estimators.protocol import LatestMarginals, Measurements, require_kind
+from saga_fg.estimators.protocol import LatestMarginals, Measurements
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.kernels.compilation import compiled_kernels
@@ -173,7 +173,7 @@ class JointKalmanFilter(LatestMarginals):
 
     def restore(self, state: KalmanState) -> None:
         """Continue from a snapshot, bit-identically."""
-        require_kind("state", state, KalmanState)
+        require_type("state", state, KalmanState)
         self._state, self._predictions, self._time = state.x, state.predictions, state.time
         self._auxiliary = state.auxiliary or AuxiliaryVariables()
 

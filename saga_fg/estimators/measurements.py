@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from factors import FactorError, MeasurementModel, Robust
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.protocol import Measurements, require_kind
+from saga_fg.estimators.protocol import Measurements
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
@@ -86,9 +86,9 @@ class RecordedMeasurements:
     weights: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        require_kind("measurements", self.measured, Measurements, Observations)
+        require_type("measurements", self.measured, Measurements, Observations)
         if self.robust is not None:
-            require_kind("robust", self.robust, Robust, GraduatedNonConvexity)
+            require_type("robust", self.robust, Robust, GraduatedNonConvexity)
 
     @property
     def loss(self) -> Robust | None:

@@ -27,7 +27,7 @@ _PAIRS = 200  # from which on a graph of pairs is worth building
 
 
 class BlockPlaces(NamedTuple):
-    """Where kernels find the blocks of a block-diagonal matrix, one after the other in one array.
+    """Index of the blocks of a block-diagonal matrix, which lie one after the other in one array, for kernels.
 
     start, size (n,) of the block of each node's component; offset (n,) of the node's state in it; first (n,): where its
     component begins in `places` (D,), which are those of the states in the joint state. See
@@ -123,7 +123,7 @@ class Partition:
 
     @property
     def block_places(self) -> BlockPlaces:
-        """Where kernels find the blocks."""
+        """Index of the blocks, for kernels."""
         return self._compiled_tables[3]
 
     @cached_property

@@ -14,7 +14,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -55,13 +54,6 @@ class Measurements:
 
     def __len__(self) -> int:
         return len(self.nodes)
-
-
-def require_kind(name: str, value: object, *kinds: type) -> None:
-    """Raise `InputError` unless `value` is an instance of one of `kinds`."""
-    if not isinstance(value, kinds):
-        wanted = " or ".join(kind.__name__ for kind in kinds)
-        raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}")
 
 
 def _one_each(value: ArrayLike, m: int) -> ArrayLike:

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors import Robust
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.backward import MarginalCovariances, SmoothedCovariance
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
-from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows, require_kind
+from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows
 from saga_fg.estimators.recording import Recording
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -99,7 +99,7 @@ class RecordedSmoother(LatestMarginals):
         outside the recording.
         """
         if robust is not None:
-            require_kind("robust", robust, Robust)
+            require_type("robust", robust, Robust)
         return self._recording.update(RecordedMeasurements(measurements, robust), time)
 
     def marginalise(self, nodes: ArrayLike) -> None:

@@ -1,8 +1,8 @@
 """A record of epochs, with the filter over them, on which the smoothers are built.
 
-Told of the past, the filter's pass is done again from there. Where something is nonlinear or robust, everything
-recorded is linearised again at the smoothed means until they stand still, which is Gauss-Newton over the recording
-(Bell, The iterated Kalman smoother as a Gauss-Newton method, SIAM J. Optimization 4, 1994).
+A measurement of the past repeats the filter's pass from its time on. Where something is nonlinear or robust, all
+of the record is linearised again at the smoothed means until they converge: Gauss-Newton over the recording (Bell,
+The iterated Kalman smoother as a Gauss-Newton method, SIAM J. Optimization 4, 1994).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import (
     MarginalCovariances,
@@ -38,7 +38,6 @@ from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
 from saga_fg.estimators.object_factors import recording_graph
-from saga_fg.estimators.protocol import require_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.settings import setting
@@ -106,7 +105,7 @@ class Recording:
         )
 
     def restore(self, state: RecordingState) -> None:
-        require_kind("state", state, RecordingState)
+        require_type("state", state, RecordingState)
         self._prior, self._converged = state.prior, state.converged
         self._epochs, self._layouts, self._steps = list(state.epochs), list(state.layouts), list(state.steps)
         self._nonlinear = not all(epoch.linear for epoch in state.epochs)

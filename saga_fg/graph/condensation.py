@@ -1,7 +1,7 @@
-"""What stands for variables that are marginalised, where a linear prior would not do.
+"""Condensation: nonlinear factors in place of the linear prior that marginalised variables leave.
 
-A prior is linear on increments from where the variables were, and true near there alone. A submap that moves by metres,
-as a whole, when a loop closes, needs factors that move along.
+The prior is linear in increments from the linearisation point, and valid near it only. A closed submap moves by metres
+as a whole when a loop closes; its factors have to move with it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,20 @@ from saga_fg.graph.linearisation_point import LinearisationPoint
 
 
 class Condensation(Protocol):
-    """Makes factors of what marginalised variables leave; `name` stands for their provider."""
+    """Makes factors of the marginal that eliminated variables leave; `name` is their provider's, and theirs."""
 
     @property
     def name(self) -> str: ...
 
-    def factors(self, marginal: Sequence[gtsam.JacobianFactor], point: LinearisationPoint) -> Sequence[Factor]:
-        """Return factors in place of the marginal, which is on increments from the base, linearised at `point`."""
+    @property
+    def anchor(self) -> int:
+        """A variable that leaves with the others, but is in the marginal. What a condensation of this name gave for it
+        earlier is handed over apart."""
+
+    def factors(
+        self,
+        marginal: Sequence[gtsam.JacobianFactor],
+        earlier: Sequence[gtsam.JacobianFactor],
+        point: LinearisationPoint,
+    ) -> Sequence[Factor]:
+        """Return factors in place of both, which are on increments from the base, linearised at `point`."""

@@ -185,14 +185,18 @@ class SceneFactorGraph:
         if not leaving:
             return
         touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self._rows_on(leaving)
+        earlier: list[gtsam.JacobianFactor] = []
         for number, mine in rows.items():
-            for factor in self.linearised(self._groups[number], np.array(mine), point):
-                touched.push_back(factor)
+            held = self._groups[number]
+            apart = into is not None and held.provider == into.name and into.anchor in held.factors.rows[mine[0]]
+            for factor in self.linearised(held, np.array(mine), point):
+                earlier.append(factor) if apart else touched.push_back(factor)
         involved = set(touched.keyVector())
         if into is not None:
-            made = into.factors(self._eliminated(touched, sorted(leaving.keys() & involved), "qr"), point)
+            eliminated = sorted((leaving.keys() & involved) - {into.anchor})
+            made = into.factors(self._eliminated(touched, eliminated, "qr"), earlier, point)
             self._replace(rows, [], leaving)
-            self.add_factors(into.name, made)
+            self.add_factors(into.name, made, into.name)
             return
         factors = self._eliminated(touched, sorted(leaving.keys() & involved), self.elimination)
         self._replace(rows, factors, leaving)

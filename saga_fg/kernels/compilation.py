@@ -15,6 +15,7 @@ import pkgutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import update_wrapper
+from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import saga_fg.kernels
@@ -25,6 +26,7 @@ R = TypeVar("R")
 log = logging.getLogger(__name__)
 _SCALARS = {"f": "float64", "i": "int64", "b": "boolean", "u": "uint32"}
 _kernels: list[Kernel[Any, Any]] = []  # of the modules that were imported
+_parts: set[Callable[..., Any]] = set()  # functions that kernels of the same module call
 _enabled: bool | None = None  # None: nobody has asked yet
 _listening = False
 _said: set[str] = set()
@@ -98,11 +100,18 @@ def kernel(arguments: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
     return lambda source: Kernel(source, arguments)
 
 
+def kernel_part(source: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a function that kernels of its module call, to be compiled as a part of them."""
+    _parts.add(source)
+    return source
+
+
 def _compiled(source: Callable[..., Any], arguments: str) -> Any:
     numba: Any = importlib.import_module("numba")
     _announce_compilation()
     signature = tuple(_argument(numba.types, kind) for kind in arguments.split())
     options = {"error_model": "numpy", "nogil": True}
+    source = _with_compiled_parts(source, numba.njit(**options))
     function = numba.njit(**options)(source)
     try:
         function.enable_caching()
@@ -114,6 +123,15 @@ def _compiled(source: Callable[..., Any], arguments: str) -> Any:
             return numba.njit(signature, **options)(source)
     function.disable_compile()
     return function
+
+
+def _with_compiled_parts(source: Callable[..., Any], compiler: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with its parts compiled, and theirs."""
+    names = [name for name in source.__code__.co_names if source.__globals__.get(name) in _parts]
+    if not names:
+        return source
+    parts = {name: compiler(_with_compiled_parts(source.__globals__[name], compiler)) for name in names}
+    return update_wrapper(FunctionType(source.__code__, source.__globals__ | parts, source.__name__), source)
 
 
 def _argument(types: Any, kind: str) -> Any:

@@ -18,7 +18,7 @@ Tables = tuple[IntArray, IntArray, IntArray, IntArray, IntArray, IntArray, IntAr
 
 @kernel("i1 i1")
 def component_tables(label: IntArray, dims: IntArray) -> Tables:
-    """Where everything is, for nodes with component `label` (n,) and states of sizes `dims` (n,).
+    """Index tables of components, for nodes with component `label` (n,) and states of sizes `dims` (n,).
 
     group, row (n,) of each node's component; offset (n,) of its state within it; start, size (n,) of the component's
     block; first (n,): where its states begin in `places` (D,), the places of the states in the joint state, group by

@@ -12,7 +12,36 @@ import math
 import numpy as np
 
 from saga_fg.kernels.array_types import FloatArray, IntArray
-from saga_fg.kernels.compilation import kernel
+from saga_fg.kernels.compilation import kernel, kernel_part
+
+
+@kernel_part
+def _add_product(out: FloatArray, A: FloatArray, B: FloatArray) -> None:
+    """Add A B to `out`."""
+    for a in range(A.shape[0]):
+        for c in range(A.shape[1]):
+            z = A[a, c]
+            if z != 0.0:
+                for b in range(B.shape[1]):
+                    out[a, b] += z * B[c, b]
+
+
+@kernel_part
+def _largest_row(M: FloatArray) -> float:
+    """Norm of M: the largest sum of magnitudes of a row."""
+    largest = 0.0
+    for a in range(M.shape[0]):
+        total = 0.0
+        for b in range(M.shape[1]):
+            total += abs(M[a, b])
+        largest = max(largest, total)
+    return largest
+
+
+@kernel_part
+def _halvings(norm: float, radius: float) -> int:
+    """Number of halvings after which a norm is at most `radius`."""
+    return math.ceil(math.log2(norm / radius)) if radius < norm < math.inf else 0
 
 
 @kernel("f3 f3 f i i i f")
@@ -28,20 +57,9 @@ def phi_and_noise(
     Z, product, term, turned = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
     phi, doubled = np.empty((order + 1, d, d)), np.empty((order + 1, d, d))
     for i in range(m):
-        largest = 0.0
-        for a in range(d):
-            total = 0.0
-            for b in range(d):
-                total += abs(M[i, a, b])
-            largest = max(largest, total)
-        doublings = 0
-        norm = largest * dt
-        if norm > radius and norm < math.inf:
-            doublings = math.ceil(math.log2(norm / radius))
+        doublings = _halvings(_largest_row(M[i]) * dt, radius)
         h = dt / 2.0**doublings
-        for a in range(d):
-            for b in range(d):
-                Z[a, b] = M[i, a, b] * h
+        Z[:] = M[i] * h
         inverse = 1.0  # 1 / (order + degree)!
         for j in range(2, order + degree + 1):
             inverse /= j
@@ -51,62 +69,35 @@ def phi_and_noise(
         for j in range(degree - 1, -order - 1, -1):  # phi_order by Horner's rule, then the lower ones
             k = order + min(j, 0)
             inverse *= order + j + 1
-            source = phi[min(k + 1, order)] if j < 0 else phi[order]
+            product[:] = 0.0
+            _add_product(product, Z, phi[min(k + 1, order)] if j < 0 else phi[order])
             for a in range(d):
-                for b in range(d):
-                    product[a, b] = 0.0
-                for c in range(d):
-                    z = Z[a, c]
-                    if z != 0.0:
-                        for b in range(d):
-                            product[a, b] += z * source[c, b]
                 product[a, a] += inverse
-            for a in range(d):
-                for b in range(d):
-                    phi[k, a, b] = product[a, b]
+            phi[k] = product
         Q = noise[i]
-        for a in range(d):
-            for b in range(d):
-                term[a, b] = Qc[i, a, b] * h
-                Q[a, b] = term[a, b]
+        term[:] = Qc[i] * h
+        Q[:] = term
         for j in range(2, noise_degree + 1):
-            for a in range(d):
-                for b in range(d):
-                    product[a, b] = 0.0
-                for c in range(d):
-                    z = Z[a, c]
-                    if z != 0.0:
-                        for b in range(d):
-                            product[a, b] += z * term[c, b]
+            product[:] = 0.0
+            _add_product(product, Z, term)
             for a in range(d):
                 for b in range(d):
                     term[a, b] = (product[a, b] + product[b, a]) / j
                     Q[a, b] += term[a, b]
         for _ in range(doublings):
-            for a in range(d):  # Q + phi_0 Q phi_0^T
-                for b in range(d):
-                    total = 0.0
-                    for c in range(d):
-                        total += phi[0, a, c] * Q[c, b]
-                    turned[a, b] = total
-            for a in range(d):
-                for b in range(d):
-                    total = 0.0
-                    for c in range(d):
-                        total += turned[a, c] * phi[0, b, c]
-                    product[a, b] = Q[a, b] + total
-            Q[:] = product
+            turned[:] = 0.0  # Q + phi_0 Q phi_0^T
+            _add_product(turned, phi[0], Q)
+            product[:] = 0.0
+            _add_product(product, turned, phi[0].T)
+            Q += product
             for k in range(order + 1):
-                for a in range(d):
-                    for b in range(d):
-                        total = 0.0
-                        for c in range(d):
-                            total += phi[0, a, c] * phi[k, c, b]
-                        factor = 1.0
-                        for j in range(k, 0, -1):  # phi_j / (k - j)!
-                            total += phi[j, a, b] * factor
-                            factor /= k - j + 1
-                        doubled[k, a, b] = total / 2.0**k
+                product[:] = 0.0
+                _add_product(product, phi[0], phi[k])
+                factor = 1.0
+                for j in range(k, 0, -1):  # phi_j / (k - j)!
+                    product += phi[j] * factor
+                    factor /= k - j + 1
+                doubled[k] = product / 2.0**k
             phi[:] = doubled
         for a in range(d):
             for b in range(a):
@@ -115,6 +106,32 @@ def phi_and_noise(
                 Q[b, a] = middle
         phis[:, i] = phi
     return phis, noise
+
+
+@kernel_part
+def _exponential_series(M: FloatArray, h: float, degree: int) -> FloatArray:
+    """Taylor series of exp(M h) by Horner's rule (degree + 1, d, d): from its innermost bracket, last, to the whole."""
+    d = M.shape[0]
+    series, Z = np.zeros((degree + 1, d, d)), np.empty((d, d))
+    for a in range(d):
+        series[:, a, a] = 1.0
+    for t in range(degree, 0, -1):
+        for a in range(d):
+            for b in range(d):
+                Z[a, b] = M[a, b] * h / t
+        _add_product(series[t - 1], Z, series[t])
+    return series
+
+
+@kernel_part
+def _squares(M: FloatArray, count: int) -> FloatArray:
+    """M, M^2, M^4, ... (count + 1, d, d)."""
+    d = M.shape[0]
+    squares = np.zeros((count + 1, d, d))
+    squares[0] = M
+    for t in range(count):
+        _add_product(squares[t + 1], squares[t], squares[t])
+    return squares
 
 
 @kernel("f3 i1 f3 f3 i1 f i f")
@@ -131,92 +148,40 @@ def coupling_integrals(
             for b in range(p):
                 rows[i, a] += abs(M[i, a, b])
     for j in range(len(A)):
-        for a in range(q):
-            total = 0.0
-            for b in range(q):
-                total += abs(A[j, a, b])
-            largest = max(largest, total)
+        largest = max(largest, _largest_row(A[j]))
     for e in range(m):
         for a in range(p):
             total = rows[at[e], a]
             for b in range(q):
                 total += abs(C[e, a, b])
             largest = max(largest, total)
-    doublings, norm = 0, largest * dt
-    if norm > radius and norm < math.inf:
-        doublings = math.ceil(math.log2(norm / radius))
+    doublings = _halvings(largest * dt, radius)
     h = dt / 2.0**doublings
     # second[j, t]: what the series of exp(A_j h) has come to; then the squares of both exponentials
     second, doubled = np.empty((len(A), degree + 1, q, q)), np.empty((len(A), doublings + 1, q, q))
     first, made = np.empty((len(M), doublings + 1, p, p)), np.zeros(len(M), dtype=np.bool_)
     for j in range(len(A)):
-        second[j, degree] = np.eye(q)
-        for t in range(degree, 0, -1):
-            for a in range(q):
-                for b in range(q):
-                    total = 1.0 if a == b else 0.0
-                    for c in range(q):
-                        total += A[j, a, c] * h / t * second[j, t, c, b]
-                    second[j, t - 1, a, b] = total
-        doubled[j, 0] = second[j, 0]
-        for t in range(doublings):
-            for a in range(q):
-                for b in range(q):
-                    total = 0.0
-                    for c in range(q):
-                        total += doubled[j, t, a, c] * doubled[j, t, c, b]
-                    doubled[j, t + 1, a, b] = total
+        second[j] = _exponential_series(A[j], h, degree)
+        doubled[j] = _squares(second[j, 0], doublings)
     result = np.empty((m, p, q))
-    corner, product, square = np.empty((p, q)), np.empty((p, q)), np.empty((p, p))
+    corner, product = np.empty((p, q)), np.empty((p, q))
     for e in range(m):
         i, j = at[e], of[e]
         if doublings > 0 and not made[i]:
             made[i] = True
-            first[i, 0] = np.eye(p)
-            for t in range(degree, 0, -1):
-                for a in range(p):
-                    for b in range(p):
-                        square[a, b] = 1.0 if a == b else 0.0
-                    for c in range(p):
-                        z = M[i, a, c] * h / t
-                        if z != 0.0:
-                            for b in range(p):
-                                square[a, b] += z * first[i, 0, c, b]
-                first[i, 0] = square
-            for t in range(doublings):
-                for a in range(p):
-                    for b in range(p):
-                        total = 0.0
-                        for c in range(p):
-                            total += first[i, t, a, c] * first[i, t, c, b]
-                        first[i, t + 1, a, b] = total
+            first[i] = _squares(_exponential_series(M[i], h, degree)[0], doublings)
         corner[:] = 0.0
         for t in range(degree, 0, -1):
-            for a in range(p):
-                for b in range(q):
-                    product[a, b] = 0.0
-                for c in range(p):
-                    z = M[i, a, c]
-                    if z != 0.0:
-                        for b in range(q):
-                            product[a, b] += z * corner[c, b]
-                for c in range(q):
-                    z = C[e, a, c]
-                    if z != 0.0:
-                        for b in range(q):
-                            product[a, b] += z * second[j, t, c, b]
+            product[:] = 0.0
+            _add_product(product, M[i], corner)
+            _add_product(product, C[e], second[j, t])
             for a in range(p):
                 for b in range(q):
                     corner[a, b] = product[a, b] * h / t
         for t in range(doublings):
-            for a in range(p):
-                for b in range(q):
-                    total = 0.0
-                    for c in range(p):
-                        total += first[i, t, a, c] * corner[c, b]
-                    for c in range(q):
-                        total += corner[a, c] * doubled[j, t, c, b]
-                    product[a, b] = total
+            product[:] = 0.0
+            _add_product(product, first[i, t], corner)
+            _add_product(product, corner, doubled[j, t])
             corner[:] = product
         result[e] = corner
     return result

@@ -296,7 +296,7 @@ def _van_loan(M: FloatArray, at: IntArray, C: FloatArray, A: FloatArray, of: Int
 
 
 def _doublings(norm: float) -> int:
-    """How often a matrix of this norm is halved until its Taylor series converges fast."""
+    """Number of halvings of a matrix of this norm after which its Taylor series converges fast."""
     return max(0, math.ceil(math.log2(norm / _TAYLOR_RADIUS))) if 0 < norm < math.inf else 0
 
 

@@ -79,7 +79,7 @@ class NodeTable:
         return len(self.id)
 
     def along(self, target: IntArray, source: IntArray) -> Along:
-        """Where nodes `source` (E,) are on the paths of nodes `target` (E,)."""
+        """Places of nodes `source` (E,) along the paths of nodes `target` (E,)."""
         return along_paths(self.position, self.heading, self.paths, target, source)
 
     def select(self, rows: IntArray) -> NodeTable:

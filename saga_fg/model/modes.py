@@ -48,6 +48,7 @@ from saga_fg.model.turning import Bicycle, CoordinatedTurn
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 
+_UNUSED_DEVIATION = 0.3  # standard deviation of a component, in its unit, while its mode does not use it
 _LEAST = 1e-12  # probability of a mode, and share of a variance that a measurement takes away
 
 
@@ -94,11 +95,6 @@ class Mixture(Settings):
     dwell_time: Positive = setting(
         5.0, "mean time in a mode before a change to another one, s; usual 2 to 10; higher: rarer changes"
     )
-    unused_deviation: Positive = setting(
-        0.3,
-        "standard deviation of a component while its mode does not use it, such as a turn rate, in its "
-        "unit; higher: freer when the mode changes to one that does",
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -126,7 +122,7 @@ class Mixture(Settings):
 
     @property
     def initial_deviation(self) -> FloatArray:
-        return np.array([1.0] * 4 + [self.unused_deviation] * (len(self.components) - 4))
+        return np.array([1.0] * 4 + [_UNUSED_DEVIATION] * (len(self.components) - 4))
 
     def transition(self, dt: float) -> FloatArray:
         """Pi (M, M): probabilities of the modes (columns) dt seconds after those of the rows."""
@@ -269,7 +265,7 @@ def mode_dynamics(mixture: Mixture, mean: FloatArray, dt: float) -> ModeDynamics
         rest = np.setdiff1d(np.arange(d), at)
         alone = discretise(SceneGraph.of([0], node_type), dt)
         F[:, r, at[:, None], at], Q[:, r, at[:, None], at] = alone.F[0].values[0], alone.Q[0].values[0]
-        Q[:, r, rest, rest] = mixture.unused_deviation**2
+        Q[:, r, rest, rest] = _UNUSED_DEVIATION**2
         if node_type.flow is not None:
             x = mean[:, r, at]
             J = node_type.flow.flow_jacobian(x, dt)

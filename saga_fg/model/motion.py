@@ -250,7 +250,7 @@ class NodeType:
 
     @cached_property
     def planar(self) -> tuple[int, int, int, int]:
-        """Where x, y, vx, vy are in the state; -1, -1 for the velocity of a type that has none."""
+        """Indices of x, y, vx, vy in the state; -1, -1 for the velocity of a type that has none."""
         velocity = ("vx", "vy")
         x, y = self.index(("x", "y")).tolist()
         return (x, y, *self.index(velocity).tolist()) if self.has(velocity) else (x, y, -1, -1)

@@ -21,7 +21,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, distinct
 from saga_fg.numerics.geometry import inverse_transform, wrap_angle, yaw_transform
 from saga_fg.settings import (
@@ -309,6 +309,14 @@ class Sensor(Settings):
 def _score_factor(low_score_growth: FloatArray, probability: FloatArray) -> FloatArray:
     """(N,) what a score below 1 multiplies a variance by."""
     return np.asarray((1 + low_score_growth * (1 - probability)) ** 2)
+
+
+def checked_sensors(sensors: Mapping[str, Sensor] | None) -> dict[str, Sensor]:
+    """Models of sensors by name, as a dictionary of its own; raises `InputError` for values of another type."""
+    found = dict(sensors or {})
+    for name, sensor in found.items():
+        require_type(f"sensors.{name}", sensor, Sensor)
+    return found
 
 
 def sensor_model(sensors: Mapping[str, Sensor], name: str) -> Sensor:

@@ -99,7 +99,7 @@ def _by_antenna(z: FloatArray, moved: FloatArray, pose: gtsam.Pose3, antenna: Fl
 
 
 def _moved_back(view: GraphView, key: int, antenna: FloatArray, age: float) -> FloatArray:
-    """Where the antenna was `age` s ago, in the frame of the pose of now; as now where there is no pose before."""
+    """Place of the antenna `age` s ago in the frame of the present pose; its present place without an earlier pose."""
     before = view.before(EGO_POSE).get(0)
     if age == 0 or before is None or view.dt == 0:
         return antenna

@@ -1,4 +1,4 @@
-"""Where a sensor sits on the vehicle: position and turn in the frame of the pose that the graph estimates."""
+"""Extrinsics of a sensor: its position and rotation in the frame of the pose that the graph estimates."""
 
 from __future__ import annotations
 

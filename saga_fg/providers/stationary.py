@@ -15,6 +15,8 @@ from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Positive, Settings, setting
 
+_SURELY_MOVING = 4.0  # residual from which the loss lets a moving object go, standard deviations
+
 
 @dataclass(frozen=True)
 class StationaryObjects(Settings):
@@ -22,7 +24,6 @@ class StationaryObjects(Settings):
 
     classes: tuple[str, ...] = setting(("traffic_cone", "barrier"), "classes of stationary objects")
     deviation: Positive = setting(0.1, "standard deviation of the velocity left after one second, m/s; lower: stronger")
-    surely_moving: Positive = setting(4.0, "residual from which the loss lets a moving object go, standard deviations")
     name: str = setting("stationary", "name in messages")
 
     def factors(self, view: GraphView) -> Additions:
@@ -32,7 +33,7 @@ class StationaryObjects(Settings):
                 dims.setdefault(one.dim, []).append([one.key])
         if view.dt == 0:
             return Additions()
-        R, robust = self.deviation**2 / view.dt * np.eye(2), Robust("geman-mcclure", self.surely_moving)
+        R, robust = self.deviation**2 / view.dt * np.eye(2), Robust("geman-mcclure", _SURELY_MOVING)
         return Additions(
             factors=[
                 ResidualFactors(

@@ -12,7 +12,6 @@ from saga_fg.model.motion import ConstantVelocity
 from saga_fg.settings import (
     Fraction,
     NonNegative,
-    NonNegativeInt,
     Positive,
     PositiveOrInf,
     Settings,
@@ -121,9 +120,6 @@ class SmoothingSettings(Settings):
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, for the final states"
     )
-    reweightings: NonNegativeInt = setting(
-        1, "repetitions of loss weights and edges at the final states; usual 1 to 3; higher: slower"
-    )
     extension: NonNegative = setting(
         1.5,
         "time by which the search for detections of an object reaches before its first and after its last "
@@ -144,11 +140,6 @@ class SmoothingSettings(Settings):
     )
     min_score: Fraction = setting(0.02, "drop objects of a lower score; higher: fewer false objects, more misses")
     quality: QualitySettings = settings_group(QualitySettings, "quality classes of boxes")
-    association_gate: Fraction = setting(
-        0.95,
-        "gate probability for detections that no track was matched to; usual 0.9 to 0.99; higher: more are "
-        "added, right and wrong",
-    )
 
     @property
     def robust(self) -> Robust | None:

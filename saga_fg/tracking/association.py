@@ -176,7 +176,7 @@ def _gated(
     measurements: FrameMeasurements,
     evidence: ClassEvidence | None,
 ) -> CandidatePairs:
-    """The same pairs by a kernel."""
+    """`gated_pairs` by the compiled kernel."""
     boxes, n = measurements.boxes, len(predicted)
     if evidence is None:
         _, number = distinct(np.concatenate([predicted.label, boxes.label]))

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.errors import InputError
-from saga_fg.model.sensor import Sensor, sensor_model
+from saga_fg.errors import require_type
+from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting, settings_group
@@ -80,8 +80,9 @@ class GreedyTracker:
     """Same methods as `saga_fg.tracking.Tracker`; a frame that comes late, up to `max_delay`, is used as a new one."""
 
     def __init__(self, settings: GreedySettings | None = None, sensors: Mapping[str, Sensor] | None = None) -> None:
-        self.settings = settings or GreedySettings()
-        self.sensors = dict(sensors or {})
+        self.settings = GreedySettings() if settings is None else settings
+        require_type("settings", self.settings, GreedySettings)
+        self.sensors = checked_sensors(sensors)
         self.time_verdict: TimeVerdict = "accepted"  # of the latest frame
         self._clock = Clock()
         self._next_id = 1
@@ -97,8 +98,7 @@ class GreedyTracker:
 
         Raises `InputError` for a frame that can't be used; the tracker is then as it was before.
         """
-        if not isinstance(frame, Frame):
-            raise InputError(f"frame: expected a Frame, got {type(frame).__name__}")
+        require_type("frame", frame, Frame)
         sensor = sensor_model(self.sensors, frame.sensor)
         detections = sensor.in_world(frame)
         settings, timestamp = self.settings, frame.timestamp + sensor.time_offset
@@ -164,6 +164,7 @@ class GreedyTracker:
 
     def restore(self, snapshot: GreedySnapshot) -> None:
         """Continue from a snapshot of a tracker of the same settings."""
+        require_type("snapshot", snapshot, GreedySnapshot)
         self._memory, self._next_id, self._clock = snapshot.memory, snapshot.next_id, snapshot.clock
         self.time_verdict = snapshot.time_verdict
 

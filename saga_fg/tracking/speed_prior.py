@@ -100,7 +100,7 @@ def _neighbours(
 
 
 def _nearest_of_each(new: IntArray, ids: IntArray, k: FloatArray) -> IntArray:
-    """Of pairs (e,) of new tracks and passages of tracks `ids`, those of the largest weight `k` of each two tracks."""
+    """Select the pair of largest weight `k` of each two tracks, from pairs (e,) of new tracks and passages of `ids`."""
     order = np.lexsort((k, ids, new))
     last = np.ones(len(order), dtype=bool)
     last[:-1] = (np.diff(new[order]) != 0) | (np.diff(ids[order]) != 0)

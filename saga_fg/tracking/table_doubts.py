@@ -1,4 +1,4 @@
-"""What is probably wrong in a table of detections although it can be read: units, and names of classes."""
+"""Warnings about tables of detections that can be read but are probably wrong: units, and names of classes."""
 
 from __future__ import annotations
 

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.model.sensor import Sensor, sensor_model
+from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.association import associate
@@ -74,8 +74,9 @@ class Tracker:
         observer: Observer | None = None,
         providers: Sequence[FactorProvider] = (),
     ) -> None:
-        self.settings = settings or TrackerSettings()
-        self.sensors = dict(sensors or {})
+        self.settings = TrackerSettings() if settings is None else settings
+        require_type("settings", self.settings, TrackerSettings)
+        self.sensors = checked_sensors(sensors)
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
         self.observer = observer
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
@@ -87,7 +88,7 @@ class Tracker:
         self._last_step_failed = False
 
     def __repr__(self) -> str:
-        """How many tracks there are, and the settings that differ from the defaults."""
+        """The number of tracks, and the settings that differ from the defaults."""
         sensors = ", ".join(self.sensors) or "by the defaults"
         usual = TrackerSettings()
         named = [item.name for item in fields(self.settings) if item.name not in ("estimator", "edges")]
@@ -106,8 +107,7 @@ class Tracker:
         the next frame fails as well, and would not without the tracks, these are deleted and it is taken in; errors of
         a provider are raised every time.
         """
-        if not isinstance(frame, Frame):
-            raise InputError(f"frame: expected a Frame, got {type(frame).__name__}")
+        require_type("frame", frame, Frame)
         state = self._state.copied()
         try:
             reported = self._step(state, frame)
@@ -229,6 +229,7 @@ class Tracker:
 
     def restore(self, snapshot: TrackerSnapshot) -> None:
         """Continue from a snapshot of a tracker of the same settings; one snapshot can be used many times."""
+        require_type("snapshot", snapshot, TrackerSnapshot)
         self._state.restore(snapshot)
 
     def __reduce__(self) -> tuple[Any, ...]:

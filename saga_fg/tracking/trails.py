@@ -38,8 +38,8 @@ _NEARER = np.tril(np.ones((NEAREST, NEAREST), dtype=np.bool_), -1)
 
 
 class _Beside(NamedTuple):
-    """What trails tell of n places, each (n,): mean of h_j - h, rad, certainty c, variance s^2, typical speed, m/s, and
-    the weight of what it is known from."""
+    """Statistics of the trails near n places, each (n,): mean of h_j - h, rad, certainty c, variance s^2, typical
+    speed, m/s, and its weight."""
 
     turn: FloatArray
     certainty: FloatArray
@@ -81,7 +81,7 @@ def _found(traffic: Traffic) -> tuple[Trails, Trails]:
 
 
 def _columns(trails: Trails, cell: float) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray, Any, Any]:
-    """What the kernel reads of trails: tracks, places, headings, speeds, whether these are known, and the cells."""
+    """Trails as arrays for the kernel: tracks, places, headings, speeds, flags of known speeds, and grid cells."""
     points = trails.points
     return points.id, points.position, points.heading, points.speed, trails.timed, *trails.cells(cell)
 

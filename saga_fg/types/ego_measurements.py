@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.numerics.arrays import FloatArray, checked, checked_covariances
 from saga_fg.types.landmark import Observation
 
@@ -121,8 +121,8 @@ class EgoMeasurements:
             ("wheels", WheelSpeed),
         ):
             value = getattr(self, name)
-            if value is not None and not isinstance(value, kind):
-                raise InputError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+            if value is not None:
+                require_type(name, value, kind)
         if not isinstance(self.landmarks, Mapping) or not all(
             isinstance(seen, Observation) for seen in self.landmarks.values()
         ):

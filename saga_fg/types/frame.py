@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.numerics.arrays import FloatArray, checked, checked_covariances, from_upper_triangle, upper_triangle
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import checked_transform
@@ -197,14 +197,13 @@ class Frame:
         vars(self)["timestamp"] = timestamp
         if not isinstance(self.sensor, str) or not self.sensor:
             raise InputError(f"sensor: expected a name, got {self.sensor!r}")
-        if not isinstance(self.detections, Detections):
-            raise InputError(f"detections: expected Detections, got {type(self.detections).__name__}")
+        require_type("detections", self.detections, Detections)
         if self.coordinates not in get_args(Coordinates):
             raise InputError(
                 f"coordinates: expected one of {', '.join(get_args(Coordinates))}, got {self.coordinates!r}"
             )
-        if self.ego is not None and not isinstance(self.ego, EgoMeasurements):
-            raise InputError(f"ego: expected EgoMeasurements, got {type(self.ego).__name__}")
+        if self.ego is not None:
+            require_type("ego", self.ego, EgoMeasurements)
         if self.world_T_ego is not None:
             pose = checked_transform("world_T_ego", self.world_T_ego)
             if (np.abs(pose[:3, 3]) > MAX_POSITION).any():

@@ -137,3 +137,34 @@ def test_poses_that_are_not_held_as_the_file_says_are_warned_of(
 ) -> None:
     read_g2o(written(tmp_path, PLANAR.replace("FIX 3", fixed)))
     assert ("FIX 7 has no effect, as pose 3, the first, is held" in caplog.text) == warned
+
+
+@pytest.mark.parametrize(
+    ("text", "places"),
+    [
+        (PLANAR, "EDGE_PRIOR_SE2_XY 3 1 2 4 1 9\nEDGE_PRIOR_SE2_XY 7 2.5 2.25 4 0 4\n"),
+        (SPATIAL, "EDGE_SE3_XYZ_PRIOR 1 0 1 2 3 4 0 1 5 0 6\n"),
+    ],
+)
+def test_known_places_are_read_and_written(tmp_path: Path, text: str, places: str) -> None:
+    graph = read_g2o(written(tmp_path, text + places))
+    assert graph.places is not None
+    assert graph.priors is None
+    assert graph.anchored
+    if graph.dim == 2:
+        np.testing.assert_array_equal(graph.ids[graph.places.pose], [3, 7])
+        np.testing.assert_array_equal(graph.places.position, [[1, 2], [2.5, 2.25]])
+        np.testing.assert_array_equal(graph.places.information[0], [[4, 1], [1, 9]])
+    else:
+        np.testing.assert_array_equal(graph.places.information[0], [[4, 0, 1], [0, 5, 0], [1, 0, 6]])
+    again = tmp_path / "again.g2o"
+    write_g2o(again, graph)
+    copy = read_g2o(again).places
+    assert copy is not None
+    np.testing.assert_array_equal(copy.position, graph.places.position)
+    np.testing.assert_array_equal(copy.information, graph.places.information)
+
+
+def test_a_known_place_of_no_pose_is_located(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="line 7: pose: there is no pose 5"):
+        read_g2o(written(tmp_path, PLANAR + "EDGE_PRIOR_SE2_XY 5 1 2 4 1 9\n"))

@@ -214,7 +214,7 @@ def test_scans_in_other_units_are_refused(scans: SimulatedScans) -> None:
 
 def test_what_is_no_scan_or_time_is_said(scans: SimulatedScans) -> None:
     slam = LidarSlam(settings=PLAIN)
-    with pytest.raises(InputError, match="scan: expected a Scan, got ndarray"):
+    with pytest.raises(InputError, match="scan: expected Scan, got ndarray"):
         slam.step(scans[0].points, 0.0)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="time: expected a finite number of seconds, got None"):
         slam.step(scans[0], None)  # type: ignore[arg-type]

@@ -11,17 +11,20 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.pose_graphs import read_g2o
+from data_tools.sensor_logs import SensorLog
 from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans
 from pipelines.cli import app
 from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.localisation import Localiser, LocaliserSettings, guess_of
 from pipelines.slam.localised_drive import localise, write_localised
+from pipelines.slam.saved_graph import read_graph
 from pipelines.slam.slam_map import SlamMap, read_map, write_map
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.pose_graph import optimise_poses
 from saga_fg.slam.submaps import SubmapSettings
+from saga_fg.types.ego_measurements import WheelSpeed
 
 PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False, submaps=SubmapSettings(length=20.0))
 
@@ -113,6 +116,10 @@ def test_of_two_like_streets_none_is_taken(known: SlamMap, turned: bool) -> None
     scans = SimulatedScans(3, world_T_lidar=poses)
     with pytest.raises(InputError, match="it is ambiguous: several places of the map look like it"):
         localise(scans, twice)
+    fixes = poses[:, :3, 3] + np.random.default_rng(0).normal(0, 1.0, (25, 3))
+    fixes[:2] += 1000.0  # elsewhere at first: the place is then looked for everywhere, and is ambiguous
+    by_gps = localise(scans, twice, log=SensorLog({"gps": np.column_stack([scans.timestamps, fixes])}))
+    assert np.linalg.norm(by_gps.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.4
     told = localise(scans, twice, poses[0])
     assert np.linalg.norm(told.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
 
@@ -124,7 +131,18 @@ def test_a_drive_shorter_than_the_search_is_looked_for_at_its_end(known: SlamMap
     assert found.registered.any()
 
 
-@pytest.mark.parametrize("option", [["--seed", "0"], ["--no-landmarks"]])
+def test_wheels_and_imu_are_heard_in_a_map(known: SlamMap) -> None:
+    poses = drive(5.0, 0.5, 20)
+    scans, times = SimulatedScans(3, world_T_lidar=poses), 0.1 * np.arange(20)
+    wheels = np.column_stack([times, np.full(20, 10.0)])
+    imu = np.column_stack([times, np.tile([0, 0, 9.81, 0, 0, 0], (20, 1))])
+    found = localise(scans, known, poses[0], log=SensorLog({"wheels": wheels, "imu": imu}))
+    assert np.linalg.norm(found.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
+    with pytest.raises(InputError, match="wheels: expected it among the sensors"):
+        Localiser(known).step(scans[0], 0.0, wheels=WheelSpeed(9.0, 0.1))
+
+
+@pytest.mark.parametrize("option", [["--odometry", "oxts"], ["--no-landmarks"]])
 def test_options_that_a_map_has_no_use_for_are_refused(tmp_path: Path, option: list[str]) -> None:
     command = ["slam", "kitti", "--dataroot", str(tmp_path), "--map", str(tmp_path), "--output", str(tmp_path / "o")]
     outcome = CliRunner().invoke(app, [*command, *option])
@@ -150,6 +168,13 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     np.testing.assert_allclose(graph.world_T_pose, result.world_T_lidar, atol=1e-9)
     settled = result.world_T_lidar[0] @ inverse_transform(graph.world_T_pose[0]) @ optimise_poses(graph).world_T_pose
     assert np.linalg.norm(settled[-1, :3, 3] - result.world_T_lidar[-1, :3, 3]) < 0.5
+    assert graph.landmarks is not None
+    assert len(graph.landmarks.ids) == sum(mark.kind.name == "pole" for mark in result.landmarks)
+    poses, landmarks = read_graph(tmp_path / "first").solved()
+    np.testing.assert_allclose(poses, result.world_T_lidar, atol=1e-4)
+    assert [(mark.number, mark.kind, mark.observations) for mark in landmarks] == [
+        (mark.number, mark.kind, mark.observations) for mark in result.landmarks
+    ]
     header, *rows = (tmp_path / "first" / "landmarks.csv").read_text().splitlines()
     assert header == "number,kind,observations,deviations,geometry"
     assert len(rows) == len(result.landmarks)
@@ -180,11 +205,17 @@ def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_pat
     options = ["slam", "kitti", "--dataroot", str(recordings / "kitti")]
     first = CliRunner().invoke(app, [*options, "--scans", "20", "--no-landmarks", "--output", str(tmp_path / "first")])
     assert first.exit_code == 0, first.output
-    again = ["--scans", "10", "--map", str(tmp_path / "first"), "--guess", "0.5,0.3,0,-1.2", "--output"]
+    assert read_map(tmp_path / "first").origin is not None
+    again = ["--scans", "10", "--map", str(tmp_path / "first"), "--guess", "0.5,0.3,0,-1.2", "--sensors", "gps,wheels"]
+    again += ["--output"]
     outcome = CliRunner().invoke(app, [*options, *again, str(tmp_path / "again")])
     assert outcome.exit_code == 0, outcome.output
     assert "registered with the map, the first of them scan 0" in outcome.stdout
     assert "in the map's frame: ATE 0." in outcome.stdout
+    (tmp_path / "first" / "map" / "origin.csv").unlink()
+    outcome = CliRunner().invoke(app, [*options, *again, str(tmp_path / "nowhere")])
+    assert outcome.exit_code != 0
+    assert "expected a map with origin.csv" in " ".join(outcome.output.split())
 
 
 def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
@@ -196,7 +227,29 @@ def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "submaps.csv").write_text("number,file,x,y,z,qx,qy,qz,qw\n0,a.ply,0,0,0,0,0,0,2\n")
     with pytest.raises(InputError, match="line 2: expected a quaternion"):
         read_map(tmp_path)
+    (tmp_path / "origin.csv").write_text("latitude [deg],longitude [deg],altitude [m]\n91,8,100\n")
+    (tmp_path / "submaps.csv").write_text("number,file,x,y,z,qx,qy,qz,qw\n")
+    with pytest.raises(InputError, match=r"line 2: latitude \[deg\]: expected a number within 85, got 91"):
+        read_map(tmp_path)
     with pytest.raises(InputError, match="expected points in at least one submap"):
         SlamMap([np.empty((0, 3), dtype=np.float32)], np.eye(4)[None])
     with pytest.raises(InputError, match=r"guess: expected x,y,z,yaw, m and rad, got '1,2'"):
         guess_of("1,2")
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("0,0,tower,1 2 3,1 0 1", "line 2: kind: expected one of wall, pole, road line, ground, got 'tower'"),
+        ("7,0,pole,1 2 3,1 0 1", "line 2: expected numbers of a keyframe of graph.g2o"),
+        ("0,0,pole,1 2 3,1 0", "line 2: expected the numbers of an observation of a pole"),
+        ("0,0,pole", "line 2: expected 5 columns, got 3"),
+    ],
+)
+def test_a_graph_that_is_none_is_named(tmp_path: Path, row: str, message: str) -> None:
+    poses = "".join(f"VERTEX_SE3:QUAT {x} {x} 0 0 0 0 0 1\n" for x in range(2))
+    information = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+    (tmp_path / "graph.g2o").write_text(f"{poses}EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {information}\n")
+    (tmp_path / "observations.csv").write_text(f"keyframe,landmark,kind,value,covariance\n{row}\n")
+    with pytest.raises(InputError, match=message):
+        read_graph(tmp_path)

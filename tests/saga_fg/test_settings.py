@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import math
+from collections.abc import Mapping
 from typing import Annotated
 
 import pytest
@@ -104,6 +105,7 @@ class EveryRange(Settings):
     span: Annotated[tuple[float, float], Range(0, ascending=True)] = setting((0.0, 1.0), "m")
     speed: dict[str, Positive] = settings_group(dict, "by class, m/s")
     lag: PositiveOrInf | None = setting(None, "s")
+    classes: Mapping[str, GreedySettings] = settings_group(dict, "by class")
 
 
 @pytest.mark.parametrize(
@@ -116,6 +118,9 @@ class EveryRange(Settings):
         ({"span": (2.0, 1.0)}, "span: expected ascending numbers, got (2.0, 1.0)"),
         ({"speed": {"car": 0.0}}, "speed.car: expected a finite number > 0, got 0.0"),
         ({"lag": 0.0}, "lag: expected a number > 0, got 0.0"),
+        ({"offset": "left"}, "offset: expected a finite number, got 'left'"),
+        ({"span": (1.0, "far")}, "span: expected a finite number >= 0, got 'far'"),
+        ({"classes": {"car": {"gate": 0.9}}}, "classes.car: expected GreedySettings, got dict"),
     ],
 )
 def test_a_range_is_that_of_every_entry(values, message):

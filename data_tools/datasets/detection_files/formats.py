@@ -58,7 +58,7 @@ class _Reading:
     own: Collection[str] | None
 
     def way(self, names: Collection[str]) -> TableImport:
-        """How to read a file with these columns."""
+        """Hint in an error message: how to read a file with these columns."""
         return TableImport() if self.own is not None and set(self.own) <= set(names) else self.how
 
     def understood(self, names: Collection[str]) -> Columns:
@@ -134,7 +134,7 @@ def _tables(reading: _Reading) -> Iterator[RawTable]:
 
 
 def _foreign_line(path: Path) -> str:
-    """Where a file is no text in UTF-8, and what to do."""
+    """Error message for a file that is not UTF-8: the place in it, and the remedy."""
     with open_bytes(path) as file:
         for number, line in enumerate(file, start=1):
             try:

@@ -61,7 +61,7 @@ class TableSurvey:
 
     @property
     def has_identities(self) -> bool:
-        """Whether objects have names: these are tracks, or true objects."""
+        """True if objects have identities: these are tracks, or true objects."""
         return "id" in self.raw.columns
 
 

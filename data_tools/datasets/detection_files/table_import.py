@@ -1,4 +1,4 @@
-"""How to read a table of somebody else: names of columns and classes, units, coordinates, order of rows."""
+"""Options for reading foreign tables: names of columns and classes, units, coordinates, order of rows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KINDS = ("time", "length", "speed", "angle", "score")
 
 @dataclass(frozen=True)
 class TableImport(Settings):
-    """How to read a table. What is left out is found by the names of the columns, and is in s, m, m/s and rad.
+    """Options for reading a table. Those left out follow from the names of the columns; units are s, m, m/s and rad.
 
     Raises `InputError` for a column that has no meaning and a unit that does not exist.
     """
@@ -77,7 +77,7 @@ class TableImport(Settings):
         )
 
     def mended(self, mend: Mend, names: Mapping[str, str]) -> TableImport:
-        """The same with the entries that mend a suspicion; `names`: the file's name of each column of ours."""
+        """A copy with the entries that mend a suspicion; `names`: the file's name of each column of ours."""
         classes = {theirs: mend.classes.get(ours, ours) for theirs, ours in self.classes.items()}
         return replace(
             self,

@@ -105,7 +105,7 @@ def _poses(raw: RawTable) -> FloatArray:
 
 
 def _visible(raw: RawTable) -> BoolArray:
-    """Which objects (N,) can be seen: all that no column `visible` calls 0 or false."""
+    """Mask (N,) of the objects that can be seen: all that no column `visible` calls 0 or false."""
     values = raw.columns.get("visible", ())
     if not len(values):
         return np.ones(raw.length, dtype=np.bool_)

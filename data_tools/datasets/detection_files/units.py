@@ -64,7 +64,7 @@ def unit_of_speed(length: str) -> str:
 
 @dataclass(frozen=True)
 class Clock:
-    """How a column of times is read: in `unit` (s, ms, us, ns, iso8601, or frames at a rate such as 10Hz).
+    """The clock of a column of times: its `unit` (s, ms, us, ns, iso8601, or frames at a rate such as 10Hz).
 
     guessed  True if the unit is neither given nor part of the column's name, and not s
     """
@@ -117,7 +117,7 @@ def checked_unit(kind: str, unit: str) -> str:
 
 
 def is_date(value: Any) -> bool:
-    """Whether a value is a text that begins like a date with a time of ISO 8601."""
+    """True for a text that begins like a date with a time of ISO 8601."""
     return isinstance(value, str) and _ISO_DATE.match(value) is not None
 
 

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """How to read a recording.
+    """Options for reading a recording.
 
     topics    topic by the sensor's name; empty: the one topic of objects that there is
     classes   name to take for a class that is there, "" to leave it out
@@ -117,7 +117,7 @@ class McapRecording:
             return RecordedScene(name, times, np.array(world_T_ego), tokens, frames, world=places.world)
 
     def _placed(self, seen: list[tuple[LoggedMessage, MessageObjects]], tree: TransformTree) -> _Places:
-        """Where the vehicle and the frames of the messages are, at the times of the messages."""
+        """Poses of the vehicle and of the frames of the messages, at the times of the messages."""
         time: IntArray = np.array([objects.stamp for _, objects in seen], dtype=np.int64)
         used = list(dict.fromkeys(objects.frame for _, objects in seen if objects.frame))
         for child, parents in tree.contested.items():

@@ -25,6 +25,10 @@ from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.settings import setting, settings_group
 from saga_fg.types.boxes import Boxes
 
+_MIN_RECALL = 0.1  # lowest recall of the sweep
+_WORST_MOTP = 2.0  # MOTP of a recall that is not reached, m
+_WORST_FAF = 500.0  # reported for a class that is never matched, false alarms per 100 frames
+_WORST_DURATION = 20.0  # initialisation and gap duration of a class that is never matched, s
 CLASS_RANGE = {
     "bicycle": 40.0,
     "bus": 50.0,
@@ -44,11 +48,7 @@ class NuScenesTrackingSettings:
         lambda: dict(CLASS_RANGE), "classes scored, and the distance from the vehicle up to which they are, m"
     )
     gate: float = setting(2.0, "distance from which a pair cannot match, m")
-    min_recall: float = setting(0.1, "lowest recall of the sweep")
     thresholds: int = setting(40, "number of recall values in the sweep")
-    worst_motp: float = setting(2.0, "MOTP of a recall that is not reached, m")
-    worst_faf: float = setting(500.0, "reported for a class that is never matched, false alarms per 100 frames")
-    worst_duration: float = setting(20.0, "initialisation and gap duration of a class that is never matched, s")
     sample_period: float = setting(0.5, "time thin one frame counts in TID and LGD, s")
 
 
@@ -110,7 +110,7 @@ def nuscenes_tracking_metrics(
     )
     pairs = candidate_pairs(true, found, settings.gate)
     everything = sweep(true, found, pairs, np.full((len(class_range), 1), -np.inf))
-    recalls = np.linspace(settings.min_recall, 1, settings.thresholds).round(12)
+    recalls = np.linspace(_MIN_RECALL, 1, settings.thresholds).round(12)
     thresholds = np.stack(
         [_thresholds(true, found, everything, label, recalls) for label in range(len(class_range))]
     ).reshape(len(class_range), settings.thresholds)
@@ -119,7 +119,7 @@ def nuscenes_tracking_metrics(
     for label, name in enumerate(class_range):
         if (true.boxes.label == label).any():
             columns = _columns(true, found, matched, thresholds[label], label, settings)
-            per_class[name] = _summary(columns, settings)
+            per_class[name] = _summary(columns)
             curves[name] = _curves(columns, recalls[::-1], thresholds[label])
         else:
             per_class[name] = NuScenesClassMetrics.undefined()
@@ -180,7 +180,7 @@ def _columns(
             "lgd": spans.longest_gap,
         }
     if np.isnan(thresholds).all():
-        worst = _never_matched(gt, len(np.unique(true.boxes.identity[rows])), settings)
+        worst = _never_matched(gt, len(np.unique(true.boxes.identity[rows])))
         return {name: np.full(len(thresholds), worst[name]) for name in columns}
     source = np.maximum.accumulate(
         np.where(np.diff(thresholds, prepend=np.nan) == 0, 0, np.arange(len(thresholds)))
@@ -204,21 +204,21 @@ def _frames_and_boxes(true: Rows, found: Rows, thresholds: FloatArray, label: in
     return frames, present.sum(axis=0).astype(np.float64)
 
 
-def _never_matched(gt: int, objects: int, settings: NuScenesTrackingSettings) -> dict[str, float]:
+def _never_matched(gt: int, objects: int) -> dict[str, float]:
     """The metrics of a class of which no box is ever matched."""
     unknown = dict.fromkeys(("fp", "ids", "frag"), float("nan"))
     nothing = dict.fromkeys(("recall", "motar", "mota", "mt", "tp"), 0.0)
-    duration = dict.fromkeys(("tid", "lgd"), settings.worst_duration)
+    duration = dict.fromkeys(("tid", "lgd"), _WORST_DURATION)
     totals = {"gt": float(gt), "fn": float(gt), "ml": float(objects)}
-    return {**unknown, **nothing, **duration, **totals, "motp": settings.worst_motp, "faf": settings.worst_faf}
+    return {**unknown, **nothing, **duration, **totals, "motp": _WORST_MOTP, "faf": _WORST_FAF}
 
 
-def _summary(columns: Mapping[str, FloatArray], settings: NuScenesTrackingSettings) -> NuScenesClassMetrics:
+def _summary(columns: Mapping[str, FloatArray]) -> NuScenesClassMetrics:
     """The metrics at the first threshold with the highest MOTA, and the means over the sweep."""
     best = int(np.nanargmax(columns["mota"]))
     return NuScenesClassMetrics(
         amota=float(np.mean(np.nan_to_num(columns["motar"], nan=0.0))),
-        amotp=float(np.mean(np.nan_to_num(columns["motp"], nan=settings.worst_motp))),
+        amotp=float(np.mean(np.nan_to_num(columns["motp"], nan=_WORST_MOTP))),
         **{name: float(column[best]) for name, column in columns.items()},
     )
 

@@ -1,4 +1,4 @@
-"""Who is compared: methods and changes of their settings, each with tracks kept alive and with the shipped life."""
+"""Contenders: methods and changes of their settings, each with tracks kept alive and with the shipped deletion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a labelled object goes: the way of its labels from a moment on, and straight on from the last of them."""
+"""Route of a labelled object: along its labels from a moment on, and straight on from the last of them."""
 
 from __future__ import annotations
 

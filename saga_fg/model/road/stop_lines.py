@@ -1,4 +1,4 @@
-"""Who comes to which stop line: the way there, along a lane of the map or straight ahead, and who is first.
+"""Approaches of vehicles to stop lines: the way along a lane of the map or straight ahead, and the first in each lane.
 
 A vehicle approaches a line along a lane of the map that crosses the line, or else straight along its heading, as where
 a lane ends before the line.

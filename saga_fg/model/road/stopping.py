@@ -176,7 +176,7 @@ class RedLight(Settings):
         return coming.select(can | halting(coming.speed, coming.front))
 
     def brakes(self, nodes: NodeTable, coming: ComingVehicles) -> tuple[FloatArray, FloatArray]:
-        """How surely each driver brakes for a closed line (E,), and the acceleration then (E,), m/s^2."""
+        """The probability that each driver brakes for a closed line (E,), and the acceleration then (E,), m/s^2."""
         g = self.interaction.gap(nodes, coming.target, coming.approach.way)
         needed = coming.speed**2 / (2 * g) - self.reaction_deceleration
         ramp = np.clip(needed / max(self.full_deceleration - self.reaction_deceleration, 1e-9), 0.0, 1.0)
@@ -190,5 +190,5 @@ class RedLight(Settings):
 
 
 def halting(speed: FloatArray, front: FloatArray) -> BoolArray:
-    """Which vehicles of these speeds, m/s, so far before the line, m, come to rest where they are."""
+    """Mask of the vehicles that come to rest before the line, by their speeds, m/s, and distances from it, m."""
     return np.asarray((speed < HALTING_SPEED) & (front < HALTING_GAP))

@@ -40,6 +40,7 @@ from saga_fg.slam.joint.record import RecordedEpoch, RecordedObjects, motion_cov
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.mapping import pose_key
 
+_START_NOISE = 1e-3  # standard deviation of the first pose, m and rad
 _LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
 _ANY_SPEED = 100.0  # m/s, deviation of an unknown velocity
 Record = Sequence[RecordedEpoch]
@@ -61,7 +62,7 @@ def start_factors(
     """Priors of the odometry's errors and of the first pose, which fixes the world frame."""
     noise = settings.odometry
     slow = prior_factor(error_key(epoch), np.zeros(ERROR_DIM), np.diag([noise.scale, noise.bias, noise.course]) ** 2)
-    sigma = gtsam.noiseModel.Isotropic.Sigma(6, settings.start_noise)
+    sigma = gtsam.noiseModel.Isotropic.Sigma(6, _START_NOISE)
     return slow, gtsam.PriorFactorPose3(pose_key(epoch), gtsam.Pose3(world_T_ego), sigma)
 
 

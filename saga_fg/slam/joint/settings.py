@@ -45,9 +45,6 @@ class JointSettings(Settings):
     """Noise of the odometry, stationarity of objects, and effort of the joint estimation."""
 
     odometry: OdometryNoise = settings_group(OdometryNoise, "errors of the odometry")
-    start_noise: Positive = setting(
-        1e-3, "standard deviation of the first pose, m and rad; lower: the path stays closer to where it starts"
-    )
     stationary_window: Positive = setting(
         3.0, "time over which an object is judged stationary or moving, s; higher: surer, later"
     )

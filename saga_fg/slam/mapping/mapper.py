@@ -39,6 +39,7 @@ from saga_fg.slam.mapping.providers import (
 )
 from saga_fg.types.landmark import Landmark, Observation
 
+_MERGE_GATE = 1 - 1e-6  # gate probability of merging duplicates; near 1, since an outlier starts a duplicate
 _THRESHOLD = 1.0  # standard deviations that a variable moves before its factors are linearised anew
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
 
@@ -49,9 +50,6 @@ class MapperSettings(Settings):
 
     gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
         0.999, "gate probability of association; higher: fewer duplicates, more wrong matches"
-    )
-    merge_gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
-        1 - 1e-6, "gate probability of merging duplicates; near 1, since an outlier starts a duplicate"
     )
     smooth_every: Annotated[int, Range(1, 10**9)] = setting(
         100, "observations between two smoothings of the whole graph; higher: faster, later corrections"
@@ -149,7 +147,7 @@ class LandmarkMapper:
             self._smoothed[last] = chunk
             self._waiting, self._seen = [], {}
             self._read()
-        while merged := duplicates(self.ekf, self.settings.merge_gate, self._seen_together()):
+        while merged := duplicates(self.ekf, _MERGE_GATE, self._seen_together()):
             changed = {
                 last: {row: [(merged.get(n, n), z) for n, z in now] for row, now in chunk.items()}
                 for last, chunk in self._smoothed.items()

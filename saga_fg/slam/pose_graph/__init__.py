@@ -10,6 +10,7 @@ from saga_fg.slam.pose_graph.landmarks import (
     ObservationKind,
     PointLandmarks,
     PosePriors,
+    PositionPriors,
 )
 from saga_fg.slam.pose_graph.optimisation import (
     OptimisedPoses,
@@ -30,6 +31,7 @@ __all__ = [
     "PointLandmarks",
     "PoseGraph",
     "PosePriors",
+    "PositionPriors",
     "chordal_minimum",
     "chordal_poses",
     "consensus",

@@ -74,7 +74,7 @@ def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
     Raises `InputError` for landmarks seen by bearings.
     """
     cost, d = ChordalCost.of(graph), graph.dim
-    if graph.priors is not None:
+    if graph.anchored:
         start = np.concatenate([start, np.eye(d + 1)[None]])
     proofs: list[tuple[float, float, int]] = []  # bound, eigenvalue, dimensions
 

@@ -16,6 +16,8 @@ estimation and its use in pose graph optimization", ICRA 2015. Both systems are 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
@@ -29,9 +31,12 @@ from saga_fg.slam.pose_graph.graph import PoseGraph
 def chordal_poses(graph: PoseGraph) -> FloatArray:
     """Return poses (N, d + 1, d + 1) from the measurements and priors alone; without priors the first is fixed.
 
+    Known places move the whole where there are no known poses.
+
     Raises `InputError` for a graph that is not connected.
     """
-    d, whole = graph.dim, graph.with_frame_as_pose()
+    d, inner = graph.dim, replace(graph, places=None)
+    whole = inner.with_frame_as_pose()
     apart = whole.components() != 0
     if apart.any():
         raise InputError(f"pose {int(whole.ids[apart][0])}: expected measurements that connect it with the first pose")
@@ -39,7 +44,8 @@ def chordal_poses(graph: PoseGraph) -> FloatArray:
     poses = np.tile(np.eye(d + 1), (len(whole), 1, 1))
     poses[:, :d, :d] = _rotations(whole, kappa)
     poses[:, :d, d] = _positions(whole, poses[:, :d, :d], tau)
-    return graph.in_its_frame(poses)
+    poses = inner.in_its_frame(poses)
+    return graph.places.fitted(poses) if graph.places is not None and graph.priors is None else poses
 
 
 def nearest_rotations(matrices: FloatArray) -> FloatArray:

@@ -13,7 +13,8 @@ A point l seen at z from a pose, with information Omega, adds a row (1 at the po
 
     tau || l - t - R z ||^2,      tau = d / tr(Omega^-1)
 
-and a prior is an edge from one more pose, the frame that it is given in.
+and a prior is an edge from one more pose, the frame that it is given in. A known place is a point z seen from there,
+with the position of the pose in place of l.
 
 Positions are free, and the best ones for given rotations solve a linear problem. What is left is a form in Y_R alone,
 
@@ -74,9 +75,15 @@ class ChordalCost:
         A = edge_matrix(graph, -T.swapaxes(1, 2), np.broadcast_to(np.eye(d + 1), T.shape))
         W = np.column_stack([np.tile(kappa[:, None], (1, d)), tau]).ravel()
         M = (A.T @ diags_array(W) @ A).tocsc()
-        if (landmarks := graph.landmarks) is not None:
-            A, W = _point_matrix(landmarks, len(graph), d)
-            M = block_diag([M, csc_array((len(landmarks.ids),) * 2)], format="csc") + A.T @ diags_array(W) @ A
+        points = 0 if graph.landmarks is None else len(graph.landmarks.ids)
+        M = block_diag([M, csc_array((points,) * 2)], format="csc") if points else M
+        size, n = M.shape[0], len(graph)
+        if graph.landmarks is not None:
+            pose, landmark, z, W = _points_seen(graph.landmarks, d)
+            M = M + _point_form(size, d, pose, n * (d + 1) + landmark, z, W)
+        if (places := graph.places) is not None:
+            frame = np.full(len(places.pose), n - 1)
+            M = M + _point_form(size, d, frame, places.pose * (d + 1) + d, places.position, places.weight)
         return cls(d, len(graph), M.tocsc())
 
     def at(self, world_T_pose: FloatArray, points: FloatArray | None = None) -> float:
@@ -132,8 +139,8 @@ class ChordalCost:
         return factorised(self.M + _FLOOR * self.M.diagonal().max() * diags_array(np.ones(self.M.shape[0])))
 
 
-def _point_matrix(landmarks: PointLandmarks, poses: int, d: int) -> tuple[csc_array, FloatArray]:
-    """Rows (S, N (d + 1) + L) of S observations, and their weights (S,)."""
+def _points_seen(landmarks: PointLandmarks, d: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Rows of the poses and of the landmarks (S,) of S observations, z (S, d), and their weights (S,)."""
     for seen in landmarks.observations:
         if seen.kind != "point":
             name = int(landmarks.ids[seen.landmark[0]])
@@ -146,11 +153,16 @@ def _point_matrix(landmarks: PointLandmarks, poses: int, d: int) -> tuple[csc_ar
     z, information = (
         np.concatenate([getattr(seen, name) for seen in landmarks.observations]) for name in ("z", "information")
     )
+    return pose, point, z, d / np.trace(np.linalg.inv(information), axis1=1, axis2=2)
+
+
+def _point_form(size: int, d: int, pose: IntArray, column: IntArray, z: FloatArray, weight: FloatArray) -> csc_array:
+    """The form (size, size) of points, whose positions stand in a column (S,) of A each, seen at z from poses."""
     ones = np.ones((len(z), 1))
-    columns = np.column_stack([pose[:, None] * (d + 1) + np.arange(d + 1), poses * (d + 1) + point])
+    columns = np.column_stack([pose[:, None] * (d + 1) + np.arange(d + 1), column])
     entries = (np.hstack([-z, -ones, ones]).ravel(), columns.ravel(), (d + 2) * np.arange(len(z) + 1))
-    A = csr_array(entries, shape=(len(z), poses * (d + 1) + len(landmarks.ids))).tocsc()
-    return A, d / np.trace(np.linalg.inv(information), axis1=1, axis2=2)
+    A = csr_array(entries, shape=(len(z), size)).tocsc()
+    return (A.T @ diags_array(weight) @ A).tocsc()
 
 
 def factorised(matrix: csc_array) -> SuperLU:

@@ -1,7 +1,7 @@
-r"""Which loop closures of a pose graph are true.
+r"""Selection of the true loop closures of a pose graph.
 
-Odometry (between successive poses), priors and landmarks are trusted. First, graduated non-convexity with truncated
-least squares from dead reckoning: in each step of mu one weighted Gauss-Newton step,
+Odometry (between successive poses), priors, known places and landmarks are trusted. First, graduated non-convexity
+with truncated least squares from dead reckoning: in each step of mu one weighted Gauss-Newton step,
 
     w = 1                     s^2 <= mu/(mu+1) c^2                s: distance of the loop's residual
         0                     s^2 >= (mu+1)/mu c^2                c^2: 99 % quantile of chi^2
@@ -11,12 +11,12 @@ Then data snooping: each loop is judged by the solution without it,
 
     d^2 = r^T ( 1 -+ S )^-1 r,     S = J H^-1 J^T        - for a loop that takes part in H, + for one that does not
 
-whitened. Covariances in files are often far too large, and a false loop then hides in them; so the gate on d^2 is
+whitened. Covariances in files are often far too large and hide false loops; so the gate on d^2 is
 
     min( c'^2, m k c^2 ),     c'^2: 99.9 % quantile,  k = median of d^2 over the loops taken / median of chi^2
 
 with k the variance of unit weight, and m = 8, because the errors of recorded loops have longer tails than a Gaussian.
-The worst loops go, the best of the others come in, until nothing changes.
+The worst loops are removed and the best of the removed ones restored until nothing changes.
 
 Sources: Yang, Antonante, Tzoumas, Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020; Baarda, A
 testing procedure for use in geodetic networks, 1968.
@@ -57,9 +57,10 @@ class Consensus:
     kept: BoolArray
 
 
-def consensus(graph: PoseGraph) -> Consensus:
+def consensus(graph: PoseGraph, too_wide: bool = True) -> Consensus:
     """The graph without false loops; priors and observations of landmarks are trusted, as odometry is.
 
+    too_wide: covariances may be far too large, as in files; else the gate is c' alone.
     Raises `InputError` for a graph that measurements between poses do not connect.
     """
     apart = graph.components() != 0
@@ -73,7 +74,7 @@ def consensus(graph: PoseGraph) -> Consensus:
     problem = _Problem.of(graph)
     values = graph_values(placed(graph, _spanning_start(graph, ~loop)))
     values, weights = _graduated(problem, values, loop)
-    values, kept = _snooped(problem, values, loop, weights > 0.5)
+    values, kept = _snooped(problem, values, loop, weights > 0.5, too_wide)
     return Consensus(chosen_edges(solved_graph(graph, values), kept), kept)
 
 
@@ -108,14 +109,15 @@ def _spanning_start(graph: PoseGraph, spanning: BoolArray) -> FloatArray:
     part = chosen_edges(graph, spanning)
     start = PoseGraph.of_measurements(part.ids, part.first, part.second, part.first_T_second, part.information)
     if (priors := graph.priors) is None:
-        return np.asarray(graph.world_T_pose[0] @ start.world_T_pose)
+        poses = np.asarray(graph.world_T_pose[0] @ start.world_T_pose)
+        return poses if graph.places is None else graph.places.fitted(poses)
     known = int(priors.pose[0])
     return np.asarray(priors.world_T_pose[0] @ np.linalg.inv(start.world_T_pose[known]) @ start.world_T_pose)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The factors of a graph: those that hold it (the first pose, or the priors), edges, and landmarks seen.
+    """The factors of a graph: `held` of the first pose or the priors, edges, then known places; and landmarks seen.
 
     k: size of the tangent
     """
@@ -129,7 +131,8 @@ class _Problem:
     @classmethod
     def of(cls, graph: PoseGraph) -> _Problem:
         factors, edges = factor_graph(graph), len(graph.first)
-        return cls(factors, factors.size() - edges, edges, 3 * (graph.dim - 1), landmark_factors(graph))
+        behind = edges + (0 if graph.places is None else len(graph.places.pose))
+        return cls(factors, factors.size() - behind, edges, 3 * (graph.dim - 1), landmark_factors(graph))
 
     @property
     def gate(self) -> float:
@@ -143,7 +146,8 @@ class _Problem:
         """A step of Gauss and Newton with weights (M,)."""
         taken = np.flatnonzero(weights > 0)
         part, full = gtsam.NonlinearFactorGraph(), np.flatnonzero(weights[taken] >= 1)
-        for row in [*range(self.held), *(self.held + taken[full]).tolist()]:
+        others = [*range(self.held), *range(self.held + self.edges, self.factors.size())]
+        for row in [*others, *(self.held + taken[full]).tolist()]:
             part.add(self.factors.at(row))
         linear = linearised(part, self.seen, values)
         unit = gtsam.noiseModel.Unit.Create(self.k)
@@ -185,7 +189,7 @@ def _graduated(problem: _Problem, values: gtsam.Values, loop: BoolArray) -> tupl
 
 
 def _snooped(
-    problem: _Problem, values: gtsam.Values, loop: BoolArray, kept: BoolArray
+    problem: _Problem, values: gtsam.Values, loop: BoolArray, kept: BoolArray, too_wide: bool
 ) -> tuple[gtsam.Values, BoolArray]:
     """Take loops out and in, until all that are in pass the gate, and none besides."""
     rows = np.flatnonzero(loop)
@@ -198,7 +202,7 @@ def _snooped(
         squares[judged] = _judged(problem, values, rows[judged], kept)
         inside = kept[rows]
         gate = float(chi2.ppf(_CERTAIN, problem.k))
-        if inside.sum() >= _FEWEST:
+        if too_wide and inside.sum() >= _FEWEST:
             k = float(np.median(squares[inside])) / float(chi2.median(problem.k))
             gate = min(gate, _TAILS * k * problem.gate)
         judged = inside | (squares < 10 * problem.gate)  # the others stay far out

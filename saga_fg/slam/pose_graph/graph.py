@@ -25,7 +25,7 @@ from saga_fg.numerics.arrays import (
     checked_ids,
     checked_rows,
 )
-from saga_fg.slam.pose_graph.landmarks import PointLandmarks, PosePriors
+from saga_fg.slam.pose_graph.landmarks import PointLandmarks, PosePriors, PositionPriors
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -43,7 +43,8 @@ class PoseGraph:
     first_T_second  (M, d + 1, d + 1) the measurements
     information     (M, k, k) of the tangent, k = 3 or 6; positive definite
     landmarks       points seen from the poses
-    priors          poses known from outside; without them the first pose is held
+    priors          poses known from outside
+    places          places of poses known from outside; without priors and places the first pose is held
 
     Raises `InputError` where these do not fit together, or a rotation is none.
     """
@@ -56,6 +57,7 @@ class PoseGraph:
     information: FloatArray
     landmarks: PointLandmarks | None = None
     priors: PosePriors | None = None
+    places: PositionPriors | None = None
 
     @classmethod
     def of_measurements(
@@ -66,6 +68,7 @@ class PoseGraph:
         first_T_second: FloatArray,
         information: FloatArray,
         priors: PosePriors | None = None,
+        places: PositionPriors | None = None,
     ) -> PoseGraph:
         """A graph without a guess: poses start at dead reckoning from the first one, along the fewest measurements.
 
@@ -73,8 +76,11 @@ class PoseGraph:
         """
         size = np.asarray(first_T_second).shape[-1]
         still = np.tile(np.eye(size), (len(ids), 1, 1))
-        graph = cls(ids, still, first, second, first_T_second, information, priors=priors)
-        return graph.at(_dead_reckoned(graph)) if len(graph) else graph
+        graph = cls(ids, still, first, second, first_T_second, information, priors=priors, places=places)
+        if not len(graph):
+            return graph
+        poses = _dead_reckoned(graph)
+        return graph.at(poses if priors is not None or places is None else places.fitted(poses))
 
     def __post_init__(self) -> None:
         ids = checked_ids("ids", self.ids)
@@ -127,18 +133,31 @@ class PoseGraph:
 
     @property
     def poses_alone(self) -> bool:
-        """Whether there are neither landmarks nor priors."""
-        return self.landmarks is None and self.priors is None
+        """True if there are neither landmarks nor anything known from outside."""
+        return self.landmarks is None and not self.anchored
+
+    @property
+    def anchored(self) -> bool:
+        """True if priors or places say where the graph is."""
+        return self.priors is not None or self.places is not None
 
     def with_frame_as_pose(self) -> PoseGraph:
-        """Return this graph with priors as measurements from one more pose, the last: the frame they are given in."""
+        """Return this graph with priors as measurements from one more pose, the last: the frame they are given in.
+
+        Places are in this frame too, and remain.
+        """
         priors, n = self.priors, len(self)
-        if priors is None:
+        if not self.anchored:
             return self
-        return replace(
+        graph = replace(
             self,
             ids=np.append(self.ids, self.ids.max() + 1),
             world_T_pose=np.concatenate([self.world_T_pose, np.eye(self.dim + 1)[None]]),
+        )
+        if priors is None:
+            return graph
+        return replace(
+            graph,
             first=np.concatenate([self.first, np.full(len(priors.pose), n)]),
             second=np.concatenate([self.second, priors.pose]),
             first_T_second=np.concatenate([self.first_T_second, priors.world_T_pose]),
@@ -149,9 +168,9 @@ class PoseGraph:
     def in_its_frame(self, poses: FloatArray) -> FloatArray:
         """Return poses (N, d + 1, d + 1), given those of `with_frame_as_pose` up to a common motion.
 
-        Without priors the first pose is then that of the graph.
+        Without priors and places the first pose is then that of the graph.
         """
-        if self.priors is None:
+        if not self.anchored:
             return np.asarray(self.world_T_pose[0] @ np.linalg.inv(poses[0]) @ poses)
         return np.asarray(np.linalg.inv(poses[-1]) @ poses[:-1])
 
@@ -165,7 +184,7 @@ class PoseGraph:
 
 
 def trusted(graph: PoseGraph) -> BoolArray:
-    """Which measurements (M,) are odometry: they join successive poses."""
+    """Mask (M,) of the measurements that are odometry: between successive poses."""
     return np.asarray(np.abs(graph.second - graph.first) == 1)
 
 

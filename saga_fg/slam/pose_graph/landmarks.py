@@ -1,4 +1,4 @@
-r"""Points seen from the poses of a graph, and poses known from outside.
+r"""Points seen from the poses of a graph, and poses and places known from outside.
 
     point           z = R^T (l - t) + v                     world_T_pose = (R, t), landmark l
     bearing         z = direction of R^T (l - t) + v        in the plane
@@ -33,6 +33,47 @@ class PosePriors:
     pose: IntArray
     world_T_pose: FloatArray
     information: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PositionPriors:
+    """Places of poses (rows of the graph) known from outside: position (n, d), m, information (n, d, d), world frame.
+
+    Raises `InputError` where these do not fit together.
+    """
+
+    pose: IntArray
+    position: FloatArray
+    information: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(checked_rows("pose", self.pose))
+        places = checked("position", self.position, (n, None))
+        checked_covariances("information", self.information, n, places.shape[1])
+
+    @property
+    def weight(self) -> FloatArray:
+        """Weights (n,) of the squared distances, 1 / m^2: d / trace of the covariance."""
+        return np.asarray(self.position.shape[1] / np.trace(np.linalg.inv(self.information), axis1=1, axis2=2))
+
+    @property
+    def orient(self) -> bool:
+        """Whether they tell which way a rigid body of these places is turned: two places, in space not on one line."""
+        middle = self.position - self.position.mean(axis=0)
+        spread = np.linalg.svd(middle, compute_uv=False)
+        needed = self.position.shape[1] - 1
+        return len(spread) >= needed and bool(spread[needed - 1] > _FLAT * np.abs(self.position).max(initial=1.0))
+
+    def fitted(self, world_T_pose: FloatArray) -> FloatArray:
+        """Poses (N, d + 1, d + 1), moved as a whole to where the places are (weighted least squares)."""
+        d, w = self.position.shape[1], self.weight / self.weight.sum()
+        at = world_T_pose[self.pose, :d, d]
+        middle, known = w @ at, w @ self.position
+        U, _, Vt = np.linalg.svd((self.position - known).T @ (w[:, None] * (at - middle)))
+        T = np.eye(d + 1)
+        T[:d, :d] = U @ np.diag([*np.ones(d - 1), np.linalg.det(U @ Vt)]) @ Vt
+        T[:d, d] = known - T[:d, :d] @ middle
+        return np.asarray(T @ world_T_pose)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +152,7 @@ class PointLandmarks:
                 raise InputError(f"landmark: expected rows of the {len(ids)} landmarks, from 0")
 
     def at(self, position: FloatArray) -> PointLandmarks:
-        """The same landmarks at other places."""
+        """A copy with the landmarks at other places."""
         return replace(self, position=position)
 
     def placed(self, world_T_pose: FloatArray) -> PointLandmarks:

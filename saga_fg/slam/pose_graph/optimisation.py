@@ -137,12 +137,19 @@ def solved_graph(graph: PoseGraph, values: gtsam.Values) -> PoseGraph:
 
 
 def factor_graph(graph: PoseGraph, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
-    """GTSAM's factors of a pose graph, keys being its rows: what holds the first pose, or the priors, come first."""
+    """GTSAM's factors of a pose graph, keys being its rows.
+
+    First what holds the first pose, or the priors, then measurements, then known places. Raises `InputError` where
+    known places alone leave open which way the graph is turned.
+    """
+    if graph.priors is None and graph.places is not None and not graph.places.orient:
+        needed = "two known places" if graph.dim == 2 else "three known places that are not on one line"
+        raise InputError(f"expected {needed}, or a known pose: nothing tells which way the graph is turned")
     factors = gtsam.NonlinearFactorGraph()
     k = graph.information.shape[1] if len(graph.information) else 3 * (graph.dim - 1)
-    if (priors := graph.priors) is None:
+    if not graph.anchored:
         factors.add(pose_prior_factor(0, graph.world_T_pose[0], HELD * np.eye(k)))
-    else:
+    if (priors := graph.priors) is not None:
         for row, known, spread in zip(
             priors.pose.tolist(), priors.world_T_pose, _inverses(priors.information), strict=True
         ):
@@ -153,6 +160,10 @@ def factor_graph(graph: PoseGraph, robust: Robust | None = None) -> gtsam.Nonlin
         graph.first.tolist(), graph.second.tolist(), graph.first_T_second, covariances, losses, strict=True
     ):
         factors.add(between_factor(first, second, measured, covariance, loss))
+    if (places := graph.places) is not None:
+        place_prior = gtsam.PoseTranslationPrior2D if graph.dim == 2 else gtsam.PoseTranslationPrior3D
+        for row, place, weight in zip(places.pose.tolist(), places.position, places.information, strict=True):
+            factors.add(place_prior(row, place, gtsam.noiseModel.Gaussian.Information(weight)))
     return factors
 
 

@@ -1,4 +1,4 @@
-"""What the vehicle's sensors measured between two poses of the graph.
+"""Buffer of the vehicle's measurements between two poses of the graph.
 
 Sensors measure at their own times. The buffer takes measurements as they come, each sensor's in order of time, and
 gives those up to a pose's time as one `EgoMeasurements`: inertial samples, each for the time since the one before; the

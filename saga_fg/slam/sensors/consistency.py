@@ -1,4 +1,4 @@
-"""Whether what a sensor measures fits the rest of the graph.
+"""Consistency of each sensor's measurements with the rest of the graph.
 
 A sensor that sits elsewhere or looks elsewhere than its settings say leaves residuals larger than its noise allows, or
 drives its biases away. Of the newest factors of a provider, d_i residuals each, whitened and after the solution,
@@ -26,7 +26,7 @@ _BIAS = 4.0  # standard deviations of the prior
 
 
 def misfits(graph: SceneFactorGraph, sensors: Collection[str], settings: SensorSettings) -> dict[str, str]:
-    """What does not fit, in words, by the name of the sensor, the one that fits least first.
+    """Inconsistent sensors, each with an explanation, by name; the least consistent one first.
 
     graph: as solved, of providers by `sensor_providers`
     """

@@ -60,7 +60,7 @@ class SubmapLandmarks:
         return [number for known in self._known.values() for number in known.numbers]
 
     def copy(self) -> SubmapLandmarks:
-        """The same landmarks, to go on with."""
+        """A copy that further observations can be associated with."""
         twin = SubmapLandmarks(self._probability)
         twin._known = {kind: known.copy() for kind, known in self._known.items()}
         return twin
@@ -164,7 +164,7 @@ def _from_above(world_T_pose: FloatArray, extent: FloatArray | None) -> FloatArr
 
 
 def _gap(known: FloatArray | None, seen: FloatArray | None) -> float:
-    """How far apart two pieces are, m, along the first one."""
+    """Gap between two pieces along the first one, m."""
     if known is None or seen is None:
         return 0.0
     along = _direction(known)

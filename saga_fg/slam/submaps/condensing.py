@@ -3,7 +3,7 @@
 The variables of the submap are eliminated; the marginal that they leave on the two anchors A and B is a Gaussian on
 increments. In the coordinates
 
-    y = ( log(A_0^-1 A),  log(R_0^-1 A^-1 B),  others ),        R_0 = A_0^-1 B_0
+    y = ( log(A_0^-1 A),  log(R_0^-1 A^-1 B) ),        R_0 = A_0^-1 B_0
 
 the second part does not change when both anchors move as one, as they do when a loop closes far away. Factors that
 speak of relative poses alone, odometry and walls, leave rows on this part only, and become a measured motion. What
@@ -11,20 +11,21 @@ refers to the world (positions by GPS, the vertical) leaves rows on the first pa
 as it is. After G. Grisetti, R. Kuemmerle, K. Ni, "Robust optimization of factor graphs by using condensed
 measurements", IROS 2012.
 
-Variables of the newest epoch that go on (velocity, bias) keep their own marginal: their correlation with the motion
-before is left out, so that factors do not grow from submap to submap.
+The graph that goes on has B with what is known of it by everything before, A eliminated too: a prior. Variables for all
+time (calibrations) are in that prior with B; between anchors they count as unknown. Variables of the newest epoch that
+go on (velocity, bias) keep their own marginal: their correlation with the motion before is left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from factors import ResidualFactor, SpatialPose, Variable, between_factor
+from factors import ResidualFactor, SpatialPose, Variable, between_factor, pose_prior_factor
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.factor_groups import PriorGroup
 from saga_fg.graph.linearisation_point import LinearisationPoint
@@ -33,46 +34,60 @@ from saga_fg.numerics.arrays import FloatArray
 _NOTHING = 1e-3  # root of the information that counts as none: a deviation of 1000 m or rad
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class CondensedSubmap:
-    """Makes the factors of a closed submap; anchor, successor: keys of the two poses."""
+    """Closes a submap; anchor, successor: keys of its two poses; named: what these are called in the graph of anchors.
+
+    between  factors of that graph, once the submap is closed; others: what goes on in the running graph besides the
+             prior of the successor
+    """
 
     anchor: int
     successor: int
+    named: tuple[int, int]
     name: str = "submaps"
+    between: list[Factor] = field(default_factory=list, init=False)
+    others: list[Factor] = field(default_factory=list, init=False)
 
-    def factors(self, marginal: Sequence[gtsam.JacobianFactor], point: LinearisationPoint) -> list[Factor]:
-        keys, J = _stacked(marginal, point, (self.anchor, self.successor))
-        if self.successor not in keys:
-            return []
-        poses = (self.anchor, self.successor)
-        gone_on = [key for key in keys if key not in poses and point.variables[key].epoch is not None]
-        known = [key for key in keys if key not in gone_on]
-        made: list[Factor] = []
-        if gone_on:
-            made += _factor_on(gone_on, _marginal(keys, J, gone_on, point), point)
-            J, keys = _marginal(keys, J, known, point), known
-        if self.anchor not in keys:
-            return [*made, *_factor_on(keys, J, point)]
+    def factors(
+        self,
+        marginal: Sequence[gtsam.JacobianFactor],
+        earlier: Sequence[gtsam.JacobianFactor],
+        point: LinearisationPoint,
+    ) -> list[Factor]:
+        self.between = self._between(*_stacked(marginal, point, (self.anchor, self.successor)), point)
+        keys, J = _stacked([*marginal, *earlier], point, (self.anchor, self.successor))
+        others = [key for key in keys if key not in (self.anchor, self.successor)]
+        gone_on = [key for key in others if point.variables[key].epoch is not None]
+        for_all_time = [key for key in others if key not in gone_on]
+        own = [_factor_on(chosen, _marginal(keys, J, chosen, point), point) for chosen in (gone_on, for_all_time)]
+        self.others = [factor for made in own for factor in made]
+        if for_all_time:
+            joint = [self.successor, *for_all_time]
+            return [*own[0], *_factor_on(joint, _marginal(keys, J, joint, point), point)]
+        W, c = _compressed(_marginal(keys, J, [self.successor], point))
+        if len(c) < 6:
+            return [*own[0], *_factor_on([self.successor], _marginal(keys, J, [self.successor], point), point)]
+        root = np.linalg.inv(W)
+        here = _pose(point, self.successor).retract(root @ c).matrix()
+        return [*own[0], pose_prior_factor(self.successor, here, root @ root.T)]
+
+    def _between(self, keys: list[int], J: FloatArray, point: LinearisationPoint) -> list[Factor]:
+        """Factors on the two poses under their names in the graph of anchors."""
+        J = _marginal(keys, J, (self.anchor, self.successor), point)
         rel = _pose(point, self.anchor).between(_pose(point, self.successor))
         Ad = rel.inverse().AdjointMap()
         columns = J.copy()
         columns[:, :6] += J[:, 6:12] @ Ad  # of y: d(B) = d(rel) + Ad d(A)
-        if len(keys) == 2 and np.abs(columns[:, :6]).max(initial=0.0) < _NOTHING:
-            R = np.linalg.qr(columns[:, 6:])
-            step = np.linalg.solve(R[1][:6, :6], R[1][:6, 6])
-            root = np.linalg.inv(R[1][:6, :6])
-            return [*made, between_factor(*poses, rel.retract(step).matrix(), root @ root.T)]
+        if np.abs(columns[:, :6]).max(initial=0.0) < _NOTHING:
+            R = np.linalg.qr(columns[:, 6:])[1]
+            step = np.linalg.solve(R[:6, :6], R[:6, 6])
+            root = np.linalg.inv(R[:6, :6])
+            return [between_factor(*self.named, rel.retract(step).matrix(), root @ root.T)]
         W, c = _compressed(columns)
-        rest = keys[2:]
-        types = tuple(point.variables[key].type for key in rest)
-        states = tuple(kind.read(point.values, key) for kind, key in zip(types, rest, strict=True))
-        factor = _Condensed(_pose(point, self.anchor), rel, types, states, W, c)
-        kinds = (SpatialPose(), SpatialPose(), *types)
-        made.append(
-            ResidualFactor(tuple(keys), kinds, factor.residual, np.eye(len(c)), factor.jacobians, name="submap")
-        )
-        return made
+        factor = _Condensed(_pose(point, self.anchor), rel, W, c)
+        kinds = (SpatialPose(), SpatialPose())
+        return [ResidualFactor(self.named, kinds, factor.residual, np.eye(len(c)), factor.jacobians, name="submap")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,26 +96,19 @@ class _Condensed:
 
     anchor: gtsam.Pose3
     rel: gtsam.Pose3
-    types: tuple[Variable, ...]
-    states: tuple[Any, ...]
     W: FloatArray
     c: FloatArray
 
-    def residual(self, A: gtsam.Pose3, B: gtsam.Pose3, *others: Any) -> FloatArray:
+    def residual(self, A: gtsam.Pose3, B: gtsam.Pose3) -> FloatArray:
         y = [self.anchor.localCoordinates(A), self.rel.localCoordinates(A.between(B))]
-        y += [kind.local(at, x) for kind, at, x in zip(self.types, self.states, others, strict=True)]
         return np.asarray(self.W @ np.concatenate(y) - self.c)
 
-    def jacobians(self, A: gtsam.Pose3, B: gtsam.Pose3, *others: Any) -> list[FloatArray]:
+    def jacobians(self, A: gtsam.Pose3, B: gtsam.Pose3) -> list[FloatArray]:
         rel = A.between(B)
         absolute = gtsam.Pose3.LogmapDerivative(self.anchor.between(A))
         relative = gtsam.Pose3.LogmapDerivative(self.rel.between(rel))
-        by_a = self.W[:, :6] @ absolute - self.W[:, 6:12] @ relative @ rel.inverse().AdjointMap()
-        columns, result = 12, [by_a, self.W[:, 6:12] @ relative]
-        for kind in self.types:
-            result.append(self.W[:, columns : columns + kind.dim])
-            columns += kind.dim
-        return result
+        by_a = self.W[:, :6] @ absolute - self.W[:, 6:] @ relative @ rel.inverse().AdjointMap()
+        return [by_a, self.W[:, 6:] @ relative]
 
 
 def _pose(point: LinearisationPoint, key: int) -> gtsam.Pose3:
@@ -135,6 +143,8 @@ def _marginal(keys: Sequence[int], J: FloatArray, kept: Sequence[int], point: Li
     for key in keys:
         spans[key] = np.arange(start, start + point.variables[key].dim)
         start += point.variables[key].dim
+    if not len(kept):
+        return np.empty((0, 1))
     mine = np.concatenate([spans[key] for key in kept])
     others = np.setdiff1d(np.arange(start), mine)
     U, s, _ = np.linalg.svd(J[:, others], full_matrices=True)

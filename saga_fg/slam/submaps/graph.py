@@ -6,10 +6,15 @@
 
 A submap is anchored at its first keyframe. When it is long enough, the keyframe at hand becomes the anchor of the next
 one, and everything in between is eliminated (`condensing`). Landmarks belong to one submap: what is seen on is a
-landmark of the next again, and they are tied through the poses. So the graph grows by one pose and one factor a submap,
-and a keyframe costs as much at the end of a drive as at its beginning.
+landmark of the next again, and they are tied through the poses.
 
-The measurements themselves are kept. `finish` solves them all together, nothing condensed, from the running estimate.
+There are two graphs: the running one, of the submap at hand alone, whose anchor has a prior from everything before; and
+that of all anchors, which is solved when a submap is closed, and when loops come. These move the anchor of the running
+submap by another prior; what the running submap says of those before comes when it is closed. So a keyframe costs as
+much at the end of a drive as at its beginning.
+
+The measurements themselves are kept. `finish` chooses the loops that agree (`loop_selection`), and solves everything
+together, nothing condensed, from the running estimate.
 """
 
 from __future__ import annotations
@@ -21,19 +26,20 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from factors import Robust, SolverSettings
+from factors import Robust, SolverSettings, pose, pose_prior_factor
 from saga_fg.errors import InputError
 from saga_fg.estimators.batch_solver import BatchSolver
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
+from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView, NewVariable, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, landmark_key, pose_key
 from saga_fg.slam.submaps.association import SubmapLandmarks
 from saga_fg.slam.submaps.condensing import CondensedSubmap
+from saga_fg.slam.submaps.loop_selection import LoopSelection, select_loops
 from saga_fg.slam.submaps.loops import LoopClosure, loop_factors
 from saga_fg.slam.submaps.recording import recorded
 from saga_fg.types.frame import Frame
@@ -79,7 +85,8 @@ class SubmapSettings(Settings):
 class SolvedDrive:
     """Everything solved together: N poses (N, 4, 4), their covariances (N, 6, 6), and the landmarks seen often enough.
 
-    solution: of the whole graph, with all variables; graph: that, at its solution
+    solution: of the whole graph, with all variables; graph: that, at its solution; loops: which of those that came are
+    in it, and with what deviations of odometry
     """
 
     world_T_pose: FloatArray
@@ -87,6 +94,7 @@ class SolvedDrive:
     landmarks: list[Landmark]
     solution: GraphSolution
     graph: SceneFactorGraph
+    loops: LoopSelection
 
 
 class SubmapGraph:
@@ -111,15 +119,14 @@ class SubmapGraph:
     ) -> None:
         self.settings = settings or SubmapSettings()
         self._providers = recorded(providers)
-        self._smoother = IncrementalSmoother(
-            lag=None, settings=RelinearisationSettings(self.settings.relinearise_above), elimination="cholesky"
-        )
+        self._smoother = self._new_smoother()
         self._motions: list[tuple[FloatArray, FloatArray]] = [(world_T_first, covariance)]
         self._times: list[float] = []
         self._seen: list[Sequence[tuple[int, Observation]]] = []
         self._anchors: list[int] = []
         self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
-        self._states: dict[int, Any] = {}  # of landmarks of closed submaps
+        self._by_anchors = self._new_smoother()  # one epoch for each anchor, once a submap was closed
+        self._closed: CondensedSubmap | None = None  # the newest one
         self._loops: list[tuple[int, LoopClosure]] = []  # with the keyframe at which they came
         self._landmarks = SubmapLandmarks(self.settings.gate)
         self._numbers, self._way = 0, 0.0
@@ -183,15 +190,16 @@ class SubmapGraph:
                 raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
         if not loops:
             return
-        self._smoother.extend([_Loops(loops, self._anchors, self.settings.robust_loops)], _AFTER_LOOPS)
+        numbers = range(len(self._anchors))
+        self._by_anchors.extend([_Loops(loops, numbers, self.settings.robust_loops)], _AFTER_LOOPS)
         self._loops += [(len(self) - 1, loop) for loop in loops]
-        self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
+        self._move_running()
 
     def pose(self, k: int) -> FloatArray:
         """The present estimate (4, 4) of a keyframe's pose; in a closed submap it goes along with the anchor."""
         if k < len(self._offsets):
-            anchor = self._anchors[int(np.searchsorted(self._anchors, k, side="right")) - 1]
-            return np.asarray(self._running(anchor) @ self._offsets[k])
+            number = int(np.searchsorted(self._anchors, k, side="right")) - 1
+            return np.asarray(self._anchor(number) @ self._offsets[k])
         return self._running(k)
 
     def covariance(self) -> FloatArray:
@@ -200,7 +208,7 @@ class SubmapGraph:
 
     def world_T_anchor(self) -> FloatArray:
         """The present estimates (n, 4, 4) of all anchors."""
-        return np.array([self._running(k) for k in self._anchors])
+        return np.array([self._anchor(number) for number in range(len(self._anchors))])
 
     def poses(self) -> FloatArray:
         """The present estimates (N, 4, 4) of all keyframes."""
@@ -216,18 +224,26 @@ class SubmapGraph:
         """All observations with their keyframes and landmarks."""
         return [AssociatedObservation(k, one, n) for k, now in enumerate(self._seen) for n, one in now]
 
-    def measurements(self) -> SceneFactorGraph:
-        """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed."""
-        graph, poses = SceneFactorGraph(), self.poses()
+    def select_loops(self) -> LoopSelection:
+        """Judge all loops that came, in this order."""
+        return select_loops(self.world_T_anchor(), self._motions[1:], self._anchors, [loop for _, loop in self._loops])
+
+    def measurements(self, loops: LoopSelection | None = None) -> SceneFactorGraph:
+        """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed.
+
+        loops: by default as `select_loops` has it
+        """
+        graph, poses, chosen = SceneFactorGraph(), self.poses(), self.select_loops() if loops is None else loops
         seen = LandmarkObservations(self._confirmed(), self._starts(poses), self.settings.robust)
-        loops: dict[int, list[LoopClosure]] = {}
-        for k, loop in self._loops:
-            loops.setdefault(k, []).append(loop)
+        came: dict[int, list[LoopClosure]] = {}
+        for (k, loop), kept in zip(self._loops, chosen.kept.tolist(), strict=True):
+            came.setdefault(k, []).extend([loop] if kept else [])
         for k, (time, motion) in enumerate(zip(self._times, self._motions, strict=True)):
             graph.advance(time)
-            own: list[FactorProvider] = [MeasuredMotion(*motion, poses[k]), seen]
-            if k in loops:
-                own.append(_Loops(loops[k], self._anchors, self.settings.robust_loops))
+            covariance = chosen.inflation**2 * motion[1] if k else motion[1]
+            own: list[FactorProvider] = [MeasuredMotion(motion[0], covariance, poses[k]), seen]
+            if came.get(k):
+                own.append(_Loops(came[k], self._anchors, None))
             ask_all([*own, *(again for provider in self._providers for again in provider.again(k))], graph)
         return graph
 
@@ -235,7 +251,8 @@ class SubmapGraph:
         """Solve all measurements together."""
         if not len(self):
             raise InputError("expected at least one keyframe before the end")
-        solver = BatchSolver(graph=self.measurements(), settings=_SOLVER)
+        loops = self.select_loops()
+        solver = BatchSolver(graph=self.measurements(loops), settings=_SOLVER)
         solution = solver.solve()
         keys = [pose_key(k) for k in range(len(self))]
         seen = LandmarkObservations(self._confirmed(), {})
@@ -246,11 +263,32 @@ class SubmapGraph:
             marks,
             solution,
             solver.graph(),
+            loops,
         )
+
+    def _new_smoother(self) -> IncrementalSmoother:
+        settings = RelinearisationSettings(self.settings.relinearise_above)
+        return IncrementalSmoother(lag=None, settings=settings, elimination="cholesky")
 
     def _running(self, k: int) -> FloatArray:
         state: Any = self._smoother.state(pose_key(k))
         return np.asarray(state.matrix())
+
+    def _anchor(self, number: int) -> FloatArray:
+        if number == len(self._anchors) - 1:
+            return self._running(self._anchors[number])
+        state: Any = self._by_anchors.state(pose_key(number))
+        return np.asarray(state.matrix())
+
+    def _move_running(self) -> None:
+        """Put the anchor of the running submap where the graph of anchors has it."""
+        assert self._closed is not None
+        number = pose_key(len(self._anchors) - 1)
+        state: Any = self._by_anchors.state(number)
+        prior = pose_prior_factor(self._closed.successor, state.matrix(), self._by_anchors.covariance(number))
+        given = Additions(named={self._closed.name: [prior, *self._closed.others]})
+        self._smoother.extend([_Given(given, self._closed.name)], _AFTER_LOOPS)
+        self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
 
     def _associated(
         self,
@@ -267,21 +305,32 @@ class SubmapGraph:
     def _begin_submap(self, k: int) -> None:
         """Close the running submap, if any, and make the keyframe k an anchor."""
         if k:
-            anchor = self._anchors[-1]
-            self._close(anchor, k)
+            self._close(self._anchors[-1], k)
         self._anchors.append(k)
         self._way = 0.0
+        if self._loops:
+            self._move_running()
 
     def _close(self, anchor: int, successor: int) -> None:
-        keep = {pose_key(k) for k in self._anchors} | {pose_key(successor)}
         mine = {n for now in self._seen[anchor:successor] for n, _ in now}
         world = inverse_transform(self._running(anchor))
         self._offsets += [np.eye(4), *(world @ self._running(k) for k in range(anchor + 1, successor))]
-        self._states |= {n: self._smoother.state(landmark_key(n)) for n in mine}
+        begin, moved = self._running(anchor), world @ self._running(successor)
         variables = self._smoother.graph().variables.values()
-        old = [one.key for one in variables if one.epoch is not None and one.epoch < successor and one.key not in keep]
-        into = CondensedSubmap(pose_key(anchor), pose_key(successor))
+        old = [one.key for one in variables if one.epoch is not None and one.epoch < successor]
+        number = len(self._anchors) - 1
+        keys = (pose_key(anchor), pose_key(successor))
+        self._closed = into = CondensedSubmap(*keys, named=(pose_key(number), pose_key(number + 1)))
         self._smoother.marginalise([*old, *map(landmark_key, mine)], into)
+        epochs: list[tuple[float, Sequence[FactorProvider]]] = []
+        if number == 0:
+            epochs.append((self._times[anchor], [_Given(_anchor_pose(begin))]))
+        else:
+            state: Any = self._by_anchors.state(into.named[0])
+            begin = np.asarray(state.matrix())
+        given = [_Given(_anchor_pose(begin @ moved)), _Given(Additions(factors=into.between))]
+        epochs.append((self._times[successor], given))
+        self._by_anchors.steps(epochs)
 
     def _confirmed(self) -> dict[int, Sequence[tuple[int, Observation]]]:
         """Observations of landmarks that were seen often enough, by keyframe."""
@@ -290,11 +339,12 @@ class SubmapGraph:
         return {k: [(n, one) for n, one in now if n in often] for k, now in enumerate(self._seen)}
 
     def _starts(self, poses: FloatArray) -> Mapping[int, Any]:
-        """Where landmarks begin: those of closed submaps anew from their last observation, since anchors have moved."""
+        """Initial values of landmarks; in closed submaps from the last observation, since anchors have moved."""
         start: dict[int, Any] = {}
+        running = self._smoother.graph().variables
         for k, now in enumerate(self._seen):
             for number, one in now:
-                if number in self._states:
+                if landmark_key(number) not in running:
                     start[number] = one.kind.initialise(poses[k], one.value)
                 elif number not in start:
                     start[number] = self._smoother.state(landmark_key(number))
@@ -307,8 +357,23 @@ class _Loops:
 
     loops: Sequence[LoopClosure]
     anchors: Sequence[int]
-    robust: Robust
+    robust: Robust | None
     name: str = "loops"
 
     def factors(self, view: GraphView) -> Additions:
         return Additions(factors=loop_factors(self.loops, self.anchors, self.robust))
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """What is known already."""
+
+    added: Additions
+    name: str = "submaps"
+
+    def factors(self, view: GraphView) -> Additions:
+        return self.added
+
+
+def _anchor_pose(world_T_anchor: FloatArray) -> Additions:
+    return Additions([NewVariable(EGO_POSE, 0, pose("world_T_anchor", world_T_anchor), label="anchor")])

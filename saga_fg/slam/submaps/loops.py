@@ -27,7 +27,9 @@ class LoopClosure:
     confirmed: bool = False
 
 
-def loop_factors(loops: Sequence[LoopClosure], epochs: Sequence[int], robust: Robust) -> list[gtsam.NonlinearFactor]:
+def loop_factors(
+    loops: Sequence[LoopClosure], epochs: Sequence[int], robust: Robust | None
+) -> list[gtsam.NonlinearFactor]:
     """Factors between the poses of `epochs`, by the numbers `first` and `second` of loops."""
     return [
         between_factor(

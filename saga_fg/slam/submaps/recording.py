@@ -1,4 +1,4 @@
-"""What providers gave, epoch by epoch, to be given again when everything is solved as a whole."""
+"""Record of providers' additions by epoch, replayed when the whole drive is solved at once."""
 
 from __future__ import annotations
 

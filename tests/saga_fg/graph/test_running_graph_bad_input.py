@@ -323,7 +323,7 @@ def test_settings_and_snapshots_are_checked():
         IncrementalSmoother(lag=-1.0)
     with pytest.raises(InputError, match="threshold"):
         RelinearisationSettings(threshold=-0.1)
-    with pytest.raises(InputError, match="expected a SceneFactorGraph"):
+    with pytest.raises(InputError, match="expected SceneFactorGraph"):
         IncrementalSmoother().restore(3)
     with pytest.raises(GraphError, match="object 4 of epoch 2 is not in the graph"):
         SceneFactorGraph().state(key_of(OBJECT, 4, 2))

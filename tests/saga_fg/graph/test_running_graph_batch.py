@@ -138,7 +138,7 @@ def test_errors_are_named_and_leave_the_solver_as_it_was():
     assert solver.time == 3.4
     with pytest.raises(GraphError, match="object 12 of epoch 7 is not in the graph"):
         solver.covariance(key_of(OBJECT, 12, 7))
-    with pytest.raises(InputError, match="expected a SceneFactorGraph, got int"):
+    with pytest.raises(InputError, match="expected SceneFactorGraph, got int"):
         BatchSolver(graph=3)
     assert len(BatchSolver().graph().variables) == 0
 

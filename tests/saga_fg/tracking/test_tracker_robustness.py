@@ -289,8 +289,24 @@ def test_how_fast_things_are_can_be_set():
 @pytest.mark.parametrize("make", [Tracker, GreedyTracker])
 @pytest.mark.parametrize("nothing", [None, [], [Detection("car", (0, 0, 0))], np.zeros((3, 2))], ids=type)
 def test_what_is_no_frame_is_refused(make, nothing):
-    with pytest.raises(InputError, match=f"frame: expected a Frame, got {type(nothing).__name__}"):
+    with pytest.raises(InputError, match=f"frame: expected Frame, got {type(nothing).__name__}"):
         make().step(nothing)
+
+
+@pytest.mark.parametrize("make", [Tracker, GreedyTracker])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"settings": {"min_hits": 2}}, "settings: expected {}, got dict"),
+        ({"sensors": {"lidar": 0.3}}, "sensors.lidar: expected Sensor, got float"),
+    ],
+)
+def test_settings_and_sensors_of_another_type_are_named(make, arguments, message):
+    wanted = {Tracker: "TrackerSettings", GreedyTracker: "GreedySettings"}[make]
+    with pytest.raises(InputError, match=message.format(wanted)):
+        make(**arguments)
+    with pytest.raises(InputError, match=r"snapshot: expected \w+Snapshot, got str"):
+        make().restore("state.json")
 
 
 def test_a_list_of_detections_may_be_any_iterable():

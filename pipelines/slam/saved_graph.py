@@ -1,0 +1,127 @@
+"""The whole graph of LiDAR SLAM as files, and back: keyframes, odometry, loops, poles, walls, curbs.
+
+graph.g2o          poses, the first one's prior, odometry and loops, poles (`pipelines.slam.graph_export`)
+observations.csv   keyframe, landmark, kind, value, covariance: all observations of landmarks of the map, the value as
+                   the kind has it (a wall nx ny nz d, a pole x y z), the covariance as its upper triangle
+
+    saved = read_graph("slam")
+    world_T_lidar, landmarks = saved.solved()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.files.atomic_files import write_text
+from data_tools.files.text_tables import read_lines
+from data_tools.pose_graphs import read_g2o, write_g2o
+from factors import SolverSettings
+from pipelines.slam.graph_export import pose_graph_of
+from pipelines.slam.lidar_slam_types import START, LidarSlamResult
+from pipelines.slam.scan_landmarks import GROUND, LINE, POLE, WALL
+from saga_fg.errors import InputError
+from saga_fg.estimators.batch_solver import BatchSolver
+from saga_fg.graph import Additions, GraphView, SceneFactorGraph, ask_all
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, pose_key
+from saga_fg.slam.pose_graph import PoseGraph, trusted
+from saga_fg.slam.submaps import LoopClosure, SubmapSettings, loop_factors
+from saga_fg.types.landmark import Landmark, LandmarkType, Observation
+
+_COLUMNS = ("keyframe", "landmark", "kind", "value", "covariance")
+
+
+@dataclass(frozen=True, eq=False)
+class SavedGraph:
+    """poses: with odometry and loops; observations: of landmarks, from these poses by row."""
+
+    poses: PoseGraph
+    observations: Sequence[AssociatedObservation]
+
+    def solved(self, settings: SubmapSettings | None = None) -> tuple[FloatArray, list[Landmark]]:
+        """Poses (M, 4, 4) and landmarks of the whole graph; settings: of the run, for the losses of landmarks."""
+        s, graph, odometry = settings or SubmapSettings(), SceneFactorGraph(), trusted(self.poses)
+        covariances = np.linalg.inv(self.poses.information)
+        edges = list(zip(self.poses.first.tolist(), self.poses.second.tolist(), strict=True))
+        moved = {edges[row][1]: row for row in np.flatnonzero(odometry).tolist()}
+        loops = [
+            LoopClosure(*edges[row], self.poses.first_T_second[row], covariances[row])
+            for row in np.flatnonzero(~odometry).tolist()
+        ]
+        seen: dict[int, list[tuple[int, Observation]]] = {}
+        start = {}
+        for one in self.observations:
+            seen.setdefault(one.pose, []).append((one.landmark, one.observation))
+            if one.landmark not in start:
+                start[one.landmark] = one.observation.kind.initialise(
+                    self.poses.world_T_pose[one.pose], one.observation.value
+                )
+        marks = LandmarkObservations(seen, start, s.robust)
+        for k, pose in enumerate(self.poses.world_T_pose):
+            graph.advance(float(k))
+            priors = self.poses.priors
+            if k == 0:
+                motion = MeasuredMotion(pose if priors is None else priors.world_T_pose[0], START, pose)
+            elif k in moved:
+                motion = MeasuredMotion(self.poses.first_T_second[moved[k]], covariances[moved[k]], pose)
+            else:
+                raise InputError(f"graph: expected odometry from keyframe {k - 1} to keyframe {k}")
+            ask_all([motion, marks, _Loops([loop for loop in loops if max(loop.first, loop.second) == k])], graph)
+        solution = BatchSolver(graph=graph, settings=SolverSettings(tolerance=1e-4, max_iterations=30)).solve()
+        poses = [solution.values.atPose3(pose_key(k)).matrix() for k in range(len(self.poses))]
+        return np.array(poses), marks.landmarks(solution, s.confirm_after)
+
+
+@dataclass(frozen=True, eq=False)
+class _Loops:
+    loops: Sequence[LoopClosure]
+    name: str = "loops"
+
+    def factors(self, view: GraphView) -> Additions:
+        return Additions(factors=loop_factors(self.loops, range(view.epoch + 1), None))
+
+
+def write_graph(folder: Path, result: LidarSlamResult) -> None:
+    """Write both files to a folder that exists; a graph of one keyframe is none."""
+    if len(result.keyframes) < 2:
+        return
+    write_g2o(folder / "graph.g2o", pose_graph_of(result))
+    marks = {mark.number for mark in result.landmarks}
+    rows = [",".join(_COLUMNS)]
+    for one in result.observations:
+        if one.landmark in marks:
+            z, P = one.observation.value, one.observation.covariance
+            fields = (z, P[np.triu_indices(len(P))])
+            value, covariance = (" ".join(f"{x:.17g}" for x in field) for field in fields)
+            rows.append(f"{one.pose},{one.landmark},{one.observation.kind.name},{value},{covariance}")
+    write_text(folder / "observations.csv", "\n".join(rows) + "\n")
+
+
+def read_graph(folder: str | Path, kinds: Sequence[LandmarkType] = (WALL, POLE, LINE, GROUND)) -> SavedGraph:
+    """Read a graph; kinds: of landmarks, your own among them. Raises `InputError` naming file and line."""
+    graph, path = read_g2o(Path(folder) / "graph.g2o"), Path(folder) / "observations.csv"
+    lines = [(number, line.split(",")) for number, line in enumerate(read_lines(path), start=1) if line.strip()]
+    if not lines or tuple(lines[0][1]) != _COLUMNS:
+        raise InputError(f"{path}: line 1: expected the columns {','.join(_COLUMNS)}")
+    known, found = {kind.name: kind for kind in kinds}, list[AssociatedObservation]()
+    for number, row in lines[1:]:
+        where = f"{path}: line {number}"
+        if len(row) != len(_COLUMNS):
+            raise InputError(f"{where}: expected {len(_COLUMNS)} columns, got {len(row)}")
+        keyframe, landmark, name, value, covariance = row
+        if name not in known:
+            raise InputError(f"{where}: kind: expected one of {', '.join(known)}, got {name[:40]!r}")
+        if not (keyframe.isdecimal() and landmark.isdecimal() and len(keyframe) < 10 and int(keyframe) < len(graph)):
+            raise InputError(f"{where}: expected numbers of a keyframe of graph.g2o and of a landmark")
+        P, upper = np.zeros((known[name].variable.dim,) * 2), np.triu_indices(known[name].variable.dim)
+        try:
+            P[upper] = P.T[upper] = [float(word) for word in covariance.split()]
+            seen = Observation(known[name], np.array([float(word) for word in value.split()]), P)
+        except ValueError as error:
+            raise InputError(f"{where}: expected the numbers of an observation of a {name}: {error}") from error
+        found.append(AssociatedObservation(int(keyframe), seen, int(landmark)))
+    return SavedGraph(graph, found)
