@@ -2,22 +2,28 @@
 
 Nodes need this package in the same version. Inputs that are read by the driver travel with their job; those that are
 read by the worker (files) must be reachable from every node under the same name. Results travel back to the driver.
+Kernels are compiled once a node.
 """
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import os
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from pipelines.scale_out.job import Job, Outcome, perform
 from pipelines.scale_out.local_pool import ATTEMPTS
 from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.kernels.compilation import load_kernels
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +44,7 @@ class RayPool:
         ray = _connected(self.address, self.workers)
         try:
             limit = self.workers if self.workers and self.address != "local" else self._in_flight(ray)
-            task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(perform)
+            task = ray.remote(num_cpus=1, max_retries=ATTEMPTS - 1)(perform_on_node)
             names: dict[Any, str] = {}
             while True:
                 while len(names) < limit and (job := next(jobs, None)) is not None:
@@ -52,6 +58,29 @@ class RayPool:
 
     def _in_flight(self, ray: ModuleType) -> int:
         return _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+
+def perform_on_node(job: Job) -> Outcome:
+    """Perform a job. Of the processes of a node one compiles kernels, the others wait and load them."""
+    with _lock_of_node():
+        load_kernels()
+    return perform(job)
+
+
+@contextmanager
+def _lock_of_node() -> Iterator[None]:
+    """Hold a lock that the user's processes on this machine share; none where the folder for them cannot be written."""
+    name = Path(tempfile.gettempdir()) / f"saga-fg-kernels-{os.getuid()}.lock"
+    try:
+        lock = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    except OSError:
+        yield
+        return
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
 
 
 def _outcome(ray: ModuleType, reference: Any, name: str) -> Outcome:

@@ -4,6 +4,7 @@ from saga_fg.estimators.batch import BatchSmoother
 from saga_fg.estimators.batch_solver import BatchSolver
 from saga_fg.estimators.bounded import BoundedKalmanFilter
 from saga_fg.estimators.fixed_lag import FixedLagSmoother
+from saga_fg.estimators.gauss_newton import GaussNewtonSettings
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_filter import GraphFilter
 from saga_fg.estimators.graph_solution import GraphSolution
@@ -15,7 +16,6 @@ from saga_fg.estimators.measurements import Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
 from saga_fg.estimators.protocol import Estimator, Measurements
 from saga_fg.estimators.recorded_smoother import SmoothedState
-from saga_fg.estimators.recording import GaussNewtonSettings
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
 from saga_fg.estimators.windowed import WindowedSmoother, WindowSettings
 

@@ -25,9 +25,9 @@ taken apart in between, the rest of its N acts through what had decayed to `Bloc
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import tee
 
 import numpy as np
 import scipy.sparse
@@ -42,17 +42,27 @@ from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped, ze
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
-def smoothed_means(steps: Sequence[FilterStep]) -> list[FloatArray]:
-    """Smoothed joint mean of every epoch, over all its nodes."""
-    return list(_means_backwards(reversed(steps)))[::-1]
+def smoothed_means(steps: Iterable[FilterStep]) -> list[FloatArray]:
+    """Smoothed joint mean of every epoch, over all its nodes; steps: from the last to the first."""
+    return list(_means_backwards(steps))[::-1]
 
 
 def smoothed_marginals(steps: Iterable[FilterStep]) -> tuple[list[FloatArray], list[MarginalCovariances]]:
     """Smoothed joint mean of every epoch, and covariances of its nodes; steps: from the last to the first."""
-    for_means, for_covariances = tee(steps)
-    own = ((step, step.filtered.partition) for step in for_covariances)
+    latest: deque[FilterStep] = deque(maxlen=1)  # for both recursions, of which the first is one step ahead
+
+    def counted() -> Iterator[FilterStep]:
+        for step in steps:
+            latest.append(step)
+            yield step
+        latest.clear()
+
+    def again() -> Iterator[FilterStep]:
+        while latest:
+            yield latest[0]
+
     means, covariances = [], []
-    for mean, whole in zip(_means_backwards(for_means), _swept(own, future_known=False), strict=True):
+    for mean, whole in zip(_means_backwards(counted()), _swept(_own(again()), False), strict=True):
         means.append(mean)
         covariances.append(MarginalCovariances.of(whole.partition.layout, whole.blocks))
     return means[::-1], covariances[::-1]
@@ -141,16 +151,16 @@ class MarginalCovariances:
         raise InputError("joint covariance: only those of single nodes were kept; ask for joint covariances")
 
 
-def smoothed_covariances(steps: Sequence[FilterStep], joint: bool) -> Iterator[SmoothedCovariance]:
-    """Smoothed covariance of every epoch, from the last to the first; those of single nodes alone if not `joint`."""
-    found = zip(reversed(steps), reversed(joined_partitions(steps)), strict=True) if joint else _own(steps)
-    return _swept(found, future_known=False)
+def joint_covariances(steps: Sequence[FilterStep]) -> Iterator[SmoothedCovariance]:
+    """Smoothed joint covariance of every epoch, from the last to the first; steps: from the first to the last."""
+    return _swept(zip(reversed(steps), reversed(joined_partitions(steps)), strict=True), future_known=False)
 
 
-def future_influence(steps: Sequence[FilterStep]) -> Iterator[FloatArray]:
+def future_influence(steps: Iterable[FilterStep]) -> Iterator[FloatArray]:
     """For every epoch from the last to the first: (D,) standard deviations, of each component of its joint state.
 
-    Nothing that is measured after the last epoch can be expected to move a smoothed mean by more.
+    Nothing that is measured after the last epoch can be expected to move a smoothed mean by more. steps: from the last
+    to the first
     """
     for reduced in _swept(_own(steps), future_known=True):
         variance: FloatArray = np.empty(reduced.partition.layout.size)
@@ -159,9 +169,9 @@ def future_influence(steps: Sequence[FilterStep]) -> Iterator[FloatArray]:
         yield np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _own(steps: Sequence[FilterStep]) -> Iterator[tuple[FilterStep, Partition]]:
-    """Every epoch from the last to the first, with its components as they are filtered."""
-    return ((step, step.filtered.partition) for step in reversed(steps))
+def _own(steps: Iterable[FilterStep]) -> Iterator[tuple[FilterStep, Partition]]:
+    """Every step with its components as they are filtered."""
+    return ((step, step.filtered.partition) for step in steps)
 
 
 def _swept(steps: Iterable[tuple[FilterStep, Partition]], future_known: bool) -> Iterator[SmoothedCovariance]:

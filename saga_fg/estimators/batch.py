@@ -19,13 +19,15 @@ from numpy.typing import ArrayLike
 from factors import FactorError, Robust
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.bounds import checked_most
 from saga_fg.estimators.epoch import Epoch
+from saga_fg.estimators.gauss_newton import GaussNewtonSettings
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_solution import NoSolution
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
-from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
+from saga_fg.estimators.recording import Recording, RecordingState
 from saga_fg.estimators.sparse_elimination import Order, SparseSolution, cheapest_order
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -53,6 +55,8 @@ class BatchSmoother(RecordedSmoother):
                  estimate is asked for, and `update` returns NaN
     order        of elimination: "time", "colamd", "metis", or "auto" for the cheapest (that of time where something is
                  nonlinear). Where sparse elimination has not the digits, and for joint covariances, it is that of time
+    max_component largest number of nodes that are smoothed jointly, in the order of time: where more are connected, the
+                 weakest interactions take over the neighbour's mean and variance only; None: any number, exact
 
     `mean`, `covariance` and their like speak of the newest epoch, `smoothed` of all epochs.
     """
@@ -62,12 +66,14 @@ class BatchSmoother(RecordedSmoother):
         settings: GaussNewtonSettings | None = None,
         likelihoods: bool = True,
         order: Literal["auto"] | Order = "auto",
+        max_component: int | None = None,
     ) -> None:
         if order not in ("auto", *get_args(Order)):
             raise InputError(f"order: expected one of auto, {', '.join(get_args(Order))}, got {order!r}")
         self._settings = settings or GaussNewtonSettings()
         self._recording = Recording(self._settings, lazy=not likelihoods)
-        self._wanted = order
+        self._most = checked_most(max_component)
+        self._wanted = order if max_component is None else "time"
         self._order: Order | None = None  # of the recording as it is
         self._sparse: SparseSolution | None = None  # its solution, where that is not in the order of time
         self._graduated = True  # whether the weights of graduated non-convexity are those of the whole recording

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.partition import Partition
@@ -38,6 +39,13 @@ class ComponentBounds:
         strong = strong[np.argsort(-strength[strong], kind="stable")]
         partition = parts.joined_up_to(a[strong], b[strong], self.most)
         return _with_inputs(x, dynamics, partition), partition
+
+
+def checked_most(most: int | None) -> int | None:
+    """Raise `InputError` unless it is a number of nodes, or None."""
+    if most is not None and (isinstance(most, bool) or not isinstance(most, int) or most < 1):
+        raise InputError(f"max_component: expected a whole number of nodes >= 1, got {most!r}")
+    return most
 
 
 def _ties(x: BlockGaussian, dynamics: Dynamics, partition: Partition) -> tuple[IntArray, IntArray, FloatArray]:

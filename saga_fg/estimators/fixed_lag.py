@@ -17,8 +17,9 @@ import copy
 import math
 
 from saga_fg.errors import InputError
+from saga_fg.estimators.gauss_newton import GaussNewtonSettings
 from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
-from saga_fg.estimators.recording import GaussNewtonSettings, Recording, RecordingState
+from saga_fg.estimators.recording import Recording, RecordingState
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
 

@@ -36,9 +36,10 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, checked
 
 @dataclass(frozen=True, eq=False)
 class IntervalDynamics:
-    """The record of an interval."""
+    """The record of an interval. most: number of nodes beyond which components are not joined, see `FilterStep`."""
 
     transition: Transition
+    most: int | None = None
 
     @property
     def dt(self) -> float:
@@ -68,7 +69,7 @@ class IntervalDynamics:
         """The first `dt` seconds of the interval and the rest, with the same edges."""
         graph = self.transition.graph
         first, rest = discretise(graph, dt), discretise(graph.after(dt), self.transition.dt - dt)
-        return IntervalDynamics(first), IntervalDynamics(rest)
+        return IntervalDynamics(first, self.most), IntervalDynamics(rest, self.most)
 
     def linearised(self, layout: StateLayout, mean: FloatArray) -> Dynamics:
         """The linear dynamics over the nodes of `layout`, nonlinear ones linearised at the joint state `mean`."""
@@ -101,6 +102,7 @@ class ZeroInterval:
 
     dt: float = 0.0
     linear: bool = True
+    most: int | None = None
 
     def linearised(self, layout: StateLayout, mean: FloatArray) -> Dynamics:
         """The identity."""

@@ -25,7 +25,8 @@ from saga_fg.estimators.bayes_tree import BayesTree
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.correction import innovation_likelihood, posterior_likelihood
 from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
-from saga_fg.estimators.epoch import Epoch, NewNodes, filter_epochs
+from saga_fg.estimators.epoch import Epoch, NewNodes
+from saga_fg.estimators.filter_pass import filter_epochs
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, whitened

@@ -67,6 +67,7 @@ class RecordedSmoother(LatestMarginals):
     """A smoother that keeps a recording. See `saga_fg.estimators.protocol.Estimator` for the methods."""
 
     _recording: Recording
+    _most: int | None = None  # largest number of nodes of a component
 
     @property
     def time(self) -> float:
@@ -86,7 +87,7 @@ class RecordedSmoother(LatestMarginals):
         self._recording.add(nodes, means, covariances)
 
     def predict(self, transition: Transition) -> None:
-        self._recording.predict(IntervalDynamics(transition))
+        self._recording.predict(IntervalDynamics(transition, self._most))
 
     def update(
         self, measurements: Measurements | Observations, time: float | None = None, robust: Robust | None = None
@@ -116,11 +117,12 @@ class RecordedSmoother(LatestMarginals):
         """Every epoch of the recording, oldest first."""
         recording = self._recording
         P: Sequence[SmoothedCovariance | MarginalCovariances | None]
-        if covariances and not joint:
-            means, P = recording.marginals()
+        if not covariances:
+            means, P = recording.means(), [None] * len(recording.epochs)
+        elif joint:
+            means, P = recording.means(), recording.joint_covariances()
         else:
-            means = recording.means()
-            P = recording.covariances(joint) if covariances else [None] * len(means)
+            means, P = recording.marginals()
         return tuple(
             SmoothedState(epoch.time, layout, mean, covariance)
             for epoch, layout, mean, covariance in zip(recording.epochs, recording.layouts, means, P, strict=True)

@@ -1,65 +1,46 @@
 """A record of epochs, with the filter over them, on which the smoothers are built.
 
 A measurement of the past repeats the filter's pass from its time on. Where something is nonlinear or robust, all
-of the record is linearised again at the smoothed means until they converge: Gauss-Newton over the recording (Bell,
-The iterated Kalman smoother as a Gauss-Newton method, SIAM J. Optimization 4, 1994).
+of the record is linearised again (`saga_fg.estimators.gauss_newton`).
 """
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, require_type
-from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import (
     MarginalCovariances,
     SmoothedCovariance,
-    smoothed_covariances,
+    joint_covariances,
     smoothed_marginals,
     smoothed_means,
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.epoch import (
-    Epoch,
-    FilterStep,
-    NewNodes,
+from saga_fg.estimators.epoch import Epoch, FilterStep, NewNodes, initial_step
+from saga_fg.estimators.filter_pass import (
+    completed,
+    completed_within,
     dead_reckoned,
     filter_backwards,
     filter_epochs,
-    initial_step,
+    step_at,
 )
+from saga_fg.estimators.gauss_newton import GaussNewtonSettings, relinearised
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
 from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.settings import setting
-
-log = logging.getLogger(__name__)
 
 _SAME_TIME = 1e-9  # s
-MOST_KEPT = 100_000  # states, over all epochs, of which the filter's pass is kept: some 0.4 GB
-
-
-@dataclass(frozen=True)
-class GaussNewtonSettings:
-    """Settings of Gauss-Newton over a recording."""
-
-    max_iterations: int = setting(100, "largest number of linearisations of the whole recording")
-    tolerance: float = setting(1e-9, "largest step of a mean at convergence, standard deviations")
-
-    def __post_init__(self) -> None:
-        if self.max_iterations < 1:
-            raise InputError(f"max_iterations: expected at least 1, got {self.max_iterations}")
-        if not self.tolerance > 0:
-            raise InputError(f"tolerance: expected a positive number, got {self.tolerance}")
+MOST_KEPT = 200_000_000  # bytes of the filter's pass of a lazy recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,11 +163,11 @@ class Recording:
         epochs[k] = replace(epochs[k], measurements=(*epochs[k].measurements, recorded))
         steps, likelihood = self._steps[:k], math.nan
         if not (self._lazy and recorded.linear):
-            known = _completed(self._steps, self._prior, self._epochs)
+            known = completed(self._steps, self._prior, self._epochs)
             steps = known[:k]
             if not inserted:
                 steps.append(known[k].updated(recorded))
-            steps = _completed(steps, self._prior, epochs)
+            steps = completed(steps, self._prior, epochs)
             if not self._lazy:
                 likelihood = sum(step.log_likelihood for step in steps[k:])
                 likelihood -= sum(step.log_likelihood for step in known[k:])
@@ -217,11 +198,15 @@ class Recording:
         """Drop the first k epochs; their posterior becomes the prior."""
         if k == 0:
             return
-        self.solve()
-        self._prior = self._steps[k].prior
-        first = replace(self._steps[k], carried=len(self._prior.layout))
+        if not (self._lazy and self.linear):
+            self.solve()
+        if k < len(self._steps):
+            self._prior = self._steps[k].prior
+            self._steps = [replace(self._steps[k], carried=len(self._prior.layout)), *self._steps[k + 1 :]]
+        else:
+            self._prior, self._steps = step_at(self._prior, self._epochs, k).prior, []
         self._epochs = [replace(self._epochs[k], new_nodes=()), *self._epochs[k + 1 :]]
-        self._layouts, self._steps = self._layouts[k:], [first, *self._steps[k + 1 :]]
+        self._layouts = self._layouts[k:]
         self._nonlinear = not all(epoch.linear for epoch in self._epochs)
         self._clear_cache()
 
@@ -230,37 +215,37 @@ class Recording:
         self.solve()
         return self._steps[-1].filtered
 
+    def backwards(self) -> Iterator[FilterStep]:
+        """The filter's pass, complete and converged, from the last epoch to the first.
+
+        That of a lazy recording is not kept where it takes more than `MOST_KEPT` bytes.
+        """
+        if self._lazy and self.linear:
+            steps = completed_within(self._steps, self._prior, self._epochs, MOST_KEPT)
+            if steps is None:
+                self._steps = []
+                return filter_backwards(self._prior, self._epochs, MOST_KEPT)
+            self._steps = steps
+        return reversed(self.steps)
+
     def means(self) -> list[FloatArray]:
         """Smoothed joint mean of every epoch, over all its nodes (with those that leave afterwards)."""
-        self.solve()
         if self._means is None:
-            self._means = smoothed_means(self._steps)
+            steps = self.backwards()
+            self._means = smoothed_means(steps) if self._means is None else self._means  # those of convergence
         return self._means
 
-    def marginals(self) -> tuple[list[FloatArray], Sequence[SmoothedCovariance | MarginalCovariances]]:
-        """Smoothed joint mean and covariances of single nodes of every epoch.
-
-        Where a lazy recording is long, and the filter's pass not done yet, it is not kept: it takes several times the
-        memory of all else.
-        """
-        known = len(self._steps) == len(self._epochs) or self._nonlinear
-        if self._means is None and not known and sum(map(len, self._layouts)) > MOST_KEPT:
-            steps = filter_backwards(self._prior, self._epochs, MOST_KEPT // 2)
-            self._means, self._marginals = smoothed_marginals(steps)
-            return self._means, self._marginals
-        return self.means(), self.covariances(joint=False)
-
-    def covariances(self, joint: bool) -> Sequence[SmoothedCovariance | MarginalCovariances]:
-        """Smoothed covariance of every epoch, joint ones or only those of single nodes, which take less memory."""
-        self.solve()
-        if self._covariances is None and joint:
-            self._covariances = list(smoothed_covariances(self._steps, joint=True))[::-1]
-        if self._covariances is not None:
-            return self._covariances
+    def marginals(self) -> tuple[list[FloatArray], Sequence[MarginalCovariances]]:
+        """Smoothed joint mean of every epoch, and covariances of its single nodes, which take little memory."""
         if self._marginals is None:
-            wholes = smoothed_covariances(self._steps, joint=False)
-            self._marginals = [MarginalCovariances.of(whole.partition.layout, whole.blocks) for whole in wholes][::-1]
-        return self._marginals
+            self._means, self._marginals = smoothed_marginals(self.backwards())
+        return self.means(), self._marginals
+
+    def joint_covariances(self) -> Sequence[SmoothedCovariance]:
+        """Smoothed joint covariance of every epoch."""
+        if self._covariances is None:
+            self._covariances = list(joint_covariances(self.steps))[::-1]
+        return self._covariances
 
     def graph(self, means: Sequence[FloatArray] | None = None) -> SceneFactorGraph:
         """The equivalent factor graph, with the smoothed means, or others, as values."""
@@ -270,7 +255,7 @@ class Recording:
         """Joint mean of every epoch from which a solution can be found: the filter's, if it takes a good start."""
         if not self._nonlinear:
             return dead_reckoned(self._prior, self._epochs, self._layouts)
-        self._steps = _completed(self._steps, self._prior, self._epochs)
+        self._steps = completed(self._steps, self._prior, self._epochs)
         return [step.filtered.mean for step in self._steps]
 
     def reweigh(self, epochs: Sequence[Epoch]) -> None:
@@ -284,33 +269,20 @@ class Recording:
 
     def solve(self) -> None:
         """Complete the filter's pass; linearise until the smoothed means stand still where that makes a difference."""
-        self._steps = _completed(self._steps, self._prior, self._epochs)
+        self._steps = completed(self._steps, self._prior, self._epochs)
         if self._converged:
             return
-        means, step, iteration = smoothed_means(self._steps), math.inf, AndersonAcceleration()
-        ends = np.cumsum([len(mean) for mean in means])[:-1]
-        for count in range(self._settings.max_iterations):
-            steps = filter_epochs(self._prior, self._epochs, means)
-            solved = smoothed_means(steps)
-            sigma = np.sqrt(np.concatenate([step.filtered.variances() for step in steps]))
-            before, after = np.concatenate(means), np.concatenate(solved)
-            step = float(np.max(np.abs(after - before) / sigma, initial=0.0))
-            log.debug("iteration %d: largest step %.3g standard deviations", count + 1, step)
-            if step <= self._settings.tolerance:
-                break
-            means = np.split(iteration.next(before, after, sigma), ends)
-        else:
-            log.warning("no convergence in %d iterations; last step %.2g sigma", self._settings.max_iterations, step)
-        self._steps, self._converged = steps, True
+        self._steps, means = relinearised(self._steps, self._prior, self._epochs, self._settings)
+        self._converged = True
         self._clear_cache()
-        self._means = solved
+        self._means = means
 
     def _begin_epoch(self, interval: IntervalDynamics | ZeroInterval) -> None:
         epoch, layout, steps = self._epochs[-1], self.layout, self._steps
         if not self._lazy:
             self.solve()
         if not (self._lazy and interval.linear):
-            known = _completed(self._steps, self._prior, self._epochs)
+            known = completed(self._steps, self._prior, self._epochs)
             step, prior = known[-1].to_next(epoch.leaving, interval)
             steps = [*known[:-1], step, initial_step(prior)]
         self._epochs = [*self._epochs[:-1], replace(epoch, interval=interval), Epoch(epoch.time + interval.dt)]
@@ -345,16 +317,3 @@ class Recording:
     def _clear_cache(self) -> None:
         self._layout = None
         self._means = self._covariances = self._marginals = None
-
-
-def _completed(steps: list[FilterStep], prior: BlockGaussian, epochs: list[Epoch]) -> list[FilterStep]:
-    """The filter's pass over all epochs, given that over the first ones."""
-    k = len(steps)
-    if k == len(epochs):
-        return steps
-    done = list(steps)
-    if k > 0:
-        interval = epochs[k - 1].interval
-        assert interval is not None
-        done[-1], prior = done[-1].to_next(epochs[k - 1].leaving, interval)
-    return done + filter_epochs(prior, epochs[k:])

@@ -13,13 +13,16 @@ memory of a graph is: an object in view settles in a second or two, a hidden one
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.backward import future_influence
+from saga_fg.estimators.bounds import checked_most
+from saga_fg.estimators.gauss_newton import GaussNewtonSettings
 from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
-from saga_fg.estimators.recording import GaussNewtonSettings, Recording
+from saga_fg.estimators.recording import Recording
 from saga_fg.settings import NonNegative, Positive, Settings, setting
 
 _SURE = 5.0  # standard deviations
@@ -51,10 +54,16 @@ class WindowedSmoother(RecordedSmoother):
     settings     of the window
     gauss_newton for what is nonlinear or robust; it is linearised within the window, so that there the past side, too,
                  is as good as the linearisation
+    max_component as of `BatchSmoother`
     """
 
-    def __init__(self, settings: WindowSettings | None = None, gauss_newton: GaussNewtonSettings | None = None) -> None:
-        self._settings = settings or WindowSettings()
+    def __init__(
+        self,
+        settings: WindowSettings | None = None,
+        gauss_newton: GaussNewtonSettings | None = None,
+        max_component: int | None = None,
+    ) -> None:
+        self._settings, self._most = settings or WindowSettings(), checked_most(max_component)
         self._recording = Recording(gauss_newton, lazy=True)
         self._next_look = self._settings.step
         self._bound = 0.0
@@ -81,7 +90,8 @@ class WindowedSmoother(RecordedSmoother):
         """Number of epochs of the window that are final."""
         settings, times = self._settings, np.array([epoch.time for epoch in self._recording.epochs])
         known = max(1, int(np.searchsorted(times, self.time - settings.late + 1e-9)))  # before it, all is measured
-        influence = np.array([s.max(initial=0.0) for s in future_influence(self._recording.steps[:known])][::-1])
+        steps = islice(self._recording.backwards(), len(times) - known, None)
+        influence = np.array([s.max(initial=0.0) for s in future_influence(steps)][::-1])
         influence *= _SURE
         waiting = np.flatnonzero(influence > settings.tolerance)
         settled = int(waiting[0]) if len(waiting) else known - 1

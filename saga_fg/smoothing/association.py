@@ -17,16 +17,16 @@ new costs
 nats, with V the covariance of the velocity of a new object and `frames` the frames in the gap that should have shown
 it; pairs are stitched where that is negative in total. Objects are chains of tracklets that do not overlap, so that the
 cheapest set of chains is a bipartite assignment (minimum-cost path cover; Zhang, Li and Nevatia, CVPR 2008, with the
-tracklet in place of the detection).
+tracklet in place of the detection). Only pairs within the gate are candidates, found by distance, moment by moment.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import assign, gate, mahalanobis
+from saga_fg.numerics.assignment import gate, least_total, mahalanobis_of_pairs
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.settings import StitchingSettings
 from saga_fg.smoothing.states import Lifespans, StateTable
@@ -52,13 +52,15 @@ def assign_detections(
         if len(b) == 0:
             continue
         z = evidence.boxes.position[b, :2]
-        d2, log_det = mahalanobis(position[a], covariance[a], z, evidence.R[b, :2, :2])
-        apart = np.hypot(*np.moveaxis(z[None] - position[a][:, None], -1, 0))
+        row, column = near_pairs(position[a], z, max_distance[a])
+        innovation = z[column] - position[a][row]
+        d2, log_det = mahalanobis_of_pairs(innovation, covariance[a][row] + evidence.R[b, :2, :2][column])
         limit = gate(share)
-        possible = (d2 < limit) & (apart < max_distance[a][:, None])
-        row, column = assign(d2 + log_det, possible, limit + log_det.max(initial=0.0))
-        objects.append(a[row])
-        detections.append(b[column])
+        possible = (d2 < limit) & (np.hypot(*innovation.T) < max_distance[a][row])
+        row, column, cost, log_det = row[possible], column[possible], (d2 + log_det)[possible], log_det[possible]
+        chosen = least_total(row, column, cost - limit - log_det.max(initial=0.0))
+        objects.append(a[row[chosen]])
+        detections.append(b[column[chosen]])
     return np.concatenate(objects), np.concatenate(detections)
 
 
@@ -96,28 +98,51 @@ def stitch_tracklets(
     seen: the tracklets, from first to last detection; states: theirs, reaching beyond both ends; velocity_prior
     (n, 2, 2): covariance of the velocity of a new object
     """
-    times = evidence.times
-    gap = times[seen.first][None, :] - times[seen.last][:, None]
-    end, begin = np.nonzero((gap > 0) & (gap <= settings.max_gap) & (seen.label[:, None] == seen.label[None, :]))
-    meeting = seen.first[begin]
-    a, b = states.rows_of(meeting, seen.id[end]), states.rows_of(meeting, seen.id[begin])
-    met = (a >= 0) & (b >= 0)
-    end, begin, a, b = end[met], begin[met], a[met], b[met]
+    limit = gate(settings.gate, 4)
+    end, begin, a, b = _meetings(seen, states, evidence.times, settings.max_gap, limit)
     d = states.mean[a] - states.mean[b]
     S = states.covariance[a] + states.covariance[b]
     d2 = np.einsum("ni,ni->n", d, np.linalg.solve(S, d[..., None])[..., 0])
+    inside = d2 <= limit
+    end, begin, d2, S = end[inside], begin[inside], d2[inside], S[inside]
     cost = (d2 + _log_det(S)) / 2 + settings.miss_cost * _opportunities_between(evidence, seen, states, end, begin)
     cost -= _log_det(velocity_prior[begin]) / 2 - np.log(settings.new_object_density)
-    cost[d2 > gate(settings.gate, 4)] = np.inf
-    gain = np.zeros((len(seen), len(seen)))
-    gain[end, begin] = np.minimum(cost, 0.0)
-    rows, columns = linear_sum_assignment(gain)
-    stitched = gain[rows, columns] < 0
+    stitched = least_total(end, begin, cost)
     before = np.arange(len(seen))
-    before[columns[stitched]] = rows[stitched]
+    before[begin[stitched]] = end[stitched]
     for row in np.argsort(seen.first, kind="stable"):  # predecessors come earlier, so that they are settled
         before[row] = before[before[row]]
     return np.asarray(seen.id[before])
+
+
+def _meetings(
+    seen: Lifespans, states: StateTable, times: FloatArray, max_gap: float, limit: float
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Pairs of tracklets of a class, one that ended at most `max_gap` s before the other begins, whose states may be
+    inside the gate there: rows (p,) of both, and rows (p,) of their states at the later one's first moment.
+
+    limit: of d^2, which is at least |d|^2 / tr S of the positions alone; the pairs are found by these
+    """
+    trace = np.trace(states.covariance[:, :2, :2], axis1=1, axis2=2)
+    reach = np.sqrt(limit * trace) * (1 + 1e-9)  # |d| <= sqrt(limit (tr P_i + tr P_j)), which is at most their sum
+    order = np.argsort(seen.first, kind="stable")
+    moments, starts = np.unique(seen.first[order], return_index=True)
+    found = [np.empty((4, 0), dtype=np.int64)]
+    for moment, begin in zip(moments.tolist(), np.split(order, starts[1:]), strict=True):
+        there = states.at(moment)
+        a = np.arange(there.start, there.stop)
+        end = seen.rows_of(states.id[there])
+        gap = times[moment] - times[seen.last[end]]
+        ended = (gap > 0) & (gap <= max_gap)
+        a, end = a[ended], end[ended]
+        b = states.rows_of(np.full(len(begin), moment), seen.id[begin])
+        begin, b = begin[b >= 0], b[b >= 0]
+        i, j = near_pairs(states.mean[a, :2], states.mean[b, :2], reach[a], reach[b])
+        alike = seen.label[end[i]] == seen.label[begin[j]]
+        i, j = i[alike], j[alike]
+        found.append(np.stack([end[i], begin[j], a[i], b[j]]))
+    pairs = np.concatenate(found, axis=1)
+    return pairs[0], pairs[1], pairs[2], pairs[3]
 
 
 def _log_det(P: FloatArray) -> FloatArray:

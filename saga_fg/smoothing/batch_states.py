@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -38,6 +39,7 @@ from saga_fg.smoothing.stationarity import StationaryStates
 from saga_fg.types.by_class import class_settings
 
 LONG_RECORDING = 120.0  # s from which it is smoothed in windows
+MOST_JOINT = 64  # objects that are smoothed jointly: their covariance takes half a megabyte
 UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of an object, m
 LEAST_WEIGHT = 1e-4  # of a detection; at zero its noise would be infinite
 
@@ -79,7 +81,8 @@ def smooth_states(
     )
     epochs = list(parts) if providers else parts
     long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING
-    states = _smoothed(epochs, WindowedSmoother() if long else BatchSmoother(likelihoods=False, order="time"))
+    batch = partial(BatchSmoother, likelihoods=False, order="time")
+    states = _smoothed(epochs, (WindowedSmoother if long else batch)(max_component=MOST_JOINT))
     if not providers:
         return states
     labels = dict(zip(lifespans.id.tolist(), lifespans.label.tolist(), strict=True))

@@ -24,10 +24,13 @@ import numpy as np
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.boxes import Boxes
+
+HAIR = 1e-9  # rad
 
 HIDDEN = 0.5  # covered share from which a frame is no opportunity to detect a box
 
@@ -98,9 +101,13 @@ def covered(boxes: Boxes, viewpoint: FloatArray, opaque: BoolArray) -> FloatArra
     turn = wrap_angle(np.arctan2(corners[..., 1], corners[..., 0]) - bearing[:, None])
     low, high = turn.min(axis=1), turn.max(axis=1)
     front = np.flatnonzero(opaque[rows])
-    apart = wrap_angle(bearing[front] - bearing[:, None])  # of box j from box i
-    common = np.minimum(high[:, None], apart + high[front]) - np.maximum(low[:, None], apart + low[front])
-    nearer = distance[front] + np.hypot(*seen.size[front, :2].T) / 2 < distance[:, None]
-    part = np.where(nearer, common, 0.0) / np.maximum(high - low, 1e-6)[:, None]
-    share[rows] = np.clip(part.max(axis=1), 0.0, 1.0)
+    angle, half = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1), np.maximum(-low, high) + HAIR
+    i, j = near_pairs(angle, angle[front], half, half[front])  # a chord is shorter than its arc
+    j = front[j]
+    apart = wrap_angle(bearing[j] - bearing[i])
+    common = np.minimum(high[i], apart + high[j]) - np.maximum(low[i], apart + low[j])
+    nearer = distance[j] + np.hypot(*seen.size[j, :2].T) / 2 < distance[i]
+    part = np.zeros(len(rows))
+    np.maximum.at(part, i[nearer], (common / np.maximum(high - low, 1e-6)[i])[nearer])
+    share[rows] = np.clip(part, 0.0, 1.0)
     return share

@@ -16,6 +16,7 @@ from saga_fg.errors import require_type
 from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
@@ -175,15 +176,18 @@ class GreedyTracker:
         if len(memory.id) == 0 or len(boxes) == 0:
             return match
         projected = memory.position[:, :2] + memory.velocity * (now - memory.last_seen)[:, None]
-        distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - projected[None], -1, 0))
         limit = class_numbers(self.settings.max_distance, lambda: GreedySettings().max_distance[DEFAULT], boxes.label)
-        possible = (boxes.label[:, None] == memory.label[None]) & (distance <= limit[:, None])
-        distance = np.where(possible, distance, np.inf)
-        for d in np.argsort(-p, kind="stable"):
-            t = int(distance[d].argmin())
-            if np.isfinite(distance[d, t]):
-                match[d] = t
-                distance[:, t] = np.inf
+        d, t = near_pairs(boxes.position[:, :2], projected, limit * (1 + 1e-9))
+        distance = np.hypot(*(boxes.position[d, :2] - projected[t]).T)
+        possible = (boxes.label[d] == memory.label[t]) & (distance <= limit[d])
+        d, t, distance = d[possible], t[possible], distance[possible]
+        free = np.ones(len(memory.id), dtype=bool)
+        turn = np.empty(len(boxes), dtype=np.int64)
+        turn[np.argsort(-p, kind="stable")] = np.arange(len(boxes))
+        order = np.lexsort((t, distance, turn[d]))
+        for one, other in zip(d[order].tolist(), t[order].tolist(), strict=True):
+            if match[one] < 0 and free[other]:
+                match[one], free[other] = other, False
         return match
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from pipelines.scale_out import (
     SceneTask,
     local_pool,
     perform,
+    ray_pool,
     run_scenes,
 )
 from pipelines.scale_out.folder import OutputFolder
@@ -191,6 +194,32 @@ def test_two_runs_do_not_write_to_one_folder(tmp_path: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(InputError, match="another run is writing"):
             run(inputs, output)
+
+
+def test_one_process_of_a_node_compiles_kernels_while_the_others_wait(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    happened: list[str] = []
+    held = []
+
+    def load() -> None:
+        (lock,) = tmp_path.iterdir()
+        held.append(lock.name)
+        with lock.open("w") as file, pytest.raises(BlockingIOError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        happened.append("kernels")
+
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(ray_pool, "load_kernels", load)
+    monkeypatch.setattr(ray_pool, "perform", lambda job: happened.append(job))
+    for job in ("first", "second"):
+        ray_pool.perform_on_node(job)  # type: ignore[arg-type]
+    assert happened == ["kernels", "first", "kernels", "second"]
+    assert len(set(held)) == 1
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path / "missing"))
+    monkeypatch.setattr(ray_pool, "load_kernels", lambda: happened.append("alone"))
+    ray_pool.perform_on_node("third")  # type: ignore[arg-type]
+    assert happened[-2:] == ["alone", "third"]
 
 
 def test_kernels_are_loaded_before_workers_begin(monkeypatch: pytest.MonkeyPatch) -> None:

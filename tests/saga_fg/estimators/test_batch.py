@@ -76,7 +76,7 @@ def test_a_long_recording_is_smoothed_in_stretches_to_the_last_digit(monkeypatch
         for operation in program:
             operation.run(smoother)
     expected = whole.smoothed()
-    monkeypatch.setattr(recording, "MOST_KEPT", sum(len(epoch.nodes) for epoch in expected) // 7)
+    monkeypatch.setattr(recording, "MOST_KEPT", sum(step.size for step in whole.snapshot().recording.steps) // 7)
     found = stretched.smoothed()
     assert len(whole.snapshot().recording.steps) == 60
     assert len(stretched.snapshot().recording.steps) < 60
@@ -273,3 +273,35 @@ def test_the_surrogate_turns_from_convex_to_the_loss_itself(loss):
         assert weights.tolist() == [1.0, 1.0, 1.0, 0.0, 0.0]
     else:
         np.testing.assert_allclose(weights, (1 / (1 + (distances / 2) ** 2)) ** 2)
+
+
+def test_no_more_nodes_than_asked_for_are_smoothed_jointly_and_the_answer_stays_near():
+    """Twelve cars in a row, each tied to the next, of which every third is not seen for some seconds."""
+    rng, nodes, S = np.random.default_rng(2), np.arange(12), np.diag([0.0, 0.0, 1.0, 1.0])
+    exact, wide = (BatchSmoother(likelihoods=False, order="time", max_component=most) for most in (None, 12))
+    bounded = BatchSmoother(likelihoods=False, max_component=4)
+    truth = np.stack([-12.0 * nodes, 0.0 * nodes, 10.0 + 0.0 * nodes, 0.0 * nodes], axis=-1)
+    pairs = np.tile(-S, (11, 1, 1)), np.tile(S, (11, 1, 1)), np.zeros((11, 4))
+    graph = SceneGraph.of(nodes, CAR, [Edges("row", nodes[1:], nodes[:-1], np.full(11, 0.3), *pairs)])
+    for smoother in (exact, wide, bounded):
+        smoother.add(nodes, truth, np.tile(np.diag([1.0, 1.0, 4.0, 4.0]), (12, 1, 1)))
+    for k in range(40):
+        truth[:, 2] += 0.1 * rng.normal()
+        truth[:, :2] += 0.2 * truth[:, 2:]
+        seen = np.flatnonzero((nodes % 3 > 0) | (k < 10) | (k > 25))
+        z = truth[seen, :2] + 0.2 * rng.normal(size=(len(seen), 2))
+        for smoother in (exact, wide, bounded):
+            smoother.predict(discretise(graph, 0.2))
+            smoother.update(Measurements(seen, z, np.eye(2, 4), 0.04 * np.eye(2)))
+    for one, other, near in zip(exact.smoothed(), wide.smoothed(), bounded.smoothed(), strict=True):
+        np.testing.assert_array_equal(one.state, other.state)
+        P, Q = one.covariance(nodes), near.covariance(nodes)
+        sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        assert np.abs((near.mean(nodes) - one.mean(nodes)) / sigma).mean() < 0.25
+        assert (np.linalg.eigvalsh(Q) > 0).all()
+        assert (np.sqrt(np.diagonal(Q, axis1=1, axis2=2)) / sigma < 2).all()
+    for smoother, most in ((exact, 12), (bounded, 4)):
+        parts = [step.filtered.uncorrelated(0.0).label for step in smoother.snapshot().recording.steps]
+        assert max(np.bincount(label).max() for label in parts) == most
+    with pytest.raises(InputError, match="max_component"):
+        BatchSmoother(max_component=0)

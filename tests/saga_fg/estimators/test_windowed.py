@@ -106,7 +106,7 @@ def test_the_influence_of_the_future_is_what_knowing_the_present_would_change():
             smoother.update(measurements)
     recording.restore(batch.snapshot().recording)
     told.update(Measurements([0, 1, 2], np.zeros((3, 4)), np.eye(4), 1e-12 * np.eye(4)))  # to know it exactly
-    influence = list(future_influence(recording.steps))[::-1]
+    influence = list(future_influence(reversed(recording.steps)))[::-1]
     for moment, better, s in zip(batch.smoothed(), told.smoothed(), influence, strict=True):
         change = moment.covariance([0, 1, 2]) - better.covariance([0, 1, 2])
         np.testing.assert_allclose(s**2, np.diagonal(change, axis1=1, axis2=2).ravel(), rtol=1e-4, atol=1e-11)

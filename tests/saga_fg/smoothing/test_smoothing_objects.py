@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -148,3 +150,31 @@ def test_edges_follow_from_smoothed_states_and_strangers_move_on_their_own() -> 
     assert sorted(graph.nodes.tolist()) == [1, 2, 5]
     (group,) = graph.edges
     assert (graph.nodes[group.target].tolist(), graph.nodes[group.source].tolist()) == ([1], [2])
+
+
+def test_many_tracklets_are_stitched_without_an_array_of_all_pairs() -> None:
+    count, rng = 1500, np.random.default_rng(0)
+    seen = Lifespans(np.arange(count), np.full(count, "car"), *(np.sort(rng.integers(20, size=(2, count)), axis=0)))
+    longer = seen.reaching(TIMES, 1.0, 3.0)
+    moment, row = np.nonzero(
+        (longer.first <= np.arange(20)[:, None]) & (np.arange(20)[:, None] <= longer.last)  # all moments of each
+    )
+    place = np.stack([row * 20.0, np.zeros(len(row))], axis=-1)
+    place[row % 3 == 1] -= [20.0, 0.0]  # every second of three continues the first
+    states = StateTable(
+        moment, row, np.concatenate([place, np.zeros_like(place)], axis=1), np.tile(0.1 * np.eye(4), (len(row), 1, 1))
+    )
+    evidence, _ = gathered({0: line(0, 19, (0, 0), (0, 0))})
+    prior = np.tile(25.0 * np.eye(2), (count, 1, 1))
+    stitch_tracklets(seen, states, prior, evidence, StitchingSettings())
+    tracemalloc.start()
+    found = stitch_tracklets(seen, states, prior, evidence, StitchingSettings())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    begin, end = TIMES[seen.first], TIMES[seen.last]
+    gap = np.maximum(begin[1::3] - end[::3], begin[::3] - end[1::3])
+    joined = found[1::3] == found[::3]
+    assert joined.sum() > 50
+    assert (joined <= (gap > 0) & (gap <= 3.0)).all()
+    assert (found[2::3] == np.arange(count)[2::3]).all()
+    assert peak < count**2
