@@ -180,8 +180,8 @@ def signals(
     if chosen:
         best = dict(zip(best, left_out(found, unit), strict=True))
     judged = [light for k, lights in enumerate(found) for light in lights if best[unit[light.window]] == k]
-    even = {"red_duration": EVEN, "amber_duration": 0.1, "green_duration": EVEN}
-    from_even = [light for one in traffic for light in believed(one, replace(tried[best[unit[one.name]]], **even))]
+    even = [replace(each, red_duration=EVEN, amber_duration=0.1, green_duration=EVEN) for each in tried]
+    from_even = [light for one in traffic for light in believed(one, even[best[unit[one.name]]])]
     shown = tables(judged, from_even, prior=float(own.stationary[2:].sum()))
     report(shown, {table.title: table.rows for table in shown}, json_file)
     if chosen:
