@@ -123,7 +123,8 @@ class MapNodes:
 
     def _add_roads(self, road_map: RoadMap) -> None:
         """Find out which known lanes cross which known stop lines, where the map brings new ones."""
-        roads = {each.name: each for each in (*road_map.lanes, *road_map.stop_lines)}
+        lanes_and_lines: tuple[Lane | StopLine, ...] = (*road_map.lanes, *road_map.stop_lines)
+        roads = {each.name: each for each in lanes_and_lines}
         if STOP_LINE not in self.classes or roads.keys() <= self._known.keys():
             return
         known = {**roads, **self._known}
