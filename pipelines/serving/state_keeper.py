@@ -57,11 +57,14 @@ class StateKeeper:
         there = self._path.exists()
         if there:
             try:
-                self._stream.restore(read_state(self._path, self._header))
+                state = read_state(self._path, self._header)
+            except InputError:
+                self.release()
+                raise
+            try:
+                self._stream.restore(state)
             except Exception as error:  # of values that do not fit each other
                 self.release()
-                if isinstance(error, InputError):
-                    raise
                 text = f"{self._path}: expected a state that fits: {type(error).__name__}: {error}"
                 raise InputError(text) from error
             self._version = self._stream.version

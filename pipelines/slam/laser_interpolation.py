@@ -6,7 +6,7 @@ import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.planar_poses import transforms, vectors
-from saga_fg.slam.pose_graph.running import way_along
+from saga_fg.slam.pose_graph.running import path_lengths
 
 
 def between_keyframes(matched: FloatArray, poses: FloatArray, rows: IntArray) -> FloatArray:
@@ -15,7 +15,7 @@ def between_keyframes(matched: FloatArray, poses: FloatArray, rows: IntArray) ->
     matched: (n, 3, 3) by scan matching alone; poses: (k, 3, 3) of the keyframes, the scans `rows` (k,).
     """
     step = np.linalg.inv(matched[:-1]) @ matched[1:]
-    way = np.concatenate([[0.0], np.cumsum(way_along(step))])
+    way = np.concatenate([[0.0], np.cumsum(path_lengths(step))])
     key = np.clip(np.searchsorted(rows, np.arange(len(matched)), side="right") - 1, 0, len(rows) - 1)
     after = np.minimum(key + 1, len(rows) - 1)
     length = way[rows[after]] - way[rows[key]]

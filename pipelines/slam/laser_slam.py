@@ -28,7 +28,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.planar_poses import heading, moved, transform, vector
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
-from saga_fg.slam.pose_graph.running import RunningPoseGraph, way_along
+from saga_fg.slam.pose_graph.running import RunningPoseGraph, path_lengths
 
 _SCAN_STEP = 0.1  # m: scans that moved less, and turned less than 3 degrees, are not registered
 _LEAST_POINTS = 20  # of a scan that is registered
@@ -167,7 +167,7 @@ class LaserSlam:
     def _add_keyframe(self, points: FloatArray, matched: FloatArray, since: FloatArray) -> None:
         frames, s, turn = self._keyframes, self.settings, abs(heading(since))
         assert self._odometry is not None
-        way = frames[-1].way + float(way_along(since[None])[0]) if frames else 0.0
+        way = frames[-1].way + float(path_lengths(since[None])[0]) if frames else 0.0
         frames.append(Keyframe(thinned(points, 0.03), matched, len(self._matched) - 1, way))
         if self._graph is None:
             self._graph = RunningPoseGraph(matched)

@@ -25,7 +25,7 @@ from pipelines.slam.place_proof import COMPARED, FEWEST, SAME, SPACING, agreeing
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
-from saga_fg.slam.pose_graph.distances import shortest_ways
+from saga_fg.slam.pose_graph.distances import shortest_paths
 from saga_fg.slam.submaps import LoopClosure
 
 _REGISTERED, _TAKEN = 4, 2  # places for each submap
@@ -166,7 +166,7 @@ class PlaceLoops:
         if not self._edges:
             return np.zeros(len(self._submaps))
         first, second, length = (np.array(column) for column in zip(*self._edges, strict=True))
-        return shortest_ways(first, second, length, len(self._submaps), number)
+        return shortest_paths(first, second, length, len(self._submaps), number)
 
     @staticmethod
     def _farthest(way: FloatArray) -> FloatArray:

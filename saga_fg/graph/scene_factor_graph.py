@@ -16,7 +16,6 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -28,15 +27,8 @@ from factors.marginal import Elimination
 from saga_fg.graph.condensation import Condensation
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.factor_checks import Factor, check_angles, grouped
-from saga_fg.graph.factor_groups import (
-    ActiveRows,
-    FactorEntry,
-    FactorGroup,
-    HeldGroup,
-    LinearGroup,
-    NativeGroup,
-    PriorGroup,
-)
+from saga_fg.graph.factor_groups import ActiveRows, FactorEntry, HeldGroup, LinearGroup, NativeGroup, PriorGroup
+from saga_fg.graph.factor_index import FactorIndex
 from saga_fg.graph.keys import VariableKind, described, key_of
 from saga_fg.graph.linearisation_point import LinearisationPoint
 from saga_fg.graph.messages import factor_error, solver_error
@@ -57,13 +49,8 @@ class SceneFactorGraph:
     def __init__(self, elimination: Elimination = "qr") -> None:
         self._variables: dict[int, GraphVariable] = {}
         self._base, self._values = gtsam.Values(), gtsam.Values()
-        self._groups: dict[int, HeldGroup] = {}
-        self._named: dict[tuple[str, Hashable], tuple[int, ...]] = {}  # groups by provider and name
-        self._touching: dict[int, tuple[int, ...]] = {}  # groups with a factor on a variable, now or before
-        self._factor_counts: dict[int, int] = {}  # number of factors on each variable
+        self._index = FactorIndex()
         self.elimination: Elimination = elimination
-        self._fresh: dict[int, list[gtsam.JacobianFactor]] = {}  # as linearised when they were added
-        self._count = 0
         self._angles_checked: dict[tuple[str, str], int] = {}
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
         self._newest: tuple[int, ...] = ()
@@ -77,7 +64,7 @@ class SceneFactorGraph:
     @property
     def groups(self) -> Mapping[int, HeldGroup]:
         """All factors, by the number of their group, which no other group ever has."""
-        return MappingProxyType(self._groups)
+        return MappingProxyType(self._index.groups)
 
     @property
     def values(self) -> gtsam.Values:
@@ -101,7 +88,7 @@ class SceneFactorGraph:
 
     def factors(self) -> Iterator[FactorEntry]:
         """Describe every factor."""
-        for held in self._groups.values():
+        for held in self._index.groups.values():
             for row in held.rows.tolist():
                 mine = tuple(self._variables[key] for key in held.factors.rows[row])
                 yield FactorEntry(held.provider, held.factors.name, mine)
@@ -149,8 +136,7 @@ class SceneFactorGraph:
         self._newest += tuple(key for key, one in added.items() if one.epoch is not None)
         self._values.insert(values)
         self._base.insert(values)
-        self._touching |= dict.fromkeys(added, ())
-        self._factor_counts |= dict.fromkeys(added, 0)
+        self._index.add_variables(added)
         return list(added)
 
     def add_factors(
@@ -170,24 +156,21 @@ class SceneFactorGraph:
                 check_angles(provider, one.factors, self._variables, self._values)
                 self._angles_checked[kind] = checked + 1
         if name is not None:
-            for number in self._named.get((provider, name), ()):
-                self._drop(number)
+            for number in self._index.named(provider, name):
+                self._index.remove(number)
         for one, factors_there in zip(held, linear, strict=True):
             if len(one.active):
-                number = self._hold(one)
-                self._fresh[number] = factors_there
-                if name is not None:
-                    self._named[provider, name] = (*self._named.get((provider, name), ()), number)
+                self._index.fresh[self._index.add(one)] = factors_there
 
     def marginalise(self, keys: Iterable[int], into: Condensation | None = None) -> None:
         """Integrate variables out; their information on the others stays, in the factors that `into` makes of it."""
         leaving = {key: self.variable(key) for key in keys}
         if not leaving:
             return
-        touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self._rows_on(leaving)
+        touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self._index.rows_on(leaving)
         earlier: list[gtsam.JacobianFactor] = []
         for number, mine in rows.items():
-            held = self._groups[number]
+            held = self._index.groups[number]
             apart = into is not None and held.provider == into.name and into.anchor in held.factors.rows[mine[0]]
             for factor in self.linearised(held, np.array(mine), point):
                 earlier.append(factor) if apart else touched.push_back(factor)
@@ -205,47 +188,31 @@ class SceneFactorGraph:
 
     def replace_by_prior(self, leaving: Collection[int], prior: gtsam.JacobianFactor) -> None:
         """Put a prior, on increments from the base, in place of all factors on its variables and those `leaving`."""
-        self._replace(self._rows_on({*leaving, *prior.keys()}), [prior], leaving)
+        self._replace(self._index.rows_on({*leaving, *prior.keys()}), [prior], leaving)
         self._choose(prior.cols() - 1)
-
-    def _rows_on(self, keys: Collection[int]) -> dict[int, list[int]]:
-        """Rows of groups on any of some variables, by the number of the group, the sharpest first."""
-        numbers = {number for key in keys for number in self._touching[key]}
-        result = {}
-        for number in sorted(numbers, key=lambda number: self._groups[number].elimination_order):
-            held = self._groups[number]
-            mine = [row for row in held.rows.tolist() if any(key in keys for key in held.factors.rows[row])]
-            if mine:
-                result[number] = mine
-        return result
 
     def _replace(
         self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
     ) -> None:
         """Take rows of groups out and put priors in, then take out the variables without any factor left."""
         for number, mine in rows.items():
-            self._fresh.pop(number, None)
-            active = self._groups[number].active.copy()
-            active[mine] = False
-            self._count_rows(self._groups[number].factors, mine, -1)
-            self._groups[number] = replace(self._groups[number], active=active)
-            if not active.any():
-                self._drop(number)
+            self._index.deactivate(number, mine)
         if factors:
             prior = PriorGroup(tuple(factors), tuple(tuple(factor.keys()) for factor in factors))
-            self._hold(HeldGroup(_MARGINALS, None, prior, np.ones(len(factors), dtype=bool)))
+            self._index.add(HeldGroup(_MARGINALS, None, prior, np.ones(len(factors), dtype=bool)))
         for key in leaving:
-            del self._variables[key], self._touching[key], self._factor_counts[key]
+            del self._variables[key]
+            self._index.remove_variable(key)
             self._values.erase(key)
             self._base.erase(key)
 
     def touching(self, key: int) -> tuple[int, ...]:
         """Numbers of the groups with a factor on a variable, now or before."""
-        return self._touching[key]
+        return self._index.touching(key)
 
     def without_factors(self) -> list[int]:
         """Variables without any factor."""
-        return [key for key, count in self._factor_counts.items() if count == 0]
+        return self._index.without_factors()
 
     def of(self, kind: VariableKind, epoch: int | None) -> dict[int, GraphVariable]:
         """The variables of a kind and an epoch, None for those for all time, by id."""
@@ -271,13 +238,13 @@ class SceneFactorGraph:
     def moved_to(self, values: gtsam.Values) -> None:
         """Put the variables where a back end has found them."""
         self._values = gtsam.Values(values)
-        self._fresh.clear()
+        self._index.fresh.clear()
 
     def linear(self, number: int, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         """Active factors of a group, linear, on increments from the base."""
-        if number in self._fresh:
-            return self._fresh[number]
-        held = self._groups[number]
+        if number in self._index.fresh:
+            return self._index.fresh[number]
+        held = self.groups[number]
         return self.linearised(held, held.rows, point)
 
     def solve(self, settings: SolverSettings | None = None) -> Solution:
@@ -286,14 +253,14 @@ class SceneFactorGraph:
         try:
             solution = solve(native, ours, self._values, settings)
         except FactorError as error:
-            raise solver_error(self._variables, self._groups, error) from error
+            raise solver_error(self._variables, self._index.groups, error) from error
         self.moved_to(solution.values)
         return solution
 
     def solver_inputs(self) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:
         """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
-        for held in sorted(self._groups.values(), key=lambda held: held.elimination_order):
+        for held in sorted(self._index.groups.values(), key=lambda held: held.elimination_order):
             if isinstance(held.factors, LinearGroup | NativeGroup):
                 for factor in held.factors.native(held.rows, point):
                     native.add(factor)
@@ -304,7 +271,7 @@ class SceneFactorGraph:
     def native(self) -> gtsam.NonlinearFactorGraph:
         """All factors as GTSAM's own, for its solvers from `values`; ours call back into Python, which is slow."""
         graph, point = gtsam.NonlinearFactorGraph(), self.point()
-        for held in self._groups.values():
+        for held in self._index.groups.values():
             for factor in held.factors.native(held.rows, point):
                 graph.add(factor)
         return graph
@@ -317,9 +284,7 @@ class SceneFactorGraph:
         """
         other = SceneFactorGraph()
         other.__dict__ |= self.__dict__
-        other._variables, other._groups = dict(self._variables), dict(self._groups)
-        other._touching, other._fresh = dict(self._touching), dict(self._fresh)
-        other._factor_counts, other._named = dict(self._factor_counts), dict(self._named)
+        other._variables, other._index = dict(self._variables), self._index.copy()
         if not share_values:
             other._base, other._values = self.base, self.values
         return other
@@ -329,19 +294,6 @@ class SceneFactorGraph:
         for values in (self._base, self._values):
             for key in set(values.keys()) - self._variables.keys():
                 values.erase(key)
-
-    def _hold(self, held: HeldGroup) -> int:
-        number, self._count = self._count, self._count + 1
-        self._groups[number] = held
-        for key in {key for row in held.factors.rows for key in row}:
-            self._touching[key] += (number,)
-        self._count_rows(held.factors, held.rows.tolist(), 1)
-        return number
-
-    def _count_rows(self, group: FactorGroup, rows: list[int], step: int) -> None:
-        for row in rows:
-            for key in group.rows[row]:
-                self._factor_counts[key] += step
 
     def _eliminated(
         self, touched: gtsam.GaussianFactorGraph, keys: list[int], elimination: Elimination
@@ -353,7 +305,7 @@ class SceneFactorGraph:
         try:
             return _jacobians(marginal_factors(touched, keys, "qr"))
         except FactorError as error:
-            raise solver_error(self._variables, self._groups, error) from error
+            raise solver_error(self._variables, self._index.groups, error) from error
 
     def _choose(self, widest: int) -> None:
         """QR where what is left of marginalised variables is on few dimensions together, else Cholesky."""
@@ -361,18 +313,6 @@ class SceneFactorGraph:
             self.elimination = "cholesky"
         elif widest < _WIDE // 2:
             self.elimination = "qr"
-
-    def _drop(self, number: int) -> None:
-        held = self._groups.pop(number)
-        self._fresh.pop(number, None)
-        if held.name is not None and (held.provider, held.name) in self._named:
-            rest = tuple(n for n in self._named.pop((held.provider, held.name)) if n != number)
-            if rest:
-                self._named[held.provider, held.name] = rest
-        self._count_rows(held.factors, held.rows.tolist(), -1)
-        for key in {key for row in held.factors.rows for key in row}:
-            if key in self._touching:
-                self._touching[key] = tuple(n for n in self._touching[key] if n != number)
 
 
 def _jacobians(graph: gtsam.GaussianFactorGraph) -> list[gtsam.JacobianFactor]:

@@ -12,7 +12,7 @@ from pipelines.slam.loop_agreement import Agreement, deviation
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.numerics.planar_poses import transform
-from saga_fg.slam.pose_graph.distances import shortest_ways
+from saga_fg.slam.pose_graph.distances import shortest_paths
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,4 +46,4 @@ def test_a_loop_is_believed_when_another_agrees(off: float, later: int, believed
 def test_ways_take_the_shortest_measurements() -> None:
     first, second = np.array([0, 1, 2, 0, 0]), np.array([1, 2, 3, 3, 1])
     length = np.array([5.0, 5.0, 5.0, 1.0, 7.0])
-    np.testing.assert_allclose(shortest_ways(first, second, length, 5, 0), [0.0, 5.0, 6.0, 1.0, np.inf])
+    np.testing.assert_allclose(shortest_paths(first, second, length, 5, 0), [0.0, 5.0, 6.0, 1.0, np.inf])

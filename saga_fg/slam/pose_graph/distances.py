@@ -1,4 +1,4 @@
-"""Shortest ways along the measurements of a pose graph: what the errors of relative poses grow with."""
+"""Shortest paths along the measurements of a pose graph, with whose length errors of relative poses grow."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 _SHORTEST = 1e-6  # m: a sparse matrix takes 0 for no measurement
 
 
-def shortest_ways(first: IntArray, second: IntArray, length: FloatArray, poses: int, row: int) -> FloatArray:
-    """Shortest way (poses,) from a pose to each along measurements (M,) of these lengths; infinite where none leads."""
+def shortest_paths(first: IntArray, second: IntArray, length: FloatArray, poses: int, row: int) -> FloatArray:
+    """Lengths (poses,) of shortest paths from a pose along measurements (M,) of these lengths; infinite without one."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 

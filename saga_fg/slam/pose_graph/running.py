@@ -14,7 +14,7 @@ import numpy as np
 from factors import Robust, between_factor, pose_prior_factor
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.pose_graph.consensus import Consensus, consensus
-from saga_fg.slam.pose_graph.distances import shortest_ways
+from saga_fg.slam.pose_graph.distances import shortest_paths
 from saga_fg.slam.pose_graph.graph import PoseGraph
 from saga_fg.slam.pose_graph.optimisation import HELD
 
@@ -32,8 +32,8 @@ class Measured:
     covariance: FloatArray
 
 
-def way_along(steps: FloatArray) -> FloatArray:
-    """Way (n,) of steps (n, 3, 3), m: their length, and a metre for each radian turned."""
+def path_lengths(steps: FloatArray) -> FloatArray:
+    """Length (n,) of steps (n, 3, 3), m: the distance, and a metre for each radian turned."""
     turn = np.abs(np.arctan2(steps[:, 1, 0], steps[:, 0, 0]))
     return np.asarray(np.hypot(steps[:, 0, 2], steps[:, 1, 2]) + _RADIAN * turn)
 
@@ -86,8 +86,8 @@ class RunningPoseGraph:
         first, second = (
             np.array([getattr(edge, end) for edge in self._edges], dtype=np.int64) for end in ("first", "second")
         )
-        length = way_along(np.array([edge.first_T_second for edge in self._edges]).reshape(-1, 3, 3))
-        return shortest_ways(first, second, length, len(self._poses), row)
+        length = path_lengths(np.array([edge.first_T_second for edge in self._edges]).reshape(-1, 3, 3))
+        return shortest_paths(first, second, length, len(self._poses), row)
 
     def graph(self, loops: list[Measured] | None = None) -> PoseGraph:
         """The whole graph; loops: in place of those that came."""

@@ -135,11 +135,12 @@ def test_headings_turn_with_the_velocity():
 
 
 @pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
-def test_predicting_leaves_no_trace(estimator):
+def test_looking_ahead_leaves_no_trace(estimator):
     silent, watched = followed(estimator, until=1.0), followed(estimator, until=1.0)
     for t in np.arange(1.0, 3.0, 0.1):
         seen_now = frame(t, braking(t), label=["truck", "car", "car"])
         watched.predict([0.0, 0.3, 7.0], joint=True)
+        watched.tracks(t + 0.7)
         assert columns(watched.step(seen_now)) == columns(silent.step(seen_now))
 
 

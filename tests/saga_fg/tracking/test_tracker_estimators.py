@@ -61,15 +61,6 @@ def test_every_estimator_gives_the_same_tracks(estimator, edges):
         agree(reference.step(f), other.step(f), 1e-8)
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_looking_ahead_leaves_no_trace(estimator):
-    in_order, _ = traffic(1)
-    silent, watched = tracker(estimator), tracker(estimator)
-    for f in in_order:
-        agree(silent.step(f), watched.step(f), 1e-9)
-        watched.tracks(f.timestamp + 0.7)
-
-
 @pytest.mark.parametrize("delay", [0.07, 0.9])
 def test_a_smoother_takes_late_frames_as_if_they_had_come_in_time(delay):
     """States of independent objects, and so with frozen edges, do not depend on the order of arrival."""

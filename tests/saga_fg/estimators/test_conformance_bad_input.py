@@ -1,0 +1,197 @@
+"""Bad input to every estimator: one clear exception, and nothing has happened."""
+
+import dataclasses
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+
+from saga_fg import InputError, UnknownNodeError
+from saga_fg.estimators import Measurements
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.transition import Blocks
+from tests.saga_fg.estimator_programs import new_nodes
+from tests.saga_fg.every_estimator import ESTIMATORS, maker
+from tests.saga_fg.random_graphs import BUS, CAR, CONE, TRAM, random_graph
+
+MIXED = (CAR, BUS, CONE, CAR)
+IDS = [4, 8, 15, 16]
+
+
+def filled(make):
+    """An estimator that has seen something of cars 4 and 16, bus 8 and cone 15."""
+    rng = np.random.default_rng(0)
+    estimator = make()
+    for node, node_type in zip(IDS, MIXED, strict=True):
+        new_nodes(rng, [node], node_type).run(estimator)
+    estimator.predict(discretise(random_graph(rng, MIXED, IDS, 0.7), 0.4))
+    estimator.update(Measurements([4, 16], rng.normal(size=(2, 2)), np.eye(2, 4), 0.2 * np.eye(2)))
+    return estimator
+
+
+def transition(ids, types=None, dt=0.3):
+    types = types or tuple(dict(zip(IDS, MIXED, strict=True)).get(node, CAR) for node in ids)
+    return discretise(random_graph(np.random.default_rng(1), types, ids, 0.7), dt)
+
+
+def measured(nodes, d=4, **columns):
+    m = len(nodes)
+    return Measurements(**({"nodes": nodes, "z": np.zeros((m, 2)), "H": np.eye(2, d), "R": np.eye(2)} | columns))
+
+
+def added(nodes, d=4, mean=0.0, P=None):
+    P = np.eye(d) if P is None else np.asarray(P)
+    return nodes, np.full((len(nodes), d), mean), np.tile(P, (len(nodes), 1, 1))
+
+
+BAD = {
+    "add: known already": (lambda e: e.add(*added([5, 8])), "node 8 is in the estimator already"),
+    "add: twice in one call": (lambda e: e.add(*added([5, 5])), "nodes: expected unique ids, 5 occurs more"),
+    "add: NaN mean": (lambda e: e.add(*added([5], mean=np.nan)), r"means\[0, 0\]: expected a finite number"),
+    "add: infinite mean": (lambda e: e.add(*added([5], mean=np.inf)), "means.*expected a finite number"),
+    "add: NaN covariance": (lambda e: e.add(*added([5], P=np.full((4, 4), np.nan))), "covariances.*finite"),
+    "add: singular covariance": (lambda e: e.add(*added([5], P=np.zeros((4, 4)))), "positive definite"),
+    "add: indefinite covariance": (lambda e: e.add(*added([5], P=-np.eye(4))), "positive definite"),
+    "add: asymmetric covariance": (
+        lambda e: e.add(*added([5], P=np.eye(4) + np.eye(4, k=1))),
+        r"covariances\[0\]: expected a symmetric matrix",
+    ),
+    "add: covariance of another size": (
+        lambda e: e.add([5], np.zeros((1, 4)), np.eye(6)[None]),
+        r"covariances: expected shape \(1, 4, 4\), got \(1, 6, 6\)",
+    ),
+    "add: flat mean": (lambda e: e.add([5], np.zeros(4), np.eye(4)[None]), "means: expected shape"),
+    "add: too few means": (lambda e: e.add(*added([5])[:1], *added([5, 6])[1:]), "means: expected shape"),
+    "add: ids that are no integers": (lambda e: e.add([5.5], *added([5])[1:]), "nodes: expected a list of"),
+    "add: ids that are no list": (lambda e: e.add(5, *added([5])[1:]), "nodes: expected a list of integers"),
+    "predict: a node missing": (lambda e: e.predict(transition([4, 8, 15])), "expected 4 nodes, got 3"),
+    "predict: an unknown node": (lambda e: e.predict(transition([4, 8, 15, 99])), "node 99 is not in the estimator"),
+    "predict: a node too many": (
+        lambda e: e.predict(transition([4, 8, 15, 16, 99])),
+        "node 99 is not in the estimator",
+    ),
+    "predict: other sizes": (
+        lambda e: e.predict(transition(IDS, (CAR, CAR, CONE, CAR))),
+        "transition: the sizes of its states differ",
+    ),
+    "predict: sizes exchanged": (
+        lambda e: e.predict(transition(IDS, (BUS, CAR, CONE, CAR))),
+        "transition: the sizes of its states differ",
+    ),
+    "predict: NaN": (
+        lambda e: e.predict(dataclasses.replace(transition(IDS), b=np.full(16, np.nan))),
+        "b: expected finite numbers",
+    ),
+    "predict: no noise for a node": (
+        lambda e: e.predict(dataclasses.replace(transition(IDS), Q=transition(IDS).Q[1:])),
+        "Q: expected one block for each of 4 nodes",
+    ),
+    "predict: blocks of the wrong size": (
+        lambda e: e.predict(
+            dataclasses.replace(transition(IDS), F=(Blocks(np.array([0]), np.array([1]), np.ones((1, 4, 4))),))
+        ),
+        "F: blocks of size 4 x 4 do not fit",
+    ),
+    "predict: negative interval": (lambda e: e.predict(transition(IDS, dt=-1.0)), "dt: expected a finite"),
+    "predict: endless interval": (lambda e: e.predict(transition(IDS, dt=np.inf)), "dt: expected a finite"),
+    "predict: no transition": (
+        lambda e: e.predict(transition(IDS).graph),
+        "transition: expected Transition, got SceneGraph",
+    ),
+    "update: no measurements": (
+        lambda e: e.update(([4], [[0.0, 0.0]])),
+        "measurements: expected Measurements.*, got tuple",
+    ),
+    "restore: no snapshot": (lambda e: e.restore((1, 2, 3.0)), "state: expected .*State, got tuple"),
+    "update: unknown node": (lambda e: e.update(measured([4, 99])), "node 99 is not in the estimator"),
+    "update: nodes of mixed sizes": (lambda e: e.update(measured([4, 8])), "expected states of equal size"),
+    "update: H of another size": (lambda e: e.update(measured([4], d=6)), "H: expected 4 columns"),
+    "update: H of another size, mixed": (lambda e: e.update(measured([8], d=4)), "H: expected 6 columns"),
+    "update: NaN": (lambda e: e.update(measured([4], z=[[np.nan, 0.0]])), r"z\[0, 0\]: expected a finite"),
+    "update: infinite": (lambda e: e.update(measured([4], z=[[np.inf, 0.0]])), "z.*expected a finite"),
+    "update: NaN in H": (lambda e: e.update(measured([4], H=np.full((2, 4), np.nan))), "H.*finite"),
+    "update: wrong shape": (lambda e: e.update(measured([4], z=[[0.0, 0.0, 0.0]])), "H: expected shape"),
+    "update: singular noise": (lambda e: e.update(measured([4], R=np.ones((2, 2)))), "positive definite"),
+    "update: no noise": (lambda e: e.update(measured([4], R=np.zeros((2, 2)))), "positive definite"),
+    "update: negative noise": (lambda e: e.update(measured([4], R=-np.eye(2))), "positive definite"),
+    "marginalise: unknown node": (lambda e: e.marginalise([4, 99]), "node 99 is not in the estimator"),
+    "marginalise: no list": (lambda e: e.marginalise(4), "nodes: expected a list of integer"),
+    "mean: unknown node": (lambda e: e.mean([99]), "node 99 is not in the estimator"),
+    "mean: mixed sizes": (lambda e: e.mean([4, 8]), "expected states of equal size"),
+    "covariance: unknown node": (lambda e: e.covariance([99]), "node 99 is not in the estimator"),
+    "covariance: mixed sizes": (lambda e: e.covariance([4, 8]), "expected states of equal size"),
+    "joint mean: unknown node": (lambda e: e.joint_mean([4, 99]), "node 99 is not in the estimator"),
+    "joint covariance: unknown node": (lambda e: e.joint_covariance([4, 99]), "node 99 is not"),
+    "joint covariance: ids that are no integers": (lambda e: e.joint_covariance(["4"]), "nodes: expected"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_ends_in_one_exception_and_changes_nothing(make, name):
+    call, message = BAD[name]
+    error = UnknownNodeError if "is not in" in message else InputError
+    estimator, untouched = filled(make), filled(make)
+    with pytest.raises(error, match=message):
+        call(estimator)
+    assert estimator.nodes.tolist() == untouched.nodes.tolist()
+    assert np.array_equal(estimator.joint_mean(IDS), untouched.joint_mean(IDS))
+    assert np.array_equal(estimator.joint_covariance(IDS), untouched.joint_covariance(IDS))
+    for either in (estimator, untouched):
+        new_nodes(np.random.default_rng(3), [23], TRAM).run(either)
+        either.predict(discretise(random_graph(np.random.default_rng(4), (*MIXED, TRAM), [*IDS, 23], 0.5), 0.2))
+        either.update(measured([4, 16]))
+        either.marginalise([8])
+    assert np.array_equal(estimator.joint_covariance([4, 15, 16, 23]), untouched.joint_covariance([4, 15, 16, 23]))
+    assert np.array_equal(estimator.joint_mean([4, 15, 16, 23]), untouched.joint_mean([4, 15, 16, 23]))
+
+
+def test_bad_input_does_not_end_the_interpreter():
+    """All of it to all estimators, in an interpreter of its own: a crash in compiled code could not be caught here."""
+    script = textwrap.dedent(
+        f"""
+        import sys, warnings
+        sys.path[:0] = {sys.path!r}
+        warnings.simplefilter("error")
+        from tests.saga_fg.estimators import test_conformance_bad_input as suite
+        from saga_fg import SagaError
+        for kind in suite.ESTIMATORS:
+            estimator = suite.filled(suite.maker(kind.values[0]))
+            for name, (call, message) in suite.BAD.items():
+                try:
+                    call(estimator)
+                except SagaError:
+                    continue
+                sys.exit(f"{{kind.id}}: {{name}}: no exception")
+            estimator.update(suite.measured([4, 16]))
+            estimator.predict(suite.transition(suite.IDS, dt=1000.0))
+            print(kind.id, len(estimator.nodes))
+        """
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-2000:] + done.stdout[-2000:]
+    assert done.stdout.split() == [word for kind in ESTIMATORS for word in (kind.id, "4")]
+
+
+def test_of_no_nodes_there_is_nothing_to_tell(make):
+    for estimator in (make(), filled(make)):
+        nodes = estimator.nodes.tolist()
+        assert estimator.mean([]).shape[0] == estimator.covariance([]).shape[0] == 0
+        assert estimator.joint_mean([]).shape == (0,)
+        assert estimator.joint_covariance([]).shape == (0, 0)
+        assert estimator.update(Measurements([], [], [], [])) == 0.0
+        estimator.marginalise([])
+        assert estimator.nodes.tolist() == nodes
+
+
+def test_a_snapshot_of_another_kind_of_estimator_is_refused(make):
+    estimator, untouched = filled(make), filled(make)
+    own = type(make().snapshot())
+    others = [filled(maker(kind.values[0])).snapshot() for kind in ESTIMATORS]
+    for state in others:
+        if not isinstance(state, own):
+            with pytest.raises(InputError, match=f"state: expected {own.__name__}, got {type(state).__name__}"):
+                estimator.restore(state)
+    assert np.array_equal(estimator.joint_mean(IDS), untouched.joint_mean(IDS))
+    assert np.array_equal(estimator.joint_covariance(IDS), untouched.joint_covariance(IDS))
