@@ -43,5 +43,10 @@ def resident_memory() -> float:
     status = Path("/proc/self/statm")
     if status.exists():
         return int(status.read_text().split()[1]) * resource.getpagesize() / 1e6
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # elsewhere: the peak
+    return peak_memory()  # elsewhere
+
+
+def peak_memory() -> float:
+    """Return the largest resident memory that this process has had, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3

@@ -7,8 +7,6 @@ into scans. Times are CPU times of the process, on one thread.
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from data_tools.simulator.course import SimulatedCourse
 from data_tools.simulator.town import Town
-from pipelines.process import one_thread
+from pipelines.process import one_thread, peak_memory
 from pipelines.slam.scan_landmarks import POLE, WALL
 from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray
@@ -110,7 +108,6 @@ def bench_drive(keyframes: int, seed: int = 0, progress: Progress | None = None)
         parts.append(DrivePart(a, b, mean, _mean_of(1e3 * closing[a:b]), int(sizes[a:b].max())))
     paths = (solved.world_T_pose, np.array(odometry))
     off = [float(np.sqrt(np.mean(np.sum((p - poses)[:, :3, 3] ** 2, axis=1)))) for p in paths]
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     return DriveCost(
         keyframes=keyframes,
         metres=float(way[-1]),
@@ -122,7 +119,7 @@ def bench_drive(keyframes: int, seed: int = 0, progress: Progress | None = None)
         error=off[0],
         before=off[1],
         finish=finish,
-        memory=peak,
+        memory=peak_memory(),
     )
 
 

@@ -37,6 +37,9 @@ def slam(
         int | None,
         typer.Option("--dense", min=2, help="Instead: SLAM all in on so many simulated scans of full density."),
     ] = None,
+    firings: Annotated[
+        int, typer.Option("--columns", min=100, help="With --dense: points of a beam; 2000 are full density.")
+    ] = 2000,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of --drive and --dense.")] = 0,
     json_file: JsonFile = None,
     verbose: Verbose = False,
@@ -64,7 +67,7 @@ def slam(
     if drive is not None:
         _drive(drive, seed, json_file)
     elif dense is not None:
-        _dense(dense, seed, json_file)
+        _dense(dense, firings, seed, json_file)
     if dataroot is None:
         return
     with progress_bar() as progress:
@@ -102,19 +105,25 @@ def _all_in(cost: AllIn) -> FigureTable:
         "ms, no keyframe",
         "ms, keyframe",
         "longest",
+        "last third / first",
+        "MB",
     )
     counts = (f"{cost.case}: {cost.scans}", str(cost.keyframes), str(cost.submaps), f"{cost.points:.0f}")
     times = (cost.mean, cost.between, cost.keyframe, cost.longest)
-    return FigureTable("SLAM all in, CPU time", columns, ((*counts, *(cell(x, 1) for x in times)),))
+    return FigureTable(
+        "SLAM all in, CPU time",
+        columns,
+        ((*counts, *(cell(x, 1) for x in times), cell(cost.growth), cell(cost.memory, 0)),),
+    )
 
 
-def _dense(scans: int, seed: int, json_file: Path | None) -> None:
-    """Scans as those of 64 beams and 2000 columns."""
+def _dense(scans: int, firings: int, seed: int, json_file: Path | None) -> None:
+    """Scans as those of 64 beams."""
     from data_tools.simulator.course import SimulatedCourse
     from data_tools.simulator.scanner import ScannerSettings
     from pipelines.bench.slam_all_in import bench_all_in
 
-    course = SimulatedCourse(seed, 0.8 * scans, settings=ScannerSettings(rings=64, columns=2000))
+    course = SimulatedCourse(seed, 0.8 * scans, settings=ScannerSettings(rings=64, columns=firings))
     with progress_bar() as progress:
         cost = bench_all_in(f"simulated, seed {seed}", course, progress)
     report([_all_in(cost)], [cost], json_file)

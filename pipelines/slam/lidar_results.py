@@ -64,6 +64,7 @@ def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySett
         "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
         "loops": len(result.loops),
         "false_loops": len(result.false_loops),
+        "odometry_inflation": dict(zip(("rotation", "translation"), result.selection.inflation.tolist(), strict=True)),
         "submaps": len(result.submaps),
         "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
         "misfits": dict(result.misfits),

@@ -48,7 +48,15 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import MapperSettings
-from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings, misfits, sensor_providers, unjudged
+from saga_fg.slam.sensors import (
+    SensorBuffer,
+    SensorName,
+    SensorSettings,
+    false_fixes,
+    misfits,
+    sensor_providers,
+    unjudged,
+)
 from saga_fg.slam.submaps import LoopClosure, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
@@ -134,7 +142,8 @@ class LidarSlam:
         self._graph = self._new_graph(self._start, START)
         self._detectors = tuple(detectors)
         self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
-        self._builder, self._submaps = SubmapBuilder(s.map_spacing), list[Submap]()
+        self._builder = SubmapBuilder(s.map_spacing, straighten=not isinstance(self._odometry, LidarOdometry))
+        self._submaps = list[Submap]()
         self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
         self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
@@ -178,6 +187,7 @@ class LidarSlam:
             raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
         moving = Boxes.empty()
         if self._moving is not None and detections is not None:
+            self._moving.check(scan, detections)
             moving = self._moving.boxes(time, detections, self._expected(time))
             scan = without_objects(scan, moving)
         if wheels is not None and "wheels" in self._sensors and isinstance(self._odometry, LidarOdometry):
@@ -217,7 +227,8 @@ class LidarSlam:
             _LOG.warning("%d of %d loops contradict the others, and are left out", chosen.count(False), len(chosen))
         unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
         unknown = unjudged(solved.graph, self._sensors, self.settings.sensors)
-        for text in (*unfit.values(), *unknown.values()):
+        far = false_fixes(solved.graph, self.settings.sensors) if "gps" in self._sensors else ""
+        for text in filter(None, (*unfit.values(), *unknown.values(), far)):
             _LOG.warning(text)
         drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
         anchors = solved.world_T_pose[[submap.anchor for submap in self._submaps]]
@@ -232,7 +243,7 @@ class LidarSlam:
             self._graph.observations(),
             [loop for loop, kept in zip(self._closed, chosen, strict=True) if kept],
             [loop for loop, kept in zip(self._closed, chosen, strict=True) if not kept],
-            solved.loops.inflation,
+            solved.loops,
             self._degenerate,
             self._boxes,
             unfit,

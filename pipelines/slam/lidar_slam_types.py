@@ -13,7 +13,7 @@ from pipelines.slam.drive import Drive
 from pipelines.slam.odometry import OdometryStep
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.mapping import AssociatedObservation
-from saga_fg.slam.submaps import LoopClosure
+from saga_fg.slam.submaps import LoopClosure, LoopSelection
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.landmark import Landmark
 
@@ -70,7 +70,7 @@ class LidarSlamResult:
     observations: Sequence[AssociatedObservation]
     loops: Sequence[LoopClosure]
     false_loops: Sequence[LoopClosure]
-    inflation: float
+    selection: LoopSelection
     degenerate: Sequence[tuple[str, ...]]
     moving: Sequence[Boxes]
     misfits: Mapping[str, str]
@@ -81,7 +81,7 @@ class LidarSlamResult:
 
     def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
         """Motions (4, 4) between scans by odometry, as `Drive.motions`, with the covariances of the solution."""
-        return [(T, self.inflation**2 * P) for T, P in self.drive.motions(rows)]
+        return [(T, self.selection.inflated(P)) for T, P in self.drive.motions(rows)]
 
     @property
     def keyframes(self) -> IntArray:

@@ -34,7 +34,7 @@ _SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometr
 _ALONE = 0.85  # and without one, up to twice the drift
 _FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
 _OPEN = 0.5  # m, standard deviation of an alignment of images
-_DISTORTION = np.array([2e-3] * 3 + [0.1] * 3) ** 2  # rad^2 and m^2, of submaps that odometry has bent
+_DISTORTION = np.array([1e-3] * 3 + [0.05] * 3) ** 2  # rad^2 and m^2, of submaps, which are never quite straight
 
 
 @dataclass(frozen=True)

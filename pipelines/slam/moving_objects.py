@@ -3,15 +3,22 @@
 Objects are tracked along the path so far, at the pose where the next scan is expected. One is faster than 1 m/s with
 the probability Phi((|v| - 1 m/s) / sigma), sigma the deviation of its speed, and leaves the scan where that is at least
 0.9: by 1.3 deviations. So new objects, whose velocity nobody knows, stay.
+
+Detections in another frame, or of other scans, have boxes where the scan shows nothing. Where most of the first ones
+near the sensor are empty, a warning says so.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import ndtr
 
+from data_tools.lidar import Scan
+from data_tools.lidar.moving import on_moving_objects
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.joint.record import in_ego
@@ -23,6 +30,9 @@ SAME_TIME = 0.01  # s
 _SPEED = 1.0  # m/s, from which an object moves
 _LIKELY = 0.9  # probability of that, from which its points are left out
 _LEAST_DEVIATION = 0.1  # m/s
+_NEAR, _JUDGED, _FILLED = (4.0, 30.0), 30, 0.6  # m; boxes that are looked at, and the share that is not empty
+_GROUND = np.array([0.0, 0.0, 0.25])  # m, around the lower face of a box, which the ground fills
+_LOG = logging.getLogger(__name__)
 
 
 class MovingObjects:
@@ -30,6 +40,25 @@ class MovingObjects:
 
     def __init__(self, tracker: Tracker) -> None:
         self._tracker = tracker
+        self._filled: list[bool] = []  # of the first boxes near the sensor
+
+    def check(self, scan: Scan, detections: Detections) -> None:
+        """Warn, once, of detections that do not belong to their scans."""
+        if len(self._filled) >= _JUDGED or not len(scan):
+            return
+        distance = np.linalg.norm(detections.boxes.position[:, :2], axis=1)
+        near = detections.boxes.select((distance > _NEAR[0]) & (distance < _NEAR[1]))
+        raised = replace(near, position=near.position + _GROUND / 2, size=near.size - 2 * np.abs(_GROUND))
+        for row in range(len(near)):
+            self._filled.append(bool(on_moving_objects(scan.points, raised.select([row]), [1.0], 0.0).any()))
+        if len(self._filled) >= _JUDGED and np.mean(self._filled) < _FILLED:
+            _LOG.warning(
+                "detections: expected boxes in the frame of the vehicle, at the times of the scans; of the first %d "
+                "within %.0f m only %d hold points",
+                len(self._filled),
+                _NEAR[1],
+                sum(self._filled),
+            )
 
     def boxes(self, time: float, detections: Detections, world_T_lidar: FloatArray) -> Boxes:
         """The detections of moving objects; detections in the scanner's frame, world_T_lidar (4, 4) about."""

@@ -48,6 +48,7 @@ _SPEED_OFF = 2.0  # m/s that a speed by other sensors may differ from that of th
 _ACCELERATION = 10.0  # m/s^2 that a vehicle reaches
 _FASTEST = 70.0  # m/s, of a vehicle whose speed nobody knows yet
 _OUT_OF_RANGE = 5  # scans in a row
+_CLEARLY, _SKEWED = 0.9, 3  # of the residual; rounds that take the skew out of the first two scans
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,7 @@ class LidarOdometry:
         self._keyframe = np.eye(4)
         self._velocity = np.zeros(6)  # rad/s, m/s, in the sensor's frame
         self._squares, self._count = _FIRST_DEVIATION**2, 1
+        self._first: Scan | None = None  # with its skew, until the second one comes
         self._degenerate: tuple[str, ...] = ()
         self._velocity_known = False  # by a scan that showed the whole motion, or by other sensors
         self._confirmed: float | None = None  # s, when a scan showed the whole motion, or a speed was taken after one
@@ -128,7 +130,7 @@ class LidarOdometry:
 
         velocity: (6,) since then by other sensors, turn rate, rad/s, and velocity, m/s, in the sensor's frame; NaN
         where they say nothing. It predicts the motion in place of that of the scan before, unless no vehicle can have
-        changed its velocity so much since then.
+        changed its velocity so much since then, or the first two scans fit each other clearly better without it.
         """
         s, last = self.settings, self._last
         if last is not None and not timestamp > last.timestamp:
@@ -136,12 +138,12 @@ class LidarOdometry:
         if velocity is not None:
             velocity = checked("velocity", velocity, (6,), "finite-or-nan")
         scan = self._within_range(scan, timestamp)
-        if velocity is not None and self._believable(velocity, timestamp):
+        if velocity is not None and self._believable(velocity, scan, timestamp):
             self._velocity = np.where(np.isnan(velocity), self._velocity, velocity)
             self._velocity_known = True
             self._confirmed = None if self._confirmed is None else timestamp
-        if scan.time is not None:
-            scan = deskewed(scan, self._velocity)
+        self._first = scan if last is None else None
+        scan = _deskewed(scan, self._velocity)
         if last is None:
             placed = OdometryStep(timestamp, np.eye(4), np.zeros((6, 6)), scan, True, None)
         else:
@@ -170,11 +172,17 @@ class LidarOdometry:
         self._out_of_range = out_of_range
         return near
 
-    def _believable(self, velocity: FloatArray, timestamp: float) -> bool:
-        """True if a vehicle can reach this velocity from the last certain one; warns at the first failure."""
+    def _believable(self, velocity: FloatArray, scan: Scan, timestamp: float) -> bool:
+        """Whether a vehicle can have this velocity, by what it last had for certain; warns where it begins to fail.
+
+        At the second scan: whether the two fit as well with it as without.
+        """
         said = ~np.isnan(velocity[3:])
         if self._confirmed is None:
             off, most = float(np.linalg.norm(velocity[3:][said])), _FASTEST
+            tried = np.where(np.isnan(velocity), self._velocity, velocity)
+            if self._first is not None and off <= most and self._contradicted(tried, self._first, scan, timestamp):
+                most = 0.0
         else:
             off = float(np.linalg.norm((velocity - self._velocity)[3:][said]))
             most = _SPEED_OFF + _ACCELERATION * (timestamp - self._confirmed)
@@ -188,22 +196,55 @@ class LidarOdometry:
         self._refused = off > most
         return not self._refused
 
+    def _contradicted(self, velocity: FloatArray, first: Scan, scan: Scan, timestamp: float) -> bool:
+        """Whether the first two scans fit each other clearly better by a velocity that they show themselves; if so, it
+        is taken, and the map begins anew with it."""
+        assert self._last is not None
+        dt, xi, before = timestamp - self._last.timestamp, np.zeros(6), self._map
+        try:
+            said = self._fit(scan, velocity, dt, True)
+        except RegistrationError:
+            said = None
+        try:
+            for _ in range(_SKEWED):
+                self._map = self._new_map(_deskewed(first, xi))
+                shown = self._fit(scan, xi, dt)
+                xi = constant_velocity(shown.map_T_scan, dt)
+        except RegistrationError:
+            self._map = before
+            return False
+        if said is not None and shown.residual / shown.pairs >= _CLEARLY * said.residual / said.pairs:
+            self._map = before
+            return False
+        self._velocity, self._velocity_known = xi, False
+        return True
+
+    def _fit(self, scan: Scan, velocity: FloatArray, dt: float, known: bool = False) -> Registration:
+        """A scan registered with the first one, by a velocity."""
+        points = _deskewed(scan, velocity).points
+        thin = points[voxel_downsample(points, self.settings.scan_spacing)]
+        return self._registered_scan(thin, gtsam.Pose3.Expmap(velocity * dt).matrix(), known)
+
+    def _new_map(self, scan: Scan) -> SurfelMap:
+        """A map of the first scan."""
+        s = self.settings
+        made = SurfelMap(s.surfel_size, s.max_range)
+        made.add(scan.points[voxel_downsample(scan.points, s.map_spacing)], np.zeros(3))
+        return made
+
+    def _registered_scan(self, points: FloatArray, predicted: FloatArray, known: bool = False) -> Registration:
+        """Points (N, 3) registered with the map; known: the velocity, so that it holds where surfaces leave it open."""
+        s = self.settings
+        farthest = s.surfel_size + 3 * self.deviation
+        return register(points, self._map, predicted, farthest, 0.1, s.registration, "hold" if known else "follow")
+
     def _place(self, last: OdometryStep, scan: Scan, timestamp: float) -> OdometryStep:
         s, dt = self.settings, timestamp - last.timestamp
         motion = gtsam.Pose3.Expmap(self._velocity * dt).matrix()
         predicted = last.map_T_lidar @ motion
         points = scan.points[voxel_downsample(scan.points, s.scan_spacing)]
-        sigma = self.deviation
         try:
-            found = register(
-                points,
-                self._map,
-                predicted,
-                s.surfel_size + 3 * sigma,
-                0.1,
-                s.registration,
-                "hold" if self._velocity_known else "follow",
-            )
+            found = self._registered_scan(points, predicted, self._velocity_known)
         except RegistrationError as error:
             _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, error)
             covariance = np.diag([s.lost_rotation] * 3 + [s.lost_translation] * 3) ** 2
@@ -231,6 +272,10 @@ class LidarOdometry:
         angle = float(rotation_angle(deviation[:3, :3]))
         self._squares += (float(np.linalg.norm(deviation[:3, 3])) + 2 * span * np.sin(angle / 2)) ** 2
         self._count += 1
+
+
+def _deskewed(scan: Scan, velocity: FloatArray) -> Scan:
+    return scan if scan.time is None else deskewed(scan, velocity)
 
 
 def moved_on(keyframe_T_scan: FloatArray, settings: OdometrySettings) -> bool:

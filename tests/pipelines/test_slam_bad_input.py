@@ -89,6 +89,21 @@ def test_a_speed_that_no_vehicle_can_reach_is_refused(
     assert error.max() < 0.15
 
 
+@pytest.mark.parametrize("factor", [-1.0, 2.0, 3.6])
+def test_wheels_that_are_wrong_from_the_start_are_refused(
+    scans: SimulatedScans, factor: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Wrong sign, wrong scale, km/h for m/s: the scans are asked before anything is believed."""
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN, ego_T_lidar=scans.ego_T_lidar, sensors=["wheels"])
+    for k, time in enumerate(scans.timestamps.tolist()):
+        slam.step(scans[k], time, wheels=WheelSpeed(factor * 8.0, 0.1))
+    assert caplog.text.count("by other sensors is refused") == 1
+    found = slam.finish()
+    error = np.linalg.norm(found.trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1)
+    assert error.max() < 0.15
+    assert "wheels" in {**found.misfits, **found.unjudged}
+
+
 def test_a_speed_predicts_only_where_wheels_are_among_the_sensors(
     scans: SimulatedScans, caplog: pytest.LogCaptureFixture
 ) -> None:

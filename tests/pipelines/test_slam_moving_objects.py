@@ -16,7 +16,7 @@ from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.moving_objects import MovingObjects
 from saga_fg import Boxes, Detections, Frame, InputError
-from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 
 START, SPEED = np.array([5.0, 1.5, 0.75]), 7.0  # m, m/s, of a car that drives ahead
 SIZE = np.array([4.4, 1.8, 1.5])
@@ -74,6 +74,18 @@ def test_a_scan_needs_its_frame() -> None:
     scans, frames, _ = drive_behind_a_car(4)
     with pytest.raises(InputError, match=r"expected one of detections at 0\.300 s, the time of a scan"):
         lidar_slam(scans, frames=frames[:-1], tracker=path_tracker(load_config("kitti")))
+
+
+@pytest.mark.parametrize(("turned", "said"), [(0.0, 0), (2.0, 1)])
+def test_detections_in_another_frame_are_noticed(turned: float, said: int, caplog: pytest.LogCaptureFixture) -> None:
+    scans, frames, _ = drive_behind_a_car(12)
+    objects = MovingObjects(path_tracker(load_config("kitti")))
+    for k, frame in enumerate(frames):
+        boxes = frame.detections.boxes.transformed(yaw_transform(3.0 * turned, yaw=turned))
+        objects.check(scans[k], Detections(boxes, frame.detections.score))
+    assert (
+        caplog.text.count("detections: expected boxes in the frame of the vehicle, at the times of the scans") == said
+    )
 
 
 @pytest.mark.parametrize(("speeds", "moving"), [([4.0] * 2, 0), ([4.0] * 4, 1), ([1.2] * 12, 0)])

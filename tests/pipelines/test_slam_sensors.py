@@ -51,7 +51,7 @@ def test_in_a_tunnel_the_wheels_say_how_far() -> None:
     assert helped.covariances[-1, 3, 3] < 0.1
 
 
-def test_over_a_field_gps_and_wheels_carry_the_pose() -> None:
+def test_over_a_field_gps_and_wheels_carry_the_pose(caplog: pytest.LogCaptureFixture) -> None:
     scans, speed = braking_drive(open_field())
     rng, times = np.random.default_rng(1), PERIOD * np.arange(len(speed))
     fixes = scans.world_T_ego[:, :3, 3] + rng.normal(0, 0.5, (len(speed), 3))
@@ -59,6 +59,7 @@ def test_over_a_field_gps_and_wheels_carry_the_pose() -> None:
     log = SensorLog({"gps": np.column_stack([times, fixes]), "wheels": np.column_stack([times, speed])})
     found = lidar_slam(scans, settings=PLAIN, log=log)
     assert np.linalg.norm(found.trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1).max() < 1.0
+    assert re.search(r"gps: 1 of \d+ fixes lie more than 9 deviations off, and hardly count", caplog.text)
     assert all("across the road" in motions for motions in found.degenerate[1:])
     assert found.misfits == {}
 

@@ -22,6 +22,7 @@ from saga_fg.slam.sensors.settings import SensorSettings
 WINDOW = 60  # factors of a sensor that are looked at
 LEAST = 15  # that are needed
 LARGEST = 2.0  # median of the squared residuals by dimension: below 1 where all is well; robust losses bound it
+_BOUND = 0.9  # of the squared scale of a Cauchy loss: a residual three times that scale
 _BIAS = 4.0  # standard deviations of the prior
 
 
@@ -67,7 +68,20 @@ def unjudged(graph: SceneFactorGraph, sensors: Collection[str], settings: Sensor
     return found
 
 
-def residual_scores(graph: SceneFactorGraph, provider: str, point: LinearisationPoint) -> FloatArray:
+def false_fixes(graph: SceneFactorGraph, settings: SensorSettings) -> str:
+    """How many fixes by GPS lie so far off that the robust loss hardly counts them, in words; empty for none."""
+    loss = settings.gps.outlier_scale
+    scores = residual_scores(graph, settings.gps.name, graph.point(), most=len(graph.variables))
+    off = int((3 * scores > _BOUND * loss**2).sum())  # a residual that is weighted by the loss stays below its scale
+    if not np.isfinite(loss) or not off:
+        return ""
+    name, far = settings.gps.name, 3 * loss
+    return f"{name}: {off} of {len(scores)} fixes lie more than {far:.0f} deviations off, and hardly count"
+
+
+def residual_scores(
+    graph: SceneFactorGraph, provider: str, point: LinearisationPoint, most: int = WINDOW
+) -> FloatArray:
     """Squared whitened residuals by dimension (n,) of the newest factors of a provider, those of priors left out."""
     scores: list[float] = []
     for held in reversed(list(graph.groups.values())):
@@ -82,9 +96,9 @@ def residual_scores(graph: SceneFactorGraph, provider: str, point: Linearisation
             step = np.concatenate([point.increment(key) for key in factor.keys()])  # noqa: SIM118 -- a factor of GTSAM
             r = factor.augmentedJacobian()[:, -1] - factor.augmentedJacobian()[:, :-1] @ step
             scores.append(float(r @ r) / len(r))
-        if len(scores) >= WINDOW:
+        if len(scores) >= most:
             break
-    return np.array(scores[:WINDOW])
+    return np.array(scores[:most])
 
 
 def _bias(graph: SceneFactorGraph, settings: SensorSettings) -> tuple[float, FloatArray]:

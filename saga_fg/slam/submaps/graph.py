@@ -240,7 +240,7 @@ class SubmapGraph:
             came.setdefault(k, []).extend([loop] if kept else [])
         for k, (time, motion) in enumerate(zip(self._times, self._motions, strict=True)):
             graph.advance(time)
-            covariance = chosen.inflation**2 * motion[1] if k else motion[1]
+            covariance = chosen.inflated(motion[1]) if k else motion[1]
             own: list[FactorProvider] = [MeasuredMotion(motion[0], covariance, poses[k]), seen]
             if came.get(k):
                 own.append(_Loops(came[k], self._anchors, None))

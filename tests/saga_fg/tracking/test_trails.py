@@ -40,6 +40,11 @@ def along(place, heading, ids=0, settings=SETTINGS):
     return trails
 
 
+def known(trails):
+    """All passages of tracks."""
+    return trails.left.append(trails.latest)
+
+
 def arc(length, radius=RADIUS):
     """Places and headings of a bend to the left that begins at (0, 0) towards x, after 20 m straight on."""
     angle = np.maximum(length, 0.0) / radius
@@ -53,7 +58,7 @@ def path(trails, position=(-10.0, 0.0), heading=0.0, curvature=0.0, steps=10, tr
 
 def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
     trails = along(*arc(np.arange(-20, 20, 0.5)))
-    apart = np.hypot(*np.diff(trails.passages.position, axis=0).T)
+    apart = np.hypot(*np.diff(known(trails).position, axis=0).T)
     assert (apart >= 1.99).all()
     assert (apart < 2.6).all()
 
@@ -61,18 +66,18 @@ def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
 def test_points_are_forgotten():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
     trails.update(passing([(100.0, 0.0)], 0.0, 60.5, [3]), 60.5)
-    assert trails.passages.time.min() >= 0.5
+    assert known(trails).time.min() >= 0.5
 
 
 def test_points_are_forgotten_while_nobody_moves():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
     trails.update(passing(np.empty((0, 2)), 0.0), 1000.0)
-    assert len(trails.passages) == 0
+    assert len(known(trails)) == 0
     assert path(trails).weight.max() == 0.0
 
 
 def test_without_a_memory_nothing_is_remembered():
-    assert len(along(*arc(np.arange(-20, 0, 2.0)), settings=TrafficSettings()).passages) == 0
+    assert len(along(*arc(np.arange(-20, 0, 2.0)), settings=TrafficSettings()).left) == 0
 
 
 def test_a_path_goes_round_the_bend_of_earlier_traffic():
