@@ -193,7 +193,7 @@ def _swept(steps: Iterable[tuple[FilterStep, Partition]], future_known: bool) ->
         after_partition = partition
         if step.carried < len(partition.layout):
             carried = np.arange(step.carried)
-            layout = StateLayout(partition.layout.nodes[carried], partition.layout.dims[carried])
+            layout = partition.layout.select(carried)
             after_partition = partition.restricted(layout, carried)
         after = _moved(N, partition, after_partition)
 

@@ -69,7 +69,7 @@ class Dynamics:
         some = self.only(rows)
         where = np.full(len(self.layout), -1)
         where[rows] = np.arange(len(rows))
-        layout = StateLayout(self.layout.nodes[rows], self.layout.dims[rows])
+        layout = self.layout.select(rows)
         return Dynamics(layout, _renamed(some.F, where), self.b[self.layout.places(rows)], _renamed(some.Q, where))
 
     def times(self, x: FloatArray) -> FloatArray:

@@ -28,7 +28,7 @@ from saga_fg.estimators.dynamics import Dynamics, identity
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.model.motion import NodeType, NonlinearMotion, distinct_types
+from saga_fg.model.motion import NodeType, NonlinearMotion
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, held
 from saga_fg.model.transition import Blocks, Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
@@ -200,7 +200,7 @@ def nonlinear_dynamics(transition: Transition) -> tuple[NonlinearDynamics, ...]:
     """The nonlinear dynamics of a transition: of nodes with such a motion, or that nonlinear edges act on."""
     graph, types = transition.graph, transition.graph.types
     acting = [group for group in graph.nonlinear if group.rate.any()]
-    if transition.dt == 0 or not (acting or any(t.flow is not None for t in distinct_types(types)[0])):
+    if transition.dt == 0 or not (acting or any(t.flow is not None for t in graph.kinds[0])):
         return ()
     sources: dict[int, dict[int, FloatArray]] = {i: {} for i, t in enumerate(types) if t.flow is not None}
     for group in acting:

@@ -90,7 +90,12 @@ class JointKalmanFilter(LatestMarginals):
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
     ) -> None:
-        mean, covariance = checked_prior(nodes, means, covariances)
+        self.extend(nodes, *checked_prior(nodes, means, covariances), labels)
+
+    def extend(
+        self, nodes: ArrayLike, mean: FloatArray, covariance: FloatArray, labels: Mapping[int, str] | None = None
+    ) -> None:
+        """As `add`, of numbers that were checked where they came in."""
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
         if self.providers:
             self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})
@@ -131,10 +136,10 @@ class JointKalmanFilter(LatestMarginals):
 
     def update(self, measurements: Measurements | Observations) -> float:
         recorded = RecordedMeasurements(measurements)
-        recorded.check(self._state.layout)
-        if len(measurements) == 0:
+        rows = recorded.check(self._state.layout)
+        if len(rows) == 0:
             return 0.0
-        seen = recorded.linearised(self._state.layout, self._state.mean)
+        seen = recorded.linearised(self._state.layout, self._state.mean, rows)
         if compiled_kernels():
             self._state, log_likelihood = corrected(self._state, seen)
         else:

@@ -17,6 +17,7 @@ from saga_fg.numerics.arrays import (
     checked_covariances,
     checked_ids,
     checked_rows,
+    unchecked,
 )
 
 
@@ -92,12 +93,22 @@ class StateLayout:
         _, known = self._places(ids)
         if known.any():
             raise InputError(f"node {ids[int(np.argmax(known))]} is in the estimator already")
-        return StateLayout(np.concatenate([self.nodes, ids]), np.concatenate([self.dims, np.full(len(ids), dim)]))
+        dims = np.concatenate([self.dims, np.full(len(ids), dim)])
+        further = self.offsets[-1] + dim * np.arange(1, len(ids) + 1)
+        offsets = np.concatenate([self.offsets, further])
+        return unchecked(StateLayout, nodes=np.concatenate([self.nodes, ids]), dims=dims, offsets=offsets)
 
     def without(self, rows: IntArray) -> StateLayout:
         keep = np.ones(len(self), dtype=bool)
         keep[rows] = False
-        return StateLayout(self.nodes[keep], self.dims[keep])
+        return self.select(keep)
+
+    def select(self, rows: IntArray | BoolArray) -> StateLayout:
+        """The nodes of some rows, or of a mask, in their order."""
+        dims = self.dims[rows]
+        offsets = np.zeros(len(dims) + 1, dtype=np.int64)
+        np.cumsum(dims, out=offsets[1:])
+        return unchecked(StateLayout, nodes=self.nodes[rows], dims=dims, offsets=offsets)
 
 
 def checked_prior(nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> tuple[FloatArray, FloatArray]:

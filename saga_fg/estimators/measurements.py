@@ -106,18 +106,19 @@ class RecordedMeasurements:
         measured = self.measured
         return int(measured.H.shape[2]) if isinstance(measured, Measurements) else measured.model.state_dim
 
-    def check(self, layout: StateLayout) -> None:
-        """Raise `UnknownNodeError` or `InputError` unless the nodes are in `layout` and of the right size."""
-        span = layout.spans(layout.rows(self.measured.nodes))
-        if len(span) and span.shape[1] != self.state_dim:
-            raise InputError(
-                f"H: expected {span.shape[1]} columns, the size of the nodes' states, got {self.state_dim}"
-            )
+    def check(self, layout: StateLayout) -> IntArray:
+        """The rows (m,) of the nodes; `UnknownNodeError` or `InputError` unless they are in `layout` and of the right
+        size."""
+        rows = layout.rows(self.measured.nodes)
+        if len(rows) and (layout.dims[rows] != self.state_dim).any():
+            size = layout.spans(rows).shape[1]
+            raise InputError(f"H: expected {size} columns, the size of the nodes' states, got {self.state_dim}")
+        return rows
 
-    def linearised(self, layout: StateLayout, mean: FloatArray) -> LinearisedMeasurements:
-        """Linearise around the joint state `mean` (D,) of `layout`."""
+    def linearised(self, layout: StateLayout, mean: FloatArray, rows: IntArray | None = None) -> LinearisedMeasurements:
+        """Linearise around the joint state `mean` (D,) of `layout`; rows: those that `check` has returned."""
         measured = self.measured
-        rows = layout.rows(measured.nodes)
+        rows = layout.rows(measured.nodes) if rows is None else rows
         if self.linear and self.weights is None:
             assert isinstance(measured, Measurements)
             return LinearisedMeasurements(rows, measured.z, measured.H, measured.R)

@@ -14,7 +14,7 @@ import os
 import pkgutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import update_wrapper
+from functools import update_wrapper, wraps
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
@@ -98,6 +98,19 @@ def kernel(arguments: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
     many dimensions, which is only read, of any strides, or contiguous where a c follows.
     """
     return lambda source: Kernel(source, arguments)
+
+
+def compiled_by(compiled: Kernel[P, R]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a NumPy function: a kernel of the same arguments and results does its work where kernels are used."""
+
+    def decorated(numpy_version: Callable[P, R]) -> Callable[P, R]:
+        @wraps(numpy_version)
+        def chosen(*args: P.args, **kwargs: P.kwargs) -> R:
+            return compiled(*args, **kwargs) if compiled_kernels() else numpy_version(*args, **kwargs)
+
+        return chosen
+
+    return decorated
 
 
 def kernel_part(source: Callable[P, R]) -> Callable[P, R]:

@@ -17,7 +17,8 @@ def compared_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: Flo
     """Rows (k,) of places a (n, 2) and b (m, 2) with |a_i - b_j| <= reach_i + further_j, in order of i, then of j."""
     n, m = len(a), len(b)
     k, room = 0, max(64, 2 * (n + m))
-    row, column = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
+    found = np.empty((2, room), dtype=np.int64)
+    row, column = found[0], found[1]
     low, high, widest = math.inf, -math.inf, -math.inf
     for j in range(m):
         low, high = min(low, b[j, 0]), max(high, b[j, 0])
@@ -35,13 +36,24 @@ def compared_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: Flo
         start, end = (a[i, 0] - span - low) / width - 1, (a[i, 0] + span - low) / width + 1
         if end < 0 or start >= m:
             continue
-        for strip in range(int(max(start, 0.0)), int(min(end, m - 1.0)) + 1):
+        if k + m > room:
+            room = 2 * room + m
+            longer = np.empty((2, room), dtype=np.int64)
+            for e in range(k):
+                longer[0, e], longer[1, e] = row[e], column[e]
+            row, column = longer[0], longer[1]
+        one, last = int(max(start, 0.0)), int(min(end, m - 1.0))
+        if (last - one) ** 2 > 4 * m:  # more work to order what is found than to compare all
+            for j in range(m):
+                x, y, r = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], reach[i] + further[j]
+                row[k], column[k] = i, j
+                k += x * x + y * y <= r * r
+            continue
+        for strip in range(one, last + 1):
             j = first[strip]
             while j >= 0:
                 x, y, r = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], reach[i] + further[j]
                 if x * x + y * y <= r * r:
-                    if k == room:
-                        row, column, room = np.append(row, row), np.append(column, column), 2 * room
                     row[k] = i
                     at = k
                     while at > begin and column[at - 1] > j:

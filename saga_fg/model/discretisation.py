@@ -38,10 +38,10 @@ import scipy.sparse
 from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import compiled_kernels
 from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise
-from saga_fg.model.motion import NodeType, distinct_types
+from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.transition import Blocks, Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 
 LONGEST = 1e12  # s; longer than any two timestamps are apart
 _TAYLOR_DEGREE = 12
@@ -59,11 +59,12 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         raise InputError(f"dt: expected a finite number of seconds from 0 to {LONGEST:g}, got {dt!r}")
     if len(graph) == 0:
         return Transition(graph, dt, (), np.empty(0), ())
-    kinds, kind = distinct_types(graph.types)
+    kinds, kind = graph.kinds
     coupled = np.zeros(len(graph), dtype=bool)
     for edges in graph.edges:
         coupled[edges.target[edges.rate > 0]] = True
-    offsets = np.concatenate([[0], np.cumsum(graph.dims)])
+    offsets = np.zeros(len(graph) + 1, dtype=np.int64)
+    np.cumsum(graph.dims, out=offsets[1:])
     b = np.zeros(int(offsets[-1]))
     F: list[Blocks] = []
     Q: list[Blocks] = []
@@ -73,11 +74,12 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
     for numbers in alike.values():
         place = np.full(len(kinds), -1)
         place[numbers] = np.arange(len(numbers))
-        rows = np.flatnonzero(~coupled & (place[kind] >= 0))
-        of_row = place[kind[rows]]
+        of_row = place[kind]
+        rows = (~coupled & (of_row >= 0)).nonzero()[0]
+        of_row = of_row[rows]
         own, noise = _own_motions(tuple(kinds[k] for k in numbers), dt)
-        F.append(Blocks(rows, rows, own[of_row]))
-        Q.append(Blocks(rows, rows, noise[of_row] * graph.diffusion_scale[rows, None, None]))
+        F.append(Blocks(rows, rows, own.take(of_row, 0)))
+        Q.append(Blocks(rows, rows, noise.take(of_row, 0) * graph.diffusion_scale[rows, None, None]))
     order = max(1, *(t.nilpotency or 0 for t in kinds))
     for d in np.unique(graph.dims[coupled]).tolist():
         rows = np.flatnonzero(coupled & (graph.dims == d))
@@ -93,7 +95,9 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
                 F.append(_coupling_blocks(edges, dt, M, phi, position, kinds, kind))
     if graph.modes:
         _move_by_modes(graph, dt, F, b, Q, offsets, coupled)
-    return Transition(graph, dt, _merged(F, len(graph)), b, tuple(Q))
+    made = unchecked(Transition, graph=graph, dt=dt, F=_merged(F, len(graph)), b=b, Q=tuple(Q), offsets=offsets)
+    made.check_finite()
+    return made
 
 
 def own_motion(node_type: NodeType, dt: float) -> tuple[FloatArray, FloatArray]:
@@ -130,31 +134,37 @@ def _move_by_modes(
     coupled: BoolArray,
 ) -> None:
     """Put the recorded motions in place of those of their types: G_i = F_ii exp(-A_i dt) acts on them, I if alone."""
+    own_blocks = [number for number, blocks in enumerate(F) if blocks.target is blocks.source]  # in the order of Q
     for record in graph.modes:
         rows = graph.rows(record.ids)
         if len(rows) == 0:
             continue
         own = record.predicted(dt, graph.diffusion_scale[rows])[1]
-        alone = np.eye(own.F.shape[1])
-        back = _exponential(-graph.types[rows[0]].generator * dt) if coupled[rows].any() else alone
         place = np.full(len(graph), -1)
         place[rows] = np.arange(len(rows))
-        G = np.empty_like(own.F)
-        for number, blocks in enumerate(F):
-            mine = np.flatnonzero((place[blocks.target] >= 0) & (blocks.target == blocks.source))
-            if len(mine):
-                at, values = place[blocks.target[mine]], blocks.values.copy()
-                G[at] = np.where(coupled[blocks.target[mine], None, None], values[mine] @ back, alone)
-                values[mine] = G[at] @ own.F[at]
-                F[number] = Blocks(blocks.target, blocks.source, values)
-        b[offsets[rows][:, None] + np.arange(own.b.shape[1])] += (G @ own.b[:, :, None])[:, :, 0]
-        for number, blocks in enumerate(Q):
-            mine = np.flatnonzero(place[blocks.target] >= 0)
-            if len(mine):
-                at, values = place[blocks.target[mine]], blocks.values.copy()
-                noise = G[at] @ own.Q[at] @ np.swapaxes(G[at], 1, 2)
-                values[mine] = (noise + np.swapaxes(noise, 1, 2)) / 2
-                Q[number] = Blocks(blocks.target, blocks.source, values)
+        own_b = own.b
+        for of_Q, of_F in enumerate(own_blocks):
+            at = place[F[of_F].target]
+            mine = (at >= 0).nonzero()[0]
+            if len(mine) == 0:
+                continue
+            at, target = at[mine], F[of_F].target
+            F_own, Q_own = own.F.take(at, 0), own.Q.take(at, 0)
+            if coupled[target[0]]:  # and so are all of these blocks
+                G = F[of_F].values[mine] @ _moved_back(graph.types[rows[0]], dt)
+                F_own, Q_own = G @ F_own, G @ Q_own @ np.swapaxes(G, 1, 2)
+                own_b = own_b.copy() if own_b is own.b else own_b
+                own_b[at] = (G @ own.b[at][:, :, None])[:, :, 0]
+            values, noise = F[of_F].values.copy(), Q[of_Q].values.copy()
+            values[mine], noise[mine] = F_own, (Q_own + np.swapaxes(Q_own, 1, 2)) / 2
+            F[of_F], Q[of_Q] = Blocks(target, target, values), Blocks(target, target, noise)
+        b[offsets[rows][:, None] + np.arange(own_b.shape[1])] += own_b
+
+
+@lru_cache(maxsize=64)
+def _moved_back(node_type: NodeType, dt: float) -> FloatArray:
+    """exp(-A dt) of a type."""
+    return _exponential(-node_type.generator * dt)
 
 
 def joint_generator(graph: SceneGraph) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -183,8 +193,8 @@ def _own_dynamics(
     """M (m, d, d), Qc (m, d, d), c (m, d) of the nodes `rows`, whose states have equal size."""
     numbers = np.flatnonzero(np.bincount(kind[rows]))
     of_row = np.searchsorted(numbers, kind[rows])
-    M = np.stack([kinds[k].generator for k in numbers])[of_row]
-    Qc = np.stack([kinds[k].diffusion for k in numbers])[of_row] * graph.diffusion_scale[rows, None, None]
+    M = np.stack([kinds[k].generator for k in numbers]).take(of_row, 0)
+    Qc = np.stack([kinds[k].diffusion for k in numbers]).take(of_row, 0) * graph.diffusion_scale[rows, None, None]
     c = np.zeros(M.shape[:2])
     position = np.full(len(graph), -1)
     position[rows] = np.arange(len(rows))
@@ -320,11 +330,16 @@ def _merged(F: list[Blocks], n: int) -> tuple[Blocks, ...]:
         by_shape.setdefault((blocks.values.shape[1], blocks.values.shape[2]), []).append(blocks)
     merged = []
     for same in by_shape.values():
+        if len(same) == 1 and same[0].target is same[0].source:
+            merged.append(same[0])
+            continue
         target = np.concatenate([blocks.target for blocks in same])
         source = np.concatenate([blocks.source for blocks in same])
         values = np.concatenate([blocks.values for blocks in same])
-        pair, first, inverse = np.unique(target * n + source, return_index=True, return_inverse=True)
-        if len(pair) < len(target):
+        pairs = target * n + source
+        ordered = np.sort(pairs)
+        if (ordered[1:] == ordered[:-1]).any():
+            pair, first, inverse = np.unique(pairs, return_index=True, return_inverse=True)
             total = np.zeros((len(pair), *values.shape[1:]))
             np.add.at(total, inverse, values)
             target, source, values = target[first], source[first], total

@@ -18,12 +18,15 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from saga_fg.kernels import lanes
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
 from saga_fg.model.edge_features import EdgeFeatures, features_of
 from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
+from saga_fg.model.paths import NO_PATHS, SHARP
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.settings import (
@@ -205,19 +208,12 @@ class Following(Settings):
         follows = _acted(nodes, able) & ~of_classes(nodes.label, self.towed)
         if not self.parked and nodes.has_moved is not None:
             follows = follows & (nodes.has_moved > 0)
-        target, source = pairs_within(nodes.position, follows, able, self.max_gap)
-        c, s, (x, y) = np.cos(nodes.heading), np.sin(nodes.heading), nodes.position.T
-        dx, dy, c, s = x[source] - x[target], y[source] - y[target], c[target], s[target]
-        ahead, widest = dx * c + dy * s, math.tan(min(3 * self.heading_scale, 1.5) / 2)
-        inside = (ahead > 0) & (np.abs(dy * c - dx * s) <= 3 * self.lateral_scale + widest * ahead)
-        if nodes.paths is not None and len(nodes.paths):
-            path = np.full(len(nodes), -1)
-            path[nodes.paths.row] = np.arange(len(nodes.paths))
-            bent = np.flatnonzero(path[target] >= 0)
-            places = nodes.position[source[bent]]
-            inside[bent] = nodes.paths.may_be_beside(path[target[bent]], places, 3 * self.lateral_scale)
-        front = np.flatnonzero(inside)
-        return target[front], source[front]
+        paths = NO_PATHS if nodes.paths is None else nodes.paths
+        path = np.full(len(nodes), -1)
+        path[paths.row] = np.arange(len(paths))
+        aside, widening = 3 * self.lateral_scale, math.tan(min(3 * self.heading_scale, 1.5) / 2)
+        lane = self.max_gap, aside, widening, path, paths.position[:, 0], *paths.cones(aside), SHARP
+        return pairs_ahead(nodes.position, nodes.heading, follows, able, *lane)
 
 
 @dataclass(frozen=True)
@@ -297,6 +293,37 @@ def pairs_within(
     target, source = to[i], of[j]
     different = target != source
     return target[different], source[different]
+
+
+@compiled_by(lanes.pairs_ahead)
+def pairs_ahead(
+    position: FloatArray,
+    heading: FloatArray,
+    follows: BoolArray,
+    able: BoolArray,
+    farthest: float,
+    aside: float,
+    widening: float,
+    path: IntArray,
+    begin: FloatArray,
+    direction: FloatArray,
+    turn: FloatArray,
+    margin: FloatArray,
+    sharp: float,
+) -> tuple[IntArray, IntArray]:
+    target, source = pairs_within(position, follows, able, farthest)
+    c, s, (x, y), of = np.cos(heading), np.sin(heading), position.T, path[target]
+    dx, dy, c, s = x[source] - x[target], y[source] - y[target], c[target], s[target]
+    ahead = dx * c + dy * s
+    inside = (ahead > 0) & (np.abs(dy * c - dx * s) <= aside + widening * ahead)
+    bent = np.flatnonzero(of >= 0)
+    of, (dx, dy) = of[bent], (position[source[bent]] - begin[of[bent]]).T
+    c, s = np.cos(direction[of]), np.sin(direction[of])
+    ahead, beside = dx * c + dy * s, np.abs(dy * c - dx * s)
+    near = (ahead >= -margin[of]) & (beside * np.cos(turn[of]) - ahead * np.sin(turn[of]) <= margin[of])
+    inside[bent] = near | (turn[of] > sharp)
+    front = np.flatnonzero(inside)
+    return target[front], source[front]
 
 
 def strongest(pairs: Pairs, n: int, degree: int) -> Pairs:

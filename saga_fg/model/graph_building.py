@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,8 +13,9 @@ from saga_fg.model.interactions import NodeTable, applies
 from saga_fg.model.motion import distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.scene_graph import Edges, ModeRecord, NonlinearEdges, SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, checked, checked_rows
+from saga_fg.numerics.arrays import BoolArray, FloatArray, checked, checked_rows, unchecked
 
+E = TypeVar("E", Edges, NonlinearEdges)
 _MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
 
 
@@ -39,39 +41,60 @@ def build_graph(
     groups: list[Edges] = []
     nonlinear: list[NonlinearEdges] = []
     total_rate = np.zeros(len(nodes))
-    graph_nodes, row = nodes, np.arange(len(nodes)) if interacting is None else np.flatnonzero(interacting)
+    graph_nodes, types = nodes, distinct_types(nodes.types)
+    row = np.arange(len(nodes)) if interacting is None else interacting.nonzero()[0]
     if len(row) < len(nodes):
         nodes = nodes.select(row)
     if len(nodes) > 1:
-        kinds, kind = distinct_types(nodes.types)
         first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
-        kind = np.array([first.setdefault(t.components, len(first)) for t in kinds])[kind]
+        kind = np.array([first.setdefault(t.components, len(first)) for t in types[0]])[types[1][row]]
         for rule in rules:
-            target, source, rate = _checked_pairs(rule, nodes)
+            target, source, rate = _pairs(rule, nodes)
+            if len(target) == 0:
+                continue
             if nodes.existence is not None:
                 rate = rate * nodes.existence[source]
-            keep = rate >= min_rate
+            keep = (rate >= min_rate).nonzero()[0]
             target, source, rate = target[keep], source[keep], rate[keep]
             pair_kind = kind[target] * len(first) + kind[source]
-            for k in np.flatnonzero(np.bincount(pair_kind)):
-                mine = pair_kind == k
+            for k in np.bincount(pair_kind).nonzero()[0]:
+                mine = (pair_kind == k).nonzero()[0]
                 t, s = target[mine], source[mine]
-                law = rule.interaction
+                law, shipped = rule.interaction, _shipped(rule) and _shipped(rule.interaction)
                 if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
                     continue
+                ends = {"target": row[t], "source": row[s], "rate": rate[mine]}
                 if isinstance(law, AccelerationLaw):
-                    nonlinear.append(NonlinearEdges(law, row[t], row[s], rate[mine], law.given(nodes, t, s)))
+                    ends["given"] = law.given(nodes, t, s)
+                    nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
                 else:
-                    groups.append(Edges(type(law).__name__, row[t], row[s], rate[mine], *law.triples(nodes, t, s)))
+                    triples = law.triples(nodes, t, s)._asdict()
+                    groups.append(_made(Edges, shipped, interaction=type(law).__name__, **ends, **triples))
                 np.add.at(total_rate, row[t], rate[mine])
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:
         scale = scale * noise_scale
-    return SceneGraph(graph_nodes.id, graph_nodes.types, tuple(groups), scale, tuple(nonlinear), modes)
+    parts = {"edges": tuple(groups), "diffusion_scale": scale, "nonlinear": tuple(nonlinear), "modes": modes}
+    return unchecked(SceneGraph, nodes=graph_nodes.id, types=graph_nodes.types, kinds=types, **parts)
+
+
+def _made(kind: type[E], shipped: bool, **columns: Any) -> E:
+    """Edges, which are checked unless their rule and law are of this package."""
+    return unchecked(kind, **columns) if shipped else kind(**columns)
+
+
+def _pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
+    """The pairs of a rule; `InputError` for rows or rates of a user's that are not valid."""
+    return rule.pairs(nodes) if _shipped(rule) else _checked_pairs(rule, nodes)
+
+
+def _shipped(part: object) -> bool:
+    """True if a rule or law is of this package, and none that was derived from one."""
+    return type(part).__module__.startswith("saga_fg.")
 
 
 def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
-    """The pairs of a rule, which may be a user's; `InputError` for rows or rates that are not valid."""
+    """The pairs of a user's rule; `InputError` for rows or rates that are not valid."""
     what = f"edge rule {type(rule).__name__}"
     pairs = rule.pairs(nodes)
     target = checked_rows(f"{what}: target", pairs[0])

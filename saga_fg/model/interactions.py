@@ -18,14 +18,14 @@ Car-following is Helly's linear law (Helly 1959); with the gap taken from the pr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from saga_fg.model.motion import NodeType
 from saga_fg.model.paths import Along, Paths, along_paths
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, unchecked
 from saga_fg.settings import (
     NonNegative,
     PositiveOrInf,
@@ -84,19 +84,21 @@ class NodeTable:
 
     def select(self, rows: IntArray) -> NodeTable:
         """The nodes `rows` (k,), ascending. Raises `TypeError` for a column of a kind that cannot be selected."""
-        place = dict(zip(rows.tolist(), range(len(rows)), strict=True))
-        columns: dict[str, Any] = {"types": tuple(map(self.types.__getitem__, place))}
-        for each in fields(self):
-            value = getattr(self, each.name)
+        chosen = rows.tolist()
+        columns: dict[str, Any] = {"types": tuple(map(self.types.__getitem__, chosen)), "derived": {}}
+        for name, value in self.__dict__.items():
             if isinstance(value, np.ndarray):
-                columns[each.name] = value[rows]
+                columns[name] = value.take(rows, 0)
             elif isinstance(value, Paths | LanesAcross):
-                columns[each.name] = value.of_nodes(rows)
-            elif isinstance(value, Mapping) and each.init:
-                columns[each.name] = {place[row]: entry for row, entry in value.items() if row in place}
-            elif each.init and each.name != "types" and value is not None:
-                raise TypeError(f"nodes: {each.name} is a {type(value).__name__}, which cannot be selected by rows")
-        return replace(self, **columns)
+                columns[name] = value.of_nodes(rows)
+            elif isinstance(value, Mapping):
+                place = dict(zip(chosen, range(len(chosen)), strict=True)) if value and name != "derived" else {}
+                columns[name] = {place[row]: entry for row, entry in value.items() if row in place}
+            elif name != "types" and value is not None:
+                raise TypeError(f"nodes: {name} is a {type(value).__name__}, which cannot be selected by rows")
+            elif value is None:
+                columns[name] = None
+        return unchecked(NodeTable, **columns)
 
 
 class Triples(NamedTuple):

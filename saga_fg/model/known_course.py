@@ -34,15 +34,17 @@ Singer (1970) for the first-order decay.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.turning import Turning, course_motions
 from saga_fg.model.discretisation import linear_motions
 from saga_fg.model.motion import Curvilinear, NodeType
 from saga_fg.model.scene_graph import MatchedMotion
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, unchecked
 from saga_fg.numerics.columns import Columns
 
 RATE_CORRELATION = 1.0  # s
@@ -103,29 +105,56 @@ class KnownCourses(Columns):
         assert isinstance(motion, Curvilinear)
         tau = max(motion.turn_time, _LEAST_TIME)
         theta = self.rate * turning_time(motion, dt)
-        (F_along, F_across, _), (Q_along, Q_across, Q_white) = _one_axis(motion, dt)
-        u = _unit(self.heading)
-        ahead = u[:, :, None] * u[:, None]
-        aside = np.eye(2) - ahead
-        F = _planar(F_along, ahead) + _planar(F_across, aside)
-        Q = _planar(Q_along, ahead) + _planar(Q_across + self.lateral_noise[:, None, None] * Q_white, aside)
-        b = -(F[:, :, _A] @ self.brake[:, :, None])[:, :, 0]
-        pull = self.pull[:, None] * u
-        b[:, _P] += dt * dt / 2 * pull
-        b[:, _V] += dt * pull
-        chord, turn = np.sinc(theta / (2 * np.pi))[:, None, None] * _rotation(theta / 2), _rotation(theta)
-        if self.settling.any():
-            passed = np.maximum(self.settling * dt, _LEAST)
-            faded = -np.expm1(-passed)
-            chord = _less_across(self.heading + theta / 2, 1 - faded / passed) @ chord
-            turn = _less_across(self.heading + theta, faded) @ turn
-        F[:, _P, 2:], b[:, _P] = chord @ F[:, _P, 2:], (chord @ b[:, _P, None])[:, :, 0]
-        for part in (_V, _A):
-            F[:, part], b[:, part] = turn @ F[:, part], (turn @ b[:, part, None])[:, :, 0]
-        later = replace(
-            self, heading=self.heading + theta, rate=self.rate * np.exp(-dt / tau), brake=np.zeros_like(self.brake)
+        F, b, Q = _motions(
+            self.heading,
+            theta,
+            self.lateral_noise,
+            self.brake,
+            self.settling,
+            self.pull,
+            scale,
+            dt,
+            _LEAST,
+            *_one_axis(motion, dt),
         )
-        return later, MatchedMotion(F, b, Q * scale[:, None, None])
+        changed = {"heading": self.heading + theta, "rate": self.rate * np.exp(-dt / tau)}
+        later = unchecked(KnownCourses, **self.__dict__ | changed | {"brake": np.zeros_like(self.brake)})
+        return later, MatchedMotion(F, b, Q)
+
+
+@compiled_by(course_motions)
+def _motions(
+    heading: FloatArray,
+    theta: FloatArray,
+    lateral_noise: FloatArray,
+    brake: FloatArray,
+    settling: FloatArray,
+    pull: FloatArray,
+    scale: FloatArray,
+    dt: float,
+    least: float,
+    F_axis: FloatArray,
+    Q_axis: FloatArray,
+) -> Turning:
+    u = _unit(heading)
+    ahead = u[:, :, None] * u[:, None]
+    aside = np.eye(2) - ahead
+    F = _planar(F_axis[0], ahead) + _planar(F_axis[1], aside)
+    Q = _planar(Q_axis[0], ahead) + _planar(Q_axis[1] + lateral_noise[:, None, None] * Q_axis[2], aside)
+    b = -(F[:, :, _A] @ brake[:, :, None])[:, :, 0]
+    pulled = pull[:, None] * u
+    b[:, _P] += dt * dt / 2 * pulled
+    b[:, _V] += dt * pulled
+    chord, turn = np.sinc(theta / (2 * np.pi))[:, None, None] * _rotation(theta / 2), _rotation(theta)
+    if settling.any():
+        passed = np.maximum(settling * dt, least)
+        faded = -np.expm1(-passed)
+        chord = _less_across(heading + theta / 2, 1 - faded / passed) @ chord
+        turn = _less_across(heading + theta, faded) @ turn
+    F[:, _P, 2:], b[:, _P] = chord @ F[:, _P, 2:], (chord @ b[:, _P, None])[:, :, 0]
+    for part in (_V, _A):
+        F[:, part], b[:, part] = turn @ F[:, part], (turn @ b[:, part, None])[:, :, 0]
+    return F, b, Q * scale[:, None, None]
 
 
 @lru_cache(maxsize=64)  # many sensors have one interval, again and again

@@ -16,7 +16,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.polyline import Polylines
 
-_SHARP = 1.2  # rad, turn from which nothing is said about where a path is
+SHARP = 1.2  # rad, turn from which nothing is said about where a path is
 _ROUNDING = 1 + 1e-9
 
 
@@ -43,31 +43,38 @@ class Paths(Columns):
         """The paths as polylines."""
         return Polylines.of(list(self.position))
 
-    @cached_property
-    def _cones(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Direction (k,) at the start of each path, how far it turns from there, and its sharpest corner, rad."""
-        angle = self.lines.angle.reshape(len(self), -1)
-        return angle[:, 0], np.abs(angle - angle[:, :1]).max(axis=1), np.abs(np.diff(angle, axis=1)).max(1, initial=0.0)
+    def cones(self, most: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Direction (k,) at the start of each path, how far it turns from there, rad, and a margin (k,), m.
 
-    def may_be_beside(self, path: IntArray, places: FloatArray, most: float) -> BoolArray:
-        """Mask (E,) of places (E, 2) that may be ahead on `path` (E,) and up to `most` m aside; all others are not.
-
-        A path that turns by at most a is in a cone of this half angle. At a corner a place may be farther from the path
-        than aside.
+        A path that turns by at most a is in a cone of this half angle: places up to `most` m aside of it are no farther
+        from that cone than the margin, or the path turns by more than `SHARP`. At a corner a place may be farther from
+        the path than aside.
         """
-        direction, turn, corner = (column[path] for column in self._cones)
-        dx, dy = (places - self.position[path, 0]).T
-        c, s = np.cos(direction), np.sin(direction)
-        near = _ROUNDING * most / np.cos(np.minimum(corner, _SHARP))
-        ahead, aside = dx * c + dy * s, np.abs(dy * c - dx * s)
-        beside = (ahead >= -near) & (aside * np.cos(turn) - ahead * np.sin(turn) <= near)
-        return np.asarray(beside | (turn > _SHARP))
+        if len(self) == 0:
+            return np.empty(0), np.empty(0), np.empty(0)
+        angle = self.lines.angle.reshape(len(self), -1)
+        turn, corner = (
+            np.abs(angle - angle[:, :1]).max(1, initial=0.0),
+            np.abs(np.diff(angle, axis=1)).max(1, initial=0.0),
+        )
+        return angle[:, 0], turn, _ROUNDING * most / np.cos(np.minimum(corner, SHARP))
 
     def of_nodes(self, rows: IntArray) -> Paths:
         """The paths of the nodes `rows` (k,), ascending, which are counted from 0 then."""
         place = np.searchsorted(rows, self.row).clip(max=max(len(rows) - 1, 0))
         kept = np.flatnonzero(rows[place] == self.row) if len(rows) else np.empty(0, dtype=np.int64)
         return replace(self.select(kept), row=place[kept])
+
+
+NO_PATHS = Paths(
+    np.empty(0, dtype=np.int64),
+    np.empty((0, 2, 2)),
+    np.empty((0, 2)),
+    np.empty((0, 2)),
+    np.empty((0, 2)),
+    np.empty(0),
+    np.empty(0),
+)
 
 
 class Along(NamedTuple):

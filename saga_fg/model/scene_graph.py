@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.model.motion import NodeType
+from saga_fg.model.motion import NodeType, distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_ids, checked_rows
 
@@ -173,7 +173,13 @@ class SceneGraph:
     @cached_property
     def dims(self) -> IntArray:
         """(n,) sizes of the nodes' states."""
-        return np.array([t.dim for t in self.types], dtype=np.int64)
+        kinds, kind = self.kinds
+        return np.array([t.dim for t in kinds], dtype=np.int64)[kind]
+
+    @cached_property
+    def kinds(self) -> tuple[list[NodeType], IntArray]:
+        """The distinct types, and the number (n,) of each node's among them."""
+        return distinct_types(self.types)
 
     @property
     def _groups(self) -> tuple[Edges | NonlinearEdges, ...]:
@@ -197,6 +203,8 @@ class SceneGraph:
 
     def rows(self, nodes: IntArray) -> IntArray:
         """Rows of nodes that are in the graph."""
+        if len(self.nodes) and (self.nodes[1:] > self.nodes[:-1]).all():
+            return np.searchsorted(self.nodes, nodes)
         order = np.argsort(self.nodes)
         return np.asarray(order[np.searchsorted(self.nodes, nodes, sorter=order)])
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
@@ -131,10 +132,12 @@ class Extrinsics(Settings):
     z: Finite = setting(0.0, "position of the sensor above the vehicle's origin, m; usual 0 to 2.5")
     yaw: Finite = setting(0.0, "heading of the sensor in the vehicle's frame, rad; 0: ahead, higher: further left")
 
-    @property
+    @cached_property
     def ego_T_sensor(self) -> FloatArray:
-        """(4, 4)"""
-        return yaw_transform(self.x, self.y, self.z, self.yaw)
+        """(4, 4), read-only."""
+        transform = yaw_transform(self.x, self.y, self.z, self.yaw)
+        transform.flags.writeable = False
+        return transform
 
 
 @dataclass(frozen=True)
@@ -245,14 +248,16 @@ class Sensor(Settings):
         rays = (factor * (along - across))[:, None, None] * (offset[:, :, None] * offset[:, None, :])
         return np.asarray(isotropic[:, None, None] * np.eye(2) + rays)
 
-    def detection_covariance(self, detections: Detections, origin: FloatArray | None) -> FloatArray:
+    def detection_covariance(
+        self, detections: Detections, origin: FloatArray | None, probability: FloatArray | None = None
+    ) -> FloatArray:
         """R (N, 2, 2), m^2, of the positions of detections in world coordinates; origin (2,): the sensor's place.
 
         Without a place of the sensor (None) the range is unknown, and its part of the noise is left out. A covariance
-        that came with the detection is taken as it is.
+        that came with the detection is taken as it is. probability (N,): of the scores, where it is known already.
         """
         label, position = detections.boxes.label, detections.boxes.position[:, :2]
-        probability = self.probability(detections.score, label)
+        probability = self.probability(detections.score, label) if probability is None else probability
         R = self.position_covariance(label, position, probability, position if origin is None else origin)
         reported = detections.position_covariance
         return np.where(np.isfinite(reported[:, :1, :1]), reported, R)

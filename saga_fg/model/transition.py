@@ -52,8 +52,6 @@ class Transition:
         what = f"transition over {self.dt:g} s"
         if np.shape(self.b) != (int(self.offsets[-1]),):
             raise InputError(f"{what}: b: expected {int(self.offsets[-1])} entries, got shape {np.shape(self.b)}")
-        if not np.isfinite(self.b).all():
-            raise InputError(f"{what}: b: expected finite numbers")
         for name, groups in (("F", self.F), ("Q", self.Q)):
             for group in groups:
                 d_i, d_j = group.values.shape[1:]
@@ -61,11 +59,16 @@ class Transition:
                     raise InputError(
                         f"{what}: {name}: blocks of size {d_i} x {d_j} do not fit the states of their nodes"
                     )
-                if not np.isfinite(group.values).all():
-                    raise InputError(f"{what}: {name}: expected finite numbers")
         noisy = np.concatenate([group.target for group in self.Q]) if self.Q else np.empty(0, dtype=np.int64)
         if not np.array_equal(np.sort(noisy), np.arange(len(self.graph))):
             raise InputError(f"{what}: Q: expected one block for each of {len(self.graph)} nodes")
+        self.check_finite()
+
+    def check_finite(self) -> None:
+        """Raise `InputError` unless all numbers are finite."""
+        for name, parts in (("b", [self.b]), ("F", [F.values for F in self.F]), ("Q", [Q.values for Q in self.Q])):
+            if not all(np.isfinite(values).all() for values in parts):
+                raise InputError(f"transition over {self.dt:g} s: {name}: expected finite numbers")
 
     @property
     def nodes(self) -> IntArray:

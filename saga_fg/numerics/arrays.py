@@ -9,7 +9,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Container
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ from saga_fg.kernels.labels import numbered_rows
 Values = Literal["finite", "finite-or-nan", "any"]
 _REMEMBERED = 1 << 16  # bytes; tables of whole recordings are not kept
 _MOST = np.iinfo(np.int64).max
+T = TypeVar("T")
 
 
 def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: Values = "finite") -> FloatArray:
@@ -51,6 +52,13 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: 
             raise InputError(f"{name}{list(where)}: expected {expected}, got {array[where]}")
     array.flags.writeable = False
     return array
+
+
+def unchecked(kind: type[T], **values: Any) -> T:
+    """A dataclass of values that were checked where they came in, or made inside: all its fields, as they are."""
+    made = object.__new__(kind)
+    made.__dict__.update(values)
+    return made
 
 
 def checked_covariances(name: str, value: ArrayLike, count: int, dim: int) -> FloatArray:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from saga_fg.numerics.arrays import BoolArray, IntArray
 
@@ -31,7 +30,7 @@ class Columns:
             if len(index) != len(self):
                 raise IndexError(f"expected a mask of {len(self)} rows, got {len(index)}")
             index = index.nonzero()[0]
-        return self._each(lambda column: column[index])
+        return self._each(lambda column: column.take(index, 0))  # of matrices ten times as fast as column[index]
 
     def copied(self) -> Self:
         """A table of the same rows that shares no array with this one that can be written."""
@@ -39,21 +38,27 @@ class Columns:
 
     def _each(self, change: Callable[[Any], Any]) -> Self:
         """The table with its arrays changed: rows of a validated table, nothing to check again."""
-        mine, changed = vars(self), object.__new__(type(self))
+        mine, changed = self.__dict__, object.__new__(type(self))
+        columns = changed.__dict__
         for name in self.__dataclass_fields__:
             column = mine[name]
             if isinstance(column, np.ndarray):  # anything else belongs to the whole table, or is one
-                column = _frozen_names(change(column))
+                column = change(column)
+                if column.dtype.char == "U":
+                    column.flags.writeable = False  # strings are replaced as a whole, and looked up often
             elif isinstance(column, Columns):
                 column = column._each(change)
-            vars(changed)[name] = column
+            columns[name] = column
         return changed
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """The rows of all parts, of which there is one at least, in order."""
-        columns = ([getattr(part, name) for part in parts] for name in cls.__dataclass_fields__)
-        return cls(*map(_concatenated, columns))
+        """The rows of all parts, of which there is one at least, in order; nothing is checked again."""
+        tables, whole = [part.__dict__ for part in parts], object.__new__(cls)
+        columns = whole.__dict__
+        for name in cls.__dataclass_fields__:
+            columns[name] = _concatenated([table[name] for table in tables])
+        return whole
 
     def append(self, other: Self) -> Self:
         """With the rows of another at the end."""
@@ -62,13 +67,11 @@ class Columns:
 
 def _concatenated(columns: Sequence[Any]) -> Any:
     first = columns[0]
-    if isinstance(first, tuple):
+    if isinstance(first, Columns):
+        return first.concatenate(columns)
+    if not isinstance(first, np.ndarray):
         return first
-    return first.concatenate(columns) if isinstance(first, Columns) else _frozen_names(np.concatenate(columns))
-
-
-def _frozen_names(column: NDArray[Any]) -> NDArray[Any]:
-    """A column that nobody else has, read-only if it has strings: they are replaced as a whole, and looked up often."""
-    if column.dtype.kind == "U":
+    column = np.concatenate(columns)
+    if column.dtype.char == "U":
         column.flags.writeable = False
     return column

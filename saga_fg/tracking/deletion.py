@@ -22,7 +22,8 @@ log = logging.getLogger(__name__)
 def delete_tracks(state: TrackerState) -> None:
     """Delete the tracks that have come to their end at the state's time."""
     table, settings = state.table, state.settings
-    detected = np.isin(table.id, state.assignment.id)  # perhaps by a late frame
+    detected = np.zeros(len(table), dtype=bool)
+    detected[table.rows(state.assignment.id)] = True  # perhaps by a late frame
     deleted = ~(detected | known_places(state) | relinkable(state))
     deleted |= table.coasting(state.time) > settings.max_coasting
     deleted |= ~table.confirmed & (table.existence < settings.existence.delete_below)

@@ -111,7 +111,9 @@ class JointTrackState:
                 new, old = ModeTable.new(node_type.motion, ids[rows], mean, P), self._modes.get(node_type.motion)
                 self._modes[node_type.motion] = new if old is None else old.extended(new)
             estimator = self._estimator_to_change()
-            if isinstance(estimator, GraphFilter | JointKalmanFilter):
+            if isinstance(estimator, JointKalmanFilter) and not estimator.providers:
+                estimator.extend(ids[rows], mean, P)
+            elif isinstance(estimator, GraphFilter | JointKalmanFilter):
                 estimator.add(ids[rows], mean, P, dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True)))
             else:
                 estimator.add(ids[rows], mean, P)

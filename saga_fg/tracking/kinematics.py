@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.track_limits import states_within
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import inverse_transform, transform_points
@@ -25,11 +27,12 @@ class Kinematics(NamedTuple):
 
     def select(self, rows: IntArray) -> Kinematics:
         """The tracks `rows` (k,)."""
-        return Kinematics._make(column[rows] for column in self)
+        x, v, P, P_v = self
+        return Kinematics(x.take(rows, 0), v.take(rows, 0), P.take(rows, 0), P_v.take(rows, 0))
 
     def append(self, other: Kinematics) -> Kinematics:
         """With the tracks of another after these."""
-        return Kinematics._make(np.concatenate(columns) for columns in zip(self, other, strict=True))
+        return Kinematics(*[np.concatenate(columns) for columns in zip(self, other, strict=True)])
 
     @property
     def speed_deviation(self) -> FloatArray:
@@ -48,16 +51,29 @@ class Kinematics(NamedTuple):
         Means and standard deviations have to be within `MAX_POSITION` and `MAX_SPEED`, variances of positions above 0,
         of velocities at least 0. NaN never is within.
         """
-        variance, velocity_variance = (np.diagonal(P, axis1=1, axis2=2) for P in (self.P, self.P_velocity))
-        within = (
-            (np.abs(self.position + origin) <= MAX_POSITION)
-            & (np.abs(self.velocity) <= MAX_SPEED)
-            & (variance > 0)
-            & (variance <= MAX_POSITION**2)
-            & (velocity_variance >= 0)
-            & (velocity_variance <= MAX_SPEED**2)
-        )
-        return np.asarray(within.all(axis=1))
+        return _within(*self, origin, MAX_POSITION, MAX_SPEED)
+
+
+@compiled_by(states_within)
+def _within(
+    position: FloatArray,
+    velocity: FloatArray,
+    P: FloatArray,
+    P_velocity: FloatArray,
+    origin: FloatArray,
+    farthest: float,
+    fastest: float,
+) -> BoolArray:
+    variance, velocity_variance = (np.diagonal(C, axis1=1, axis2=2) for C in (P, P_velocity))
+    within = (
+        (np.abs(position + origin) <= farthest)
+        & (np.abs(velocity) <= fastest)
+        & (variance > 0)
+        & (variance <= farthest**2)
+        & (velocity_variance >= 0)
+        & (velocity_variance <= fastest**2)
+    )
+    return np.asarray(within.all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

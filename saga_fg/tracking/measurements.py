@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.tracking.kinematics import RelativePositions
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.boxes import Boxes
@@ -88,7 +88,7 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     detections, probability, viewpoint = detections.select(keep), probability[keep], sensor.origin(frame)
     boxes = detections.boxes
     R = np.zeros((len(boxes), 4, 4))
-    R[:, :2, :2] = sensor.detection_covariance(detections, viewpoint)
+    R[:, :2, :2] = sensor.detection_covariance(detections, viewpoint, probability)
     R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
     limit = sensor.max_speed if sensor.use_velocity else -1.0
@@ -123,8 +123,11 @@ def suppress_duplicates(
     if len(boxes) < 2:
         return np.arange(len(boxes))
     position = boxes.position[:, :2]
-    pairs = cKDTree(position).query_pairs(float(max(distance.max(), weak_distance.max())), output_type="ndarray")
-    a, b = pairs[:, 0], pairs[:, 1]
+    a, b = near_pairs(position, position, np.full(len(boxes), max(distance.max(), weak_distance.max())))
+    once = (a < b).nonzero()[0]
+    if len(once) == 0:
+        return np.arange(len(boxes))
+    a, b = a[once], b[once]
     apart = np.hypot(*(position[a] - position[b]).T)
     strong, weak = _ordered(a, b, probability)
     duplicate = apart < np.minimum(distance[a], distance[b])

@@ -25,8 +25,9 @@ import math
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by, compiled_kernels
 from saga_fg.kernels.pairs import relinking_pairs
+from saga_fg.kernels.track_limits import log_peaks
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
 from saga_fg.numerics.near_pairs import MOST_LOOPED, near_pairs
@@ -69,7 +70,8 @@ def relinked(
         t, d, others, z, R = tracks[i], rows[j], state.class_groups.number_of_group(label)[j], places[j], noise[j]
         moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
         still = _log_density(z - state.table.stationarity.position[t], S)
-        log_odds = log_survival(state)[t] + _mixed(state, t, moving, still) - np.log(others / area(state))
+        s = np.clip(state.table.stationarity.probability[t], 0.0, 1 - 1e-9)
+        log_odds = log_survival(state)[t] + _mixed(s, moving, still) - np.log(others / area(state))
         cost = least_log_odds(state) - log_odds
     chosen = least_total(t, d, cost)
     t, d = t[chosen], d[chosen]
@@ -119,11 +121,16 @@ def relinkable(state: TrackerState) -> BoolArray:
     association, table = state.settings.association, state.table
     if association.relink_above == 1 or len(table) == 0:
         return np.zeros(len(table), dtype=bool)
-    none = np.zeros((len(table), 2))
-    peaks = _log_density(none, state.kinematics().P), _log_density(none, table.stationarity.P)
-    log_odds = log_survival(state) + _mixed(state, np.arange(len(table)), *peaks) + math.log(area(state))
+    still = table.stationarity
+    peaks = _log_peaks(state.kinematics().P, still.P, still.probability, log_survival(state))
     within = table.coasting(state.time) <= state.settings.max_coasting
-    return np.asarray(within & (log_odds >= least_log_odds(state)))
+    return np.asarray(within & (peaks >= least_log_odds(state) - math.log(area(state))))
+
+
+@compiled_by(log_peaks)
+def _log_peaks(P: FloatArray, D: FloatArray, stationary: FloatArray, log_survival: FloatArray) -> FloatArray:
+    none, s = np.zeros((len(P), 2)), np.clip(stationary, 0.0, 1 - 1e-9)
+    return np.asarray(log_survival + _mixed(s, _log_density(none, P), _log_density(none, D)))
 
 
 def initiating(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> IntArray:
@@ -153,9 +160,8 @@ def log_survival(state: TrackerState) -> FloatArray:
     return np.asarray(np.log(real) - table.coasting(state.time) / lifetime)
 
 
-def _mixed(state: TrackerState, rows: IntArray, moving: FloatArray, still: FloatArray) -> FloatArray:
-    """(k,) log densities of the tracks `rows` (k,) from those of moving and of stationary objects (k,)."""
-    s = np.clip(state.table.stationarity.probability[rows], 0.0, 1 - 1e-9)
+def _mixed(s: FloatArray, moving: FloatArray, still: FloatArray) -> FloatArray:
+    """(k,) log densities of tracks from those of moving and, with probability s (k,), of stationary objects (k,)."""
     return np.asarray(np.logaddexp(np.log1p(-s) + moving, np.log(np.maximum(s, 1e-300)) + still))
 
 

@@ -20,43 +20,58 @@ growth are the sensor's noise settings, see `saga_fg.model.sensor`.
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from typing import Any
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
+from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.track import Tracks
 
 LASTING_SHARE = 0.3  # of the best detection's probability, which later boxes score at least; 0.2 to 0.5 rank alike
 
 
 def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
-    """The tracks to be reported, as of `timestamp` (s)."""
+    """The tracks to be reported, as of `timestamp` (s): arrays of their own, read-only."""
     table, settings, rows = state.table, state.settings, reported_rows(state)
-    coasting, tentative = table.coasting(state.time), table.tentative
-    table, coasting, now = table.select(rows), coasting[rows], state.reported_kinematics().select(rows)
-    boxes = replace(table.boxes(now.position + state.origin, now.velocity))  # checked, and their own
-    P = calibrated_covariance(now.P, boxes.yaw, table.covariance_scale, table.position_bias)
-    certainty = state.class_groups.certainty(table.class_belief)
-    score = reported_score(table, certainty, coasting > 0, settings.existence)
-    score = np.where(tentative[rows], settings.tentative_score_factor * score, score)
-    return Tracks(timestamp, table.id, boxes, score, P, now.P_velocity, coasting)
+    coasting = table.coasting(state.time)[rows]
+    now = state.reported_kinematics(rows)
+    yaw, (scale, bias) = table.box.yaw[rows], (table.covariance_scale[rows], table.position_bias[rows])
+    centre = np.concatenate([now.position + state.origin, table.box.z[rows, None]], axis=1)
+    P = calibrated_covariance(now.P, yaw, scale, bias)
+    score = reported_score(table, rows, state.class_groups, coasting > 0, settings.existence)
+    if settings.tentative_score_factor < 1:
+        score = np.where(table.tentative[rows], settings.tentative_score_factor * score, score)
+    columns = {"label": table.label[rows], "position": centre, "size": table.box.size.take(rows, 0)}
+    boxes = unchecked(Boxes, **_frozen(columns | {"yaw": yaw, "velocity": now.velocity}))
+    columns = {"id": table.id[rows], "score": score, "coasting": coasting}
+    covariances = {"position_covariance": P, "velocity_covariance": now.P_velocity}
+    return unchecked(Tracks, timestamp=timestamp, boxes=boxes, **_frozen(columns | covariances))
+
+
+def _frozen(columns: dict[str, Any]) -> dict[str, Any]:
+    """Columns that nobody else has, which cannot be written from now on."""
+    for column in columns.values():
+        column.flags.writeable = False
+    return columns
 
 
 def reported_rows(state: TrackerState) -> IntArray:
     """Rows of the tracks to be reported."""
     table, settings = state.table, state.settings
     coasting = table.coasting(state.time)
-    carried = (coasting <= settings.report_coasting) & known_places(state)
-    return np.flatnonzero(
-        (~table.tentative | (settings.tentative_score_factor > 0))
-        & (table.confirmed | (table.existence >= settings.existence.report_above))
-        & ((coasting == 0) | carried)
-        & (table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view)
-    )
+    chosen = table.confirmed | (table.existence >= settings.existence.report_above)
+    if settings.tentative_score_factor == 0:
+        chosen &= ~table.tentative
+    chosen &= (coasting == 0) | ((coasting <= settings.report_coasting) & known_places(state))
+    if settings.max_out_of_view < math.inf:
+        chosen &= table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view
+    return chosen.nonzero()[0]
 
 
 def known_places(state: TrackerState) -> BoolArray:
@@ -66,12 +81,15 @@ def known_places(state: TrackerState) -> BoolArray:
 
 
 def reported_score(
-    table: TrackTable, certainty: FloatArray, coasting: BoolArray, settings: ExistenceSettings
+    table: TrackTable, rows: IntArray, groups: ClassGroups, coasting: BoolArray, settings: ExistenceSettings
 ) -> FloatArray:
-    """(n,) score of the tracks' boxes, times the certainty (n,) of the class; coasting (n,): not detected now."""
-    hit_ratio = (table.hits / (table.opportunities + settings.prior_opportunities)) ** settings.hit_ratio_weight
-    evidence = np.maximum(table.score, LASTING_SHARE * table.best_score)
-    return np.asarray(evidence * certainty * hit_ratio * np.where(coasting, table.existence, 1.0))
+    """(k,) score of the boxes of tracks `rows` (k,); coasting (k,): not detected now."""
+    hits, opportunities = table.hits[rows], table.opportunities[rows]
+    hit_ratio = (hits / (opportunities + settings.prior_opportunities)) ** settings.hit_ratio_weight
+    evidence = np.maximum(table.score[rows], LASTING_SHARE * table.best_score[rows])
+    if len(groups):
+        evidence = evidence * groups.certainty(table.class_belief.take(rows, 0))
+    return np.asarray(evidence * hit_ratio * np.where(coasting, table.existence[rows], 1.0))
 
 
 def calibrated_covariance(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:

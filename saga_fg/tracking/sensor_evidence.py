@@ -107,18 +107,24 @@ class SensorEvidence(Columns):
     def detected_by_others(self, sensor: str, now: float, memory: float) -> BoolArray:
         """(n,) which tracks another sensor has detected in the last `memory` s."""
         at = self._column(sensor)
+        if len(self.sensors) == 1:
+            return np.zeros(len(self), dtype=bool)
         seen = self.detected & (now - self.time <= memory)
         seen[:, at] = False
         return np.asarray(seen.any(axis=1))
 
     def best_hits(self) -> tuple[FloatArray, FloatArray]:
         """Hits (n,) and opportunities (n,) of the sensor with the best hit ratio of each track."""
+        if len(self.sensors) == 1:
+            return self.hits[:, 0].astype(np.float64), self.opportunities[:, 0].astype(np.float64)
         best = ((self.hits + 0.0) / (self.opportunities + 1.0)).argmax(axis=1)[:, None]
         hits, total = (np.take_along_axis(count, best, axis=1)[:, 0] for count in (self.hits, self.opportunities))
         return hits.astype(np.float64), total.astype(np.float64)
 
     def confirmed(self, detections: FloatArray) -> BoolArray:
         """(n,) which tracks two sensors have detected, or one at least this often (n,)."""
+        if len(self.sensors) == 1:
+            return np.asarray(self.hits[:, 0] >= detections)
         return np.asarray(((self.hits > 0).sum(axis=1) > 1) | (self.hits.sum(axis=1) >= detections))
 
     def _column(self, sensor: str) -> int:

@@ -91,6 +91,10 @@ class TrackTable(Columns):
         """A copy that shares no array with this table that can be written."""
         return self.copied()
 
+    def rows(self, ids: IntArray) -> IntArray:
+        """Rows (k,) of tracks that are in the table."""
+        return np.searchsorted(self.id, ids)  # ids count up
+
     @property
     def tentative(self) -> BoolArray:
         """(n,) tracks that may be no object of their own: of too few detections, or unresolved."""
@@ -98,11 +102,11 @@ class TrackTable(Columns):
 
     def coasting(self, now: float) -> FloatArray:
         """(n,) time since the latest detection, s, rounded to the microsecond."""
-        return np.maximum(np.round(now - self.last_detected, 6), 0.0)
+        return np.maximum((now - self.last_detected).round(6), 0.0)
 
     def out_of_view(self, now: float) -> FloatArray:
         """(n,) time since it was last in a sensor's field of view, s, rounded to the microsecond."""
-        return np.asarray(np.round(now - self.last_in_view, 6))
+        return np.asarray((now - self.last_in_view).round(6))
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks at positions (n, 2), world, with velocities (n, 2), which are not checked."""

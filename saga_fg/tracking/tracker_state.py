@@ -22,7 +22,7 @@ import numpy as np
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
@@ -123,12 +123,12 @@ class TrackerState:
         """The estimates of all tracks."""
         return self.joint.kinematics(self.table.id, self.table.label)
 
-    def reported_kinematics(self) -> Kinematics:
-        """The estimates of all tracks, allowing for those that are stationary."""
-        now, table = self.kinematics(), self.table
-        if self.settings.stationarity.prior == 0:
-            return now
-        return table.stationarity.reported(now, table.coasting(self.time) > 0)
+    def reported_kinematics(self, rows: IntArray | None = None) -> Kinematics:
+        """The estimates of all tracks, or of some rows, allowing for those that are stationary."""
+        now, still, coasting = self.kinematics(), self.table.stationarity, self.table.coasting(self.time) > 0
+        if rows is not None:
+            now, still, coasting = now.select(rows), still.select(rows), coasting[rows]
+        return still.reported(now, coasting) if self.settings.stationarity.prior > 0 else now
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""

@@ -185,23 +185,20 @@ class Traffic:
         """A memory that changes independently of this one."""
         return replace(self)
 
-    @property
-    def passages(self) -> Passages:
-        """The passages of tracks."""
-        return self.left.append(self.latest)
-
     def update(self, passing: Passages, time: float) -> None:
         """Remember where tracks are at `time`, s, every `SPACING` m, and forget what is older than `memory`."""
         if self.settings.memory == 0:
             return
         self._trails = None
-        left, marked, latest = (
-            each.select(each.time >= time - self.settings.memory) for each in (self.left, self.marked, self.latest)
-        )
-        new = passing.select(_moved(passing, marked))
-        self.left, self.latest = left.append(new), latest.select(~np.isin(latest.id, passing.id)).append(passing)
-        marked = marked.select(~np.isin(marked.id, new.id)).append(new)
-        self.marked = marked.select(np.argsort(marked.id))
+        since = time - self.settings.memory
+        left, marked, latest = (_since(each, since) for each in (self.left, self.marked, self.latest))
+        self.latest = latest.select(_others(latest.id, passing.id)).append(passing)
+        moved = _moved(passing, marked).nonzero()[0]
+        if len(moved):
+            new = passing.select(moved)
+            left, marked = left.append(new), marked.select(_others(marked.id, new.id)).append(new)
+            marked = marked.select(np.argsort(marked.id))
+        self.left, self.marked = left, marked
 
     def add_lanes(self, road_map: RoadMap) -> None:
         """Take in the lanes of a map that are not known yet, by their names and centre lines.
@@ -232,6 +229,18 @@ class Traffic:
         if self._trails is None:
             self._trails = Trails(self.left.select(self.left.moves).append(self.latest.select(self.latest.moves)))
         return self._trails
+
+
+def _since(passages: Passages, time: float) -> Passages:
+    """Those that are not before a time, s."""
+    old = passages.time < time
+    return passages.select(~old) if old.any() else passages
+
+
+def _others(ids: IntArray, known: IntArray) -> IntArray:
+    """Rows of the ids (n,) that are not among the `known` (k,)."""
+    names = set(known.tolist())
+    return np.array([row for row, name in enumerate(ids.tolist()) if name not in names], dtype=np.int64)
 
 
 def _beside(a: Lane, b: Lane) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from operator import attrgetter
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from saga_fg.numerics.arrays import FloatArray, StrArray, distinct
 
 DEFAULT = "default"  # key of the settings for every class that has none of its own
 S = TypeVar("S")
+_MOST_KEPT = 512  # tables of numbers; settings that are gone are kept as long
+_tables: dict[tuple[int, tuple[str, ...], tuple[str, ...]], tuple[Mapping[str, Any], FloatArray]] = {}
 
 
 def class_settings(classes: Mapping[str, S], plain: Callable[[], S], label: str) -> S:
@@ -27,8 +29,18 @@ def class_numbers(numbers: Mapping[str, float], plain: Callable[[], float], labe
 
 
 def class_values(classes: Mapping[str, S], plain: Callable[[], S], label: StrArray, *names: str) -> FloatArray:
-    """The numbers of these names, of the class of each label (n,): a row (n,) for every name."""
+    """The numbers of these names, of the class of each label (n,): a row (n,) for every name.
+
+    They are looked up once for the same settings, which are never changed.
+    """
     occurring, index = distinct(label)
-    number = attrgetter(*names)
-    of_classes = [number(class_settings(classes, plain, c)) for c in occurring]
-    return np.array(of_classes, dtype=np.float64).reshape(len(occurring), len(names)).T[:, index]
+    key = id(classes), occurring, names
+    known = _tables.get(key)
+    if known is None:
+        if len(_tables) >= _MOST_KEPT:
+            _tables.clear()
+        number = attrgetter(*names)
+        numbers = [number(class_settings(classes, plain, c)) for c in occurring]
+        table = np.array(numbers, dtype=np.float64).reshape(len(occurring), len(names)).T.copy()
+        known = _tables[key] = classes, table  # with the settings, so that their id stays theirs
+    return known[1].take(index, 1)

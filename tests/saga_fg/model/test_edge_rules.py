@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.model.edge_information import EdgeInformation
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs, Repulsion, traffic_rules
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs, Repulsion, pairs_ahead, traffic_rules
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
-from saga_fg.model.paths import Paths
+from saga_fg.model.paths import SHARP, Paths
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.random_graphs import BUS, CAR, CONE
 
@@ -514,7 +514,13 @@ def test_no_place_beside_a_path_is_left_out(seed):
     others = rng.uniform(-70, 70, (2000, 2))
     at = paths.lines.feet(np.zeros(2000, dtype=np.int64), others)
     beside = (at.s > 0) & (np.abs(at.e) < 3.6)
-    kept = paths.may_be_beside(np.zeros(2000, dtype=np.int64), others, 3.6)
+    path, able = np.full(2001, -1), np.ones(2001, dtype=bool)
+    path[0], follows, every = 0, ~able, np.concatenate([places[:1], others])
+    follows[0] = True
+    cones = paths.cones(3.6)
+    _, source = pairs_ahead(every, np.zeros(2001), follows, able, 200.0, 3.6, 0.1, path, places[:1], *cones, SHARP)
+    kept = np.zeros(2000, dtype=bool)
+    kept[source - 1] = True
     assert beside.any()
     assert kept[beside].all()
     if np.abs(np.cumsum(bend)).max() < 0.3:

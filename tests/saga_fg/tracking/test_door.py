@@ -66,7 +66,7 @@ def test_inside_nothing_is_checked_again(monkeypatch):
     assert made[Boxes] <= 2
 
 
-def test_what_is_reported_is_checked_and_its_own():
+def test_what_is_reported_is_its_own_and_cannot_be_written():
     tracker = Tracker(sensors={"lidar": Sensor()})
     for number in range(4):
         tracks = tracker.step(frame(number))

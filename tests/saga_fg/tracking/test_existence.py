@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
+from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.existence import after_hit, after_miss
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import TrackTable
@@ -24,7 +25,7 @@ def score(probability, hits, opportunities, coasting=False, existence=0.9, setti
     counts = {"hits": np.full(n, hits * 1.0), "opportunities": np.full(n, opportunities * 1.0)}
     best = np.maximum(probability, best)
     table = replace(TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, **counts)
-    return reported_score(table, np.ones(n), np.full(n, coasting), settings)
+    return reported_score(table, np.arange(n), ClassGroups(()), np.full(n, coasting), settings)
 
 
 def test_a_miss_is_the_likelier_the_less_the_track_exists():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.tracking import ClassSettings
+from saga_fg.tracking import ClassSettings, known_courses
 from saga_fg.tracking.known_courses import typical_speed
 from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings
 from saga_fg.tracking.trails import STEP, paths
@@ -40,6 +40,11 @@ def along(place, heading, ids=0, settings=SETTINGS):
     return trails
 
 
+def known(trails):
+    """All passages of tracks."""
+    return trails.left.append(trails.latest)
+
+
 def arc(length, radius=RADIUS):
     """Places and headings of a bend to the left that begins at (0, 0) towards x, after 20 m straight on."""
     angle = np.maximum(length, 0.0) / radius
@@ -53,7 +58,7 @@ def path(trails, position=(-10.0, 0.0), heading=0.0, curvature=0.0, steps=10, tr
 
 def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
     trails = along(*arc(np.arange(-20, 20, 0.5)))
-    apart = np.hypot(*np.diff(trails.passages.position, axis=0).T)
+    apart = np.hypot(*np.diff(known(trails).position, axis=0).T)
     assert (apart >= 1.99).all()
     assert (apart < 2.6).all()
 
@@ -61,18 +66,18 @@ def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
 def test_points_are_forgotten():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
     trails.update(passing([(100.0, 0.0)], 0.0, 60.5, [3]), 60.5)
-    assert trails.passages.time.min() >= 0.5
+    assert known(trails).time.min() >= 0.5
 
 
 def test_points_are_forgotten_while_nobody_moves():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
     trails.update(passing(np.empty((0, 2)), 0.0), 1000.0)
-    assert len(trails.passages) == 0
+    assert len(known(trails)) == 0
     assert path(trails).weight.max() == 0.0
 
 
 def test_without_a_memory_nothing_is_remembered():
-    assert len(along(*arc(np.arange(-20, 0, 2.0)), settings=TrafficSettings()).passages) == 0
+    assert len(along(*arc(np.arange(-20, 0, 2.0)), settings=TrafficSettings()).left) == 0
 
 
 def test_a_path_goes_round_the_bend_of_earlier_traffic():
@@ -336,3 +341,21 @@ def test_a_hidden_car_keeps_to_the_lane_of_the_map_round_a_bend():
         reported = [tracker.step(seen) for tracker in trackers]
     with_lane, without = (np.hypot(*(tracks.boxes.position[0, :2] - place)) for tracks in reported)
     assert with_lane < 1.0 < 3.0 < without
+
+
+def test_where_nothing_tells_the_path_some_turn_off(monkeypatch):
+    """The variance across grows by about that of those who turn, share a^2 t^4 / 4; fast cars turn at 2 m/s^2."""
+
+    def across(speed):
+        tracker = Tracker(replace(ON, classes={"default": replace(CAR, motion=Curvilinear(course_time=0.2))}), SENSORS)
+        for k in range(20):
+            tracker.step(frame(k * DT, np.array([[speed * k * DT, 0.0]]), yaw=0.0))
+        return tracker.predict([2.0, 4.0]).position_covariance[:, 0, 1, 1]
+
+    grown = [across(speed) for speed in (3.0, 15.0)]
+    monkeypatch.setattr(known_courses, "TURNING_OFF", 0.0)
+    before = [across(speed) for speed in (3.0, 15.0)]
+    share, hardest, time = 0.05, np.array([[0.3 * 3.0], [2.0]]), np.array([2.0, 4.0])
+    ratio = np.subtract(grown, before) / (share * hardest**2 * time**4 / 4)
+    assert (ratio > 0.5).all()
+    assert (ratio < 1.2).all()
