@@ -1,4 +1,4 @@
-"""Odometry of a robot with a planar laser: steps that no robot makes, and the scale of the wheels.
+"""Odometry of a robot with a planar laser, without implausible steps, and the scale of the wheels.
 
 Along a bare corridor odometry alone tells the way, and wheels of another size than the robot believes err by some per
 cent. The scale k is estimated from the steps s that registration determines, as x ahead:
