@@ -1,4 +1,4 @@
-"""Marginalising variables: they go, what they knew of the others stays.
+"""Marginalisation of variables: Gaussian factors that keep their information on the others.
 
     phi(x_b) = max_{x_a} prod phi(x_a, x_b)        ||A_a x_a + A_b x_b - b||^2  ->  ||(Q_2^T A_b) x_b - Q_2^T b||^2
 

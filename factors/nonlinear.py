@@ -1,4 +1,4 @@
-"""The general nonlinear factor of ours: a residual function with a full noise model, optionally robust.
+"""The general nonlinear factor: a residual function with a full noise model, optionally robust.
 
     phi(x) = exp( -rho( || r(x_1, ..., x_n) ||_R ) ),      rho(s) = s^2 / 2 unless robust
 

@@ -1,4 +1,4 @@
-"""Robust losses: how much a factor may say when its residual is far out.
+"""Robust losses: weights of factors that fall with their residuals.
 
 With s = || r ||_R the distance of the residual in standard deviations, a factor costs rho(s) instead of s^2 / 2.
 Solvers reach its minimum by iteratively reweighted least squares: each linearisation is weighted by w(s) = rho'(s) / s.

@@ -1,4 +1,4 @@
-"""Checks at the door of C++: GTSAM answers a wrong shape with a crash or a wrong number, so it never sees one.
+"""Validation of arrays before GTSAM's C++, which answers a wrong shape with a crash or a wrong number.
 
 Noise enters a linear factor by whitening. With Q = L L^T (Cholesky) and W = L^-1,
 

@@ -1,4 +1,4 @@
-r"""Angles in a residual that nobody wraps.
+r"""Detection of residuals whose angles are not wrapped.
 
 An angle has a branch cut: while a pose turns once round, a component that is one jumps by 2 pi somewhere (in degrees,
 by 360). Where the jump goes from pi to -pi, the residual wraps the angle itself, or the measured angle is 0; elsewhere

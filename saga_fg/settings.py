@@ -70,9 +70,12 @@ class Settings:
         cls: Any = type(self)
         for name, allowed in _allowed(cls):
             given = getattr(self, name)
+            if isinstance(allowed, type):
+                entries = given.items() if isinstance(given, Mapping) else [("", given)]
+                for key, entry in entries:
+                    require_type(f"{name}.{key}".rstrip("."), entry, allowed)
+                continue
             for where, value in _values(name, given):
-                if isinstance(allowed, type):
-                    require_type(where, value, allowed)
                 if isinstance(allowed, Range) and not (isinstance(value, Real) and float(value) in allowed):
                     raise InputError(f"{where}: expected a {allowed}, got {value!r}")
                 if isinstance(allowed, tuple) and value not in allowed:

@@ -1,4 +1,4 @@
-"""False loop closures for pose graphs: measurements between random poses that say something at random."""
+"""False loop closures for pose graphs: random measurements between random poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CenterPoint's greedy tracker as it was in November 2026, in bare NumPy: a clock to measure others by.
+"""CenterPoint's greedy tracker of November 2026 in bare NumPy: the unit in which benchmarks give times.
 
 Nothing of it may change, or ratios measured at different times could not be compared. It has the algorithm of
 `saga_fg.tracking.greedy`, for detections in world coordinates whose velocity is not known, without the checks and the

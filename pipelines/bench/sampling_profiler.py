@@ -1,4 +1,4 @@
-"""A profile by sampling: what the calling thread is at, every millisecond, as a file for speedscope.app.
+"""Sampling profiler: the stack of the calling thread, every millisecond, as a file for speedscope.app.
 
 Source of the format: https://www.speedscope.app/file-format-schema.json
 """

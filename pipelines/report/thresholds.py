@@ -1,4 +1,4 @@
-"""The score from which on a page shows tracks: that of the best MOTA, as `evaluate` has it, where there is truth."""
+"""Score threshold of the tracks on a page: that of the best MOTA, as in `evaluate`, if there is ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Odometry of a robot with a planar laser: steps that no robot makes."""
+"""Odometry of a robot with a planar laser, without implausible steps."""
 
 from __future__ import annotations
 

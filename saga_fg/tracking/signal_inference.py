@@ -1,4 +1,4 @@
-r"""Colours of lights inferred from who moves: the first vehicle before each stop line drives as its light tells it.
+r"""Colours of lights inferred from traffic: the first vehicle before each stop line drives by its light.
 
     L_k <- L_k + r ( a_k T dv - (a_k T)^2 / 2 ) / V,    V = max( P + q T - P', q T )
     L_k <- max( L_k - max L, log h ),    p_k <- p_k exp( change of L_k ) / sum

@@ -1,4 +1,4 @@
-r"""Paths along the trails of earlier traffic and the lanes of the map: others can be expected to do as they did.
+r"""Predicted paths along the trails of earlier traffic and the lanes of the map.
 
 A trail is the row of passages of one track, or the centre of a lane (`saga_fg.tracking.traffic`). A path is predicted
 from a place and a course h in steps of ds, with u the curvature that the vehicle has itself, which fades along the way.

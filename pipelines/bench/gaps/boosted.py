@@ -1,4 +1,4 @@
-"""An outside judge: gradient-boosted trees that predict where a hidden object is, without a filter.
+"""Baseline without a filter: gradient-boosted trees that predict where a hidden object is.
 
 For each length of a gap two regressors, along and across the heading at the start, predict how far the object gets from
 where constant velocity takes it, from the features of `pipelines.bench.gaps.features`. They learn from all windows of

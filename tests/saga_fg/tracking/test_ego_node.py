@@ -112,7 +112,7 @@ def errors(step: Callable[[Frame], object], frames: list[tuple[Frame, np.ndarray
 
 def test_objects_err_as_they_say_where_the_pose_is_uncertain() -> None:
     joint, decoupled = [], []
-    for seed in range(10):
+    for seed in range(5):
         frames = drawn(seed)
         settings = TrackerSettings(classes=MODEL, edges=(), estimator="isam2", ego=APART)
         tracker = Tracker(settings, SENSORS, providers=[Odometry(START), Gps(gate=1)])
