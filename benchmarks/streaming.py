@@ -202,7 +202,7 @@ def streaming(
     Examples:
       python -m benchmarks streaming --seconds 60
       python -m benchmarks streaming --seconds 3600 --json figures.json
-      python -m benchmarks streaming --seconds 1 --compared 60 --compared-objects 200 --detected 0.6 --clutter 60
+      python -m benchmarks streaming --seconds 1 --compared 4 --compared-objects 100 --detected 0.6 --clutter 100
     """
     settings = StreamingBenchSettings(objects, seconds, rate, compared, compared_objects, detected, clutter, seed)
     with progress_bar() as progress:

@@ -100,10 +100,23 @@ def regrouped_blocks(
     count = 0
     for k in range(n):
         count = max(count, new_label[k] + 1)
+    of, whole = np.full(count, -1, dtype=np.int64), np.ones(count, dtype=np.bool_)
+    for k in range(n):  # components that stay as they are
+        i, c = source[k], new_label[k]
+        if i < 0 or size[i] != new_size[k] or offset[i] != new_offset[k] or (of[c] >= 0 and start[of[c]] != start[i]):
+            whole[c] = False
+        else:
+            of[c] = i
+    for k in range(n):
+        c = new_label[k]
+        if whole[c] and of[c] >= 0:
+            old, new, area = start[of[c]], new_start[k], new_size[k] * new_size[k]
+            result[new : new + area] = flat[old : old + area]
+            of[c] = -1
     latest, before = np.full(count, -1, dtype=np.int64), np.full(n, -1, dtype=np.int64)
     for k in range(n):  # before[k]: the node of its component that comes before it
         i = source[k]
-        if i < 0:
+        if i < 0 or whole[new_label[k]]:
             continue
         d = dims[i]
         other = k

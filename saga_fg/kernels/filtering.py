@@ -14,7 +14,20 @@ import math
 import numpy as np
 
 from saga_fg.kernels.array_types import FloatArray, IntArray
-from saga_fg.kernels.compilation import kernel
+from saga_fg.kernels.compilation import kernel, kernel_part
+
+TILE = 16  # rows and columns that are turned at once: as much as the nearest cache holds
+
+
+@kernel_part
+def mirror(P: FloatArray) -> None:
+    """Make a matrix (s, s) symmetric by what is below its diagonal, in place."""
+    s = len(P)
+    for tile in range(0, s, TILE):
+        for other in range(0, tile + 1, TILE):
+            for p in range(tile, min(tile + TILE, s)):
+                for q in range(other, min(other + TILE, p)):
+                    P[q, p] = P[p, q]
 
 
 @kernel("f1 f1c i1 i1 i1 i1 i1 i1 i1 i1 i1 i1 f1 f1 i1 i1 f1")
@@ -82,11 +95,13 @@ def predicted_state(
                                 for q in range(s):
                                     F_P[row, q] += f * P[other, q]
             i = following[i]
-        for p in range(s):
-            for q in range(s):
-                product[p, q] = F_P[q, p]
+        for tile in range(0, s, TILE):
+            for other in range(0, s, TILE):
+                for p in range(tile, min(tile + TILE, s)):
+                    for q in range(other, min(other + TILE, s)):
+                        product[p, q] = F_P[q, p]
         i = first[k]
-        while i >= 0:  # F (F P)^T
+        while i >= 0:  # F (F P)^T, below the diagonal
             for x in range(into[i], into[i + 1]):
                 e = at[x]
                 j = source[e]
@@ -99,14 +114,10 @@ def predicted_state(
                         f = F[at_F[e] + a * d + c]
                         if f != 0.0:
                             other = offset[j] + c
-                            for q in range(s):
+                            for q in range(row + 1):
                                 after[row, q] += f * product[other, q]
             i = following[i]
-        for p in range(s):
-            for q in range(p):
-                middle = (after[p, q] + after[q, p]) * 0.5
-                after[p, q] = middle
-                after[q, p] = middle
+        mirror(after)
     for e in range(m):  # inputs from other parts
         i, j = target[e], source[e]
         if part[i] != part[j]:
@@ -159,7 +170,7 @@ def corrected_state(
     Begins with whether all S are positive definite; otherwise the rest is void. first (n,), places (D,): where the
     states of a component are in the mean; cancellation: ratio of variances below which a correction is refined
     """
-    result, moved = flat.copy(), mean.copy()
+    result, moved = flat.copy(), mean.copy()  # of the blocks only what is below their diagonals, until the end
     m, k, d = H.shape
     largest = 0
     for r in range(m):
@@ -180,8 +191,10 @@ def corrected_state(
                 if h != 0.0:
                     w[a] -= h * moved[offsets[i] + c]
                     row = offset[i] + c
-                    for q in range(s):
+                    for q in range(row + 1):
                         W[a, q] += h * P[row, q]
+                    for q in range(row + 1, s):
+                        W[a, q] += h * P[q, row]
         for a in range(k):  # S = L L^T
             for c in range(a + 1):
                 total = R[r, a, c]
@@ -213,14 +226,15 @@ def corrected_state(
                 moved[places[first[i] + p]] += W[a, p] * w[a]
             for a in range(0, k - 1, 2):  # two rows at once take half as many passes over P
                 f, g, b = W[a, p], W[a + 1, p], a + 1
-                for q in range(s):
+                for q in range(p + 1):
                     P[p, q] -= f * W[a, q] + g * W[b, q]
             if k % 2:
                 f, b = W[k - 1, p], k - 1
-                for q in range(s):
+                for q in range(p + 1):
                     P[p, q] -= f * W[b, q]
             lost = lost or P[p, p] < cancellation * before[p]
         if lost:  # K^T = L^-T W;  P <- P + K (R K^T - H P)
+            mirror(P)
             for a in range(k - 1, -1, -1):
                 for q in range(s):
                     total = W[a, q]
@@ -244,6 +258,12 @@ def corrected_state(
                     middle = (P[p, q] + P[q, p]) / 2
                     P[p, q] = middle
                     P[q, p] = middle
+    corrected = np.zeros(len(flat) + 1, dtype=np.bool_)  # by where their blocks begin
+    for r in range(m):
+        i = rows[r]
+        if not corrected[start[i]]:
+            corrected[start[i]] = True
+            mirror(result[start[i] : start[i] + size[i] * size[i]].reshape(size[i], size[i]))
     return True, moved, result, likelihood
 
 
