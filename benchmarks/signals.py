@@ -30,6 +30,7 @@ from pipelines.cli.tables import JsonFile, report
 from pipelines.config import TrackConfig, load_config
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.types.signal import SignalSettings
 
 SINCE = (0.0, 0.5, 1.0, 2.0, 4.0, np.inf)  # s since the first vehicle was there
 BELIEFS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
@@ -164,23 +165,24 @@ def signals(
     named = names("--scenes", scenes) if scenes else windows.names
     traffic = [one for one in map(windows.recording, named) if scenes or one.colours]
     unit = overlapping(traffic)
-    found: list[tuple[list[BelievedLight], list[BelievedLight]]] = []  # by candidate, from the prior and an even one
-    for share, noise in CANDIDATES if chosen else ((own.non_compliance, own.driver_noise),):
-        signal = replace(own, non_compliance=share, driver_noise=noise)
-        even = replace(signal, red_duration=EVEN, amber_duration=0.1, green_duration=EVEN)
-        priors = (replace(settings, tracker=replace(settings.tracker, signals=each)) for each in (signal, even))
-        of_prior, of_even = ([light for one in traffic for light in believed_lights(one, each)] for each in priors)
-        found.append((of_prior, of_even))
-    if not found[0][0]:
+    tried = [
+        replace(own, non_compliance=share, driver_noise=noise)
+        for share, noise in (CANDIDATES if chosen else ((own.non_compliance, own.driver_noise),))
+    ]
+
+    def believed(one: RecordedTraffic, signal: SignalSettings) -> list[BelievedLight]:
+        return believed_lights(one, replace(settings, tracker=replace(settings.tracker, signals=signal)))
+
+    found = [[light for one in traffic for light in believed(one, signal)] for signal in tried]
+    if not found[0]:
         raise InputError(f"{dataroot}: expected windows with vehicles before stop lines, there are none")
     best = dict.fromkeys(unit.values(), 0)
     if chosen:
-        best = dict(zip(best, left_out([lights for lights, _ in found], unit), strict=True))
-    judged = [
-        [light for k, lights in enumerate(found) for light in lights[prior] if best[unit[light.window]] == k]
-        for prior in range(2)
-    ]
-    shown = tables(judged[0], judged[1], prior=float(own.stationary[2:].sum()))
+        best = dict(zip(best, left_out(found, unit), strict=True))
+    judged = [light for k, lights in enumerate(found) for light in lights if best[unit[light.window]] == k]
+    even = [replace(each, red_duration=EVEN, amber_duration=0.1, green_duration=EVEN) for each in tried]
+    from_even = [light for one in traffic for light in believed(one, even[best[unit[one.name]]])]
+    shown = tables(judged, from_even, prior=float(own.stationary[2:].sum()))
     report(shown, {table.title: table.rows for table in shown}, json_file)
     if chosen:
         counts = Counter(best.values())

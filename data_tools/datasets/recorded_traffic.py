@@ -77,6 +77,26 @@ class TrafficRecordings(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Stretches:
+    """The middle of each recording of a collection, at most `longest` s of it."""
+
+    recordings: TrafficRecordings
+    longest: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the recordings."""
+        return self.recordings.names
+
+    def recording(self, name: str) -> RecordedTraffic:
+        """Read one recording; raises `InputError` for an unknown name or a broken record."""
+        whole = self.recordings.recording(name)
+        moments = round(min(self.longest / PERIOD, len(whole) - 1)) + 1
+        first = (len(whole) - moments) // 2
+        return whole.moments(slice(first, first + moments))
+
+
 @dataclass(frozen=True, eq=False)
 class StateRows:
     """Recorded states, one a row: moment (n,) from 0, vehicle (n,), position (n, 2), velocity (n, 2), yaw (n,)."""

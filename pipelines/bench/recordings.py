@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import inf
 from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
@@ -17,7 +18,7 @@ from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_sce
 from data_tools.datasets.nuscenes.evaluation import nuscenes_hota, nuscenes_label_errors
 from data_tools.datasets.openacc import OpenAccPlatoons
 from data_tools.datasets.overlapping import overlapping
-from data_tools.datasets.recorded_traffic import TrafficRecordings
+from data_tools.datasets.recorded_traffic import Stretches, TrafficRecordings
 from data_tools.datasets.source import ChosenScenes
 from data_tools.evaluation.hota import HotaRow
 from data_tools.evaluation.placed_detections import placed_detections
@@ -211,10 +212,13 @@ def simulated_set(scenes: int, seed: int = 0, settings: SimulatorSettings | None
     return TrueSet("simulated", "simulated", SimulatedTraffic(settings, scenes, seed))
 
 
-def recording_set(name: str, data: Path | None, scenes: int, viewpoint: str | None = None) -> RecordingSet:
+def recording_set(
+    name: str, data: Path | None, scenes: int, viewpoint: str | None = None, longest: float = inf
+) -> RecordingSet:
     """A set by name; `data` holds a folder for each kind of recordings, `scenes` simulated ones are made.
 
     viewpoint  of the sensors that see recorded traffic, see `data_tools.simulator.recorded_world`; None: the set's own
+    longest    of recorded traffic, s, from the middle of longer recordings
 
     Raises `InputError` for an unknown name or missing recordings.
     """
@@ -227,7 +231,7 @@ def recording_set(name: str, data: Path | None, scenes: int, viewpoint: str | No
     if name in SETS:
         return SETS[name](data)
     traffic, usual = TRAFFIC_SETS[name]
-    recordings = traffic(data)
+    recordings: TrafficRecordings = Stretches(traffic(data), longest)
     clusters = overlapping(map(recordings.recording, recordings.names)) if name in OVERLAPPING else {}
     return TrueSet(name, "traffic", SensedRecordings(recordings, viewpoint or usual, None, seed=0), clusters)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -108,6 +109,12 @@ def gaps(
             "of one, or X,Y,Z in m.",
         ),
     ] = "above",
+    longest: Annotated[
+        float | None,
+        typer.Option(
+            "--longest", min=1.0, help="Of recordings of ngsim and openacc, s, from the middle of longer ones."
+        ),
+    ] = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 1,
     config: Config = None,
     plot: PictureFile = None,
@@ -123,7 +130,7 @@ def gaps(
     ] = None,
     of: Annotated[
         str | None,
-        typer.Option("--of", help="Draw a gap of an object in this situation, such as 'at red'.", metavar="SITUATION"),
+        typer.Option("--of", help="Make gaps of objects in this situation alone, as 'at red'.", metavar="SITUATION"),
     ] = None,
     json_file: JsonFile = None,
     markdown: MarkdownFile = None,
@@ -145,6 +152,7 @@ def gaps(
       saga-fg bench gaps --data data --sets ngsim --life kept --lengths 3,5 --situations
       saga-fg bench gaps --data data --sets ngsim --life kept --folds place --fit edges,boosted --situations
       saga-fg bench gaps --data data --sets ngsim --test USA_Lanker-2_6_T-1 --life kept --picture gap.png --of 'at red'
+      saga-fg bench gaps --data data --sets openacc --life kept --longest 20 --folds 2
       saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
     from pipelines.bench.gaps.bench import GapBenchSettings
@@ -161,7 +169,7 @@ def gaps(
     for name in chosen:
         if name not in KNOWN:
             raise InputError(f"--sets: {unknown_name('set', name, KNOWN)}")
-    sources = [RecordingSource(name, data, scenes, labels, viewpoint) for name in chosen]
+    sources = [RecordingSource(name, data, scenes, labels, viewpoint, longest or inf) for name in chosen]
     taught, judged = (names(option, value) if value else () for option, value in (("--train", train), ("--test", test)))
     recordings = {source.name: _recordings(source) for source in sources}
     _check_names(recordings, taught, judged)
@@ -183,11 +191,11 @@ def gaps(
             raise InputError(f"set {name}: expected recordings to judge, {why}")
     if plot is not None and passes == 0:
         raise InputError("--plot: expected --passes of 1 or more, it shows made gaps")
-    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths))
     if situations and (life == "shipped" or passes == 0):
         raise InputError("--situations: expected --life kept or both, and --passes of 1 or more: it shows made gaps")
-    if of is not None and (picture is None or of not in SITUATIONS):
-        raise InputError(f"--of: expected --picture, and one of {', '.join(SITUATIONS)}")
+    if of is not None and of not in SITUATIONS:
+        raise InputError(f"--of: {unknown_name('situation', of, SITUATIONS)}")
+    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths), of=of)
     runs: dict[str, list[Run]] = {}
     with progress_bar(unit="runs") as progress:
         for source in sources:

@@ -37,7 +37,7 @@ from pipelines.slam.drive import KeyframeClouds
 from pipelines.slam.graph_export import write_landmark_table
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.odometry import OdometrySettings
-from pipelines.slam.results import landmark_rows, object_paths, write_covariances, write_objects
+from pipelines.slam.results import confirmed_paths, landmark_rows, object_paths, write_covariances, write_objects
 from pipelines.slam.saved_graph import write_graph
 from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
 from pipelines.slam.slam_map import Origin, SlamMap, write_map
@@ -135,7 +135,7 @@ def write_lidar_slam(
         paths = {"reference": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
         if objects is not None:
             write_objects(folder / "tracks.csv", objects)
-        driven = () if objects is None else tuple(object_paths(objects).values())
+        driven = () if objects is None else tuple(confirmed_paths(objects).values())
         figure = scan_map_from_above(points, paths, _poles(result.landmarks), _lines(result), driven)
         write_bytes(folder / "above.png", png(figure))
         write_figures(folder / "metrics.json", figures)

@@ -33,6 +33,8 @@ from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
 from saga_fg.types.landmark import Landmark
 
+_CONFIRMED = 5  # detections
+
 
 def landmark_row(
     number: int, kind: str, coordinates: Mapping[str, float], covariance: FloatArray, observations: int
@@ -66,6 +68,14 @@ def object_paths(estimate: JointEstimate) -> dict[int, FloatArray]:
         for name, place in zip(objects.id.tolist(), objects.position, strict=True):
             found.setdefault(name, []).append(place)
     return {name: np.array(places) for name, places in found.items()}
+
+
+def confirmed_paths(estimate: JointEstimate) -> dict[int, FloatArray]:
+    """Return those of objects that were detected `_CONFIRMED` times at least: pictures leave clutter out."""
+    seen = [estimate.assignment(row).id for row in range(len(estimate.timestamps))]
+    ids, counts = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *seen]), return_counts=True)
+    known = set(ids[counts >= _CONFIRMED].tolist())
+    return {name: path for name, path in object_paths(estimate).items() if name in known}
 
 
 def write_objects(path: Path, estimate: JointEstimate) -> None:
@@ -113,7 +123,7 @@ def write_landmark_map(
 
 def write_joint(output: Path, run: JointRun) -> None:
     """Write the results of a simulated scene: the paths of the run as NAME.tum, and errors.json against the truth."""
-    last = np.array([path[-1] for path in object_paths(run.estimate).values()]).reshape(-1, 2)
+    last = np.array([path[-1] for path in confirmed_paths(run.estimate).values()]).reshape(-1, 2)
     drawn = {name: path.positions for name, path in run.paths.items() if name != "settled"}
     with atomic_directory(output) as folder:
         for name, path in run.paths.items():

@@ -28,7 +28,7 @@ from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
 from saga_fg.estimators.joint_gaussian import joint_gaussian
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.graph.condensation import Condensation
-from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.errors import GraphError
 from saga_fg.graph.linearisation_point import LinearisationPoint
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -225,7 +225,7 @@ class IncrementalSmoother:
             engine = Engine(graph.elimination)
         try:
             return engine.solved(graph, settings)
-        except UndeterminedError:
+        except GraphError:
             if graph.elimination == "qr":
                 raise
         graph.moved_to(start)  # Cholesky has half the digits

@@ -20,10 +20,13 @@ from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.trails import STEP, paths
+from saga_fg.tracking.turn_rate import TURNING
 
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
 LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
 WIDEST = 0.3  # rad, of a course, however slow the vehicle
+TURNING_OFF = 0.05  # share of vehicles that begin to turn where no earlier traffic tells it
+HARDEST_TURN = 2.0  # m/s^2, across the path: of fast vehicles, comfort limits the turn
 TURNING_TIME = 1.0  # s: a path is not known better than by what it turns within this time
 FLOW_TIME = 3.0  # s, in which a vehicle takes on the speed of earlier traffic
 STEPS = 20  # of a path, as far as leaders are looked for
@@ -76,11 +79,13 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
         if len(led):
             own, way = paths.select(path[rows[led]]), speed[led] * dt
             turn = _at(own.heading, way) - own.heading[:, 0]
-            heading[led], across[led] = own.heading[:, 0], _across(own, speed[led])
+            heading[led] = own.heading[:, 0]
+            unseen = table.coasting(state.time)[rows[led]]
+            settling[led], across[led] = _across(own, speed[led], unseen, motion.course_time)
             typical, weight = typical_speed(own, way)
             pull[led] = weight / (weight + 1) * np.where(speed[led] > MOVING, typical - speed[led], 0.0) / FLOW_TIME
             after[rows[led]] = wrap_angle(heading[led] + turn)
-            rate[led], settling[led] = turn / turning_time(motion, dt), 1 / motion.course_time
+            rate[led] = turn / turning_time(motion, dt)
         mean = state.joint.estimator.mean(table.id[rows])
         ids, course = table.id[rows], (settling, across, pull)
         found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, *course))
@@ -95,11 +100,19 @@ def typical_speed(paths: Paths, way: FloatArray) -> tuple[FloatArray, FloatArray
     return _at(paths.weight * paths.speed, way) / np.maximum(weight, _LEAST), weight
 
 
-def _across(paths: Paths, speed: FloatArray) -> FloatArray:
-    """Variances (k,) of the velocity across paths, (m/s)^2."""
+def _across(paths: Paths, speed: FloatArray, unseen: FloatArray, course_time: float) -> tuple[FloatArray, FloatArray]:
+    """Rate (k,), 1/s, with which the velocity across paths settles, and its variance (k,), (m/s)^2.
+
+    It is that within the path, of the correlation time `course_time`, and that of those that have begun to turn off
+    since they were seen, `unseen` (k,) s ago, with the acceleration a:
+
+        s^2 = s_0^2 + a^2 t^2,   2 s^2 / k = 2 s_0^2 course_time + a^2 t^3      growth of the variance of the position
+    """
     own = np.minimum(ACROSS**2 + (1 - paths.certainty) * LEAVING**2, (WIDEST * speed) ** 2)
     turn = _at(paths.heading, speed * TURNING_TIME) - paths.heading[:, 0]
-    return np.asarray(own + (paths.disagreement + turn**2) * speed**2)
+    own = own + (paths.disagreement + turn**2) * speed**2
+    off = (1 - paths.certainty) ** 2 * TURNING_OFF * np.minimum(TURNING * speed, HARDEST_TURN) ** 2 * unseen**2
+    return 2 * (own + off) / np.maximum(2 * own * course_time + off * unseen, _LEAST), own + off
 
 
 def _at(column: FloatArray, way: FloatArray) -> FloatArray:

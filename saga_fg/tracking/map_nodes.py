@@ -23,6 +23,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, of_classes
 from saga_fg.numerics.assignment import assign, gate, mahalanobis
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.kinematics import Kinematics
+from saga_fg.tracking.map_tiles import Element, elements, in_known_names
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.signal_inference import FirstVehicles
 from saga_fg.types.by_class import class_settings
@@ -81,7 +82,7 @@ class MapNodes:
     across: LanesAcross | None = None
     beliefs: Mapping[str, FloatArray] = field(default_factory=dict)
     drivers: FirstVehicles = field(default_factory=FirstVehicles.none)
-    _roads: Mapping[str, Lane | StopLine] = field(default_factory=dict)
+    _known: Mapping[str, Element] = field(default_factory=dict)
     _latest: RoadMap | None = None
 
     def __len__(self) -> int:
@@ -96,10 +97,12 @@ class MapNodes:
         if road_map is self._latest:
             return
         self._latest = road_map
+        road_map = in_known_names(road_map, self._known)
         new = [each for each in _elements(road_map) if each[1] in self.classes and each[0] not in self.name]
         if new:
             self._add_nodes(new, road_map.deviation, origin, joint)
         self._add_roads(road_map)
+        self._known = {each.name: each for each in elements(road_map)} | dict(self._known)
 
     def _add_nodes(
         self, new: Sequence[tuple[str, str, Place, str]], deviation: float, origin: FloatArray, joint: JointTrackState
@@ -122,11 +125,11 @@ class MapNodes:
         """Find out which known lanes cross which known stop lines, where the map brings new ones."""
         lanes_and_lines: tuple[Lane | StopLine, ...] = (*road_map.lanes, *road_map.stop_lines)
         roads = {each.name: each for each in lanes_and_lines}
-        if STOP_LINE not in self.classes or roads.keys() <= self._roads.keys():
+        if STOP_LINE not in self.classes or roads.keys() <= self._known.keys():
             return
-        self._roads = {**self._roads, **{name: each for name, each in roads.items() if name not in self._roads}}
-        nodes = [self._roads.get(self.name[k]) for k in np.flatnonzero(self.label == STOP_LINE).tolist()]
-        lanes = [each for each in self._roads.values() if isinstance(each, Lane)]
+        known = {**roads, **self._known}
+        nodes = [known.get(self.name[k]) for k in np.flatnonzero(self.label == STOP_LINE).tolist()]
+        lanes = [each for each in known.values() if isinstance(each, Lane)]
         lines = [each for each in nodes if isinstance(each, StopLine)]
         self.across = LanesAcross.of(lanes, lines) if lines else None
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from pipelines.bench.gaps import fitted, sources
-from pipelines.bench.gaps.bench import Contender, GapBenchSettings, bench_gaps, hidden, run_of
+from pipelines.bench.gaps.bench import Contender, GapBenchSettings, bench_gaps, hidden, prepared, run_of
 from pipelines.bench.gaps.contenders import KEPT_ALIVE, LIFE, contenders, with_life
 from pipelines.bench.gaps.fitted import Split, splits_of
 from pipelines.bench.gaps.gap import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
@@ -21,6 +21,7 @@ from pipelines.bench.gaps.judging import CAP, JudgedRun, Links
 from pipelines.bench.gaps.labelled import LabelledScene
 from pipelines.bench.gaps.learned import LearnedForms
 from pipelines.bench.gaps.picture import drawn_gap, gap_picture, telling_gap
+from pipelines.bench.gaps.situations import situations_of
 from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.bench.gaps.summary import gap_figures, link_figures
 from pipelines.bench.recordings import simulated_set
@@ -193,6 +194,8 @@ def test_made_gaps_hide_one_object_among_others() -> None:
     assert gaps == made_gaps(traffic, passes=2, seed=0)
     assert {gap.run for gap in gaps} == {1, 2}
     assert {gap.length for gap in gaps} <= set(LENGTHS)
+    still = made_gaps(traffic, passes=2, seed=0, chosen=lambda gap: not gap.moving)
+    assert not any(gap.moving for gap in still)
     time = traffic.scene.timestamps
     for gap in gaps:
         assert time[gap.stop - 1] - time[gap.start] == pytest.approx(gap.length, abs=0.06)
@@ -222,7 +225,7 @@ def test_made_gaps_hide_one_object_among_others() -> None:
 def short_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulated scenes of the benchmark that last for seconds."""
     settings = replace(SHORT, duration=7.0)
-    monkeypatch.setattr(sources, "_set", lambda name, data, scenes, viewpoint: simulated_set(scenes, settings=settings))
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes, *_: simulated_set(scenes, settings=settings))
 
 
 @pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "file"])
@@ -293,6 +296,22 @@ def test_places_are_sites_and_settings() -> None:
     names = ("USA_Lanker-1_10_T-1", "USA_Lanker-2_4_T-1", "USA_US101-1_1_T-1")
     assert list(RecordingSource("ngsim").places(names).values()) == ["USA_Lanker", "USA_Lanker", "USA_US101"]
     assert RecordingSource("kitti").places(("0000",)) == {}
+
+
+def test_nothing_is_hidden_from_above() -> None:
+    assert RecordingSource("ngsim").complete
+    assert not RecordingSource("ngsim", viewpoint="mast").complete
+    assert not RecordingSource("kitti").complete
+
+
+@pytest.mark.usefixtures("short_scenes")
+def test_gaps_may_be_of_one_situation_alone() -> None:
+    source = RecordingSource("simulated", scenes=1, labels=True)
+    settings = GapBenchSettings(1, ("kept",), (2.0,), of="visible leader")
+    labelled, gaps = prepared(source, "scene-0001", settings, load_config("simulated").sensors)
+    made = [gap for gap in gaps if gap.run > 0]
+    assert made
+    assert all("visible leader" in situations_of(labelled, gap)[2.0] for gap in made)
 
 
 def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
@@ -401,7 +420,7 @@ def test_the_command_prints_tables_and_writes_figures(tmp_path: Path) -> None:
 
 def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = replace(SHORT, duration=1.0)
-    monkeypatch.setattr(sources, "_set", lambda name, data, scenes, viewpoint: simulated_set(scenes, settings=settings))
+    monkeypatch.setattr(sources, "_set", lambda name, data, scenes, *_: simulated_set(scenes, settings=settings))
     arguments = ["bench", "gaps", "--sets", "simulated", "--scenes", "1", "--passes", "1", "--contenders", "kf"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
@@ -421,7 +440,7 @@ def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyP
         (["--fit", "edge"], "--fit: expected some of noise, edges, boosted, got 'edge'"),
         (["--fit", "edges"], "--fit: expected --train or --folds"),
         (["--fit", "boosted", "--folds", "2", "--life", "shipped"], "--fit boosted: expected --life kept or both"),
-        (["--of", "red"], "--of: expected --picture, and one of all, moving,"),
+        (["--of", "red"], "--of: unknown situation 'red'"),
         (["--folds", "1"], "--folds: expected a number of 2 or more, or place, got '1'"),
         (["--lengths", "4"], "--lengths: expected some of 1, 2, 3, 5, got '4'"),
         (["--situations", "--life", "shipped"], "--situations: expected --life kept or both"),

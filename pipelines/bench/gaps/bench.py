@@ -46,6 +46,7 @@ class GapBenchSettings:
     """Passes over each recording with made gaps, the lives compared, lengths of made gaps, s, seed of their choice.
 
     real  whether the gaps of the recordings themselves are judged too, and the links
+    of    the situation of objects at the end of made gaps (`pipelines.bench.gaps.situations`), None: any
     """
 
     passes: int = 2
@@ -53,6 +54,7 @@ class GapBenchSettings:
     lengths: tuple[float, ...] = LENGTHS
     seed: int = 0
     real: bool = True
+    of: str | None = None
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,12 @@ def prepared(
 def _prepared(of: _Preparation) -> tuple[LabelledScene, list[Gap]]:
     labelled, settings = LabelledScene.of(of.source.scene(of.recording), of.sensors), of.settings
     real = real_gaps(labelled) if settings.real else []
-    return labelled, [*real, *made_gaps(labelled, settings.passes, settings.seed, settings.lengths)]
+
+    def wanted(gap: Gap) -> bool:
+        return settings.of in situations_of(labelled, gap).get(gap.length, ())
+
+    chosen = None if settings.of is None else wanted
+    return labelled, [*real, *made_gaps(labelled, settings.passes, settings.seed, settings.lengths, chosen)]
 
 
 def run_of(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life, real: bool = True) -> Run:

@@ -18,7 +18,7 @@ from saga_fg.learning import measured_trajectories
 
 Fit = Literal["noise", "edges", "boosted"]
 FITS: tuple[Fit, ...] = ("noise", "edges", "boosted")
-LEARNING = LearningSettings(passes=1, most=150)  # there is a fit to every fold, and a half of the usual tells enough
+LEARNING = LearningSettings(passes=1, most=100)  # there is a fit to every fold, and a half of the usual tells enough
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,7 @@ def bench_splits(
     scikit-learn.
     """
     runs: list[Run] = []
+    settings = replace(settings, real=settings.real and not source.complete)
     for split in splits:
         fitted: list[Contender] = []
         if split.train and "noise" in fits:

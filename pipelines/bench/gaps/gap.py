@@ -7,7 +7,7 @@ it travels faster than `MOVING` over the gap.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,8 +71,16 @@ def reached(time: FloatArray, gap: Gap) -> dict[float, int]:
     return found
 
 
-def made_gaps(labelled: LabelledScene, passes: int, seed: int, lengths: Sequence[float] = LENGTHS) -> list[Gap]:
+def made_gaps(
+    labelled: LabelledScene,
+    passes: int,
+    seed: int,
+    lengths: Sequence[float] = LENGTHS,
+    chosen: Callable[[Gap], bool] | None = None,
+) -> list[Gap]:
     """Windows in which objects can be hidden: well followed before, labelled throughout, detected at the end.
+
+    chosen  the windows that count, all if not given
 
     In one pass an object may be hidden several times; objects that are hidden at the same time are `SPACING` apart.
     """
@@ -80,7 +88,7 @@ def made_gaps(labelled: LabelledScene, passes: int, seed: int, lengths: Sequence
     if len(time) < 3:
         return []
     rng = np.random.default_rng([seed, zlib.crc32(labelled.scene.name.encode())])
-    possible = windows(labelled, rng, lengths)
+    possible = [gap for gap in windows(labelled, rng, lengths) if chosen is None or chosen(gap)]
     gaps: list[Gap] = []
     for number in range(1, passes + 1):
         order = rng.permutation(len(possible))

@@ -16,6 +16,7 @@ The route is where the labels say that the object goes after the start, and stra
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -99,6 +100,7 @@ def lights_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, fro
     return road, frozenset(name for name, colour in shown.items() if colour in CLOSED)
 
 
+@lru_cache(maxsize=64)
 def colours_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, Mapping[str, str]]:
     """The road map at a time, and the colours of its lights by their names, where these were reported lately."""
     road: RoadMap | None = None

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.tracking import ClassSettings
+from saga_fg.tracking import ClassSettings, known_courses
 from saga_fg.tracking.known_courses import typical_speed
 from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings
 from saga_fg.tracking.trails import STEP, paths
@@ -341,3 +341,21 @@ def test_a_hidden_car_keeps_to_the_lane_of_the_map_round_a_bend():
         reported = [tracker.step(seen) for tracker in trackers]
     with_lane, without = (np.hypot(*(tracks.boxes.position[0, :2] - place)) for tracks in reported)
     assert with_lane < 1.0 < 3.0 < without
+
+
+def test_where_nothing_tells_the_path_some_turn_off(monkeypatch):
+    """The variance across grows by about that of those who turn, share a^2 t^4 / 4; fast cars turn at 2 m/s^2."""
+
+    def across(speed):
+        tracker = Tracker(replace(ON, classes={"default": replace(CAR, motion=Curvilinear(course_time=0.2))}), SENSORS)
+        for k in range(20):
+            tracker.step(frame(k * DT, np.array([[speed * k * DT, 0.0]]), yaw=0.0))
+        return tracker.predict([2.0, 4.0]).position_covariance[:, 0, 1, 1]
+
+    grown = [across(speed) for speed in (3.0, 15.0)]
+    monkeypatch.setattr(known_courses, "TURNING_OFF", 0.0)
+    before = [across(speed) for speed in (3.0, 15.0)]
+    share, hardest, time = 0.05, np.array([[0.3 * 3.0], [2.0]]), np.array([2.0, 4.0])
+    ratio = np.subtract(grown, before) / (share * hardest**2 * time**4 / 4)
+    assert (ratio > 0.5).all()
+    assert (ratio < 1.2).all()
