@@ -42,3 +42,11 @@ def test_memory_is_read_and_the_labels_are_those_of_the_whole(tmp_path: Path) ->
 def test_settings_are_checked() -> None:
     with pytest.raises(InputError, match="objects"):
         bench_streaming(StreamingBenchSettings(objects=2))
+
+
+def test_missed_detections_and_clutter_are_as_many_as_asked_for(tmp_path: Path) -> None:
+    settings = StreamingBenchSettings(objects=20, seconds=20.0, seed=1, detected=0.5, clutter=7.0)
+    write_traffic(tmp_path / "table.csv", settings)
+    dataset = read_detections(tmp_path / "table.csv")
+    frames = dataset.scene(dataset.scenes[0]).frames
+    assert sum(map(len, frames)) / len(frames) == pytest.approx(0.5 * 0.94 * 20 + 7, rel=0.1)

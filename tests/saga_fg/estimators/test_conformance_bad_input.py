@@ -123,7 +123,10 @@ BAD = {
     "covariance: unknown node": (lambda e: e.covariance([99]), "node 99 is not in the estimator"),
     "covariance: mixed sizes": (lambda e: e.covariance([4, 8]), "expected states of equal size"),
     "joint mean: unknown node": (lambda e: e.joint_mean([4, 99]), "node 99 is not in the estimator"),
-    "joint covariance: unknown node": (lambda e: e.joint_covariance([4, 99]), "node 99 is not"),
+    "joint covariance: unknown node": (
+        lambda e: e.joint_covariance([4, 99]),
+        "node 99 is not in the estimator",
+    ),
     "joint covariance: ids that are no integers": (lambda e: e.joint_covariance(["4"]), "nodes: expected"),
 }
 
