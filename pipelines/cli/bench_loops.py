@@ -79,6 +79,7 @@ def _courses(seeds: list[float], drifts: list[float], json_file: Path | None) ->
             f"{row.found} of {row.stretches}",
             str(row.loops),
             str(row.false),
+            str(row.lost),
         )
         for row in rows
     ]
@@ -92,6 +93,7 @@ def _courses(seeds: list[float], drifts: list[float], json_file: Path | None) ->
         "stretches found",
         "loops",
         "false",
+        "true lost",
     )
     report(
         [FigureTable("simulated courses: odometry that errs by 1 %, and loops", columns, tuple(shown))], rows, json_file

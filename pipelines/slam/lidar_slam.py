@@ -223,7 +223,8 @@ class LidarSlam:
         solved = self._graph.finish()
         self._finished, chosen = True, solved.loops.kept.tolist()
         if not all(chosen):
-            _LOG.warning("%d of %d loops contradict the others, and are left out", chosen.count(False), len(chosen))
+            out, taken = chosen.count(False), chosen.count(True)
+            _LOG.warning("%d of %d loops contradict the other %d, and are left out", out, len(chosen), taken)
         unfit, unknown = misfits(solved.graph, self._sensors, self.settings.sensors)
         far = false_fixes(solved.graph, self.settings.sensors) if "gps" in self._sensors else ""
         for text in filter(None, (*unfit.values(), *unknown.values(), far)):

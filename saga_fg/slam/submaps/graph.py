@@ -226,7 +226,7 @@ class SubmapGraph:
 
     def select_loops(self) -> LoopSelection:
         """Judge all loops that came, in this order."""
-        return select_loops(self.world_T_anchor(), self._motions[1:], self._anchors, [loop for _, loop in self._loops])
+        return select_loops(self._motions[1:], self._anchors, [loop for _, loop in self._loops])
 
     def measurements(self, loops: LoopSelection | None = None) -> SceneFactorGraph:
         """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed.

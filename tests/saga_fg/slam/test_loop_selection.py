@@ -1,0 +1,66 @@
+"""Loops are left out where other loops contradict them, and never by odometry alone."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from saga_fg.slam.submaps import LoopClosure
+from saga_fg.slam.submaps.loop_selection import LoopSelection, select_loops
+
+PER_LAP, STEPS, EVERY = 100, 200, 5
+STATED = np.array([1e-3] * 3 + [0.03] * 3)
+OWN = np.array([2e-3] * 3 + [0.05] * 3)
+
+
+def selected(
+    count: int, seed: int = 0, noise: float = 1.0, turn: float = 0.0, false: tuple[float, ...] = ()
+) -> LoopSelection:
+    """Two laps of a circle; true loops from lap to lap, and a false one of this error behind them.
+
+    noise: of odometry, times that stated; turn: its bias, rad a step
+    """
+    rng = np.random.default_rng(seed)
+    step = gtsam.Pose3(gtsam.Rot3.Yaw(2 * np.pi / PER_LAP), [6.0, 0.0, 0.0])
+    bias = gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.zeros(3))
+    true, motions = [gtsam.Pose3()], []
+    for _ in range(STEPS - 1):
+        true.append(true[-1].compose(step))
+        moved = step.compose(bias).retract(noise * STATED * rng.normal(size=6))
+        motions.append((moved.matrix(), np.diag(STATED**2)))
+
+    def loop(first: int, second: int, error: tuple[float, ...] = (0.0,) * 6) -> LoopClosure:
+        between = true[EVERY * first].between(true[EVERY * second]).retract(np.array(error))
+        seen = between.retract(OWN * rng.normal(size=6))
+        return LoopClosure(first, second, seen.matrix(), np.diag(OWN**2), confirmed=True)
+
+    loops = [loop(2 * k, 2 * k + PER_LAP // EVERY) for k in range(count)]
+    loops += [loop(2, 25, false)] if false else []
+    return select_loops(motions, range(0, STEPS, EVERY), loops)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize(("noise", "turn"), [(1.0, 1e-3), (1.0, 5e-3), (3.0, 0.0), (5.0, 0.0)])
+def test_true_loops_stay_however_far_odometry_is_off(count: int, noise: float, turn: float) -> None:
+    for seed in range(4):
+        assert selected(count, seed, noise, turn).kept.all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_a_false_loop_beside_true_ones_is_left_out(count: int) -> None:
+    for seed in range(3):
+        found = selected(count, seed, false=(0.0, 0.0, 0.0, 20.0, 0.0, 0.0))  # its rotation is right
+        np.testing.assert_array_equal(found.kept, [True] * count + [False])
+        assert found.inflation.max() < 3.0
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_false_loop_is_left_out_where_odometry_is_worse_than_it_says(count: int) -> None:
+    found = selected(count, noise=3.0, false=(0.0, 0.0, 0.1, 20.0, 10.0, 0.0))
+    np.testing.assert_array_equal(found.kept, [True] * count + [False])
+    assert 1.5 < found.inflation.max() < 6.0
+
+
+def test_nothing_is_known_without_loops() -> None:
+    np.testing.assert_array_equal(selected(0).inflation, [1.0, 1.0])
