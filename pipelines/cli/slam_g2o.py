@@ -28,8 +28,9 @@ def g2o(
         typer.Option("--compare", help="Run GTSAM's Levenberg-Marquardt and iSAM2 (QR) too, with times."),
     ] = False,
     isam2_batch: Annotated[
-        int, typer.Option("--isam2-batch", min=1, help="Poses that iSAM2 is given with each update.")
-    ] = 10,
+        int | None,
+        typer.Option("--isam2-batch", min=1, help="With --compare: poses that iSAM2 is given at once.  [default: 10]"),
+    ] = None,
     certify: Annotated[
         bool,
         typer.Option("--certify", help="Find the global minimum of the chordal cost too, start from it, and prove it."),
@@ -49,8 +50,8 @@ def g2o(
         ),
     ] = None,
     robust_scale: Annotated[
-        float, typer.Option("--robust-scale", help="Scale of that loss, standard deviations.")
-    ] = 3.0,
+        float | None, typer.Option("--robust-scale", help="Scale of that loss, standard deviations.  [default: 3]")
+    ] = None,
     verbose: Verbose = False,
 ) -> None:
     """Optimise a pose graph, whatever the guess in the file is worth.
@@ -77,12 +78,17 @@ def g2o(
         raise InputError("--certify: expected without a robust loss, the proof is for squared errors")
     if robust not in (None, "consensus") and compare:
         raise InputError("--compare: expected without a robust loss, GTSAM's optimisers are run without one")
-    if not 0 < robust_scale < math.inf:
-        raise InputError(f"--robust-scale {robust_scale:g}: expected a number > 0")
+    scale = 3.0 if robust_scale is None else robust_scale
+    if not 0 < scale < math.inf:
+        raise InputError(f"--robust-scale {scale:g}: expected a number > 0")
+    if robust in (None, "consensus") and robust_scale is not None:
+        raise InputError("--robust-scale: expected with --robust and the name of a loss only")
+    if not compare and isam2_batch is not None:
+        raise InputError("--isam2-batch: expected with --compare only")
     check_writable_folder(output)
     rejected: list[str] = []
     compared: list[FromStart] = []
-    loss = None if robust is None or robust == "consensus" else Robust(robust, robust_scale)
+    loss = None if robust is None or robust == "consensus" else Robust(robust, scale)
     graph = read_g2o(file)
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
         rows, guess = _rows(covariances, graph.ids), graph_error(graph, loss)
@@ -101,7 +107,7 @@ def g2o(
             for row in compared:
                 errors[f"GTSAM Levenberg-Marquardt from the {row.start}"] = row.gtsam_error
             if graph.poses_alone:
-                errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch)
+                errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch or 10)
     write_pose_graph(output, graph, optimised, rows, blocks, errors, rejected)
     poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
     if graph.landmarks is not None:

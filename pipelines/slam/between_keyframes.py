@@ -41,7 +41,7 @@ class BetweenKeyframes:
             if getattr(measured, name) is None or name in self._sensors:
                 continue
             if not self._others_read:
-                raise InputError(f"{name}: expected it among the sensors of LidarSlam, as in sensors=[{name!r}]")
+                raise InputError(f"{name}: expected it among the sensors that were named, as in sensors=[{name!r}]")
             if name not in self._warned:
                 _LOG.warning("%s: not among the sensors; only the providers that were given can read it", name)
                 self._warned.add(name)

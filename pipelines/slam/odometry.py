@@ -188,10 +188,10 @@ class LidarOdometry:
             most = _SPEED_OFF + _ACCELERATION * (timestamp - self._confirmed)
         if off > most and not self._refused:
             _LOG.warning(
-                "scan at %.3f s: a velocity of %.1f m/s by other sensors is refused; by the scans it was %.1f m/s",
+                "scan at %.3f s: a velocity of %s m/s (ahead, left, up) by other sensors is refused; by the scans it was %s m/s",
                 timestamp,
-                float(np.linalg.norm(velocity[3:][said])),
-                float(np.linalg.norm(self._velocity[3:])),
+                _components(velocity[3:]),
+                _components(self._velocity[3:]),
             )
         self._refused = off > most
         return not self._refused
@@ -290,3 +290,8 @@ def _said(names: tuple[str, ...]) -> str:
     if not names:
         return "the surfaces in view determine the whole motion again"
     return f"the surfaces in view do not determine the motion {', '.join(names)}; it is only predicted there"
+
+
+def _components(velocity: FloatArray) -> str:
+    """Those that are known, m/s."""
+    return ", ".join("?" if np.isnan(x) else f"{x:.1f}" for x in velocity)

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import gtsam
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
@@ -27,10 +28,13 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.batch_solver import BatchSolver
 from saga_fg.graph import Additions, GraphView, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, pose_key
-from saga_fg.slam.pose_graph import PoseGraph, trusted
+from saga_fg.slam.pose_graph import PoseGraph
 from saga_fg.slam.submaps import LoopClosure, SubmapSettings, loop_factors
 from saga_fg.types.landmark import Landmark, LandmarkType, Observation
+
+Motion = tuple[FloatArray, FloatArray]
 
 _COLUMNS = ("keyframe", "landmark", "kind", "value", "covariance")
 
@@ -43,15 +47,19 @@ class SavedGraph:
     observations: Sequence[AssociatedObservation]
 
     def solved(self, settings: SubmapSettings | None = None) -> tuple[FloatArray, list[Landmark]]:
-        """Poses (M, 4, 4) and landmarks of the whole graph; settings: of the run, for the losses of landmarks."""
-        s, graph, odometry = settings or SubmapSettings(), SceneFactorGraph(), trusted(self.poses)
+        """Poses (M, 4, 4) and landmarks of the whole graph; settings: of the run, for the losses of landmarks.
+
+        Objects, other sensors and providers of the run are in no file, and are not in it.
+        """
+        s, graph, others = settings or SubmapSettings(), SceneFactorGraph(), list[LoopClosure]()
+        motions: list[Motion | None] = [self._prior(), *[None] * (len(self.poses) - 1)]
         covariances = np.linalg.inv(self.poses.information)
-        edges = list(zip(self.poses.first.tolist(), self.poses.second.tolist(), strict=True))
-        moved = {edges[row][1]: row for row in np.flatnonzero(odometry).tolist()}
-        loops = [
-            LoopClosure(*edges[row], self.poses.first_T_second[row], covariances[row])
-            for row in np.flatnonzero(~odometry).tolist()
-        ]
+        for row, (a, b) in enumerate(zip(self.poses.first.tolist(), self.poses.second.tolist(), strict=True)):
+            edge = LoopClosure(a, b, self.poses.first_T_second[row], covariances[row])
+            if abs(b - a) == 1 and motions[max(a, b)] is None:
+                motions[max(a, b)] = _motion(edge)
+            else:
+                others.append(edge)
         seen: dict[int, list[tuple[int, Observation]]] = {}
         start = {}
         for one in self.observations:
@@ -63,17 +71,31 @@ class SavedGraph:
         marks = LandmarkObservations(seen, start, s.robust)
         for k, pose in enumerate(self.poses.world_T_pose):
             graph.advance(float(k))
-            priors = self.poses.priors
-            if k == 0:
-                motion = MeasuredMotion(pose if priors is None else priors.world_T_pose[0], START, pose)
-            elif k in moved:
-                motion = MeasuredMotion(self.poses.first_T_second[moved[k]], covariances[moved[k]], pose)
-            else:
+            motion = motions[k]
+            if motion is None:
                 raise InputError(f"graph: expected odometry from keyframe {k - 1} to keyframe {k}")
-            ask_all([motion, marks, _Loops([loop for loop in loops if max(loop.first, loop.second) == k])], graph)
+            loops = [loop for loop in others if max(loop.first, loop.second) == k]
+            ask_all([MeasuredMotion(*motion, pose), marks, _Loops(loops)], graph)
         solution = BatchSolver(graph=graph, settings=SolverSettings(tolerance=1e-4, max_iterations=30)).solve()
         poses = [solution.values.atPose3(pose_key(k)).matrix() for k in range(len(self.poses))]
         return np.array(poses), marks.landmarks(solution, s.confirm_after)
+
+    def _prior(self) -> Motion:
+        """Of the first keyframe: that of the file, or where it stands."""
+        priors = self.poses.priors
+        if priors is None:
+            return self.poses.world_T_pose[0], START
+        if priors.pose.tolist() != [0]:
+            raise InputError("graph: expected a prior of the first keyframe alone")
+        return priors.world_T_pose[0], np.linalg.inv(priors.information[0])
+
+
+def _motion(edge: LoopClosure) -> Motion:
+    """Odometry to the later keyframe, as an edge has it forwards or backwards."""
+    if edge.first < edge.second:
+        return edge.first_T_second, edge.covariance
+    Ad = gtsam.Pose3(edge.first_T_second).AdjointMap()
+    return inverse_transform(edge.first_T_second), Ad @ edge.covariance @ Ad.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +126,8 @@ def write_graph(folder: Path, result: LidarSlamResult) -> None:
 def read_graph(folder: str | Path, kinds: Sequence[LandmarkType] = (WALL, POLE, LINE, GROUND)) -> SavedGraph:
     """Read a graph; kinds: of landmarks, your own among them. Raises `InputError` naming file and line."""
     graph, path = read_g2o(Path(folder) / "graph.g2o"), Path(folder) / "observations.csv"
+    if graph.dim != 3:
+        raise InputError(f"{Path(folder) / 'graph.g2o'}: expected poses in space, got poses in the plane")
     lines = [(number, line.split(",")) for number, line in enumerate(read_lines(path), start=1) if line.strip()]
     if not lines or tuple(lines[0][1]) != _COLUMNS:
         raise InputError(f"{path}: line 1: expected the columns {','.join(_COLUMNS)}")

@@ -140,6 +140,9 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
             ["--covariances", "10,elephant"],
             "--covariances: expected all, last, none or ids of poses with commas, got 'e",
         ),
+        (["--robust-scale", "2"], "--robust-scale: expected with --robust and the name of a loss only"),
+        (["--robust", "consensus", "--robust-scale", "2"], "--robust-scale: expected with --robust"),
+        (["--isam2-batch", "2"], "--isam2-batch: expected with --compare only"),
         (["--robust", "huber", "--robust-scale", "-1"], "--robust-scale -1: expected a number > 0"),
     ],
 )

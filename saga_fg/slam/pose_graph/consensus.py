@@ -58,10 +58,9 @@ class Consensus:
     kept: BoolArray
 
 
-def consensus(graph: PoseGraph, too_wide: bool = True) -> Consensus:
+def consensus(graph: PoseGraph) -> Consensus:
     """The graph without false loops; priors and observations of landmarks are trusted, as odometry is.
 
-    too_wide: covariances may be far too large, as in files; else the gate is c' alone.
     Raises `InputError` for a graph that measurements between poses do not connect.
     """
     apart = graph.components() != 0
@@ -75,7 +74,7 @@ def consensus(graph: PoseGraph, too_wide: bool = True) -> Consensus:
     problem = _Problem.of(graph)
     values = graph_values(placed(graph, _spanning_start(graph, ~loop)))
     values, weights = _graduated(problem, values, loop)
-    values, kept = _readmitted(problem, *_snooped(problem, values, loop, weights > 0.5, too_wide))
+    values, kept = _readmitted(problem, *_snooped(problem, values, loop, weights > 0.5))
     return Consensus(chosen_edges(solved_graph(graph, values), kept), kept)
 
 
@@ -190,7 +189,7 @@ def _graduated(problem: _Problem, values: gtsam.Values, loop: BoolArray) -> tupl
 
 
 def _snooped(
-    problem: _Problem, values: gtsam.Values, loop: BoolArray, kept: BoolArray, too_wide: bool
+    problem: _Problem, values: gtsam.Values, loop: BoolArray, kept: BoolArray
 ) -> tuple[gtsam.Values, BoolArray]:
     """Take loops out and in, until all that are in pass the gate, and none besides."""
     rows = np.flatnonzero(loop)
@@ -203,7 +202,7 @@ def _snooped(
         squares[judged] = _judged(problem, values, rows[judged], kept)
         inside = kept[rows]
         gate = float(chi2.ppf(_CERTAIN, problem.k))
-        if too_wide and inside.sum() >= _FEWEST:
+        if inside.sum() >= _FEWEST:
             k = float(np.median(squares[inside])) / float(chi2.median(problem.k))
             gate = min(gate, _TAILS * k * problem.gate)
         judged = inside | (squares < 10 * problem.gate)  # the others stay far out
