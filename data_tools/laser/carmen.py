@@ -6,8 +6,9 @@
 
 m, rad and s; readings run from right to left. The first pose is the laser's, the second one the robot's, both by
 odometry; where they differ by the same transform throughout, that is where the laser is mounted. FLASER means 180
-degrees about the direction ahead: n readings of 180/n degrees where n is even, of 180/(n-1) where it is odd. Readings
-of the largest value that recurs say that nothing was hit. Source: http://carmen.sourceforge.net/logger_playback.html.
+degrees about the direction ahead, as CARMEN guesses: 180, 360 or 720 readings lack the last one of 181, 361 or 721, and
+400 or 401 readings are of a quarter degree each. A value far more frequent than those near it, with hardly a reading
+beyond, says that nothing was hit. Source: http://carmen.sourceforge.net/logger_playback.html.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from saga_fg.numerics.arrays import FloatArray
 _RECORDS = ("FLASER", "ROBOTLASER1")
 _UNPACK: dict[str, Callable[[bytes], bytes]] = {".bz2": bz2.decompress, ".gz": gzip.decompress}
 _LEAST_READINGS = 10
-_RECURS = 1e-4  # share of all readings from which on the largest value means that nothing was hit
+_RECURS = 1e-3  # share of all readings that a value must have to mean that nothing was hit; beyond it there are fewer
+_PEAK = 10.0  # how much more frequent it is than the values near it, on average
 _RIGID = 1e-3  # m and rad, that the mounting may vary by
 _LARGEST = 1e6  # m
 
@@ -85,9 +87,7 @@ def read_carmen(path: str | Path) -> LaserLog:
         raise InputError(f"{file}: expected records {' or '.join(_RECORDS)}, there are none")
     table, m = np.array(rows), len(angles)
     ranges, laser, robot = table[:, 1 : 1 + m], table[:, 1 + m : 4 + m], table[:, 4 + m :]
-    top = float(ranges.max())
-    if (ranges >= 0.999 * top).mean() > _RECURS:
-        largest = min(largest, 0.999 * top)
+    largest = min(largest, 0.999 * _nothing(ranges))
     ranges = np.where((ranges > 0) & (ranges < largest), ranges, np.nan)
     return LaserLog(table[:, 0], ranges, angles, robot, _mounting(robot, laser))
 
@@ -96,9 +96,25 @@ def _flaser(where: str, fields: list[str]) -> tuple[FloatArray, FloatArray, floa
     n = _count(where, fields, 0)
     if len(fields) != n + 10:
         raise InputError(f"{where}: expected {n + 10} values after FLASER, for {n} readings, got {len(fields)}")
-    step = np.pi / (n if n % 2 == 0 else n - 1)
+    quarter = n in (400, 401)
+    step = np.deg2rad(0.25) if quarter else np.pi / (n if n in (180, 360, 720) else n - 1)
     values = _numbers(where, [fields[n + 7], *fields[1 : n + 7]])
-    return values, np.asarray(-np.pi / 2 + step * np.arange(n), dtype=np.float64), np.inf
+    start = -np.deg2rad(50) if quarter else -np.pi / 2
+    return values, np.asarray(start + step * np.arange(n), dtype=np.float64), np.inf
+
+
+def _nothing(ranges: FloatArray) -> float:
+    """The value of readings that hit nothing; infinite where there is none."""
+    values = np.sort(ranges[ranges > 0])
+    n = len(values)
+    if not n:
+        return np.inf
+    for value in np.unique(values[-max(1, int(_RECURS * n)) - 1 :])[::-1]:  # beyond it few readings
+        at, about = (np.searchsorted(values, [(1 - w) * value, (1 + w) * value]) for w in (1e-3, 0.1))
+        peak, near = at[1] - at[0], about[1] - about[0]
+        if peak > _RECURS * n and peak > _PEAK * (near - peak) / 100:  # those near it lie in a hundred times the width
+            return float(value)
+    return np.inf
 
 
 def _robotlaser(where: str, fields: list[str]) -> tuple[FloatArray, FloatArray, float]:

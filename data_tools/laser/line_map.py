@@ -17,10 +17,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 SIGMA = 0.04  # m, of a point about its line: noise of the laser, and what is not a line
+SMEAR = 4.0  # how often the points of a wall say the same: information of a registration is divided by this
+_WEAK = 0.3  # ratio of information along and across below which few points tell the way along
 _NEIGHBOURS, _REACH = 8, 0.4  # of a point that determine its line, and m from it
+_COARSE = 0.12  # m: lines are those of means in such cells, so that the noise of dense scans is averaged
+_FEWEST = 4  # of them
 _FLAT = 0.15  # largest ratio of the standard deviations across and along a line
 _ITERATIONS, _STEP = 20, 1e-4
 
@@ -42,26 +46,18 @@ class LineMap:
     tree: cKDTree
     points: FloatArray
     normals: FloatArray
-    flat: FloatArray
+    flat: BoolArray
 
     @classmethod
     def of(cls, points: FloatArray, cell: float = 0.04) -> LineMap:
-        """A map of points (n, 2), one for each cell, m."""
-        points = thinned(points, cell)
+        """A map of points (n, 2), their mean in each cell, m."""
+        points = cell_means(points, cell)
         tree = cKDTree(points)
-        k = min(_NEIGHBOURS, len(points))
-        distance, rows = tree.query(points, k=k, distance_upper_bound=_REACH)
-        known = np.isfinite(distance).reshape(len(points), k)
-        near = points[np.where(known, rows.reshape(len(points), k), 0)]
-        weight = known / np.maximum(known.sum(axis=1, keepdims=True), 1)
-        centre = (weight[:, :, None] * near).sum(axis=1)
-        off = near - centre[:, None]
-        xx, yy, xy = ((weight * a).sum(axis=1) for a in (off[..., 0] ** 2, off[..., 1] ** 2, off[..., 0] * off[..., 1]))
-        half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-        angle = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
-        normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        flat = (known.sum(axis=1) >= 4) & (half - root <= _FLAT**2 * (half + root))
-        return cls(tree, points, normals, flat)
+        normals, ratio = _lines(points, points)
+        wider, wider_ratio = _lines(points, cell_means(points, _COARSE))
+        better = wider_ratio < ratio
+        normals[better] = wider[better]
+        return cls(tree, points, normals, np.minimum(ratio, wider_ratio) <= _FLAT**2)
 
     def fit(self, scan: FloatArray, pose: FloatArray, prior: FloatArray, reach: float, near: float = 0.15) -> Fit:
         """Register points (n, 2) of a scan from a pose (3,), of which odometry knows `prior` (3, 3).
@@ -86,13 +82,44 @@ class LineMap:
             w = 1 / (1 + (r / (2 * SIGMA)) ** 2) / SIGMA**2
             J = np.column_stack([n, n[:, 1] * arms[:, 0] - n[:, 0] * arms[:, 1]])
             H = J.T @ (w[:, None] * J)
-            gradient = J.T @ (w * r) + prior @ difference(x, start)
-            step = -np.linalg.solve(H + prior, gradient)
+            known = prior + _along_weak(H, prior)
+            gradient = J.T @ (w * r) + known @ difference(x, start)
+            step = -np.linalg.solve(H + known, gradient)
             x = x + step
             if farthest == near and np.abs(step).max() < _STEP:
                 break
         distance, _ = self.tree.query(_turned(scan, x[2]) + x[:2], distance_upper_bound=near)
         return Fit(x, H, float(np.isfinite(distance).mean()) if len(scan) else 0.0)
+
+
+def _lines(points: FloatArray, map_points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normal (n, 2) of the line through the nearest points of a map, and the ratio (n,) of variances across and along.
+
+    The ratio is infinite where fewer than four points are near.
+    """
+    k = min(_NEIGHBOURS, len(map_points))
+    distance, rows = cKDTree(map_points).query(points, k=k, distance_upper_bound=_REACH)
+    known = np.isfinite(distance).reshape(len(points), k)
+    near = map_points[np.where(known, rows.reshape(len(points), k), 0)]
+    weight = known / np.maximum(known.sum(axis=1, keepdims=True), 1)
+    centre = (weight[:, :, None] * near).sum(axis=1)
+    off = near - centre[:, None]
+    xx, yy, xy = ((weight * a).sum(axis=1) for a in (off[..., 0] ** 2, off[..., 1] ** 2, off[..., 0] * off[..., 1]))
+    half, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
+    normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    counts = (known.sum(axis=1) >= _FEWEST) & (half + root > 0)
+    return normals, np.where(counts, (half - root) / np.maximum(half + root, 1e-12), np.inf)
+
+
+def _along_weak(H: FloatArray, prior: FloatArray) -> FloatArray:
+    """Information (3, 3) to add to a prior in the direction that few points tell, whose errors are not independent."""
+    values, vectors = np.linalg.eigh(H[:2, :2])
+    added = np.zeros((3, 3))
+    if values[0] < _WEAK * values[1]:
+        u = vectors[:, 0]
+        added[:2, :2] = (SMEAR - 1) * (u @ prior[:2, :2] @ u) * np.outer(u, u)
+    return added
 
 
 def _turned(points: FloatArray, angle: float) -> FloatArray:
@@ -109,6 +136,17 @@ def difference(x: FloatArray, other: FloatArray) -> FloatArray:
 
 def thinned(points: FloatArray, cell: float) -> FloatArray:
     """One of the points (n, 2) in each cell, m."""
-    keys = np.floor(points / cell).astype(np.int64)
-    _, first = np.unique(keys[:, 0] * 4_000_037 + keys[:, 1], return_index=True)
+    _, first = np.unique(_cells(points, cell), return_index=True)
     return np.asarray(points[np.sort(first)])
+
+
+def cell_means(points: FloatArray, cell: float) -> FloatArray:
+    """Mean of the points (n, 2) in each cell, m: the noise of several readings is averaged."""
+    _, part = np.unique(_cells(points, cell), return_inverse=True)
+    sums = [np.bincount(part, weights=column) for column in points.T]
+    return np.asarray(np.stack(sums, axis=1) / np.bincount(part)[:, None])
+
+
+def _cells(points: FloatArray, cell: float) -> IntArray:
+    keys = np.floor(points / cell).astype(np.int64)
+    return np.asarray(keys[:, 0] * 4_000_037 + keys[:, 1])

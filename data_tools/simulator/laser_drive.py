@@ -6,6 +6,7 @@ constant share and at random, so that odometry does not close. All is known: the
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,28 +17,48 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.planar_poses import transforms
 
 _OUTER, _WIDTH = (30.0, 20.0), 3.0  # m: the building, its corridor
-_STEP, _PERIOD = 0.15, 0.2  # m and s between scans
-_READINGS, _REACH, _NOISE = 180, 20.0, 0.01  # of a scan; m
+_PERIOD = 0.2  # s between scans
 _BIAS, _SPREAD = 0.006, 0.01  # rad per m that the wheels turn too far, and rad per root metre at random
 _NOTHING = 81.91  # m, what the laser says where it hits nothing
 
 
-def laser_drive(seed: int, rounds: float = 1.5) -> tuple[LaserLog, FloatArray]:
+@dataclass(frozen=True)
+class LaserKind:
+    """A laser and its robot.
+
+    readings over `field`, rad; reach, noise (standard deviation) and steps between scans, m; missing: share of readings
+    that hit nothing; wheels: ratio of the way that they tell to the true one; people: who walk ahead of the robot
+    """
+
+    readings: int = 180
+    field: float = np.pi
+    reach: float = 20.0
+    noise: float = 0.01
+    missing: float = 0.0
+    step: float = 0.15
+    wheels: float = 1.02
+    people: int = 0
+
+
+def laser_drive(seed: int, rounds: float = 1.5, kind: LaserKind | None = None) -> tuple[LaserLog, FloatArray]:
     """A log of a drive, and the true poses (n, 3, 3), the first one at the origin."""
-    rng = np.random.default_rng(seed)
+    rng, kind = np.random.default_rng(seed), kind or LaserKind()
     walls = _walls(rng)
-    x = _path(rounds)
+    x = _path(rounds, kind.step)
     n = len(x)
-    angles = np.asarray(-np.pi / 2 + np.pi / _READINGS * np.arange(_READINGS), dtype=np.float64)
-    ranges = np.stack([_rays(walls, pose, angles) for pose in x])
-    ranges = ranges + _NOISE * rng.normal(size=ranges.shape)
-    ranges[ranges > _REACH] = np.nan
+    whole = kind.readings - kind.readings % 2
+    angles = np.asarray(kind.field * (np.arange(kind.readings) / whole - 0.5), dtype=np.float64)
+    ranges = np.stack([_rays(_with_people(walls, kind.people, k, pose), pose, angles) for k, pose in enumerate(x)])
+    ranges = ranges + kind.noise * rng.normal(size=ranges.shape)
+    ranges[ranges > kind.reach] = np.nan
+    if kind.missing > 0:
+        ranges[rng.random(ranges.shape) < kind.missing] = np.nan
     true = transforms(x)
     steps = np.linalg.inv(true[:-1]) @ true[1:]
     way = np.hypot(steps[:, 0, 2], steps[:, 1, 2])
     turn = np.arctan2(steps[:, 1, 0], steps[:, 0, 0]) + _BIAS * way + _SPREAD * np.sqrt(way) * rng.normal(size=n - 1)
     heading = np.concatenate([[0.0], np.cumsum(turn)])
-    ahead = 1.02 * way  # wheels a little too small
+    ahead = kind.wheels * way
     place = np.stack([np.cumsum(ahead * np.cos(heading[:-1])), np.cumsum(ahead * np.sin(heading[:-1]))], axis=1)
     odometry = np.column_stack([np.concatenate([np.zeros((1, 2)), place]), heading])
     time = np.asarray(_PERIOD * np.arange(n), dtype=np.float64)
@@ -68,23 +89,39 @@ def _walls(rng: np.random.Generator) -> FloatArray:
         else:
             x, y = w if side == 1 else 0.0, along * h
             boxes.append((x, y, x + (-deep if side == 1 else deep), y + long))
+    return _sides(boxes)
+
+
+def _with_people(walls: FloatArray, people: int, k: int, pose: FloatArray) -> FloatArray:
+    """Segments with boxes of people who walk ahead at scan k, each off to another side, and draw away by and by."""
+    boxes = []
+    for number in range(people):
+        far = 1.5 + (0.01 * k + 2.5 * number) % 5
+        turn = pose[2] + 0.3 * np.sin(0.05 * k + 2 * number)
+        x, y = pose[:2] + far * np.array([np.cos(turn), np.sin(turn)])
+        boxes.append((x - 0.15, y - 0.1, x + 0.15, y + 0.1))
+    return np.concatenate([walls, _sides(boxes)]) if boxes else walls
+
+
+def _sides(boxes: list[tuple[float, float, float, float]]) -> FloatArray:
+    """Segments (k, 2, 2) of boxes: x and y of two corners."""
     corners = np.array([[(a, b), (c, b), (c, d), (a, d)] for a, b, c, d in boxes])
     return np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
 
 
-def _path(rounds: float) -> FloatArray:
+def _path(rounds: float, step: float) -> FloatArray:
     """Poses (n, 3): x, y, heading along the middle of the corridor, with round corners."""
     (w, h), m, r = _OUTER, _WIDTH / 2, 1.0
     long, short = w - 2 * m - 2 * r, h - 2 * m - 2 * r
     lengths = np.array([long, r * np.pi / 2, short, r * np.pi / 2] * 2)
     ends = np.cumsum(lengths)
-    way = np.arange(0.0, rounds * ends[-1], _STEP)
+    way = np.arange(0.0, rounds * ends[-1], step)
     turned = 2 * np.pi * (way // ends[-1])
     part = np.searchsorted(ends, way % ends[-1], side="right")
     inside = way % ends[-1] - (ends - lengths)[part]
     heading = turned + np.pi / 2 * (part // 2) + np.where(part % 2 == 1, inside / r, 0.0)
     middle = (heading[1:] + heading[:-1]) / 2
-    steps = _STEP * np.stack([np.cos(middle), np.sin(middle)], axis=1)
+    steps = step * np.stack([np.cos(middle), np.sin(middle)], axis=1)
     place = np.array([m + r, m]) + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     return np.column_stack([place, heading])
 

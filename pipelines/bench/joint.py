@@ -23,11 +23,14 @@ from pipelines.bench.joint_objects import (
     ObjectErrors,
     ObjectRow,
     by_recording,
+    detected_by,
     object_changes,
     object_rows,
     object_tables,
+    planar_states,
     true_objects,
     true_speeds,
+    truth_at,
 )
 from pipelines.bench.simulated_poles import poles_at
 from pipelines.config import TrackConfig
@@ -153,23 +156,18 @@ def score_objects(run: JointRun, scene: Scene, config: TrackConfig, settings: Jo
     errors = {name: ObjectErrors() for name in ("decoupled", "held", "joint")}
     labelled = []
     for k, frame in enumerate(run.frames):
-        moment = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
         detections = in_ego(frame, tracker.sensor(frame.sensor))
         tracks = tracker.step(Frame(frame.timestamp, frame.sensor, detections, driven[k], "ego"))
-        if abs(scene.timestamps[moment] - frame.timestamp) > 1e-3:
+        if (truth := truth_at(scene, frame.timestamp)) is None:
             continue
-        truth = scene.ground_truth[moment]
         labelled.append((k, truth))
         objects = true_objects(detections, frame.world_T_ego, truth)
-        boxes = np.concatenate([tracks.boxes.position[:, :2], tracks.boxes.velocity], axis=1)
-        found = {"decoupled": (tracks.id, boxes, driven[k], tracker.assignment)}
+        found = {"decoupled": (tracks.id, planar_states(tracks.boxes), driven[k], tracker.assignment)}
         for name, one in (("held", held), ("joint", run.estimate)):
             now = one.objects[k]
-            states = np.concatenate([now.position, now.velocity], axis=1)
-            found[name] = now.id, states, one.world_T_ego[k], one.assignment(k)
+            found[name] = now.id, planar_states(now), one.world_T_ego[k], one.assignment(k)
         for name, (ids, states, pose, assignment) in found.items():
-            detected = zip(assignment.id.tolist(), assignment.detection.tolist(), strict=True)
-            errors[name].add(k, ids, states, (pose, true[k]), detected, objects, truth)
+            errors[name].add(k, ids, states, (pose, true[k]), detected_by(assignment), objects, truth)
     return object_rows(errors, true_speeds(labelled))
 
 

@@ -19,12 +19,14 @@ from data_tools.figures import FigureTable, cell, percent
 from data_tools.metrics import Interval, paired_bootstrap
 from saga_fg.graph import EGO_POSE, Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import assign
+from saga_fg.numerics.assignment import Assignment, assign
+from saga_fg.slam.joint.estimate import ObjectStates
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations
+from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections
 
 NEAR, SETTLED = 2.0, 3  # m, of a detection from the object that it is of; frames
+_SAME_TIME = 1e-3  # s, between a frame and its truth
 MOVING = 1.0  # m/s, from which an object moves
 FIGURES = ("world position", "world velocity", "ego position", "ego velocity")
 Pair = tuple[int, str]  # frame, object
@@ -90,6 +92,23 @@ class ObjectErrors:
 def _from_vehicle(state: FloatArray, pose: FloatArray) -> FloatArray:
     R = pose[:2, :2]
     return np.concatenate([(state[:2] - pose[:2, 3]) @ R, state[2:] @ R])
+
+
+def truth_at(scene: Scene, time: float) -> Annotations | None:
+    """The truth of a moment, s; None where the scene has none then."""
+    moment = int(np.argmin(np.abs(scene.timestamps - time)))
+    there = scene.ground_truth is not None and abs(scene.timestamps[moment] - time) <= _SAME_TIME
+    return scene.ground_truth[moment] if scene.ground_truth is not None and there else None
+
+
+def planar_states(objects: Boxes | ObjectStates) -> FloatArray:
+    """States (n, 4) of objects: place and velocity in the plane."""
+    return np.concatenate([objects.position[:, :2], objects.velocity], axis=1)
+
+
+def detected_by(assignment: Assignment) -> list[tuple[int, int]]:
+    """Each track with its detection."""
+    return list(zip(assignment.id.tolist(), assignment.detection.tolist(), strict=True))
 
 
 def true_objects(detections: Detections, world_T_ego: FloatArray | None, truth: Annotations) -> dict[int, int]:

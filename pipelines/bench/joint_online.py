@@ -19,11 +19,14 @@ from pipelines.bench.joint_objects import (
     ObjectErrors,
     ObjectRow,
     by_recording,
+    detected_by,
     object_changes,
     object_rows,
     object_tables,
+    planar_states,
     true_objects,
     true_speeds,
+    truth_at,
 )
 from pipelines.config import TrackConfig
 from pipelines.slam.joint import degraded_drive, path_tracker
@@ -99,24 +102,21 @@ def _run(scene: Scene, config: TrackConfig, settings: JointSettings, sensor: str
     labelled = []
     for k, frame in enumerate(frames):
         detections = in_ego(frame, alone.sensor(sensor))
-        moment = int(np.argmin(np.abs(scene.timestamps - frame.timestamp)))
-        truth, there = scene.ground_truth[moment], abs(scene.timestamps[moment] - frame.timestamp) < 1e-3
-        labelled += [(k, truth)] if there else []
-        objects = true_objects(detections, frame.world_T_ego, truth) if there else {}
         tracks = alone.step(Frame(frame.timestamp, frame.sensor, detections, driven[k], "ego"))
-        boxes = np.concatenate([tracks.boxes.position[:, :2], tracks.boxes.velocity], axis=1)
         step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
         newest.append(step.newest.world_T_ego[-1])
         settled += [] if step.settled is None else [*step.settled.world_T_ego]
+        if (truth := truth_at(scene, frame.timestamp)) is None:
+            continue
+        labelled.append((k, truth))
+        objects = true_objects(detections, frame.world_T_ego, truth)
         now = step.newest.objects[-1]
-        states = np.concatenate([now.position, now.velocity], axis=1)
-        for name, tracker, ids, found, pose in (
-            ("decoupled", alone, tracks.id, boxes, driven[k]),
-            ("joint", joined, now.id, states, newest[-1]),
+        for name, tracker, ids, states, pose in (
+            ("decoupled", alone, tracks.id, planar_states(tracks.boxes), driven[k]),
+            ("joint", joined, now.id, planar_states(now), newest[-1]),
         ):
-            seen = tracker.assignment
-            detected = zip(seen.id.tolist(), seen.detection.tolist(), strict=True)
-            errors[name].add(k, ids, found, (pose, path.world_T_ego[k]), detected, objects, truth)
+            detected = detected_by(tracker.assignment)
+            errors[name].add(k, ids, states, (pose, path.world_T_ego[k]), detected, objects, truth)
     settled += [*estimator.window().world_T_ego]
     paths = (Trajectory(path.timestamps, np.stack(one)) for one in (list(driven), newest, settled))
     ate = [trajectory_errors(one, path).ate for one in paths]

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_tools.laser.line_map import Fit
+from data_tools.laser.line_map import SMEAR, Fit
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.planar_poses import moved, transform
 from saga_fg.slam.pose_graph.running import Measured
 
-SMEAR = 4.0  # how often the points of a wall say the same: information of a registration is divided by this
 _FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any number of points, m^2 and rad^2
 _DETERMINED = 0.05  # ratio of information along and across below which a place is a bare corridor
 

@@ -1,8 +1,15 @@
-"""Odometry of a robot with a planar laser, without implausible steps."""
+"""Odometry of a robot with a planar laser, without implausible steps, and the scale of the wheels.
+
+Along a bare corridor odometry alone tells the way, and wheels of another size than the robot believes err by some per
+cent. The scale k is estimated from the steps s that registration determines, as x ahead:
+
+    s_registered = k s_wheels + noise of variance v,        k ~ N(1, 0.05^2)
+"""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +18,10 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.planar_poses import transforms, vectors
 
 _SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
+_SCALE = 0.05  # standard deviation of the scale of wheels
+_STEP_NOISE = 0.02  # m, of a step that registration determines: it errs with the map
+_KNOWN = 0.005  # standard deviation at which the scale is as good as known
+_BELIEVED = 0.3  # share of a step by which registration may differ: beyond, wheels slipped, or it erred
 _log = logging.getLogger(__name__)
 
 
@@ -34,3 +45,36 @@ def without_jumps(log: LaserLog, largest_speed: float) -> tuple[FloatArray, int]
     for row in jumps.tolist():  # what follows moves by what the jump did
         wheels[row + 1 :] = wheels[row] @ np.linalg.inv(wheels[row + 1]) @ wheels[row + 1 :]
     return vectors(wheels), len(jumps)
+
+
+@dataclass(eq=False)
+class WheelScale:
+    """Ratio of ways driven to those that the wheels tell, from steps that registration determines."""
+
+    _information: float = _SCALE**-2
+    _weighted: float = _SCALE**-2
+
+    @property
+    def value(self) -> float:
+        """The estimate of k."""
+        return self._weighted / self._information
+
+    @property
+    def known(self) -> bool:
+        """True if more steps hardly change it."""
+        return self._information > _KNOWN**-2
+
+    def corrected(self, step: FloatArray) -> FloatArray:
+        """A step (3, 3) of the wheels in true metres."""
+        scaled = step.copy()
+        scaled[:2, 2] *= self.value
+        return scaled
+
+    def update(self, predicted: FloatArray, registered: FloatArray, covariance: FloatArray) -> None:
+        """Take a corrected step of the wheels and that by registration (3, 3), with the covariance of the latter."""
+        wheels, driven = float(predicted[0, 2]) / self.value, float(registered[0, 2])
+        if abs(driven - predicted[0, 2]) > _BELIEVED * abs(predicted[0, 2]):
+            return
+        weight = 1 / (float(covariance[0, 0]) + _STEP_NOISE**2)
+        self._information += weight * wheels**2
+        self._weighted += weight * wheels * driven

@@ -15,12 +15,12 @@ from typing import Annotated
 import numpy as np
 
 from data_tools.laser.carmen import LaserLog
-from data_tools.laser.line_map import LineMap, thinned
+from data_tools.laser.line_map import SMEAR, LineMap, thinned
 from data_tools.laser.score_grid import ScoreGrid
 from pipelines.slam.laser_interpolation import between_keyframes
-from pipelines.slam.laser_keyframes import SMEAR, Keyframe, covariance_of
+from pipelines.slam.laser_keyframes import Keyframe, covariance_of
 from pipelines.slam.laser_loops import LoopSearch
-from pipelines.slam.laser_odometry import without_jumps
+from pipelines.slam.laser_odometry import WheelScale, without_jumps
 from pipelines.slam.laser_passes import registered_passes
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
@@ -76,10 +76,15 @@ class LaserPath:
 
 @dataclass(eq=False)
 class LaserSlam:
-    """Scans in, poses out: `step` for each scan, `finish` at the end."""
+    """Scans in, poses out: `step` for each scan, `finish` at the end.
+
+    robot_T_laser (3, 3); scale: of the wheels, estimated on the way; loops: False for scan matching alone
+    """
 
     settings: LaserSettings = field(default_factory=LaserSettings)
     robot_T_laser: FloatArray = field(default_factory=lambda: np.eye(3))
+    scale: WheelScale = field(default_factory=WheelScale)
+    loops: bool = True
     _keyframes: list[Keyframe] = field(default_factory=list)
     _matched: list[FloatArray] = field(default_factory=list)
     _graph: RunningPoseGraph | None = None
@@ -89,13 +94,14 @@ class LaserSlam:
     _odometry: FloatArray | None = None
     _wheels: FloatArray = field(default_factory=lambda: np.eye(3))
     _information: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    _seen: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     _search: LoopSearch | None = None
 
     def step(self, points: FloatArray, odometry: FloatArray) -> FloatArray:
         """Take a scan, points (n, 2) in the laser's frame, and the wheels' pose (3,); returns the pose (3, 3) now."""
         points = points @ self.robot_T_laser[:2, :2].T + self.robot_T_laser[:2, 2]
         wheels = transform(odometry)
-        step = np.eye(3) if self._odometry is None else np.linalg.inv(self._odometry) @ wheels
+        step = np.eye(3) if self._odometry is None else self.scale.corrected(np.linalg.inv(self._odometry) @ wheels)
         if self._graph is None:  # by the wheels until a scan tells where it is
             self._at, self._odometry = self._at @ step, wheels
             self._matched.append(self._at)
@@ -107,7 +113,9 @@ class LaserSlam:
         if (way < _SCAN_STEP and turn < np.deg2rad(3)) or len(points) < _LEAST_POINTS:
             self._matched.append(predicted)
             return self._now(predicted)
-        self._at, self._odometry = self._registered(points, predicted, way, turn), wheels
+        before, self._at = self._at, self._registered(points, predicted, way, turn)
+        self._odometry = wheels
+        self.scale.update(step, np.linalg.inv(before) @ self._at, covariance_of(self._seen, self._at))
         self._matched.append(self._at)
         since = np.linalg.inv(self._keyframes[-1].matched) @ self._at
         if (
@@ -161,7 +169,8 @@ class LaserSlam:
             if found is not None:
                 other = self._map.fit(scan, found.pose, 0.01 * prior, reach=0.3)
                 fit = max(fit, other, key=lambda each: each.share)
-        self._information = fit.information / SMEAR + prior
+        self._seen = fit.information / SMEAR
+        self._information = self._seen + prior
         return transform(fit.pose)
 
     def _add_keyframe(self, points: FloatArray, matched: FloatArray, since: FloatArray) -> None:
@@ -172,13 +181,16 @@ class LaserSlam:
         if self._graph is None:
             self._graph = RunningPoseGraph(matched)
         else:
-            off = vector(np.linalg.inv(since) @ np.linalg.inv(self._wheels) @ self._odometry)
+            wheels = self.scale.corrected(np.linalg.inv(self._wheels) @ self._odometry)
+            off = vector(np.linalg.inv(since) @ wheels)
             doubt = _DOUBT * np.array([np.hypot(off[0], off[1])] * 2 + [abs(off[2])]) + [0.0, 0.0, _TURNING * turn]
             self._graph.append(since, covariance_of(self._information, matched) + np.diag(doubt**2))
         self._wheels = self._odometry
         recent = [frame for frame in frames if frame.way > way - s.local_map]
         self._map = LineMap.of(np.concatenate([moved(frame.points, frame.matched) for frame in recent]))
         self._grid = None
+        if not self.loops:
+            return
         self._search = self._search or LoopSearch(frames, self._graph, s.submap, s.loop_drift, s.loop_score)
         self._search.extend()
         if len(frames) % 2 == 0:
@@ -189,10 +201,21 @@ class LaserSlam:
 
 def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: Progress | None = None) -> LaserPath:
     """The path of a log."""
-    slam = LaserSlam(settings or LaserSettings(), transform(log.robot_T_laser))
-    odometry, jumps = without_jumps(log, slam.settings.largest_speed)
+    settings = settings or LaserSettings()
+    odometry, jumps = without_jumps(log, settings.largest_speed)
+    slam = LaserSlam(settings, transform(log.robot_T_laser), _wheel_scale(log, odometry, settings))
     for row in range(len(log)):
         slam.step(log.points(row, slam.settings.largest_range), odometry[row])
         if progress is not None:
             progress("scans", row + 1, len(log))
     return replace(slam.finish(progress), jumps=jumps)
+
+
+def _wheel_scale(log: LaserLog, odometry: FloatArray, settings: LaserSettings) -> WheelScale:
+    """The scale of the wheels from the log: what is driven before it is known shall count alike."""
+    slam = LaserSlam(settings, transform(log.robot_T_laser), loops=False)
+    for row in range(len(log)):
+        slam.step(log.points(row, settings.largest_range), odometry[row])
+        if slam.scale.known:
+            break
+    return slam.scale

@@ -55,7 +55,6 @@ from saga_fg.slam.sensors import (
     false_fixes,
     misfits,
     sensor_providers,
-    unjudged,
 )
 from saga_fg.slam.submaps import LoopClosure, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
@@ -225,8 +224,7 @@ class LidarSlam:
         self._finished, chosen = True, solved.loops.kept.tolist()
         if not all(chosen):
             _LOG.warning("%d of %d loops contradict the others, and are left out", chosen.count(False), len(chosen))
-        unfit = misfits(solved.graph, self._sensors, self.settings.sensors)
-        unknown = unjudged(solved.graph, self._sensors, self.settings.sensors)
+        unfit, unknown = misfits(solved.graph, self._sensors, self.settings.sensors)
         far = false_fixes(solved.graph, self.settings.sensors) if "gps" in self._sensors else ""
         for text in filter(None, (*unfit.values(), *unknown.values(), far)):
             _LOG.warning(text)

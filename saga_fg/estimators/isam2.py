@@ -157,7 +157,7 @@ class IncrementalFilter(LatestMarginals):
         self._state, x = _solve(self._state)
         state = self._state
         steps = filter_epochs(state.before, list(state.epochs))
-        means = [*smoothed_means(steps)[:-1], x.mean]
+        means = [*smoothed_means(reversed(steps))[:-1], x.mean]
         return recording_graph(state.before, state.epochs, [step.layout for step in steps], means)
 
     def snapshot(self) -> IncrementalState:

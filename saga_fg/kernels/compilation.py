@@ -14,7 +14,7 @@ import os
 import pkgutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import update_wrapper, wraps
+from functools import cache, update_wrapper, wraps
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
@@ -24,6 +24,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 log = logging.getLogger(__name__)
+_OPTIONS = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 _SCALARS = {"f": "float64", "i": "int64", "b": "boolean", "u": "uint32"}
 _kernels: list[Kernel[Any, Any]] = []  # of the modules that were imported
 _parts: set[Callable[..., Any]] = set()  # functions that kernels of the same module call
@@ -123,9 +124,8 @@ def _compiled(source: Callable[..., Any], arguments: str) -> Any:
     numba: Any = importlib.import_module("numba")
     _announce_compilation()
     signature = tuple(_argument(numba.types, kind) for kind in arguments.split())
-    options = {"error_model": "numpy", "nogil": True}
-    source = _with_compiled_parts(source, numba.njit(**options))
-    function = numba.njit(**options)(source)
+    source = _with_compiled_parts(source)
+    function = numba.njit(**_OPTIONS)(source)
     try:
         function.enable_caching()
         function.compile(signature)
@@ -133,18 +133,24 @@ def _compiled(source: Callable[..., Any], arguments: str) -> Any:
         folder = function.stats.cache_path or "disk"
         _say_once("kernels cannot be loaded from %s or kept there, and are compiled anew: %s", folder, repr(error))
         if not function.signatures:
-            return numba.njit(signature, **options)(source)
+            return numba.njit(signature, **_OPTIONS)(source)
     function.disable_compile()
     return function
 
 
-def _with_compiled_parts(source: Callable[..., Any], compiler: Callable[..., Any]) -> Callable[..., Any]:
+def _with_compiled_parts(source: Callable[..., Any]) -> Callable[..., Any]:
     """The function with its parts compiled, and theirs."""
     names = [name for name in source.__code__.co_names if source.__globals__.get(name) in _parts]
     if not names:
         return source
-    parts = {name: compiler(_with_compiled_parts(source.__globals__[name], compiler)) for name in names}
+    parts = {name: _compiled_part(source.__globals__[name]) for name in names}
     return update_wrapper(FunctionType(source.__code__, source.__globals__ | parts, source.__name__), source)
+
+
+@cache  # kernels share their parts
+def _compiled_part(source: Callable[..., Any]) -> Any:
+    numba: Any = importlib.import_module("numba")
+    return numba.njit(**_OPTIONS, no_cpython_wrapper=True)(_with_compiled_parts(source))
 
 
 def _argument(types: Any, kind: str) -> Any:

@@ -111,7 +111,8 @@ def regrouped_blocks(
         c = new_label[k]
         if whole[c] and of[c] >= 0:
             old, new, area = start[of[c]], new_start[k], new_size[k] * new_size[k]
-            result[new : new + area] = flat[old : old + area]
+            for e in range(area):
+                result[new + e] = flat[old + e]
             of[c] = -1
     latest, before = np.full(count, -1, dtype=np.int64), np.full(n, -1, dtype=np.int64)
     for k in range(n):  # before[k]: the node of its component that comes before it

@@ -180,21 +180,26 @@ def coupling_integrals(
     # second[j, t]: what the series of exp(A_j h) has come to; then the squares of both exponentials
     second, doubled = np.empty((len(A), degree + 1, q, q)), np.empty((len(A), doublings + 1, q, q))
     first, made = np.empty((len(M), doublings + 1, p, p)), np.zeros(len(M), dtype=np.bool_)
+    A_j = np.empty((q, q))
     for j in range(len(A)):
-        _exponential_series(second[j], A[j], h)
+        _set_scaled(A_j, A[j], 1.0)
+        _exponential_series(second[j], A_j, h)
         _squares(doubled[j], second[j, 0])
     result = np.empty((m, p, q))
     corner, product, own = np.empty((p, q)), np.empty((p, q)), np.empty((degree + 1, p, p))
+    M_i, C_e = np.empty((p, p)), np.empty((p, q))  # parts are compiled once for arrays like these
     for e in range(m):
         i, j = at[e], of[e]
+        _set_scaled(M_i, M[i], 1.0)
+        _set_scaled(C_e, C[e], 1.0)
         if doublings > 0 and not made[i]:
             made[i] = True
-            _exponential_series(own, M[i], h)
+            _exponential_series(own, M_i, h)
             _squares(first[i], own[0])
-        _set_scaled(corner, C[e], 0.0)
+        _set_scaled(corner, C_e, 0.0)
         for t in range(degree, 0, -1):
-            _set_product(product, M[i], corner)
-            _add_product(product, C[e], second[j, t])
+            _set_product(product, M_i, corner)
+            _add_product(product, C_e, second[j, t])
             for a in range(p):
                 for b in range(q):
                     corner[a, b] = product[a, b] * h / t

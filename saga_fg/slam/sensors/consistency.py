@@ -26,16 +26,22 @@ _BOUND = 0.9  # of the squared scale of a Cauchy loss: a residual three times th
 _BIAS = 4.0  # standard deviations of the prior
 
 
-def misfits(graph: SceneFactorGraph, sensors: Collection[str], settings: SensorSettings) -> dict[str, str]:
-    """Inconsistent sensors, each with an explanation, by name; the least consistent one first.
+def misfits(
+    graph: SceneFactorGraph, sensors: Collection[str], settings: SensorSettings
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Inconsistent sensors, the least consistent one first, and those that have measured too little to judge them.
 
-    graph: as solved, of providers by `sensor_providers`
+    Each has an explanation, by name. graph: as solved, of providers by `sensor_providers`
     """
-    point, found = graph.point(), dict[str, tuple[float, str]]()
+    point, found, unjudged = graph.point(), dict[str, tuple[float, str]](), dict[str, str]()
     for sensor in sensors:
         name = getattr(settings, sensor).name
         scores = residual_scores(graph, name, point)
-        if len(scores) >= LEAST and np.median(scores) > LARGEST:
+        if len(scores) < LEAST:
+            unjudged[sensor] = (
+                f"{name}: too few measurements to judge whether it fits: {len(scores)}, {LEAST} are needed"
+            )
+        elif np.median(scores) > LARGEST:
             found[sensor] = (
                 float(np.median(scores)),
                 (
@@ -54,18 +60,7 @@ def misfits(graph: SceneFactorGraph, sensors: Collection[str], settings: SensorS
                     "check how its settings turn it on the vehicle, its units, and gravity"
                 ),
             )
-    return {sensor: text for sensor, (_, text) in sorted(found.items(), key=lambda one: -one[1][0])}
-
-
-def unjudged(graph: SceneFactorGraph, sensors: Collection[str], settings: SensorSettings) -> dict[str, str]:
-    """The sensors, by name, that have measured too little for `misfits` to judge them, in words."""
-    point, found = graph.point(), dict[str, str]()
-    for sensor in sensors:
-        name = getattr(settings, sensor).name
-        count = len(residual_scores(graph, name, point))
-        if count < LEAST:
-            found[sensor] = f"{name}: too few measurements to judge whether it fits: {count}, {LEAST} are needed"
-    return found
+    return {sensor: text for sensor, (_, text) in sorted(found.items(), key=lambda one: -one[1][0])}, unjudged
 
 
 def false_fixes(graph: SceneFactorGraph, settings: SensorSettings) -> str:

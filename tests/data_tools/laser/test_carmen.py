@@ -40,6 +40,45 @@ def test_both_records_say_the_same(tmp_path: Path, record: str, last: float) -> 
     assert np.isnan(log.ranges[0, 10])  # the largest, which recurs
 
 
+@pytest.mark.parametrize(
+    ("readings", "first", "last"),
+    [
+        (180, -90, 89),
+        (181, -90, 90),
+        (360, -90, 89.5),
+        (361, -90, 90),
+        (400, -50, 49.75),
+        (401, -50, 50),
+        (540, -90, 90),
+    ],
+)
+def test_directions_are_those_that_carmen_guesses(tmp_path: Path, readings: int, first: float, last: float) -> None:
+    ranges = " ".join(f"{1 + k / 1000:.3f}" for k in range(readings))
+    (tmp_path / "drive.log").write_text(f"FLASER {readings} {ranges} 0 0 0 0 0 0 17.5 nohost 0.1\n")
+    angles = np.rad2deg(read_carmen(tmp_path / "drive.log").angles)
+    np.testing.assert_allclose(angles[[0, -1]], [first, last], atol=1e-9)
+
+
+@pytest.mark.parametrize("nothing", [8.0, 81.91])
+def test_a_value_that_stands_out_hit_nothing_though_a_few_lie_beyond(tmp_path: Path, nothing: float) -> None:
+    rng = np.random.default_rng(0)
+    ranges = np.round(rng.uniform(0.5, 7.9, (50, 180)), 2)
+    ranges[rng.random(ranges.shape) < 0.05] = nothing
+    ranges[7, 90] = 95.0
+    lines = [f"FLASER 180 {' '.join(map(str, row))} 0 0 0 0 0 0 {k} nohost {k}\n" for k, row in enumerate(ranges)]
+    (tmp_path / "drive.log").write_text("".join(lines))
+    read = read_carmen(tmp_path / "drive.log").ranges
+    np.testing.assert_array_equal(np.isnan(read), ranges >= nothing)
+    np.testing.assert_allclose(read[ranges < nothing], ranges[ranges < nothing])
+
+
+def test_without_such_a_value_all_readings_count(tmp_path: Path) -> None:
+    ranges = np.round(np.random.default_rng(0).uniform(0.5, 7.9, (50, 180)), 2)
+    lines = [f"FLASER 180 {' '.join(map(str, row))} 0 0 0 0 0 0 {k} nohost {k}\n" for k, row in enumerate(ranges)]
+    (tmp_path / "drive.log").write_text("".join(lines))
+    assert not np.isnan(read_carmen(tmp_path / "drive.log").ranges).any()
+
+
 def test_a_laser_ahead_of_the_robot_is_mounted_there(tmp_path: Path) -> None:
     (tmp_path / "ahead.log").write_text(FLASER)
     np.testing.assert_allclose(read_carmen(tmp_path / "ahead.log").robot_T_laser, [0.2, 0, 0], atol=1e-9)

@@ -28,7 +28,7 @@ def test_point_to_line_finds_the_pose(seed: int) -> None:
     lines = LineMap.of(room(rng))
     fit = lines.fit(seen_from(room(rng, 180), true), true + np.array([0.15, -0.1, 0.05]), np.eye(3), reach=0.5)
     assert (np.abs(fit.pose - true) < [0.01, 0.01, 0.005]).all()
-    assert fit.share > 0.99
+    assert fit.share > 0.97  # the sampled walls have gaps
     assert np.linalg.eigvalsh(fit.information[:2, :2])[0] > 0
 
 

@@ -59,7 +59,7 @@ class Run:
         return np.linalg.norm(self.path[:, :3, 3] - self.truth[:, :3, 3], axis=1)
 
     def misfits(self, sensors: tuple[str, ...], settings: SensorSettings) -> dict[str, str]:
-        return misfits(self.smoother.graph(), sensors, settings)
+        return misfits(self.smoother.graph(), sensors, settings)[0]
 
     def static(self, number: int) -> np.ndarray:
         return np.asarray(self.smoother.state(self.smoother.graph().of(EGO_CALIBRATION, None)[number].key))
