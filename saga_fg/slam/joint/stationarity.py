@@ -161,7 +161,8 @@ def _posteriors(log: FloatArray, shares: FloatArray) -> FloatArray:
 def _shares_of_traffic(log: FloatArray, time: FloatArray, judged: BoolArray) -> FloatArray:
     """Shares (K, N) of the hypotheses around each detection; log-likelihoods (K, N), time (N,); judged (N,) count."""
     order = np.argsort(time, kind="stable")
-    low, high = (np.searchsorted(time[order], time + by, side) for by, side in ((-_ALIKE, "left"), (_ALIKE, "right")))
+    low = np.searchsorted(time[order], time - _ALIKE, "left")
+    high = np.searchsorted(time[order], time + _ALIKE, "right")
     shares = np.full(log.shape, 1 / len(log))
     for _ in range(_ROUNDS):
         p = np.where(judged, _posteriors(log, shares), 0.0)[:, order]
