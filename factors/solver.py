@@ -35,6 +35,7 @@ from factors.validation import FloatArray, format_keys
 
 _LOG = logging.getLogger(__name__)
 _EXACT = 1e-12  # relative agreement of the error with its prediction from which a problem counts as linear
+_ROUNDING = 1e-9  # relative, of an error, at the most
 _MAX_DAMPING = 1e12
 _PIVOT = 1e-14  # relative to its column
 
@@ -129,7 +130,7 @@ def solve(
         move = _move(graph, factors, linear, ordering, values, error, damping, settings)
         if move is None:  # no damping helps: error and linearisation contradict each other
             return Solution(values, error, iteration, False, graph, factors)
-        _LOG.debug("iteration %d: error %.9g, step %.3g sigma", iteration, move.error, move.length)
+        _LOG.debug("iteration %d: error %.9g, damping %.3g", iteration, move.error, move.damping)
         values, error, damping = move.values, move.error, move.damping
         if damping == 0 and (move.length <= settings.tolerance or move.exact):
             return Solution(values, _final(graph, factors, values, error), iteration, True, graph, factors)
@@ -210,8 +211,9 @@ def check_jacobians(factors: Iterable[gtsam.CustomFactor], values: gtsam.Values)
 
 @dataclass(frozen=True)
 class _Move:
-    """values, error: where the step led (nan: nobody asked), length: of the step, in sigmas, damping: that it took,
-    exact: whether the error came out as the linearisation had said, which means that there is nothing nonlinear.
+    """values, error: where the step led (nan: nobody asked), length: of the step, in sigmas, or infinite where it is
+    longer than the tolerance for sure, damping: that it took, exact: whether the error came out as the linearisation
+    had said, which means that there is nothing nonlinear.
     """
 
     values: gtsam.Values
@@ -241,13 +243,14 @@ def _move(
             if not careful:
                 raise singular_system(linear)
         else:
-            length = _length(linear, step, damping)
             moved = values.retract(step)
             if not careful:
-                return _Move(moved, float("nan"), length, 0.0, False)
+                return _Move(moved, float("nan"), _length(linear, step, damping), 0.0, False)
+            moved_error = _error_or_infinity(graph, factors, moved)
+            gained = error - moved_error > max(settings.tolerance**2, _ROUNDING * error)  # twice what such a step gains
+            length = float("inf") if gained else _length(linear, step, damping)
             if undetermined and length <= settings.tolerance and damping <= settings.damping:
                 raise singular_system(linear)  # standing still, but only the damping says where
-            moved_error = _error_or_infinity(graph, factors, moved)
             if moved_error <= error * (1 + _EXACT) or (length <= settings.tolerance and damping == 0):
                 exact = abs(moved_error - linear.error(step)) <= _EXACT * error
                 return _Move(moved, moved_error, length, damping, exact)
@@ -288,11 +291,12 @@ def _step(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, damping: 
     if damping > 0:
         system = gtsam.GaussianFactorGraph()
         system.push_back(linear)
-        zero = linear.gradientAtZero()
+        zero, rows = linear.gradientAtZero(), {}
         for i in range(ordering.size()):
             key = ordering.at(i)
-            dim = zero.dim(key)
-            system.push_back(native_factor([key], [dim], np.sqrt(damping) * np.eye(dim, dim + 1)))
+            if (dim := zero.dim(key)) not in rows:
+                rows[dim] = np.asfortranarray(np.sqrt(damping) * np.eye(dim, dim + 1))
+            system.push_back(native_factor([key], [dim], rows[dim]))
     step: gtsam.VectorValues | None
     try:
         step = system.optimize(ordering)
@@ -326,5 +330,5 @@ def _step_by_qr(system: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> 
 
 def _length(linear: gtsam.GaussianFactorGraph, step: gtsam.VectorValues, damping: float) -> float:
     """Return sqrt(delta^T H delta); (H + lambda I) delta = g makes that g^T delta - lambda delta^T delta."""
-    square = -linear.gradientAtZero().dot(step) - damping * step.dot(step)
+    square = -linear.gradientAtZero().dot(step) - (damping * step.dot(step) if damping > 0 else 0.0)
     return float(np.sqrt(max(square, 0.0)))

@@ -130,7 +130,9 @@ def gaps(
     ] = None,
     of: Annotated[
         str | None,
-        typer.Option("--of", help="Make gaps of objects in this situation alone, as 'at red'.", metavar="SITUATION"),
+        typer.Option(
+            "--of", help="Make gaps of objects in one of these situations alone, with commas.", metavar="SITUATIONS"
+        ),
     ] = None,
     json_file: JsonFile = None,
     markdown: MarkdownFile = None,
@@ -193,9 +195,11 @@ def gaps(
         raise InputError("--plot: expected --passes of 1 or more, it shows made gaps")
     if situations and (life == "shipped" or passes == 0):
         raise InputError("--situations: expected --life kept or both, and --passes of 1 or more: it shows made gaps")
-    if of is not None and of not in SITUATIONS:
-        raise InputError(f"--of: {unknown_name('situation', of, SITUATIONS)}")
-    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths), of=of)
+    wanted = names("--of", of) if of is not None else ()
+    for name in wanted:
+        if name not in SITUATIONS:
+            raise InputError(f"--of: {unknown_name('situation', name, SITUATIONS)}")
+    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths), of=wanted)
     runs: dict[str, list[Run]] = {}
     with progress_bar(unit="runs") as progress:
         for source in sources:
@@ -219,7 +223,7 @@ def gaps(
         compared = _contenders(contenders, own or [], interactions, source.family, load_config(source.family, config))
         better = next((each for each in compared if each.name != against), compared[0])
         pair = [next(each for each in compared if each.name == against), better]
-        write_telling_picture(picture, source, runs[source.name], pair, of)
+        write_telling_picture(picture, source, runs[source.name], pair, wanted)
 
 
 def chosen_lengths(text: str | None) -> tuple[float, ...]:

@@ -305,13 +305,15 @@ def test_nothing_is_hidden_from_above() -> None:
 
 
 @pytest.mark.usefixtures("short_scenes")
-def test_gaps_may_be_of_one_situation_alone() -> None:
+def test_gaps_may_be_of_some_situations_alone() -> None:
     source = RecordingSource("simulated", scenes=1, labels=True)
-    settings = GapBenchSettings(1, ("kept",), (2.0,), of="visible leader")
+    settings = GapBenchSettings(1, ("kept",), (2.0,), of=("visible leader", "turning"))
     labelled, gaps = prepared(source, "scene-0001", settings, load_config("simulated").sensors)
     made = [gap for gap in gaps if gap.run > 0]
     assert made
-    assert all("visible leader" in situations_of(labelled, gap)[2.0] for gap in made)
+    found = [situations_of(labelled, gap)[2.0] for gap in made]
+    assert all(each & {"visible leader", "turning"} for each in found)
+    assert any("visible leader" in each for each in found)
 
 
 def test_fitted_noise_reaches_the_classes_and_nothing_else() -> None:
@@ -440,7 +442,7 @@ def test_the_command_refuses_recordings_without_gaps(monkeypatch: pytest.MonkeyP
         (["--fit", "edge"], "--fit: expected some of noise, edges, boosted, got 'edge'"),
         (["--fit", "edges"], "--fit: expected --train or --folds"),
         (["--fit", "boosted", "--folds", "2", "--life", "shipped"], "--fit boosted: expected --life kept or both"),
-        (["--of", "red"], "--of: unknown situation 'red'"),
+        (["--of", "halting,red"], "--of: unknown situation 'red'"),
         (["--folds", "1"], "--folds: expected a number of 2 or more, or place, got '1'"),
         (["--lengths", "4"], "--lengths: expected some of 1, 2, 3, 5, got '4'"),
         (["--situations", "--life", "shipped"], "--situations: expected --life kept or both"),

@@ -46,7 +46,7 @@ class GapBenchSettings:
     """Passes over each recording with made gaps, the lives compared, lengths of made gaps, s, seed of their choice.
 
     real  whether the gaps of the recordings themselves are judged too, and the links
-    of    the situation of objects at the end of made gaps (`pipelines.bench.gaps.situations`), None: any
+    of    situations, one of which objects are in at the end of made gaps (`pipelines.bench.gaps.situations`); none: any
     """
 
     passes: int = 2
@@ -54,7 +54,7 @@ class GapBenchSettings:
     lengths: tuple[float, ...] = LENGTHS
     seed: int = 0
     real: bool = True
-    of: str | None = None
+    of: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,9 +160,9 @@ def _prepared(of: _Preparation) -> tuple[LabelledScene, list[Gap]]:
     real = real_gaps(labelled) if settings.real else []
 
     def wanted(gap: Gap) -> bool:
-        return settings.of in situations_of(labelled, gap).get(gap.length, ())
+        return not situations_of(labelled, gap).get(gap.length, frozenset()).isdisjoint(settings.of)
 
-    chosen = None if settings.of is None else wanted
+    chosen = wanted if settings.of else None
     return labelled, [*real, *made_gaps(labelled, settings.passes, settings.seed, settings.lengths, chosen)]
 
 

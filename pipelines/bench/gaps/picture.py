@@ -51,23 +51,23 @@ class DrawnGap:
     outcome: GapOutcome
 
 
-def telling_gap(first: Sequence[Run], second: Sequence[Run], situation: str | None = None) -> tuple[str, Gap]:
+def telling_gap(first: Sequence[Run], second: Sequence[Run], situations: Sequence[str] = ()) -> tuple[str, Gap]:
     """The recording and the gap in which the first contender does better than the second by most.
 
-    Where identity is kept by the first alone; among those, or else among all, of largest difference of errors. With a
-    situation, among made gaps in which the object is in it. Raises `InputError` where there is no gap.
+    Where identity is kept by the first alone; among those, or else among all, of largest difference of errors. With
+    situations, among made gaps in which the object is in one of them. Raises `InputError` where there is no gap.
     """
     best: tuple[tuple[int, float], str, Gap] | None = None
     for ours, theirs in zip(first, second, strict=True):
         for gap, at, mine, other in zip(ours.gaps, ours.situations, ours.outcomes, theirs.outcomes, strict=True):
-            if situation is not None and not any(situation in each for each in at.values()):
+            if situations and all(each.isdisjoint(situations) for each in at.values()):
                 continue
             gain = min(other.error, CAP) - mine.error
             worth = (int(mine.kept is True) - int(other.kept is True), gain if np.isfinite(gain) else 0.0)
             if best is None or worth > best[0]:
                 best = worth, ours.recording, gap
     if best is None:
-        of = f" of objects {situation}" if situation is not None else ""
+        of = f" of objects {' or '.join(situations)}" if situations else ""
         raise InputError(f"--picture: expected recordings with gaps{of}, there are none")
     return best[1], best[2]
 
@@ -77,15 +77,15 @@ def write_telling_picture(
     source: RecordingSource,
     runs: Sequence[Run],
     contenders: Sequence[Contender],
-    situation: str | None = None,
+    situations: Sequence[str] = (),
 ) -> None:
-    """Draw the gap, in a situation if one is wanted, in which the second of two contenders beats the first by most.
+    """Draw the gap, in one of some situations or any, in which the second of two contenders beats the first by most.
 
     Raises `InputError` for a path that is not writable, and where there is no gap.
     """
     life = runs[0].life
     first, second = ([run for run in runs if (run.life, run.contender) == (life, c.name)] for c in contenders)
-    recording, gap = telling_gap(second, first, situation)
+    recording, gap = telling_gap(second, first, situations)
     labelled = LabelledScene.of(source.scene(recording), contenders[0].config.sensors)
     gaps = next(run.gaps for run in first if run.recording == recording)
     drawn = [drawn_gap(labelled, gaps, gap, contender, life) for contender in contenders]

@@ -16,7 +16,8 @@ whitened. Covariances in files are often far too large and hide false loops; so 
     min( c'^2, m k c^2 ),     c'^2: 99.9 % quantile,  k = median of d^2 over the loops taken / median of chi^2
 
 with k the variance of unit weight, and m = 8, because the errors of recorded loops have longer tails than a Gaussian.
-The worst loops are removed and the best of the removed ones restored until nothing changes.
+The worst loops are removed and the best of the removed ones restored until nothing changes. At last those of s^2 <= c^2
+at the solution without them come back, until there are none: whatever k, they agree with it.
 
 Sources: Yang, Antonante, Tzoumas, Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020; Baarda, A
 testing procedure for use in geodetic networks, 1968.
@@ -74,7 +75,7 @@ def consensus(graph: PoseGraph, too_wide: bool = True) -> Consensus:
     problem = _Problem.of(graph)
     values = graph_values(placed(graph, _spanning_start(graph, ~loop)))
     values, weights = _graduated(problem, values, loop)
-    values, kept = _snooped(problem, values, loop, weights > 0.5, too_wide)
+    values, kept = _readmitted(problem, *_snooped(problem, values, loop, weights > 0.5, too_wide))
     return Consensus(chosen_edges(solved_graph(graph, values), kept), kept)
 
 
@@ -216,9 +217,21 @@ def _snooped(
         if (state := kept.tobytes()) in seen:
             break
         seen.add(state)
+    return _settled(problem, values, kept), kept
+
+
+def _readmitted(problem: _Problem, values: gtsam.Values, kept: BoolArray) -> tuple[gtsam.Values, BoolArray]:
+    """Take in what was left out and agrees with the solution, until nothing does."""
+    while (agreeing := ~kept & (problem.distances(values) <= problem.gate)).any():
+        kept = kept | agreeing
+        values = _settled(problem, values, kept)
+    return values, kept
+
+
+def _settled(problem: _Problem, values: gtsam.Values, kept: BoolArray) -> gtsam.Values:
     for _ in range(_SETTLING):
         values = problem.step(values, kept.astype(float))
-    return values, kept
+    return values
 
 
 def _judged(problem: _Problem, values: gtsam.Values, edges: IntArray, kept: BoolArray) -> FloatArray:

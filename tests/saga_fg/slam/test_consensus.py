@@ -43,6 +43,18 @@ def test_the_optimum_is_that_without_the_false_loops(dim: int, scale: float) -> 
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.05
 
 
+def test_a_loop_far_worse_than_the_others_is_kept_where_its_covariance_allows_it() -> None:
+    graph = graph_of(2)
+    graph = replace(graph, information=graph.information / 400)
+    loop = int(np.flatnonzero(~trusted(graph))[3])
+    measured = graph.first_T_second.copy()
+    measured[loop, 0, 2] += 2 / np.sqrt(graph.information[loop, 0, 0])
+    spoilt = with_false_loops(replace(graph, first_T_second=measured), 0.5, seed=3)
+    agreed = consensus(spoilt)
+    assert agreed.kept[loop]
+    assert not agreed.kept[len(graph.first) :].any()
+
+
 def test_priors_and_landmarks_take_part_and_are_kept() -> None:
     """The graph lies where the priors say, and landmarks seen from far apart speak against false loops too."""
     graph, true = city(200, seed=1)
