@@ -215,16 +215,15 @@ def _nilpotency(kinds: Sequence[NodeType]) -> int | None:
 
 def _phi_and_noise(
     M: FloatArray, Qc: FloatArray, dt: float, order: int, nilpotency: int | None = None
-) -> tuple[list[FloatArray], FloatArray]:
-    """phi_0 ... phi_order of M dt (each (m, d, d)), and Q = int_0^dt exp(M s) Qc exp(M^T s) ds.
+) -> tuple[FloatArray, FloatArray]:
+    """phi_0 ... phi_order of M dt (order + 1, m, d, d), and Q = int_0^dt exp(M s) Qc exp(M^T s) ds.
 
     Where M^nilpotency = 0 the series end.
     """
     degrees = _TAYLOR_DEGREE, _TAYLOR_DEGREE + 1, _TAYLOR_RADIUS
     if nilpotency is not None:
         degrees = max(nilpotency - 1, 0), max(2 * nilpotency - 1, 1), math.inf
-    phis, Q = _series(M, Qc, dt, order, *degrees)
-    return list(phis), Q
+    return _series(M, Qc, dt, order, *degrees)
 
 
 @compiled_by(phi_and_noise)
@@ -243,8 +242,7 @@ def _series(
     phis = [phi]
     for k in range(order - 1, -1, -1):
         phis.insert(0, Z @ phis[0] + eye / math.factorial(k))
-    term = Qc * h
-    Q = term
+    Q = term = Qc * h
     for j in range(2, noise_degree + 1):
         half = Z @ term
         term = (half + np.swapaxes(half, -1, -2)) / j
@@ -264,7 +262,7 @@ def _coupling_blocks(
     edges: Edges,
     dt: float,
     M: FloatArray,
-    phi: list[FloatArray],
+    phi: FloatArray,
     position: IntArray,
     kinds: list[NodeType],
     kind: IntArray,
@@ -318,8 +316,7 @@ def _doublings(norm: float, radius: float = _TAYLOR_RADIUS) -> int:
 def _exponential(Z: FloatArray) -> FloatArray:
     """exp(Z) of matrices (..., d, d): the Taylor series of Z / 2^s, squared s times."""
     doublings = _doublings(float(np.abs(Z).sum(axis=-1).max(initial=0.0)))
-    Z = Z / 2**doublings
-    eye = np.eye(Z.shape[-1])
+    Z, eye = Z / 2**doublings, np.eye(Z.shape[-1])
     result = eye + Z / _TAYLOR_DEGREE
     for j in range(_TAYLOR_DEGREE - 1, 0, -1):
         result = eye + Z @ result / j
