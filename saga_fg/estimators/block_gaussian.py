@@ -9,7 +9,7 @@ import numpy as np
 
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, flattened, regrouped
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.components import node_blocks, uncorrelated_labels
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -67,13 +67,7 @@ class BlockGaussian:
         kept = np.flatnonzero(keep)
         old = self.partition
         partition = old.restricted(self.layout.without(rows), kept)
-        alone = old.count - partition.count == len(rows)  # nodes without partners go, all others stay as they are
-        if alone and not compiled_kernels():
-            leaving = [old.row[rows[old.group[rows] == number]] for number in range(len(self.blocks))]
-            left = (np.delete(P, of_group, axis=0) for P, of_group in zip(self.blocks, leaving, strict=True))
-            blocks = tuple(P for P in left if len(P))
-        else:
-            blocks = regrouped(self.blocks, old, partition, kept)
+        blocks = _left(self.blocks, old, partition, rows, kept)
         return BlockGaussian(partition, self.mean[self.layout.places(kept)], blocks)
 
     def decoupled(self) -> BlockGaussian:
@@ -82,32 +76,10 @@ class BlockGaussian:
 
     def uncorrelated(self, tolerance: float) -> Partition:
         """The partition into parts that no correlation above `tolerance` ties."""
-        partition, layout = self.partition, self.layout
-        if partition.count == len(layout):
-            return partition
-        if compiled_kernels():
-            at = partition.block_places
-            place = at.start, at.size, at.offset
-            parts = Partition(layout, uncorrelated_labels(self.flat, partition.label, *place, layout.dims, tolerance))
-            return partition if parts.count == partition.count else parts
-        node_of = np.repeat(np.arange(len(layout)), layout.dims)
-        a, b = [], []
-        for places, P in zip(partition.groups, self.blocks, strict=True):
-            node, (c, s) = node_of[places], places.shape
-            d = int(layout.dims[node[0, 0]])
-            if s == d and (node == node[:, :1]).all():  # nodes on their own
-                continue
-            alike = s % d == 0 and (layout.dims[node] == d).all()  # then node by node
-            of_nodes = d if alike else 1
-            chunk = max(1, _IN_CACHE // (s * s))
-            tied = [_tied(P[first : first + chunk], tolerance, of_nodes) for first in range(0, c, chunk)]
-            node = node[:, ::of_nodes]
-            k, i, j = np.nonzero(np.concatenate(tied))
-            once = i < j
-            a.append(node[k[once], i[once]])
-            b.append(node[k[once], j[once]])
-        parts = Partition.apart(layout).joined(np.concatenate(a), np.concatenate(b))
-        return partition if parts.count == partition.count else parts
+        if self.partition.count == len(self.layout):
+            return self.partition
+        parts = _uncorrelated(self, tolerance)
+        return self.partition if parts.count == self.partition.count else parts
 
     def covariances(self, rows: IntArray) -> FloatArray:
         """(k, d, d) of the nodes at `rows`, whose states have equal size d."""
@@ -145,6 +117,43 @@ class BlockGaussian:
         return variances
 
 
+@compiled_by(lambda blocks, old, new, rows, kept: regrouped(blocks, old, new, kept))
+def _left(blocks: BlockDiagonal, old: Partition, new: Partition, rows: IntArray, kept: IntArray) -> BlockDiagonal:
+    """The blocks of the `kept` nodes, without those at `rows`."""
+    if old.count - new.count < len(rows):
+        return regrouped(blocks, old, new, kept)
+    leaving = [old.row[rows[old.group[rows] == number]] for number in range(len(blocks))]  # nodes without partners
+    left = (np.delete(P, of_group, axis=0) for P, of_group in zip(blocks, leaving, strict=True))
+    return tuple(P for P in left if len(P))
+
+
+def _uncorrelated_by_kernel(x: BlockGaussian, tolerance: float) -> Partition:
+    at, layout, label = x.partition.block_places, x.layout, x.partition.label
+    return Partition(layout, uncorrelated_labels(x.flat, label, at.start, at.size, at.offset, layout.dims, tolerance))
+
+
+@compiled_by(_uncorrelated_by_kernel)
+def _uncorrelated(x: BlockGaussian, tolerance: float) -> Partition:
+    partition, layout = x.partition, x.layout
+    node_of = np.repeat(np.arange(len(layout)), layout.dims)
+    a, b = [], []
+    for places, P in zip(partition.groups, x.blocks, strict=True):
+        node, (c, s) = node_of[places], places.shape
+        d = int(layout.dims[node[0, 0]])
+        if s == d and (node == node[:, :1]).all():  # nodes on their own
+            continue
+        alike = s % d == 0 and (layout.dims[node] == d).all()  # then node by node
+        of_nodes = d if alike else 1
+        chunk = max(1, _IN_CACHE // (s * s))
+        tied = [_tied(P[first : first + chunk], tolerance, of_nodes) for first in range(0, c, chunk)]
+        node = node[:, ::of_nodes]
+        k, i, j = np.nonzero(np.concatenate(tied))
+        once = i < j
+        a.append(node[k[once], i[once]])
+        b.append(node[k[once], j[once]])
+    return Partition.apart(layout).joined(np.concatenate(a), np.concatenate(b))
+
+
 def _tied(P: FloatArray, tolerance: float, d: int) -> BoolArray:
     """(c, s / d, s / d) which nodes, of d states each, any correlation above `tolerance` ties; P (c, s, s)."""
     sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
@@ -153,15 +162,18 @@ def _tied(P: FloatArray, tolerance: float, d: int) -> BoolArray:
     return np.asarray(np.logical_or.reduce([columns[:, k::d] for k in range(d)]))
 
 
+def _diagonal_by_kernel(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
+    place, d = partition.block_places, int(partition.layout.dims[rows[0]])
+    return node_blocks(flattened(blocks), place.start, place.size, place.offset, rows, d)
+
+
+@compiled_by(_diagonal_by_kernel, where=lambda blocks, partition, rows: len(rows) > 0)
 def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
     """(k, d, d) blocks of the nodes at `rows`, whose states have equal size d."""
     d = int(partition.layout.dims[rows[0]]) if len(rows) else 0
     result = np.empty((len(rows), d, d))
     if len(rows) == 0:
         return result
-    if compiled_kernels():
-        place = partition.block_places
-        return node_blocks(flattened(blocks), place.start, place.size, place.offset, rows, d)
     if partition.size:
         own = np.empty((len(partition.layout), d, d))
         for (nodes, row, slot), block in zip(partition.nodes_by_group, blocks, strict=True):

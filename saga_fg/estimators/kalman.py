@@ -20,9 +20,7 @@ from numpy.typing import ArrayLike
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.bounds import ComponentBounds
-from saga_fg.estimators.compiled_filter import corrected, predicted
-from saga_fg.estimators.correction import correct
-from saga_fg.estimators.dynamics import predict
+from saga_fg.estimators.filter_steps import corrected, predicted
 from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
@@ -30,7 +28,6 @@ from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.protocol import LatestMarginals, Measurements
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.kernels.compilation import compiled_kernels
 from saga_fg.kernels.components import planar_marginals
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -125,12 +122,7 @@ class JointKalmanFilter(LatestMarginals):
     def predict(self, transition: Transition) -> None:
         dynamics = self._auxiliary.dynamics(transition, self._state)
         look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
-        if compiled_kernels():
-            self._state = predicted(self._state, dynamics, self.bounds, look)
-        elif self.bounds is None:
-            self._state = predict(dynamics.separated(self._state) if look else self._state, dynamics)
-        else:
-            self._state = predict(self._state, *self.bounds.applied(self._state, dynamics))
+        self._state = predicted(self._state, dynamics, self.bounds, look)
         self._predictions += 1
         self._time += transition.dt
 
@@ -140,10 +132,7 @@ class JointKalmanFilter(LatestMarginals):
         if len(rows) == 0:
             return 0.0
         seen = recorded.linearised(self._state.layout, self._state.mean, rows)
-        if compiled_kernels():
-            self._state, log_likelihood = corrected(self._state, seen)
-        else:
-            self._state, _, log_likelihood = correct(self._state, *seen)
+        self._state, log_likelihood = corrected(self._state, seen)
         return log_likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:

@@ -17,7 +17,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from saga_fg.estimators.layout import StateLayout
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.components import component_tables, regrouped_blocks
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -127,30 +127,8 @@ class Partition:
         return self._compiled_tables[3]
 
     @cached_property
-    def _tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, IntArray]:
-        if compiled_kernels():
-            return (*self._compiled_tables[:3], self.block_places.offset)
-        layout, label = self.layout, self.label
-        none = np.empty(0, dtype=np.int64)
-        if len(label) == 0:
-            return (), none, none, none
-        order = np.argsort(label, kind="stable")
-        size = np.bincount(label, weights=layout.dims).astype(np.int64)
-        start = np.cumsum(size) - size
-        ends = np.cumsum(layout.dims[order])
-        first = ends - layout.dims[order]  # of each node, in the order of components
-        offset = np.empty(len(label), dtype=np.int64)
-        offset[order] = first - start[label[order]]
-        places = np.repeat(layout.offsets[:-1][order] - first, layout.dims[order]) + np.arange(layout.size)
-        sizes = np.flatnonzero(np.bincount(size))
-        group = np.searchsorted(sizes, size)
-        row = np.empty(len(size), dtype=np.int64)
-        groups = []
-        for number, s in enumerate(sizes.tolist()):
-            members = np.flatnonzero(group == number)
-            row[members] = np.arange(len(members))
-            groups.append(places[start[members][:, None] + np.arange(s)])
-        return tuple(groups), group[label], row[label], offset
+    def _tables(self) -> _Tables:
+        return _made_tables(self)
 
     def members(self, rows: IntArray, dim: int) -> list[tuple[int, IntArray, IntArray]]:
         """Node rows (m,) of states of size `dim`, by group of components: its number, which of them, where.
@@ -218,6 +196,38 @@ class Partition:
         return Partition(layout, _without_gaps(self.label[rows]))
 
 
+_Tables = tuple[tuple[IntArray, ...], IntArray, IntArray, IntArray]  # groups; group, row, offset of each node
+
+
+def _tables_by_kernel(partition: Partition) -> _Tables:
+    return (*partition._compiled_tables[:3], partition.block_places.offset)
+
+
+@compiled_by(_tables_by_kernel)
+def _made_tables(partition: Partition) -> _Tables:
+    layout, label = partition.layout, partition.label
+    none = np.empty(0, dtype=np.int64)
+    if len(label) == 0:
+        return (), none, none, none
+    order = np.argsort(label, kind="stable")
+    size = np.bincount(label, weights=layout.dims).astype(np.int64)
+    start = np.cumsum(size) - size
+    ends = np.cumsum(layout.dims[order])
+    first = ends - layout.dims[order]  # of each node, in the order of components
+    offset = np.empty(len(label), dtype=np.int64)
+    offset[order] = first - start[label[order]]
+    places = np.repeat(layout.offsets[:-1][order] - first, layout.dims[order]) + np.arange(layout.size)
+    sizes = np.flatnonzero(np.bincount(size))
+    group = np.searchsorted(sizes, size)
+    row = np.empty(len(size), dtype=np.int64)
+    groups = []
+    for number, s in enumerate(sizes.tolist()):
+        members = np.flatnonzero(group == number)
+        row[members] = np.arange(len(members))
+        groups.append(places[start[members][:, None] + np.arange(s)])
+    return tuple(groups), group[label], row[label], offset
+
+
 def _united(count: int, a: IntArray, b: IntArray) -> IntArray:
     """(count,) number of the set that each of `count` elements is in when a[k] and b[k] are in one, without gaps."""
     if len(a) > _PAIRS:
@@ -270,17 +280,20 @@ def unflattened(flat: FloatArray, partition: Partition) -> BlockDiagonal:
     return tuple(blocks)
 
 
+def _regrouped_by_kernel(blocks: BlockDiagonal, old: Partition, new: Partition, source: IntArray) -> BlockDiagonal:
+    here, there, length = old.block_places, new.block_places, sum(p.size * p.shape[1] for p in new.groups)
+    before = flattened(blocks), old.label, here.start, here.size, here.offset, old.layout.dims
+    after = new.label, there.start, there.size, there.offset
+    return unflattened(regrouped_blocks(*before, source, *after, length), new)
+
+
+@compiled_by(_regrouped_by_kernel, where=lambda blocks, old, new, source: len(new.label) > 0)
 def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: IntArray) -> BlockDiagonal:
     """Copy the blocks of a matrix over to another partition.
 
     source: for each node of `new` its row in `old`, -1 for none; a row may serve several nodes. Entries between nodes
     in different components of either partition are zero.
     """
-    if compiled_kernels() and len(new.label):
-        here, there, length = old.block_places, new.block_places, sum(p.size * p.shape[1] for p in new.groups)
-        before = flattened(blocks), old.label, here.start, here.size, here.offset, old.layout.dims
-        after = new.label, there.start, there.size, there.offset
-        return unflattened(regrouped_blocks(*before, source, *after, length), new)
     result = zeros(new)
     to = np.flatnonzero(source >= 0)
     if len(to) == 0:

@@ -13,8 +13,8 @@ import logging
 import os
 import pkgutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import cache, update_wrapper, wraps
+from contextlib import contextmanager, suppress
+from functools import cache, update_wrapper
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
@@ -101,17 +101,30 @@ def kernel(arguments: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
     return lambda source: Kernel(source, arguments)
 
 
-def compiled_by(compiled: Kernel[P, R]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a NumPy function: a kernel of the same arguments and results does its work where kernels are used."""
+class Choice(Generic[P, R]):
+    """A function in two versions of the same arguments and results: `compiled` where kernels are used, else NumPy's."""
 
-    def decorated(numpy_version: Callable[P, R]) -> Callable[P, R]:
-        @wraps(numpy_version)
-        def chosen(*args: P.args, **kwargs: P.kwargs) -> R:
-            return compiled(*args, **kwargs) if compiled_kernels() else numpy_version(*args, **kwargs)
+    def __init__(
+        self, numpy_version: Callable[P, R], compiled: Callable[P, R], where: Callable[P, bool] | None
+    ) -> None:
+        self.numpy_version, self.compiled, self.where = numpy_version, compiled, where
+        self.__name__ = numpy_version.__name__
+        update_wrapper(self, numpy_version)
+        choices.append(self)
 
-        return chosen
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        by_kernel = compiled_kernels() and (self.where is None or self.where(*args, **kwargs))
+        return (self.compiled if by_kernel else self.numpy_version)(*args, **kwargs)
 
-    return decorated
+
+choices: list[Choice[Any, Any]] = []  # of the modules that were imported
+
+
+def compiled_by(
+    compiled: Callable[P, R], where: Callable[P, bool] | None = None
+) -> Callable[[Callable[P, R]], Choice[P, R]]:
+    """Decorate a NumPy function: a kernel, or its caller, does its work where kernels are used and `where` holds."""
+    return lambda numpy_version: Choice(numpy_version, compiled, where)
 
 
 def kernel_part(source: Callable[P, R]) -> Callable[P, R]:
@@ -126,14 +139,20 @@ def _compiled(source: Callable[..., Any], arguments: str) -> Any:
     signature = tuple(_argument(numba.types, kind) for kind in arguments.split())
     source = _with_compiled_parts(source)
     function = numba.njit(**_OPTIONS)(source)
-    try:
-        function.enable_caching()
-        function.compile(signature)
-    except Exception as error:  # no folder to keep it in, a damaged file there, a full disk
-        folder = function.stats.cache_path or "disk"
-        _say_once("kernels cannot be loaded from %s or kept there, and are compiled anew: %s", folder, repr(error))
-        if not function.signatures:
-            return numba.njit(signature, **_OPTIONS)(source)
+    for attempt in ("first", "last"):
+        try:
+            function.enable_caching()
+            function.compile(signature)
+            break
+        except Exception as error:  # no folder to keep it in, a damaged file there, a full disk
+            folder = function.stats.cache_path or "disk"
+            _say_once("kernels cannot be loaded from %s or kept there, and are compiled anew: %s", folder, repr(error))
+            if function.signatures:
+                break
+            if attempt == "last":
+                return numba.njit(signature, **_OPTIONS)(source)
+            with suppress(Exception):
+                function._cache.flush()  # what is damaged is forgotten, and written anew
     function.disable_compile()
     return function
 

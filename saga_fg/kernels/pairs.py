@@ -145,7 +145,7 @@ def relinking_pairs(
     least: float,
     rounding: float,
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pairs of `tracks` and measurements (k,) with their costs (k,), the least log-odds less theirs.
+    """Pairs of `tracks` and measurements (k,) with their costs (k,) < 0, the least log-odds less theirs.
 
     Of all n tracks: group (n,), N(position, P) if they move, N(place, D) if they are stationary, with the probability
     `stationary` (n,); of m measurements: z (m, 2), R (m, 2, 2), group_z (m,), log_density (m,) of others like them.
@@ -186,7 +186,9 @@ def relinking_pairs(
                 term = density + (terms[1] if still else terms[0])
                 high, low = max(total, term), min(total, term)
                 total = high if low == -math.inf else high + math.log1p(math.exp(low - high))
-            found_t.append(i)
-            found_d.append(j)
-            costs.append(least - (log_survival[i] + total - log_density[j]))
+            cost = least - (log_survival[i] + total - log_density[j])
+            if cost < 0:
+                found_t.append(i)
+                found_d.append(j)
+                costs.append(cost)
     return np.array(found_t), np.array(found_d), np.array(costs)

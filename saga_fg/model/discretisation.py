@@ -36,7 +36,7 @@ import scipy.linalg
 import scipy.sparse
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
@@ -215,20 +215,23 @@ def _nilpotency(kinds: Sequence[NodeType]) -> int | None:
 
 def _phi_and_noise(
     M: FloatArray, Qc: FloatArray, dt: float, order: int, nilpotency: int | None = None
-) -> tuple[list[FloatArray], FloatArray]:
-    """phi_0 ... phi_order of M dt (each (m, d, d)), and Q = int_0^dt exp(M s) Qc exp(M^T s) ds.
+) -> tuple[FloatArray, FloatArray]:
+    """phi_0 ... phi_order of M dt (order + 1, m, d, d), and Q = int_0^dt exp(M s) Qc exp(M^T s) ds.
 
     Where M^nilpotency = 0 the series end.
     """
-    degree, noise_degree, doublings = _TAYLOR_DEGREE, _TAYLOR_DEGREE + 1, 0
+    degrees = _TAYLOR_DEGREE, _TAYLOR_DEGREE + 1, _TAYLOR_RADIUS
     if nilpotency is not None:
-        degree, noise_degree = max(nilpotency - 1, 0), max(2 * nilpotency - 1, 1)
-    if compiled_kernels():
-        radius = math.inf if nilpotency is not None else _TAYLOR_RADIUS
-        of_order, Q = phi_and_noise(M, Qc, dt, order, degree, noise_degree, radius)
-        return list(of_order), Q
-    if nilpotency is None:
-        doublings = _doublings(float(np.abs(M).sum(axis=-1).max(initial=0.0)) * dt)
+        degrees = max(nilpotency - 1, 0), max(2 * nilpotency - 1, 1), math.inf
+    return _series(M, Qc, dt, order, *degrees)
+
+
+@compiled_by(phi_and_noise)
+def _series(
+    M: FloatArray, Qc: FloatArray, dt: float, order: int, degree: int, noise_degree: int, radius: float
+) -> tuple[FloatArray, FloatArray]:
+    """phi_0 ... phi_order (order + 1, m, d, d) and Q by Taylor series at M dt / 2^s of at most `radius`, doubled."""
+    doublings = _doublings(float(np.abs(M).sum(axis=-1).max(initial=0.0)) * dt, radius)
     h = dt / 2**doublings
     Z = M * h
     eye = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
@@ -239,8 +242,7 @@ def _phi_and_noise(
     phis = [phi]
     for k in range(order - 1, -1, -1):
         phis.insert(0, Z @ phis[0] + eye / math.factorial(k))
-    term = Qc * h
-    Q = term
+    Q = term = Qc * h
     for j in range(2, noise_degree + 1):
         half = Z @ term
         term = (half + np.swapaxes(half, -1, -2)) / j
@@ -253,14 +255,14 @@ def _phi_and_noise(
             tail = sum((phis[j] / math.factorial(k - j) for j in range(1, k + 1)), np.zeros_like(phi))
             doubled.append((phis[0] @ phis[k] + tail) / 2**k)
         phis = doubled
-    return phis, (Q + np.swapaxes(Q, -1, -2)) / 2
+    return np.stack(phis), (Q + np.swapaxes(Q, -1, -2)) / 2
 
 
 def _coupling_blocks(
     edges: Edges,
     dt: float,
     M: FloatArray,
-    phi: list[FloatArray],
+    phi: FloatArray,
     position: IntArray,
     kinds: list[NodeType],
     kind: IntArray,
@@ -274,7 +276,7 @@ def _coupling_blocks(
     A = np.stack([kinds[k].generator for k in numbers.tolist()])
     steps = _nilpotency([kinds[k] for k in numbers.tolist()])
     if steps is None:
-        return Blocks(target, source, _van_loan(M, at, C, A, of_edge, dt))
+        return Blocks(target, source, _van_loan(M, at, C, A, of_edge, dt, _TAYLOR_DEGREE, _TAYLOR_RADIUS))
     values = np.zeros_like(C)
     for k in range(steps):
         values += dt ** (k + 1) * (phi[k + 1][at] @ C)
@@ -282,21 +284,22 @@ def _coupling_blocks(
     return Blocks(target, source, values)
 
 
-def _van_loan(M: FloatArray, at: IntArray, C: FloatArray, A: FloatArray, of: IntArray, dt: float) -> FloatArray:
+@compiled_by(coupling_integrals)
+def _van_loan(
+    M: FloatArray, at: IntArray, C: FloatArray, A: FloatArray, of: IntArray, dt: float, degree: int, radius: float
+) -> FloatArray:
     """int_0^dt exp(M_at (dt - s)) C exp(A_of s) ds for stacks M (n, d_i, d_i), C (m, d_i, d_j), A (k, d_j, d_j).
 
     at (m,) and of (m,) are rows of M and A. This is the corner of the exponential of [[M, C], [0, A]] dt, whose other
     blocks are those of a node and of a type.
     """
-    if compiled_kernels():
-        return coupling_integrals(M, at, C, A, of, dt, _TAYLOR_DEGREE, _TAYLOR_RADIUS)
     row_sums = np.abs(M).sum(axis=-1)[at] + np.abs(C).sum(axis=-1)
-    doublings = _doublings(dt * max(row_sums.max(initial=0.0), np.abs(A).sum(axis=-1).max(initial=0.0)))
+    doublings = _doublings(dt * max(row_sums.max(initial=0.0), np.abs(A).sum(axis=-1).max(initial=0.0)), radius)
     h = dt / 2**doublings
     M, C, A, mine = M * h, C * h, A * h, M[at] * h
     first, second = (np.broadcast_to(np.eye(Z.shape[-1]), Z.shape) for Z in (M, A))
     corner = np.zeros_like(C)
-    for j in range(_TAYLOR_DEGREE, 0, -1):
+    for j in range(degree, 0, -1):
         corner = (mine @ corner + C @ second[of]) / j
         first, second = (np.eye(Z.shape[-1]) + Z @ power / j for Z, power in ((M, first), (A, second)))
     for _ in range(doublings):
@@ -305,16 +308,15 @@ def _van_loan(M: FloatArray, at: IntArray, C: FloatArray, A: FloatArray, of: Int
     return np.asarray(corner)
 
 
-def _doublings(norm: float) -> int:
+def _doublings(norm: float, radius: float = _TAYLOR_RADIUS) -> int:
     """Number of halvings of a matrix of this norm after which its Taylor series converges fast."""
-    return max(0, math.ceil(math.log2(norm / _TAYLOR_RADIUS))) if 0 < norm < math.inf else 0
+    return math.ceil(math.log2(norm / radius)) if radius < norm < math.inf else 0
 
 
 def _exponential(Z: FloatArray) -> FloatArray:
     """exp(Z) of matrices (..., d, d): the Taylor series of Z / 2^s, squared s times."""
     doublings = _doublings(float(np.abs(Z).sum(axis=-1).max(initial=0.0)))
-    Z = Z / 2**doublings
-    eye = np.eye(Z.shape[-1])
+    Z, eye = Z / 2**doublings, np.eye(Z.shape[-1])
     result = eye + Z / _TAYLOR_DEGREE
     for j in range(_TAYLOR_DEGREE - 1, 0, -1):
         result = eye + Z @ result / j

@@ -19,7 +19,7 @@ from saga_fg.kernels.array_types import BoolArray as BoolArray
 from saga_fg.kernels.array_types import FloatArray as FloatArray
 from saga_fg.kernels.array_types import IntArray as IntArray
 from saga_fg.kernels.array_types import StrArray as StrArray
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.labels import numbered_rows
 
 Values = Literal["finite", "finite-or-nan", "any"]
@@ -165,13 +165,7 @@ def distinct(label: StrArray) -> tuple[tuple[str, ...], IntArray]:
     known = _of_array.get(id(label))
     if known is not None and known[0]() is label:
         return known[1]
-    if not compiled_kernels() or len(label) == 0:
-        look = _distinct if label.nbytes < _REMEMBERED else _distinct.__wrapped__
-        found = look(np.ascontiguousarray(label).tobytes(), label.dtype.str, len(label))
-    else:
-        number, first = numbered_rows(np.ascontiguousarray(label).view(np.uint32).reshape(len(label), -1))
-        number.flags.writeable = False
-        found = tuple(label[first].tolist()), number
+    found = _numbered(label)
     if not label.flags.writeable and label.base is None:
         key = id(label)
         _of_array[key] = weakref.ref(label, lambda _: _of_array.pop(key, None)), found
@@ -180,6 +174,18 @@ def distinct(label: StrArray) -> tuple[tuple[str, ...], IntArray]:
 
 _Distinct = tuple[tuple[str, ...], IntArray]
 _of_array: dict[int, tuple[weakref.ref[StrArray], _Distinct]] = {}  # by id, while the array lives
+
+
+def _numbered_by_rows(label: StrArray) -> _Distinct:
+    number, first = numbered_rows(np.ascontiguousarray(label).view(np.uint32).reshape(len(label), -1))
+    number.flags.writeable = False
+    return tuple(label[first].tolist()), number
+
+
+@compiled_by(_numbered_by_rows, where=lambda label: len(label) > 0)
+def _numbered(label: StrArray) -> _Distinct:
+    look = _distinct if label.nbytes < _REMEMBERED else _distinct.__wrapped__
+    return look(np.ascontiguousarray(label).tobytes(), label.dtype.str, len(label))
 
 
 @lru_cache(maxsize=256)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.pairs import compared_pairs
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -26,8 +26,11 @@ def near_pairs(
     a (n, 2), b (m, 2), reach (n,) and further (m,) in m; where one of these is NaN there is no pair
     """
     reach, further = np.asarray(reach, dtype=np.float64), np.broadcast_to(np.asarray(further, dtype=np.float64), len(b))
-    if compiled_kernels() and len(a) * len(b) <= MOST_LOOPED:
-        return compared_pairs(a, b, reach, further)
+    return _near_pairs(a, b, reach, further)
+
+
+@compiled_by(compared_pairs, where=lambda a, b, reach, further: len(a) * len(b) <= MOST_LOOPED)
+def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
     if len(a) * len(b) <= MOST_COMPARED:
         return _compared(a, b, reach, further)
     i, j = np.flatnonzero(~np.isnan(reach)), np.flatnonzero(~np.isnan(further))

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.pairs import gated_pairs
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, distinct
 from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
@@ -144,31 +144,17 @@ def candidates(
     evidence: ClassEvidence | None = None,
 ) -> CandidatePairs:
     """The pairs of one class, or group, that are inside its gate; the arguments are those of `match`."""
-    (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(measurements.boxes.label)
+    (classes, of_track), (_, of_detection) = distinct(predicted.label), distinct(measurements.boxes.label)
     names = ("max_distance", "giou_weight")
     reach, giou_weight = class_values(settings.classes, ClassSettings, predicted.label, *names)
     gates = np.array([gate(class_settings(settings.classes, ClassSettings, c).gate) for c in classes])[of_track]
-    if compiled_kernels() and len(predicted) * len(measurements) <= MOST_LOOPED:
-        found = _gated(predicted, P, reach, gates, measurements, evidence)
-    else:
-        same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
-        if evidence is not None:
-            same = evidence.groups.same_group(np.array(classes), np.array(seen))
-        t, d = near_pairs(predicted.position[:, :2], measurements.boxes.position[:, :2], reach)
-        alike = same[of_track[t], of_detection[d]].nonzero()[0]
-        t, d = t[alike], d[alike]
-        innovation = measurements.boxes.position[d, :2] - predicted.position[t, :2]
-        S = P[t] + measurements.R[d, :2, :2]
-        d2, log_det = mahalanobis_of_pairs(innovation, S)
-        of_class = 0.0 if evidence is None else evidence.costs(t, d)
-        inside = (d2 + of_class < gates[t]).nonzero()[0]
-        found = CandidatePairs(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
+    found = _gated(predicted, P, reach, gates, measurements, evidence)
     found = found._replace(gain=found.gain - _overlap(found, predicted, measurements.boxes, giou_weight))
     unmatched = _unmatched(found, expected, measurements.probability, of_detection, settings.association, clutter_area)
     return found._replace(gain=found.gain - unmatched)
 
 
-def _gated(
+def _gated_by_kernel(
     predicted: Boxes,
     P: FloatArray,
     reach: FloatArray,
@@ -176,7 +162,6 @@ def _gated(
     measurements: FrameMeasurements,
     evidence: ClassEvidence | None,
 ) -> CandidatePairs:
-    """`gated_pairs` by the compiled kernel."""
     boxes, n = measurements.boxes, len(predicted)
     if evidence is None:
         _, number = distinct(np.concatenate([predicted.label, boxes.label]))
@@ -187,6 +172,34 @@ def _gated(
         belief, likelihood = evidence.belief, evidence.likelihood
     tracks = predicted.position[:, :2], P, reach, gates, of_track, belief
     return CandidatePairs(*gated_pairs(*tracks, boxes.position[:, :2], measurements.R, of_detection, likelihood))
+
+
+@compiled_by(
+    _gated_by_kernel,
+    where=lambda predicted, P, reach, gates, measurements, evidence: len(predicted) * len(measurements) <= MOST_LOOPED,
+)
+def _gated(
+    predicted: Boxes,
+    P: FloatArray,
+    reach: FloatArray,
+    gates: FloatArray,
+    measurements: FrameMeasurements,
+    evidence: ClassEvidence | None,
+) -> CandidatePairs:
+    """The pairs inside the `gates` (n,), without overlap."""
+    (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(measurements.boxes.label)
+    same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
+    if evidence is not None:
+        same = evidence.groups.same_group(np.array(classes), np.array(seen))
+    t, d = near_pairs(predicted.position[:, :2], measurements.boxes.position[:, :2], reach)
+    alike = same[of_track[t], of_detection[d]].nonzero()[0]
+    t, d = t[alike], d[alike]
+    innovation = measurements.boxes.position[d, :2] - predicted.position[t, :2]
+    S = P[t] + measurements.R[d, :2, :2]
+    d2, log_det = mahalanobis_of_pairs(innovation, S)
+    of_class = 0.0 if evidence is None else evidence.costs(t, d)
+    inside = (d2 + of_class < gates[t]).nonzero()[0]
+    return CandidatePairs(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
 
 
 def _overlap(found: CandidatePairs, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ import math
 import numpy as np
 
 from saga_fg.estimators import JointKalmanFilter
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.returns import return_evidence, returned_pairs
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -70,10 +70,19 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     if len(new) == 0:
         return new, new, new
     old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.max_coasting))
-    if compiled_kernels() and len(new) * len(old) <= MOST_LOOPED:
-        now, still, group = state.kinematics(), table.stationarity, state.class_groups.numbers(table.label)
-        places = now.position, now.P, still.position, still.P
-        return returned_pairs(new, old, group, table.initiated, table.last_detected, *places, _FARTHEST)
+    return _returned(state, new, old)
+
+
+def _returned_by_kernel(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    now, still, table = state.kinematics(), state.table.stationarity, state.table
+    group, places = state.class_groups.numbers(table.label), (now.position, now.P, still.position, still.P)
+    return returned_pairs(new, old, group, table.initiated, table.last_detected, *places, _FARTHEST)
+
+
+@compiled_by(_returned_by_kernel, where=lambda state, new, old: len(new) * len(old) <= MOST_LOOPED)
+def _returned(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """The candidates among `new` and `old` tracks."""
+    table = state.table
     i, j = _near(state, new, old)
     alike = state.class_groups.pairs_of_group(table.label[new], table.label[old], i, j)
     chosen = alike & (table.last_detected[old[j]] < table.initiated[new[i]])
@@ -98,18 +107,31 @@ def _near(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
     """(k,) logs of `moving` and `stationary`, see the module."""
-    table, stationarity = state.table, state.table.stationarity
     now, prior = state.kinematics(), state.settings.stationarity.prior
     each, of_pair = np.unique(new, return_inverse=True)  # a new track is in many pairs
     _, V_0, p = unmeasured_velocity(state, state.boxes(now.position, now.velocity).select(each), prior)
-    if compiled_kernels() and isinstance(state.joint.estimator, JointKalmanFilter):
-        ends, places = (new, old), state.joint.places(table.label)
-        (x, P), (x_old, P_old) = (state.joint.estimator.planar_marginals(table.id[k], places[k]) for k in ends)
-        place, D, s = stationarity.position, stationarity.P, stationarity.probability
-        velocity = places[new, 2] >= 0, V_0[of_pair], p[of_pair]
-        if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
-        return return_evidence(x, P, x_old, P_old, *velocity, *if_still)
-    V_0, p = V_0[of_pair], np.clip(p, 1e-9, 1 - 1e-9)[of_pair]
+    return _evidence(state, new, old, V_0[of_pair], p[of_pair])
+
+
+def _evidence_by_kernel(
+    state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    estimator, table, still = state.joint.estimator, state.table, state.table.stationarity
+    assert isinstance(estimator, JointKalmanFilter)
+    places, place, D, s = state.joint.places(table.label), still.position, still.P, still.probability
+    (x, P), (x_old, P_old) = (estimator.planar_marginals(table.id[k], places[k]) for k in (new, old))
+    if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
+    return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0, p, *if_still)
+
+
+@compiled_by(
+    _evidence_by_kernel, where=lambda state, new, old, V_0, p: isinstance(state.joint.estimator, JointKalmanFilter)
+)
+def _evidence(
+    state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`_log_evidence` of velocities V_0 (k, 2, 2) that nobody has measured, and prior probabilities p (k,)."""
+    table, stationarity, p = state.table, state.table.stationarity, np.clip(p, 1e-9, 1 - 1e-9)
     s, s_new = (np.clip(stationarity.probability[rows], 0.0, 1 - 1e-9) for rows in (old, new))
     moving = np.log1p(-s) + np.log1p(-s_new) - np.log1p(-p)
     for node_type, rows in state.joint.rows_by_type(table.label[new]):

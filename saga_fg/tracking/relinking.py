@@ -25,7 +25,7 @@ import math
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by, compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.pairs import relinking_pairs
 from saga_fg.kernels.track_limits import log_peaks
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
@@ -56,29 +56,35 @@ def relinked(
     if len(tracks) == 0:
         return matching
     places, noise = measurements.boxes.position[rows, :2] - state.origin, measurements.R[rows, :2, :2]
-    if compiled_kernels() and len(tracks) * len(rows) <= MOST_LOOPED:
-        t, j, cost = _pairs(state, tracks, position, P, label, places, noise)
-        if len(t) == 0:
-            return matching
-        d, z, R = rows[j], places[j], noise[j]
-    else:
-        i, j = _within_reach(state, tracks, position, P, places, noise)
-        alike = state.class_groups.pairs_of_group(state.table.label[tracks], label, i, j)
-        i, j = i[alike], j[alike]
-        if len(i) == 0:
-            return matching
-        t, d, others, z, R = tracks[i], rows[j], state.class_groups.number_of_group(label)[j], places[j], noise[j]
-        moving, S = _log_density(z - position[t], P[t] + R), state.table.stationarity.P[t] + R
-        still = _log_density(z - state.table.stationarity.position[t], S)
-        s = np.clip(state.table.stationarity.probability[t], 0.0, 1 - 1e-9)
-        log_odds = log_survival(state)[t] + _mixed(s, moving, still) - np.log(others / area(state))
-        cost = least_log_odds(state) - log_odds
-    chosen = least_total(t, d, cost)
-    t, d = t[chosen], d[chosen]
-    distance, _ = mahalanobis_of_pairs(z[chosen] - position[t], P[t] + R[chosen])
-    return matching.append(Matching(t, d, distance))
+    t, j, cost = _pairs(state, tracks, position, P, label, places, noise)
+    if len(t) == 0:
+        return matching
+    chosen = least_total(t, j, cost)
+    t, j = t[chosen], j[chosen]
+    distance, _ = mahalanobis_of_pairs(places[j] - position[t], P[t] + noise[j])
+    return matching.append(Matching(t, rows[j], distance))
 
 
+def _pairs_by_kernel(
+    state: TrackerState,
+    tracks: IntArray,
+    position: FloatArray,
+    P: FloatArray,
+    label: StrArray,
+    z: FloatArray,
+    R: FloatArray,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    still, number = state.table.stationarity, state.class_groups.numbers
+    group, of_place = number(state.table.label), number(label)
+    log_density = np.log(np.bincount(of_place)[of_place] / area(state))
+    objects = position, P, still.position, still.P, still.probability, log_survival(state)
+    return relinking_pairs(tracks, group, *objects, z, R, of_place, log_density, least_log_odds(state), _ROUNDING)
+
+
+@compiled_by(
+    _pairs_by_kernel,
+    where=lambda state, tracks, position, P, label, z, R: len(tracks) * len(z) <= MOST_LOOPED,
+)
 def _pairs(
     state: TrackerState,
     tracks: IntArray,
@@ -88,12 +94,19 @@ def _pairs(
     z: FloatArray,
     R: FloatArray,
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Rows of tracks, of places `z` (m, 2) of classes `label` (m,), and costs (k,) of all pairs, by a kernel."""
-    still, number = state.table.stationarity, state.class_groups.numbers
-    group, of_place = number(state.table.label), number(label)
-    log_density = np.log(np.bincount(of_place)[of_place] / area(state))
-    objects = position, P, still.position, still.P, still.probability, log_survival(state)
-    return relinking_pairs(tracks, group, *objects, z, R, of_place, log_density, least_log_odds(state), _ROUNDING)
+    """Rows of tracks, of places `z` (m, 2) of classes `label` (m,), and costs (k,) of pairs
+    that re-linking pays for."""
+    i, j = _within_reach(state, tracks, position, P, z, R)
+    alike = state.class_groups.pairs_of_group(state.table.label[tracks], label, i, j)
+    t, j = tracks[i[alike]], j[alike]
+    still, others = state.table.stationarity, state.class_groups.number_of_group(label)[j]
+    moving = _log_density(z[j] - position[t], P[t] + R[j])
+    standing = _log_density(z[j] - still.position[t], still.P[t] + R[j])
+    s = np.clip(still.probability[t], 0.0, 1 - 1e-9)
+    log_odds = log_survival(state)[t] + _mixed(s, moving, standing) - np.log(others / area(state))
+    cost = least_log_odds(state) - log_odds
+    paying = (cost < 0).nonzero()[0]
+    return t[paying], j[paying], cost[paying]
 
 
 def _within_reach(

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_kernels
+from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.trails import trail_paths
 from saga_fg.model.interactions import unit
 from saga_fg.model.paths import Paths
@@ -48,6 +48,16 @@ class _Beside(NamedTuple):
     weight: FloatArray
 
 
+def _paths_by_kernel(
+    traffic: Traffic, ids: IntArray, position: FloatArray, heading: FloatArray, curvature: FloatArray, steps: int
+) -> Paths:
+    reach = max(traffic.settings.reach, _LEAST)
+    lanes, trails = (_columns(each, 2 * reach) for each in _found(traffic))
+    tracks, scales = (ids, position, heading, curvature), (reach, STEP, _BEND, TURN, PRIOR, AGREEMENT)
+    return Paths(np.arange(len(ids)), *trail_paths(*lanes, *trails, *tracks, steps, NEAREST, *scales))
+
+
+@compiled_by(_paths_by_kernel)
 def paths(
     traffic: Traffic, ids: IntArray, position: FloatArray, heading: FloatArray, curvature: FloatArray, steps: int
 ) -> Paths:
@@ -55,11 +65,6 @@ def paths(
 
     Their steps are `STEP` m long, their rows 0 to n - 1.
     """
-    if compiled_kernels():
-        reach = max(traffic.settings.reach, _LEAST)
-        lanes, trails = (_columns(each, 2 * reach) for each in _found(traffic))
-        tracks, scales = (ids, position, heading, curvature), (reach, STEP, _BEND, TURN, PRIOR, AGREEMENT)
-        return Paths(np.arange(len(ids)), *trail_paths(*lanes, *trails, *tracks, steps, NEAREST, *scales))
     place, beside = position, _beside(traffic, ids, position, heading)
     course = heading + beside.certainty * beside.turn
     certainty, disagreement = beside.certainty, beside.variance

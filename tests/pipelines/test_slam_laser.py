@@ -70,7 +70,7 @@ def test_the_path_starts_at_the_wheels_until_a_scan_hits_something() -> None:
     log.ranges[:8] = np.nan
     path = laser_slam(log)
     assert path.keyframes[0] == 8
-    assert np.linalg.norm(path.poses[:, :2, 2] - true[:, :2, 2], axis=1).max() < 0.18  # by the wheels alone 0.17
+    assert np.linalg.norm(path.poses[:, :2, 2] - true[:, :2, 2], axis=1).max() < 0.16  # by the wheels alone 0.27
 
 
 def test_scans_that_never_hit_are_one_error() -> None:
@@ -105,7 +105,7 @@ def test_jumps_of_the_wheels_are_counted_and_not_believed(caplog: pytest.LogCapt
         (LaserKind(readings=181, reach=8.0), 0.02, 0.03),
         (LaserKind(readings=541, field=1.5 * np.pi, reach=30.0, noise=0.015), 0.02, 0.02),
         (LaserKind(readings=361, reach=80.0), 0.02, 0.02),
-        (LaserKind(noise=0.03), 0.04, 0.05),
+        (LaserKind(noise=0.03), 0.02, 0.02),
         (LaserKind(missing=0.4), 0.02, 0.03),
         (LaserKind(step=0.5, wheels=1.05), 0.02, 0.03),
         (LaserKind(wheels=0.93), 0.02, 0.02),

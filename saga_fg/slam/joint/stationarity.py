@@ -8,14 +8,18 @@ has D ~ N(0, S): noise of the detections and of the odometry over the T seconds 
 
 where shift and turn are the summed variances of the increments in between, in translation and in heading; scale, bias
 and course are the odometry's deviations as known so far. A moving object has D ~ N(0, S + (u T)^2), with the usual
-speed u of its class (`moving_speed`). By Bayes, with a share q of stationary objects, one half in a whole recording,
+speed u_2 of its class (`moving_speed`), or u_1 = 0.3 u_2 where traffic creeps. By Bayes, with u_0 = 0 and shares q_k,
 
-    P(stationary | D) = q N(D; 0, S) / (q N(D; 0, S) + (1 - q) N(D; 0, S + (u T)^2))
+    P(stationary | D) = q_0 N(D; 0, S) / sum_k q_k N(D; 0, S + (u_k T)^2)
 
-Where T is short, S and S + (u T)^2 are nearly equal, and P is about one half; so it is for slow classes far away.
+Where T is short, all these variances are nearly equal, and P is about q_0; so it is for slow classes far away.
 
-Online the window ends now, T is short, and creeping queues look parked: q is `online_stationary_share`, and the last
-term of S, errors of the heading, counts across the line of sight only.
+In a queue, cars too far to be seen creeping look parked, and the vehicle's path would bend until they are. But others,
+nearer, are seen to creep. So the shares are those of the traffic then, within 10 s: maximum likelihood of all
+detections by expectation maximisation, with a Dirichlet prior worth a few detections.
+
+Online the window ends now, and T is short: q_0 is `online_stationary_share`, q_1 = 0, and the last term of S, errors
+of the heading, counts across the line of sight only.
 """
 
 from __future__ import annotations
@@ -25,12 +29,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.geometry import transform_points
 from saga_fg.slam.joint.record import RecordedEpoch, motion_covariances
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.types.by_class import class_numbers
+
+_CREEPING = 0.3  # speed of creeping traffic, as a share of the usual one
+_ALIKE = 10.0  # s, time over which traffic keeps its shares
+_PRIOR = 10.0  # detections of each hypothesis that the prior of the shares is worth
+_ROUNDS = 30  # of expectation maximisation
 
 
 @dataclass(frozen=True)
@@ -124,11 +133,43 @@ def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSet
     along = (D * sight).sum(axis=1) ** 2 / np.maximum((sight**2).sum(axis=1), 1e-9)
     d2 = np.stack([along, (D**2).sum(axis=1) - along])  # along the line of sight, and across
     S = np.stack([S if online else S + turned, S + turned])
-    M = S + (seen.speed * T) ** 2
-    q = settings.online_stationary_share if online else 0.5
-    odds = np.log(q / (1 - q)) + (np.log(M / S) - d2 * (1 / S - 1 / M)).sum(axis=0) / 2  # log
-    p = 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
+    usual = (seen.speed * T) ** 2
+    if online:
+        q = settings.online_stationary_share
+        variances, shares = np.stack([S, S + usual]), np.array([[q], [1 - q]])
+        log = _log_likelihoods(variances, d2)
+    else:
+        variances = np.stack([S, S + _CREEPING**2 * usual, S + usual])
+        log = _log_likelihoods(variances, d2)
+        shares = _shares_of_traffic(log, seen.time, n1 > 0)
+    p = _posteriors(log, shares)[0]
     return np.where(n1 > 0, p, 0.0)
+
+
+def _log_likelihoods(variances: FloatArray, d2: FloatArray) -> FloatArray:
+    """Of each hypothesis (K, N), but for a constant: variances (K, 2, N) of distances whose squares are d2 (2, N)."""
+    return np.asarray(-(np.log(variances) + d2 / variances).sum(axis=1) / 2)
+
+
+def _posteriors(log: FloatArray, shares: FloatArray) -> FloatArray:
+    """Probabilities (K, N) of hypotheses with log-likelihoods (K, N) and prior shares (K, N) or (K, 1)."""
+    weight = np.log(shares) + log
+    weight = np.exp(weight - weight.max(axis=0))
+    return np.asarray(weight / weight.sum(axis=0))
+
+
+def _shares_of_traffic(log: FloatArray, time: FloatArray, judged: BoolArray) -> FloatArray:
+    """Shares (K, N) of the hypotheses around each detection; log-likelihoods (K, N), time (N,); judged (N,) count."""
+    order = np.argsort(time, kind="stable")
+    low = np.searchsorted(time[order], time - _ALIKE, "left")
+    high = np.searchsorted(time[order], time + _ALIKE, "right")
+    shares = np.full(log.shape, 1 / len(log))
+    for _ in range(_ROUNDS):
+        p = np.where(judged, _posteriors(log, shares), 0.0)[:, order]
+        total = np.concatenate([np.zeros((len(p), 1)), np.cumsum(p, axis=1)], axis=1)
+        count = total[:, high] - total[:, low] + _PRIOR
+        shares = count / count.sum(axis=0)
+    return shares
 
 
 def _place(record: Sequence[RecordedEpoch], path: FloatArray, settings: JointSettings) -> _PlacedDetections:

@@ -73,17 +73,19 @@ def test_a_numba_that_cannot_be_imported_is_told_once_and_numpy_is_used(tmp_path
 
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-def test_a_damaged_file_of_kernels_is_told_with_its_folder(suffix, tmp_path):
+@pytest.mark.parametrize("content", [b"", b"\x80\x04damaged"])
+def test_a_damaged_file_of_kernels_is_told_with_its_folder_and_replaced(suffix, content, tmp_path):
     environment = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
     run(LABELS, ROOT, **environment)
     kept = list(tmp_path.rglob(f"*.{suffix}"))
     assert kept
     for path in kept:
-        path.write_bytes(b"")
+        path.write_bytes(content)
     out, said = run(LABELS, ROOT, **environment)
     assert out == "[0 1 0]"
     assert said.count(str(kept[0].parent)) == 1
     assert "Traceback" not in said
+    assert run(LABELS, ROOT, **environment) == ("[0 1 0]", "")
 
 
 def test_on_a_full_disk_kernels_are_compiled_once_and_not_kept(tmp_path):

@@ -110,7 +110,29 @@ def test_who_walks_far_away_does_not_stand():
     assert says["pedestrian"] < 0.6
 
 
-def test_a_queue_that_creeps_does_not_pass_for_parked_online():
+def test_a_car_far_away_is_taken_for_parked_only_beside_cars_that_are():
+    """Poor odometry explains its motion; whether the cars nearby creep or stand decides."""
+
+    def far(speed: float) -> float:
+        t, rng = 0.2 * np.arange(20), np.random.default_rng(0)
+        poses = np.stack([yaw_transform(8.0 * s) for s in t])
+        frames = []
+        for time, pose in zip(t, poses, strict=True):
+            near = [[5.0 + 6 * k + speed * time, 4.0 * (-1) ** k, 1.0] for k in range(6)]
+            places = np.array([*near, [60.0 + 0.4 * time, 30.0, 1.0]])
+            places[:, :2] += 0.1 * rng.normal(size=(7, 2))
+            detections = Detections(Boxes.of(["car"] * 7, places).transformed(inverse_transform(pose)), np.full(7, 0.9))
+            frames.append(Frame(time, "lidar", detections, np.eye(4), "ego"))
+        settings = JointSettings(POOR)
+        record = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker())
+        p = stationary_probabilities(record, poses, SlowErrors.at_start(settings), settings)
+        return float(p[10][np.argmax(np.hypot(*record[10].seen.z[:, :2].T))])
+
+    assert far(speed=0.0) > 0.9
+    assert far(speed=1.5) < 0.5
+
+
+def test_a_queue_that_creeps_does_not_pass_for_parked():
     """Ahead, far off, seen for less than a second: a turn of the vehicle explains no motion along the line of sight."""
     t = 0.2 * np.arange(5)
     poses = np.stack([yaw_transform(5.0 * s) for s in t])
@@ -123,7 +145,8 @@ def test_a_queue_that_creeps_does_not_pass_for_parked_online():
     slow = SlowErrors.at_start(settings)
     batch, online = (stationary_probabilities(record, poses, slow, settings, online)[-1] for online in (False, True))
     creeps, parked = [int(np.argmin(abs(record[-1].seen.z[:, 1] - y))) for y in (0.0, 6.0)]
-    assert batch[creeps] > 0.9
+    assert batch[creeps] < 0.9
+    assert batch[parked] > 0.9
     assert online[creeps] < 0.5
     assert online[parked] > 0.8
     with pytest.raises(InputError, match="online_stationary_share: expected a number from"):

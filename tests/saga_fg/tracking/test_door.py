@@ -1,14 +1,22 @@
 """What comes in is checked once, at the door; inside, tables of tracks and measurements are not checked again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipelines.config import load_config
 from saga_fg import InputError, Sensor, Tracker
 from saga_fg.estimators import Measurements
+from saga_fg.estimators.layout import StateLayout
+from saga_fg.model.edge_rules import Neighbours
+from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
 from saga_fg.model.sensor import NoiseModel
+from saga_fg.model.transition import Transition
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
+from tests.saga_fg.random_graphs import CAR
 
 
 def frame(number, count=6):
@@ -44,13 +52,49 @@ def test_boxes_that_cannot_be(column, value):
         Boxes.of(["car"], **columns)
 
 
+class Rule(Neighbours):
+    """A user's, who names rows the graph has not."""
+
+    def pairs(self, nodes):
+        return np.array([len(nodes)]), np.array([0]), np.array([0.5])
+
+
+class Law(SharedVelocity):
+    """A user's, whose triples are not finite."""
+
+    def triples(self, nodes, target, source):
+        triples = super().triples(nodes, target, source)
+        return triples._replace(b=triples.b + np.nan)
+
+
+def tracked_with(rule):
+    config = load_config("nuscenes")
+    tracker = replace(config, tracker=replace(config.tracker, edges=(rule,))).new_tracker("saga")
+    return [tracker.step(frame(number)) for number in range(3)]
+
+
+@pytest.mark.parametrize(("rule", "error"), [(Rule(SharedVelocity()), "rule Rule"), (Neighbours(Law()), "of Law: b")])
+def test_edges_by_rules_and_laws_of_users(rule, error):
+    with pytest.raises(InputError, match=error):
+        tracked_with(rule)
+
+
+@pytest.mark.parametrize("edges", [{"target": [9]}, {"rate": [-1.0]}, {"rate": [np.nan]}, {"A_self": np.eye(3)[None]}])
+def test_edges_that_cannot_be(edges):
+    """Made by hand, edges and graphs are checked."""
+    given = {"target": [0], "source": [1], "rate": [0.5], "A_self": -np.eye(4)[None], "A_other": np.eye(4)[None]}
+    with pytest.raises(InputError):
+        SceneGraph([1, 2], (CAR, CAR), (Edges("shared", **given | edges, b=np.zeros((1, 4))),))
+
+
 def test_inside_nothing_is_checked_again(monkeypatch):
-    """Of boxes only those that the sensor places in the world and those reported; of measurements none."""
+    """Of boxes only those that the sensor places in the world and those reported; of all else none."""
     tracker = load_config("nuscenes").new_tracker("saga")
     for number in range(5):
         tracker.step(frame(number))
-    made: dict = {Boxes: 0, Measurements: 0}
-    for kind in (Boxes, Measurements):
+    inner = Measurements, Edges, NonlinearEdges, SceneGraph, Transition, StateLayout
+    made: dict = dict.fromkeys((Boxes, *inner), 0)
+    for kind in made:
         real = kind.__post_init__
 
         def counted(self, kind=kind, real=real):
@@ -62,8 +106,8 @@ def test_inside_nothing_is_checked_again(monkeypatch):
     made[Boxes] = 0
     reported = tracker.step(coming)
     assert len(reported.id) == 6
-    assert made[Measurements] == 0
-    assert made[Boxes] <= 2
+    assert made.pop(Boxes) <= 2
+    assert set(made.values()) == {0}
 
 
 def test_what_is_reported_is_its_own_and_cannot_be_written():
