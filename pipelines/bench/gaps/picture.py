@@ -185,7 +185,7 @@ def _draw_tracks(
     holders = list(dict.fromkeys(name for k in shown.tolist() if (name := drawn.holders[k]) is not None))
     for number, name in enumerate(holders):
         colour, first = COLOURS[number % len(COLOURS)], drawn.holders.index(name)
-        places, seconds = [], 1.0
+        places, seconds = list[FloatArray](), 1.0
         for k in shown.tolist():
             row = np.flatnonzero(drawn.tracks[k].id == name)
             if len(row) == 0 or k < first:
