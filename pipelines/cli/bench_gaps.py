@@ -13,7 +13,7 @@ from data_tools.datasets.source import names
 from data_tools.files.error_messages import unknown_name
 from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
-from pipelines.cli.tables import JsonFile, MarkdownFile, PictureFile, report, writable
+from pipelines.cli.tables import JsonFile, MarkdownFile, PictureFile, report, writable_picture
 from pipelines.cli.tracking_options import InteractionsOption, with_interactions
 from saga_fg.errors import InputError
 
@@ -102,13 +102,13 @@ def gaps(
     ] = False,
     lengths: LengthsOption = None,
     viewpoint: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--viewpoint",
             help="Of the sensors in the sets ngsim and openacc: above, where nothing is hidden, mast, vehicle, the id "
-            "of one, or X,Y,Z in m.",
+            "of one, or X,Y,Z in m.  [default: above]",
         ),
-    ] = "above",
+    ] = None,
     longest: Annotated[
         float | None,
         typer.Option(
@@ -125,7 +125,7 @@ def gaps(
             help="Draw the gap in which the first contender does better than that of --against by most, in the first "
             "set, to this PNG file.",
             metavar="FILE",
-            callback=writable,
+            callback=writable_picture,
         ),
     ] = None,
     of: Annotated[
@@ -157,6 +157,7 @@ def gaps(
       saga-fg bench gaps --data data --sets openacc --life kept --longest 20 --folds 2
       saga-fg bench gaps --data data --sets kitti,argoverse2 --labels --folds 2 --passes 8 --life kept
     """
+    from data_tools.simulator.recorded_world import ABOVE
     from pipelines.bench.gaps.bench import GapBenchSettings
     from pipelines.bench.gaps.contenders import LIVES
     from pipelines.bench.gaps.fitted import bench_splits, splits_of
@@ -165,13 +166,17 @@ def gaps(
     from pipelines.bench.gaps.situations import SITUATIONS
     from pipelines.bench.gaps.sources import KNOWN, RecordingSource, set_names
     from pipelines.bench.gaps.tables import figures, tables
+    from pipelines.bench.recordings import TRAFFIC_SETS
     from pipelines.config import load_config
 
     chosen = names("--sets", sets) if sets else set_names(data)
     for name in chosen:
         if name not in KNOWN:
             raise InputError(f"--sets: {unknown_name('set', name, KNOWN)}")
-    sources = [RecordingSource(name, data, scenes, labels, viewpoint, longest or inf) for name in chosen]
+    for option, value in (("--viewpoint", viewpoint), ("--longest", longest)):
+        if value is not None and not set(chosen) & set(TRAFFIC_SETS):
+            raise InputError(f"{option}: expected {' or '.join(TRAFFIC_SETS)} among --sets, others do not use it")
+    sources = [RecordingSource(name, data, scenes, labels, viewpoint or ABOVE, longest or inf) for name in chosen]
     taught, judged = (names(option, value) if value else () for option, value in (("--train", train), ("--test", test)))
     recordings = {source.name: _recordings(source) for source in sources}
     _check_names(recordings, taught, judged)
@@ -206,7 +211,8 @@ def gaps(
             base = load_config(source.family, config)
             compared = _contenders(contenders, own or [], interactions, source.family, base)
             if against not in (known := tuple(each.name for each in compared)):
-                raise InputError(f"--against: {unknown_name('contender', against, known)}")
+                hint = f"; add {against} to --contenders or give another --against" if against == "kf" else ""
+                raise InputError(f"--against: {unknown_name('contender', against, known)}{hint}")
             if splits[source.name]:
                 runs[source.name] = bench_splits(
                     source, splits[source.name], compared, base, settings, fits, workers, progress

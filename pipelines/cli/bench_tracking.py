@@ -77,7 +77,7 @@ def tracking(
       saga-fg bench tracking --data data --sets megvii,centerpoint,kitti --contenders --no-components
     """
     from pipelines.bench.gaps.hidden_recordings import with_made_gaps
-    from pipelines.bench.recordings import SETS, chosen_recordings, recording_set
+    from pipelines.bench.recordings import SETS, TRAFFIC_SETS, chosen_recordings, recording_set
     from pipelines.bench.tracking import TrackingBenchSettings, bench_set
     from pipelines.bench.tracking_tables import figures, tables
     from pipelines.config import load_config
@@ -85,7 +85,10 @@ def tracking(
     if lengths is not None and passes == 0:
         raise InputError("--lengths: expected --passes of 1 or more, they are those of made gaps")
     everything = (*SETS, "simulated") if data is not None else ("simulated",)
-    chosen = [recording_set(name, data, scenes, viewpoint) for name in (names("--sets", sets) if sets else everything)]
+    wanted = names("--sets", sets) if sets else everything
+    if viewpoint is not None and not set(wanted) & set(TRAFFIC_SETS):
+        raise InputError(f"--viewpoint: expected {' or '.join(TRAFFIC_SETS)} among --sets, others do not use it")
+    chosen = [recording_set(name, data, scenes, viewpoint) for name in wanted]
     if test is not None:
         chosen = chosen_recordings(chosen, names("--test", test))
     settings = TrackingBenchSettings(components, contenders, draws)

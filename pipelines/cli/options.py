@@ -46,9 +46,7 @@ def apart(output: Path, *inputs: Path, option: str = "--output") -> None:
 
 def counts(option: str, value: str, least: int = 1) -> tuple[int, ...]:
     """The entries of a comma-separated option as whole numbers from `least` on, each once."""
-    from data_tools.datasets.source import names
-
-    entries = names(option, value)
-    if not all(entry.isdecimal() and len(entry) < 10 and int(entry) >= least for entry in entries):
+    entries = dict.fromkeys(entry.strip() for entry in value.split(",") if entry.strip())
+    if not entries or not all(entry.isdecimal() and len(entry) < 10 and int(entry) >= least for entry in entries):
         raise InputError(f"{option}: expected whole numbers >= {least} with commas between them, got {value[:40]!r}")
     return tuple(map(int, entries))

@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from saga_fg.errors import InputError
+
 if TYPE_CHECKING:
     from data_tools.figures import FigureTable
 
@@ -23,6 +25,13 @@ def writable(path: Path | None) -> Path | None:
     return path
 
 
+def writable_picture(path: Path | None) -> Path | None:
+    """Refuse a file that cannot be written, or whose name does not say that it is a PNG file."""
+    if path is not None and path.suffix.lower() != ".png":
+        raise InputError(f"{path}: expected a name that ends in .png")
+    return writable(path)
+
+
 JsonFile = Annotated[
     Path | None,
     typer.Option("--json", help="Write the figures to this file too.", metavar="FILE", callback=writable),
@@ -33,7 +42,7 @@ MarkdownFile = Annotated[
 ]
 PictureFile = Annotated[
     Path | None,
-    typer.Option("--plot", help="Draw the figures to this PNG file too.", metavar="FILE", callback=writable),
+    typer.Option("--plot", help="Draw the figures to this PNG file too.", metavar="FILE", callback=writable_picture),
 ]
 
 

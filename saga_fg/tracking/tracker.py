@@ -63,6 +63,9 @@ class Tracker:
     `providers` or where objects move nonlinearly. An older one is left out and counted in `late_frames`; so is,
     uncounted, one far from the newest time until a second one confirms that the clock was set.
 
+    The methods `kf` and `centerpoint` of the command come from `load_config(family).new_tracker(method)` of
+    `pipelines.config`.
+
     A tracker can be pickled and copied; its copies have no observer.
     """
 
@@ -79,6 +82,9 @@ class Tracker:
         self.sensors = checked_sensors(sensors)
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
         self.observer = observer
+        for provider in providers:
+            if not callable(getattr(provider, "factors", None)):
+                raise InputError(f"providers: expected factor providers, with a method factors, got {provider!r:.40}")
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
         max_jump = self.settings.clock.max_jump
         if math.isfinite(self.settings.max_coasting):

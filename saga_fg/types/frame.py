@@ -228,7 +228,7 @@ class Frame:
 def finite_seconds(timestamp: Any) -> float:
     """A timestamp as a finite number of seconds, or `InputError`."""
     try:
-        seconds = float(timestamp)
+        seconds = NAN if isinstance(timestamp, str | bytes) else float(timestamp)
     except (TypeError, ValueError, OverflowError):
         seconds = NAN
     if not math.isfinite(seconds):

@@ -94,7 +94,7 @@ def checked_table(table: Table, required: Sequence[str] = ("timestamp", *PLACE))
     missing = [name for name in required if name not in table.columns]
     if missing:
         there = ", ".join(map(str, table.columns))
-        raise InputError(f"expected the columns {', '.join(required)}; {', '.join(missing)} missing, there are {there}")
+        raise InputError(f"expected the columns {', '.join(missing)} as well, there are {there or 'none'}")
     return table
 
 

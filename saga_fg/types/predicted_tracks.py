@@ -50,6 +50,8 @@ class PredictedTracks:
 
 def checked_horizons(horizons: ArrayLike) -> FloatArray:
     """Return horizons (H,), s; raises `InputError` unless they are increasing, from 0 to `LONGEST`, one at least."""
+    if np.ndim(horizons) == 0:
+        raise InputError(f"horizons: expected a list of seconds, got {horizons!r:.40}")
     found = checked("horizons", horizons, (None,))
     if len(found) == 0 or found[0] < 0 or found[-1] > LONGEST or (np.diff(found) <= 0).any():
         raise InputError(

@@ -33,7 +33,10 @@ def known_velocities(velocity: FloatArray, covariance: FloatArray) -> FloatArray
 
 @dataclass(frozen=True)
 class Track:
-    """One tracked object at one moment, in world coordinates: a row of `Tracks` (units and frames there)."""
+    """One tracked object at one moment, in world coordinates: a row of `Tracks` (units and frames there).
+
+    Position, size and velocity are tuples, covariances arrays (2, 2); to calculate there are the columns of `Tracks`.
+    """
 
     id: int
     label: str

@@ -82,3 +82,9 @@ def test_the_environment_says_whether_kernels_ran() -> None:
     with only_numpy():
         assert environment()["kernels"] == "none"
     assert "numba" in environment()
+
+
+def test_the_command_asks_for_numbers() -> None:
+    result = CliRunner().invoke(app, ["bench", "speed", "--sizes", ""])
+    assert result.exit_code == 2
+    assert "--sizes: expected whole numbers >= 1" in result.output

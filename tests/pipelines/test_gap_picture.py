@@ -31,9 +31,18 @@ def test_lanes_and_stop_lines_are_drawn_in_the_colours_of_their_lights() -> None
         assert any(np.ptp(line.get_xdata()) == pytest.approx(130.0) for line in ax.lines), "the lane"
 
 
+def test_a_track_breaks_off_where_the_object_returns_and_the_legend_tells_all() -> None:
+    scene = labelled({"a": STEADY, "b": along(STEADY[:, 0] + 8)})
+    figure = gap_picture(scene, GAPS[0], [drawn_gap(scene, GAPS, GAPS[0], KF, "kept")])
+    (track,) = [line for line in figure.axes[0].lines if line.get_marker() == "o"]
+    assert np.isnan(track.get_xdata()).sum() == 1
+    told = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"detections then", "track N, a colour each; ring: 90 % ellipse"} <= told
+
+
 def test_the_gap_may_be_chosen_by_situation() -> None:
     scene = labelled({"a": STEADY}, colour="red")
     run = run_of(scene, GAPS, KF, "kept")
-    assert telling_gap([run], [run], "at red") == ("drawn", GAPS[0])
+    assert telling_gap([run], [run], ("at red",)) == ("drawn", GAPS[0])
     with pytest.raises(InputError, match="expected recordings with gaps of objects starting, there are none"):
-        telling_gap([run], [run], "starting")
+        telling_gap([run], [run], ("starting",))

@@ -185,11 +185,13 @@ def _draw_tracks(
     holders = list(dict.fromkeys(name for k in shown.tolist() if (name := drawn.holders[k]) is not None))
     for number, name in enumerate(holders):
         colour, first = COLOURS[number % len(COLOURS)], drawn.holders.index(name)
-        places, seconds = [], 1.0
+        places, seconds = list[FloatArray](), 1.0
         for k in shown.tolist():
             row = np.flatnonzero(drawn.tracks[k].id == name)
             if len(row) == 0 or k < first:
                 continue
+            if k == gap.stop and places:  # where the object returns, the track jumps to it
+                places.append(np.full(2, np.nan))
             at = (drawn.tracks[k].boxes.position[row[0], :2] - origin) @ turn
             places.append(at)
             if gap.start < k < gap.stop and time[k] - time[gap.start] >= seconds - 1e-6:
@@ -212,7 +214,8 @@ def _legend(road: RoadMap | None) -> list[Any]:
         Line2D([], [], color="#555555", linewidth=2.0, linestyle=":", label="labels, no detection"),
         Patch(facecolor="#f3dcc4", edgecolor="#b5651d", label="the object at the end of the gap"),
         Patch(facecolor="#d8d8d8", label="other objects then"),
-        Line2D([], [], color=COLOURS[0], marker="o", markersize=3, label="track; ring: 90 % ellipse"),
+        Line2D([], [], color="black", linestyle="", marker="x", markersize=4, label="detections then"),
+        Line2D([], [], color=COLOURS[0], marker="o", markersize=3, label="track N, a colour each; ring: 90 % ellipse"),
         *((lane,) if road is not None and road.lanes else ()),
         *((line,) if road is not None and road.stop_lines else ()),
     ]

@@ -174,3 +174,5 @@ def test_horizons_that_are_none_are_refused(horizons):
     tracker = followed(until=0.5)
     with pytest.raises(InputError, match=r"horizons.*: expected"):
         tracker.predict(horizons)
+    with pytest.raises(InputError, match="horizons: expected a list of seconds"):
+        tracker.predict(1.0)

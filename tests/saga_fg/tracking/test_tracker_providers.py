@@ -83,6 +83,11 @@ def test_a_users_factor_moves_what_the_tracker_reports() -> None:
     assert moved[2] < 1e-3 * moved[1], "that one is far away"
 
 
+def test_what_is_no_provider_is_refused_at_construction() -> None:
+    with pytest.raises(InputError, match="providers: expected factor providers, with a method factors, got 1"):
+        Tracker(providers=[1])  # type: ignore[list-item]
+
+
 def test_variables_have_the_names_of_their_classes_and_times() -> None:
     class Named:
         name = "names"

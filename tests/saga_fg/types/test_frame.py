@@ -93,6 +93,7 @@ def test_as_many_scores_as_boxes():
     ("arguments", "message"),
     [
         ({"timestamp": NAN}, "timestamp: expected a finite number of seconds, got nan"),
+        ({"timestamp": "0.1"}, "timestamp: expected a finite number of seconds, got '0.1'"),
         ({"timestamp": np.inf}, "timestamp: expected a finite number of seconds, got inf"),
         ({"timestamp": 1.7e18}, "timestamp: expected seconds, got 1.7e\\+18: milli-, micro- or nanoseconds?"),
         ({"timestamp": "noon"}, "timestamp: expected a finite number of seconds, got 'noon'"),

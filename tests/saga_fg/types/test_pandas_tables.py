@@ -83,7 +83,7 @@ def test_a_table_is_tracked_in_one_line() -> None:
     ("rows", "message"),
     [
         ([1, 2], r"expected a pandas.DataFrame, got list"),
-        (pd.DataFrame({"t": [1.0], "x": [1.0]}), r"timestamp, y missing, there are t, x"),
+        (pd.DataFrame({"t": [1.0], "x": [1.0]}), r"expected the columns timestamp, y as well, there are t, x"),
         (pd.DataFrame({"timestamp": [1.0], "x": ["far"], "y": [1.0]}), r"x: expected numbers"),
         (pd.DataFrame({"timestamp": [1e15], "x": [1.0], "y": [1.0]}), r"timestamp"),
     ],
