@@ -109,6 +109,8 @@ def kitti(
         raise InputError("--guess: expected with --map only")
     if known_map is not None and (objects or odometry == "oxts" or not landmarks):
         raise InputError("--map: expected without --objects, --no-landmarks and --odometry oxts")
+    if known_map is not None and known_map.resolve() == output.resolve():
+        raise InputError("--output: expected another folder than that of --map, whose run would lose its files")
     if seed is not None and not sensors:
         raise InputError("--seed: expected with --sensors only")
     window = online_window(online, lag)

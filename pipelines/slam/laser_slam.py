@@ -24,7 +24,7 @@ from pipelines.slam.laser_odometry import WheelScale, without_jumps
 from pipelines.slam.laser_passes import registered_passes
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked
 from saga_fg.numerics.planar_poses import heading, moved, transform, vector
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
@@ -98,7 +98,11 @@ class LaserSlam:
     _search: LoopSearch | None = None
 
     def step(self, points: FloatArray, odometry: FloatArray) -> FloatArray:
-        """Take a scan, points (n, 2) in the laser's frame, and the wheels' pose (3,); returns the pose (3, 3) now."""
+        """Take a scan, points (n, 2) in the laser's frame, and the wheels' pose (3,); returns the pose (3, 3) now.
+
+        Raises `InputError` for other shapes, and for numbers that are not finite.
+        """
+        points, odometry = checked("points", points, (None, 2)), checked("odometry", odometry, (3,))
         points = points @ self.robot_T_laser[:2, :2].T + self.robot_T_laser[:2, 2]
         wheels = transform(odometry)
         step = np.eye(3) if self._odometry is None else self.scale.corrected(np.linalg.inv(self._odometry) @ wheels)

@@ -133,6 +133,8 @@ class LidarSlam:
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._ego_T_lidar = np.eye(4) if ego_T_lidar is None else checked_transform("ego_T_lidar", ego_T_lidar)
         self._odometry = LidarOdometry(s.odometry) if odometry is None else odometry
+        if isinstance(sensors, str):
+            raise InputError(f"sensors: expected a list of names, such as [{sensors!r}], got a string")
         self._sensors, self._moving = tuple(sensors), moving
         lidar_T_ego = inverse_transform(self._ego_T_lidar)
         of_sensors = sensor_providers(s.sensors, sensors, lidar_T_ego)

@@ -188,7 +188,7 @@ class LidarOdometry:
             most = _SPEED_OFF + _ACCELERATION * (timestamp - self._confirmed)
         if off > most and not self._refused:
             _LOG.warning(
-                "scan at %.3f s: velocity (ahead, left, up) by other sensors is refused: %s m/s; by the scans: %s m/s",
+                "scan at %.3f s: a velocity by other sensors is refused, %s m/s ahead, left, up; by the scans %s m/s",
                 timestamp,
                 _components(velocity[3:]),
                 _components(self._velocity[3:]),

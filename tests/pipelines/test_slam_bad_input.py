@@ -240,3 +240,8 @@ def test_a_turn_on_the_spot_makes_keyframes_of_recorded_poses_too() -> None:
     recorded = RecordedOdometry(scans, 1e-3, 0.03, OdometrySettings(keyframe_rotation=0.05))
     keyframes = [recorded.step(scans[k], time).keyframe for k, time in enumerate(scans.timestamps.tolist())]
     assert keyframes == [True, False, False, True, False, False, True]
+
+
+def test_sensors_are_a_list_of_names() -> None:
+    with pytest.raises(InputError, match=r"sensors: expected a list of names, such as \['gps'\], got a string"):
+        LidarSlam(sensors="gps")  # type: ignore[arg-type]

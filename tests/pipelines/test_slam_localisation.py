@@ -271,3 +271,10 @@ def test_a_read_graph_is_in_space(tmp_path: Path) -> None:
     (tmp_path / "observations.csv").write_text("keyframe,landmark,kind,value,covariance\n")
     with pytest.raises(InputError, match="expected poses in space, got poses in the plane"):
         read_graph(tmp_path)
+
+
+def test_a_map_is_not_written_over(tmp_path: Path) -> None:
+    command = ["slam", "kitti", "--dataroot", str(tmp_path), "--sequence", "0000"]
+    result = CliRunner().invoke(app, [*command, "--map", str(tmp_path), "--output", str(tmp_path)])
+    assert result.exit_code != 0
+    assert "--output: expected another folder than that of --map" in f"{result.output}{result.exception}"
