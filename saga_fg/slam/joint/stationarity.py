@@ -15,8 +15,8 @@ speed u_2 of its class (`moving_speed`), or u_1 = 0.3 u_2 where traffic creeps. 
 Where T is short, all these variances are nearly equal, and P is about q_0; so it is for slow classes far away.
 
 In a queue, cars too far to be seen creeping look parked, and the vehicle's path would bend until they are. But others,
-nearer, are seen to creep. So the shares are those of the traffic then, within 10 s: maximum likelihood of all
-detections by expectation maximisation, with a Dirichlet prior worth a few detections.
+nearer, are seen to creep. So q_0 is one half, and the other half is divided as the traffic moves then, within 10 s:
+maximum likelihood of all detections by expectation maximisation, with a Dirichlet prior worth a few detections.
 
 Online the window ends now, and T is short: q_0 is `online_stationary_share`, q_1 = 0, and the last term of S, errors
 of the heading, counts across the line of sight only.
@@ -163,12 +163,12 @@ def _shares_of_traffic(log: FloatArray, time: FloatArray, judged: BoolArray) -> 
     order = np.argsort(time, kind="stable")
     low = np.searchsorted(time[order], time - _ALIKE, "left")
     high = np.searchsorted(time[order], time + _ALIKE, "right")
-    shares = np.full(log.shape, 1 / len(log))
+    shares = np.tile([[0.5], [0.25], [0.25]], (1, log.shape[1]))
     for _ in range(_ROUNDS):
         p = np.where(judged, _posteriors(log, shares), 0.0)[:, order]
         total = np.concatenate([np.zeros((len(p), 1)), np.cumsum(p, axis=1)], axis=1)
-        count = total[:, high] - total[:, low] + _PRIOR
-        shares = count / count.sum(axis=0)
+        count = (total[:, high] - total[:, low] + _PRIOR)[1:]
+        shares[1:] = 0.5 * count / count.sum(axis=0)
     return shares
 
 
