@@ -156,7 +156,9 @@ class Following(Settings):
         0.4, "sigma of the kernel on the difference of headings, rad; .inf: no kernel; higher: edges in bends, too"
     )
     information_gain: EdgeInformation | None = information_setting()
-    parked: bool = setting(False, "true: vehicles that were never seen moving follow, too")
+    parked: bool = setting(
+        False, "true: vehicles that were never seen moving follow, too, leaders within lateral_scale"
+    )
     min_separation: NonNegative = setting(
         0.0, "ignore leaders nearer than this share of half of both lengths: they are duplicates; usual 0 to 0.8"
     )
@@ -173,7 +175,9 @@ class Following(Settings):
 
     def strength(self, f: EdgeFeatures) -> FloatArray:
         """Rates (...), 1/s, of edges with these features, before classes and nearest leaders are considered."""
-        share = np.ones_like(f.ahead) if self.parked else f.target_moved
+        share = f.target_moved
+        if self.parked:
+            share = np.where(np.abs(f.lateral) <= self.lateral_scale, 1.0, share)
         if self.leaders != "any":
             share = share * (f.source_moved if self.leaders == "moving" else 1 - f.source_moved)
         exponent = (f.turn / self.heading_scale) ** 2 + (f.lateral / self.lateral_scale) ** 2

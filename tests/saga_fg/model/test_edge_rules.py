@@ -165,6 +165,18 @@ def test_by_default_a_hidden_vehicle_follows_and_a_duplicate_leads_nobody():
     assert hidden > 1.5 * seen
 
 
+def test_who_was_never_seen_moving_queues_behind_a_leader_and_is_not_dragged_along_beside_it():
+    """A heading known to 0.05 rad puts a car parked 2.2 m beside a stream 1.2 m beside leaders 20 m ahead."""
+    rule = Following(parked=True, lateral_scale=0.8)
+
+    def rate(lateral, moved):
+        nodes = joined(straight(1, start=20.0), straight(1, lateral=lateral))
+        return rule.pairs(replace(table(*nodes), has_moved=np.array([1.0, moved]))).rate.sum()
+
+    assert rate(0.3, 0.0) > 0.7 * rate(0.3, 1.0), "in the queue"
+    assert rate(1.2, 0.0) < 0.05 * rate(1.2, 1.0), "at the kerb"
+
+
 # following
 
 
