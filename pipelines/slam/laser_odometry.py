@@ -47,6 +47,17 @@ def without_jumps(log: LaserLog, largest_speed: float) -> tuple[FloatArray, int]
     return vectors(wheels), len(jumps)
 
 
+def warn_of_times(time: FloatArray) -> None:
+    """Warns where times (n,), s, run backwards, as those of logs that are written by several processes do."""
+    back = np.flatnonzero(np.diff(time) < 0)
+    if len(back):
+        _log.warning(
+            "scan %d: its time is %.3g s before that of the scan ahead of it; so for %d of %d scans, "
+            "which are taken in the order of the log, with poses written in the order of time",
+            int(back[0]) + 2, time[back[0]] - time[back[0] + 1], len(back), len(time),
+        )  # fmt: skip
+
+
 @dataclass(eq=False)
 class WheelScale:
     """Ratio of ways driven to those that the wheels tell, from steps that registration determines."""

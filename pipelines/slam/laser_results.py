@@ -35,6 +35,7 @@ def write_laser_slam(
         "loops": path.loops,
         "false_loops": path.rejected,
         "jumps_of_the_wheels": path.jumps,
+        "scale_of_the_wheels": path.wheel_scale,
         "entropy": grid.entropy,
         "entropy_scan_matching": _grid(log, path, path.matched, largest_range).entropy,
         "seconds": seconds,

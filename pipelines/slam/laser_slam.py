@@ -20,7 +20,7 @@ from data_tools.laser.score_grid import ScoreGrid
 from pipelines.slam.laser_interpolation import between_keyframes
 from pipelines.slam.laser_keyframes import Keyframe, covariance_of
 from pipelines.slam.laser_loops import LoopSearch
-from pipelines.slam.laser_odometry import WheelScale, without_jumps
+from pipelines.slam.laser_odometry import WheelScale, warn_of_times, without_jumps
 from pipelines.slam.laser_passes import registered_passes
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
@@ -62,7 +62,8 @@ class LaserSettings(Settings):
 @dataclass(frozen=True, eq=False)
 class LaserPath:
     """poses (n, 3, 3) of the robot at each scan, matched: by scan matching alone; loops taken, rejected as false;
-    keyframes: their rows; graph: of these, with the measurements kept; jumps: steps of the wheels too fast to believe.
+    keyframes: their rows; graph: of these, with the measurements kept; wheel_scale: ways driven by those of the
+    wheels; jumps: steps of the wheels too fast to believe.
     """
 
     poses: FloatArray
@@ -71,6 +72,7 @@ class LaserPath:
     rejected: int
     keyframes: IntArray
     graph: PoseGraph
+    wheel_scale: float
     jumps: int = 0
 
 
@@ -151,7 +153,7 @@ class LaserSlam:
                 graph = self._graph.settled(again).graph
         rows = np.array([frame.row for frame in self._keyframes])
         poses = between_keyframes(np.stack(self._matched), graph.world_T_pose, rows)
-        return LaserPath(poses, np.stack(self._matched), loops, rejected, rows, graph)
+        return LaserPath(poses, np.stack(self._matched), loops, rejected, rows, graph, self.scale.value)
 
     def _now(self, matched: FloatArray) -> FloatArray:
         assert self._graph is not None
@@ -206,6 +208,7 @@ class LaserSlam:
 def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: Progress | None = None) -> LaserPath:
     """The path of a log."""
     settings = settings or LaserSettings()
+    warn_of_times(log.time)
     odometry, jumps = without_jumps(log, settings.largest_speed)
     slam = LaserSlam(settings, transform(log.robot_T_laser), _wheel_scale(log, odometry, settings))
     for row in range(len(log)):

@@ -36,7 +36,9 @@ def test_loops_are_closed_and_the_path_is_right(tmp_path: Path) -> None:
     np.testing.assert_allclose(again, 0.15, atol=0.05)  # no jumps where corrections begin
 
 
-def test_times_that_run_backwards_are_sorted_in_the_result(tmp_path: Path) -> None:
+def test_times_that_run_backwards_are_named_and_sorted_in_the_result(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     log, _ = laser_drive(1, rounds=0.1)
     log.time[[10, 11]] = log.time[[11, 10]]
     log.time[20] = log.time[19]
@@ -44,6 +46,8 @@ def test_times_that_run_backwards_are_sorted_in_the_result(tmp_path: Path) -> No
     output = tmp_path / "out"
     result = CliRunner().invoke(app, ["slam", "laser", str(tmp_path / "drive.log"), "--output", str(output)])
     assert result.exit_code == 0, result.output
+    assert "scan 12: its time is 0.2 s before that of the scan ahead of it; so for 1 of" in caplog.text
+    assert json.loads((output / "figures.json").read_text())["scale_of_the_wheels"] == pytest.approx(1.0, abs=0.05)
     path = read_tum_poses(output / "trajectory.tum")
     assert len(path) == len(log) - 1
     np.testing.assert_allclose(path.timestamps, np.unique(log.time), atol=1e-6)
