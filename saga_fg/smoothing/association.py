@@ -126,9 +126,10 @@ def _meetings(
     trace = np.trace(states.covariance[:, :2, :2], axis1=1, axis2=2)
     reach = np.sqrt(limit * trace) * (1 + 1e-9)  # |d| <= sqrt(limit (tr P_i + tr P_j)), which is at most their sum
     order = np.argsort(seen.first, kind="stable")
-    moments, starts = np.unique(seen.first[order], return_index=True)
+    moments, starts, counts = np.unique(seen.first[order], return_index=True, return_counts=True)
     found = [np.empty((4, 0), dtype=np.int64)]
-    for moment, begin in zip(moments.tolist(), np.split(order, starts[1:]), strict=True):
+    for moment, start, count in zip(moments.tolist(), starts.tolist(), counts.tolist(), strict=True):
+        begin = order[start : start + count]
         there = states.at(moment)
         a = np.arange(there.start, there.stop)
         end = seen.rows_of(states.id[there])
