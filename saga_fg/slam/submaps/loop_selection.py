@@ -182,9 +182,13 @@ def _better(misfits: Misfits, found: _Found) -> _Found | None:
     kept = found.kept
     true, false = _judged(found.solution, kept, np.arange(len(kept)))
     score = true - false
-    tried = []
-    for group in (~kept & (score < 0), kept & (score > max(score[kept].max() / 2, 0.0))):
-        tried += [kept ^ group] if group.sum() > 1 else []
+    returning = np.flatnonzero(~kept & (score < 0))
+    returning, tried = returning[np.argsort(score[returning], kind="stable")], []
+    while len(returning) > 1:  # the best half of them, and so on
+        tried.append(kept | np.isin(np.arange(len(kept)), returning))
+        returning = returning[: len(returning) // 2]
+    leaving = kept & (score > max(score[kept].max() / 2, 0.0))
+    tried += [kept & ~leaving] if leaving.sum() > 1 else []
     for group in (np.flatnonzero(~kept), np.flatnonzero(kept)[::-1]):
         inside = bool(len(group) and kept[group[0]])
         order = group[np.argsort(-score[group] if inside else score[group], kind="stable")][:_TRIED]
