@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.model.edge_information import EdgeInformation
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs, Repulsion, pairs_ahead, traffic_rules
+from saga_fg.model.edge_pairs import pairs_ahead
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs, Repulsion, traffic_rules
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
