@@ -95,7 +95,7 @@ class JointKalmanFilter(LatestMarginals):
     def extend(
         self, nodes: ArrayLike, mean: FloatArray, covariance: FloatArray, labels: Mapping[int, str] | None = None
     ) -> None:
-        """As `add`, of numbers that were checked where they came in."""
+        """Add nodes as `add` does, without checking the numbers again."""
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
         if self.providers:
             self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})

@@ -273,7 +273,7 @@ def traffic_rules() -> tuple[Following, Neighbours]:
 
 
 def _acted(nodes: NodeTable, able: BoolArray) -> BoolArray:
-    """Those of the `able` (n,) nodes that others may act on."""
+    """The `able` (n,) nodes that others may act on."""
     return able if nodes.acted is None else able & nodes.acted
 
 

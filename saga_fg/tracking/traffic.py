@@ -234,7 +234,7 @@ class Traffic:
 
 
 def _since(passages: Passages, time: float) -> Passages:
-    """Those that are not before a time, s."""
+    """The passages at or after a time, s."""
     old = passages.time < time
     return passages.select(~old) if old.any() else passages
 
