@@ -30,7 +30,7 @@ from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.kernels.components import planar_marginals
 from saga_fg.model.transition import Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, shallow_copy
 from saga_fg.types.frame import Frame
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
@@ -74,6 +74,9 @@ class JointKalmanFilter(LatestMarginals):
         self._auxiliary = AuxiliaryVariables()
         self._frame: Frame | None = None
         self._origin = np.zeros(2)
+
+    def __copy__(self) -> JointKalmanFilter:
+        return shallow_copy(self)
 
     @property
     def nodes(self) -> IntArray:
