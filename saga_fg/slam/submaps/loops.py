@@ -36,7 +36,7 @@ class LoopClosure:
         name = f"loop from {self.first} to {self.second}"
         checked_transform(f"{name}: first_T_second", self.first_T_second)
         P = checked(f"{name}: covariance", self.covariance, (6, 6))
-        if not np.allclose(P, P.T, rtol=1e-6, atol=0.0) or np.linalg.eigvalsh((P + P.T) / 2)[0] <= 0:
+        if np.abs(P - P.T).max() > 1e-6 * np.abs(P).max() or np.linalg.eigvalsh((P + P.T) / 2)[0] <= 0:
             raise InputError(f"{name}: covariance: expected a symmetric matrix, positive definite")
 
 
