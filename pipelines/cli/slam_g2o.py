@@ -114,8 +114,8 @@ def g2o(
     if graph.landmarks is not None:
         poses += f", {counted(len(graph.landmarks.ids), 'landmark')}"
         count += sum(len(seen.pose) for seen in graph.landmarks.observations)
-    errors = f"error {optimised.error:.6g} (at the start {guess:.6g})"
-    typer.echo(f"{output}: {poses}, {counted(count, 'measurement')}, {errors}")
+    rounded = f"error {optimised.error:.6g} (at the start {guess:.6g})"
+    typer.echo(f"{output}: {poses}, {counted(count, 'measurement')}, {rounded}")
     if robust == "consensus":
         typer.echo(f"left out as false: {counted(len(rejected), 'loop')}")
     if (minimum := optimised.chordal) is not None:
