@@ -166,8 +166,8 @@ class LidarSlam:
             raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
         if scan is None:
             raise InputError(
-                "scan: expected one in every step: what the vehicle's sensors measure between scans comes with the next "
-                "scan, as SensorBuffer gives it; of detections between scans give those nearest to a scan"
+                "scan: expected one in every step: what sensors measure between scans comes with the next scan, as "
+                "SensorBuffer gives it; of detections between scans give those nearest to a scan"
             )
         require_type("scan", scan, Scan)
         if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
