@@ -110,12 +110,13 @@ def g2o(
                 errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch or 10)
     write_pose_graph(output, graph, optimised, rows, blocks, errors, rejected)
     poses, count = counted(len(graph), "pose"), len(graph.first)
-    count += sum(len(known.pose) for known in (graph.priors, graph.places) if known is not None)
+    count += sum(len(one.pose) for one in (graph.priors, graph.places) if one is not None)
     if graph.landmarks is not None:
         poses += f", {counted(len(graph.landmarks.ids), 'landmark')}"
         count += sum(len(seen.pose) for seen in graph.landmarks.observations)
-    rounded = f"error {optimised.error:.6g} (at the start {guess:.6g})"
-    typer.echo(f"{output}: {poses}, {counted(count, 'measurement')}, {rounded}")
+    typer.echo(
+        f"{output}: {poses}, {counted(count, 'measurement')}, error {optimised.error:.6g} (at the start {guess:.6g})"
+    )
     if robust == "consensus":
         typer.echo(f"left out as false: {counted(len(rejected), 'loop')}")
     if (minimum := optimised.chordal) is not None:

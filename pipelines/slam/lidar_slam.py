@@ -164,6 +164,11 @@ class LidarSlam:
         """
         if self._finished:
             raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
+        if scan is None:
+            raise InputError(
+                "scan: expected one in every step: what sensors measure between scans comes with the next scan, as "
+                "SensorBuffer gives it; of detections between scans give those nearest to a scan"
+            )
         require_type("scan", scan, Scan)
         if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
             raise InputError(f"time: expected a finite number of seconds, got {time!r}")
