@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factors import nonlinear_graph
+from factors.gaussian import gaussian_graph
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.block_variables import BlockVariables
-from saga_fg.estimators.dynamics import Dynamics, PredictionSummary
+from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.measurements import WhitenedMeasurements
-from saga_fg.estimators.partition import Partition
 from saga_fg.numerics.arrays import IntArray
 
 
@@ -26,7 +25,6 @@ class BayesTree:
 
     isam        as of the last update
     variables   of the present states
-    components  nodes that are correlated
     factors     to be added
     new         keys of the variables to be added, with their sizes
     leaving     keys of the past variables, to be marginalised, with their sizes
@@ -34,7 +32,6 @@ class BayesTree:
 
     isam: gtsam.ISAM2
     variables: BlockVariables
-    components: Partition
     factors: tuple[gtsam.JacobianFactor, ...]
     new: dict[int, int]
     leaving: dict[int, int]
@@ -47,7 +44,7 @@ class BayesTree:
             raise np.linalg.LinAlgError("a variance is not positive")
         variables = BlockVariables.over(x.partition, 0, x.mean, np.sqrt(variances))
         priors = tuple(variables.priors(x, np.arange(len(x.layout))))
-        return BayesTree(gtsam.ISAM2(_parameters(qr)), variables, x.partition, priors, variables.dims(), {})
+        return BayesTree(gtsam.ISAM2(_parameters(qr)), variables, priors, variables.dims(), {})
 
     def with_new_nodes(self, x: BlockGaussian) -> BayesTree:
         """Add the nodes that `x` has at its end and the tree has not, independent of all others."""
@@ -57,28 +54,26 @@ class BayesTree:
         variables = self.variables.extended(x.layout, x.mean[known.size :], scale, first)
         new = {key: size for key, size in variables.dims().items() if key >= first}
         factors = self.factors + tuple(variables.node_priors(rows, x.covariances(rows)))
-        return replace(self, variables=variables, components=x.partition, factors=factors, new=self.new | new)
-
-    def with_measurements(self, rows: WhitenedMeasurements) -> BayesTree:
-        """Add linear measurements."""
-        return replace(self, factors=self.factors + tuple(self.variables.detections(rows)))
+        return replace(self, variables=variables, factors=factors, new=self.new | new)
 
     def predicted(
-        self, rows: IntArray, dynamics: Dynamics, prediction: PredictionSummary, by_covariance: BlockGaussian
+        self, x: BlockGaussian, rows: IntArray, dynamics: Dynamics, by_factors: IntArray, by_covariance: IntArray
     ) -> BayesTree:
-        """Move over an interval; rows: of the nodes that stay.
+        """Move over an interval, whose prediction is `x`; rows: of its nodes in the tree's present variables.
 
-        dynamics: of the nodes predicted by interaction factors; by_covariance: the prediction of the others.
+        by_factors, by_covariance: rows of `x`, of the components that interaction factors lead to, and of those that
+        begin with a prior of their own. Raises LinAlgError where a covariance has no root.
         """
-        components = prediction.components
-        variables = BlockVariables.over(components, self._next_key, prediction.mean, prediction.scale, dynamics)
-        others = components.layout.rows(by_covariance.layout.nodes)
-        factors = (*variables.interactions(self.variables, rows, dynamics), *variables.priors(by_covariance, others))
+        variances = x.variances()
+        if not (variances > 0).all():
+            raise np.linalg.LinAlgError("a variance is not positive")
+        variables = BlockVariables.over(x.partition, self._next_key, x.mean, np.sqrt(variances), dynamics)
+        interactions = variables.interactions(self.variables, rows, dynamics.only(by_factors))
+        priors = variables.priors(x.without(by_factors), by_covariance)
         return BayesTree(
             self.isam,
             variables,
-            components,
-            self.factors + factors,
+            (*self.factors, *interactions, *priors),
             self.new | variables.dims(),
             self.leaving | self.variables.dims(),
         )
@@ -92,17 +87,26 @@ class BayesTree:
     def _next_key(self) -> int:
         return int(self.variables.keys.max(initial=-1)) + 1
 
-    def updated(self) -> tuple[BayesTree, BlockGaussian]:
-        """Take in all changes and marginalise the past; returns the posterior as well.
+    def corrected(self, x: BlockGaussian, measured: WhitenedMeasurements) -> tuple[BayesTree, BlockGaussian]:
+        """Take in linear measurements, with all that is still to be taken in; returns also the posterior.
 
-        GTSAM raises RuntimeError where its arithmetic fails.
+        x: the Gaussian before them. It is read anew where something was measured; nowhere else have they changed it.
         """
+        tree = replace(self, factors=self.factors + tuple(self.variables.detections(measured))).updated()
+        return tree, tree.variables.posterior(tree.isam, x, measured.rows)
+
+    def updated(self) -> BayesTree:
+        """Take in all changes and marginalise the past. GTSAM raises RuntimeError where its arithmetic fails."""
         isam = gtsam.ISAM2(self.isam)
         present = self.variables.dims()
-        graph = nonlinear_graph(self.factors, present | self.leaving | self.new)
-        values = gtsam.Values()
+        dims = present | self.leaving | self.new
+        zeros = {size: np.zeros(size) for size in {*dims.values()}}
+        values, point = gtsam.Values(), gtsam.Values()  # where factors are linearised: those of increments from there
         for key, size in self.new.items():
-            values.insert(key, np.zeros(size))
+            values.insert(key, zeros[size])
+        for key in {key for factor in self.factors for key in factor.keys()}:  # noqa: SIM118 -- a factor is no dict
+            point.insert(key, zeros[dims[key]])
+        graph = gtsam.LinearContainerFactor.ConvertLinearGraph(gaussian_graph(self.factors), point)
         parameters = gtsam.ISAM2UpdateParams()
         if self.leaving:
             groups, leaving = gtsam.KeyGroupMap(), gtsam.KeyList()
@@ -115,11 +119,7 @@ class BayesTree:
         isam.update(graph, values, parameters)
         if self.leaving:
             isam.marginalizeLeaves(leaving)
-        mean = self.variables.mean(isam.getDelta())
-        if not np.isfinite(mean).all():
-            raise RuntimeError("iSAM2 answers with numbers that are not finite")
-        x = BlockGaussian(self.components, mean, self.variables.marginals(isam, self.components))
-        return replace(self, isam=isam, factors=(), new={}, leaving={}), x
+        return replace(self, isam=isam, factors=(), new={}, leaving={})
 
 
 def _parameters(qr: bool) -> gtsam.ISAM2Params:

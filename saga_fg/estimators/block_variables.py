@@ -30,7 +30,7 @@ from saga_fg.estimators.correction import rank
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import WhitenedMeasurements
-from saga_fg.estimators.partition import Partition
+from saga_fg.estimators.partition import Partition, unflattened
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _WHOLE = 64  # size of a component up to which it is one variable
@@ -71,25 +71,9 @@ class BlockVariables:
         sizes = np.bincount(self.partition.label, weights=self.partition.layout.dims, minlength=len(self.keys))
         return sizes.astype(np.int64)
 
-    @cached_property
-    def places(self) -> list[IntArray]:
-        """Places of each variable in the joint state."""
-        partition = self.partition
-        places: list[IntArray] = [np.empty(0, dtype=np.int64)] * len(self.keys)
-        for node in np.unique(partition.label, return_index=True)[1].tolist():
-            places[partition.label[node]] = partition.groups[partition.group[node]][partition.row[node]]
-        return places
-
     def dims(self) -> dict[int, int]:
         """Size of each variable, by key."""
         return dict(zip(self.keys.tolist(), self.sizes.tolist(), strict=True))
-
-    def mean(self, delta: gtsam.VectorValues) -> FloatArray:
-        """(D,) the joint state at the solution `delta`."""
-        y = np.empty(len(self.origin))
-        if len(self.keys):
-            y[np.concatenate(self.places)] = delta.vector(self.keys.tolist())
-        return self.origin + self.scale * y
 
     def priors(self, x: BlockGaussian, rows: IntArray) -> list[gtsam.JacobianFactor]:
         """One factor a component of `x`, whose nodes are at `rows` here; no variable belongs to two components."""
@@ -190,40 +174,58 @@ class BlockVariables:
             factors.append(native_factor(keys, [int(self.sizes[variable]), *before.sizes[here].tolist()], matrix))
         return factors
 
-    def marginals(self, isam: gtsam.ISAM2, components: Partition) -> tuple[FloatArray, ...]:
-        """Covariances of the components; no variable belongs to two of them.
+    def posterior(self, isam: gtsam.ISAM2, x: BlockGaussian, rows: IntArray) -> BlockGaussian:
+        """Read the components of the nodes at `rows` from the Bayes tree; the others are those of `x`.
 
         A component of one variable is a root of the Bayes tree. One of several is too, but GTSAM would eliminate it
-        again to hand it over; the sum of its factors is the same information.
+        again to hand it over; the sum of its factors is the same information. Raises RuntimeError or LinAlgError where
+        the tree has lost its digits.
         """
-        blocks = []
-        factors = isam.getFactorsUnsafe()
-        first = np.unique(components.label, return_index=True)[1]  # a node of each component
-        count = np.bincount(components.label[np.unique(self.partition.label, return_index=True)[1]])
-        for number, places in enumerate(components.groups):
-            nodes = np.empty(len(places), dtype=np.int64)
-            here = first[components.group[first] == number]
-            nodes[components.row[here]] = here
+        components, own = x.partition, self.partition.label
+        mean, blocks = x.mean.copy(), unflattened(np.array(x.flat), components)
+        read = np.unique(components.label[rows])
+        node = first_nodes(components.label)[read]
+        cut = np.bincount(components.label[first_nodes(own)])[read] > 1
+        information = self._information(isam, components, read[cut])
+        for number in np.unique(components.group[node]).tolist():
+            mine = np.flatnonzero(components.group[node] == number)
+            at = components.row[node[mine]]
+            places = components.groups[number][at]
             order = np.broadcast_to(np.arange(places.shape[1]), places.shape).copy()
-            roots = np.empty((*places.shape, places.shape[1]))  # upper triangular in the order of the variables
-            single = count[components.label[nodes]] == 1
-            for component in np.flatnonzero(single).tolist():
-                conditional = isam.marginalFactor(int(self.keys[self.partition.label[nodes[component]]]))
-                roots[component] = conditional.R()  # a view into what must stay alive
-            for component in np.flatnonzero(~single).tolist():
-                order[component], variables = self._variables_of(places[component])
-                information = _information(factors, self.keys[variables].tolist())
-                roots[component] = np.linalg.cholesky(information).T
-            half = _inverted(roots) * np.take_along_axis(self.scale[places], order, axis=1)[:, :, None]
+            y, roots = np.empty(places.shape), np.empty((*places.shape, places.shape[1]))  # in the order of variables
+            for k, component in enumerate(mine.tolist()):
+                if cut[component]:
+                    order[k], variables = self._variables_of(places[k])
+                    roots[k] = np.linalg.cholesky(information[int(read[component])]).T
+                else:
+                    variables = own[node[component]][None]
+                    conditional = isam.marginalFactor(int(self.keys[variables[0]]))
+                    roots[k] = conditional.R()  # a view into what must stay alive
+                y[k] = np.concatenate([isam.calculateEstimateVector(key) for key in self.keys[variables].tolist()])
+            ordered = np.take_along_axis(places, order, axis=1)
+            mean[ordered] = self.origin[ordered] + self.scale[ordered] * y
+            half = _inverted(roots) * self.scale[ordered][:, :, None]
+            back = np.argsort(order, axis=1)
+            half = np.take_along_axis(half, back[:, :, None], axis=1)
             P = half @ np.swapaxes(half, 1, 2)
-            if not single.all():
-                ordered, which = P, np.arange(len(places))[:, None, None]
-                P = np.empty_like(ordered)
-                P[which, order[:, :, None], order[:, None, :]] = ordered
-            if not np.isfinite(P).all():
+            if not (np.isfinite(P).all() and np.isfinite(y).all()):
                 raise RuntimeError("the Bayes tree holds numbers that are not finite")
-            blocks.append(P)
-        return tuple(blocks)
+            blocks[number][at] = P
+        return BlockGaussian(components, mean, blocks)
+
+    def _information(self, isam: gtsam.ISAM2, components: Partition, labels: IntArray) -> dict[int, FloatArray]:
+        """Information matrices of components by label, in the order of their variables, from all factors on them."""
+        variables = {
+            k: self.keys[np.unique(self.partition.label[components.label == k])].tolist() for k in labels.tolist()
+        }
+        number = {key: k for k, keys in variables.items() for key in keys}
+        linear = {k: gtsam.GaussianFactorGraph() for k in variables}
+        factors = isam.getFactorsUnsafe()
+        for i in range(factors.size()) if variables else ():
+            factor = factors.at(i) if factors.exists(i) else None
+            if isinstance(factor, gtsam.LinearContainerFactor) and (k := number.get(factor.keys()[0])) is not None:
+                linear[k].push_back(factor.factor())
+        return {k: np.asarray(linear[k].hessian(gtsam.Ordering(keys))[0]) for k, keys in variables.items()}
 
     def _variables_of(self, places: IntArray) -> tuple[IntArray, IntArray]:
         """Order of the entries of a component, at `places` of the joint state, by variable; and its variables."""
@@ -233,16 +235,9 @@ class BlockVariables:
         return np.argsort(variable, kind="stable"), np.unique(variable)
 
 
-def _information(factors: gtsam.NonlinearFactorGraph, keys: list[int]) -> FloatArray:
-    """Information matrix of the variables `keys`, in this order, from all factors on them."""
-    wanted = set(keys)
-    linear = gtsam.GaussianFactorGraph()
-    for i in range(factors.size()):
-        factor = factors.at(i) if factors.exists(i) else None
-        if isinstance(factor, gtsam.LinearContainerFactor) and wanted.issuperset(factor.keys()):
-            linear.push_back(factor.factor())
-    information, _ = linear.hessian(gtsam.Ordering(keys))
-    return np.asarray(information)
+def first_nodes(label: IntArray) -> IntArray:
+    """A node of each label."""
+    return np.unique(label, return_index=True)[1]
 
 
 def _inverted(roots: FloatArray) -> FloatArray:

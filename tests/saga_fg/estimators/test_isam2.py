@@ -124,10 +124,31 @@ def test_one_interval_and_its_measurements_take_one_update(updates):
     estimator.add(np.arange(4), rng.normal(size=(4, 4)), random_covariance(rng, 4, 4))
     for _ in range(3):
         estimator.predict(discretise(ring(np.arange(4), rng), 0.1))
+        estimator.covariance(np.arange(4))
         estimator.update(Measurements(np.arange(4), rng.normal(size=(4, 2)), np.eye(2, 4), 0.1 * np.eye(2)))
         estimator.covariance(np.arange(4))
-    # first the priors of four nodes; then one cell, its interaction and its detection factor
-    assert updates == [6, 2, 2]
+    # first the prior of one variable, then its interaction; and its detection factor
+    assert updates == [2, 2, 2]
+
+
+def test_intervals_without_measurements_leave_no_more_than_one_behind(updates):
+    rng = np.random.default_rng(2)
+    estimator, expected = IncrementalFilter(), JointKalmanFilter()
+    seen = Measurements(np.arange(4), rng.normal(size=(4, 2)), np.eye(2, 4), 0.1 * np.eye(2))
+    prior = np.arange(4), rng.normal(size=(4, 4)), random_covariance(rng, 4, 4)
+    for either in (estimator, expected):
+        either.add(*prior)
+        either.update(seen)
+    for _ in range(20):
+        graph = ring(np.arange(4), rng)
+        for either in (estimator, expected):
+            either.predict(discretise(graph, 0.1))
+        assert len(estimator._state.tree.factors) == 1
+    for either in (estimator, expected):
+        either.update(seen)
+    assert len(updates) == 21
+    np.testing.assert_allclose(estimator.joint_mean(prior[0]), expected.joint_mean(prior[0]), rtol=1e-9)
+    np.testing.assert_allclose(estimator.joint_covariance(prior[0]), expected.joint_covariance(prior[0]), rtol=1e-9)
 
 
 def test_nothing_grows_with_time():
