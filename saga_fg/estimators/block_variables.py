@@ -166,12 +166,13 @@ class BlockVariables:
             span = old.layout.offsets[j][:, None] + np.arange(d_j)
             values = -(W[d_i][i] @ blocks.values) * before.scale[span][:, None, :]
             put(values, i, column[pair[mine]] + old.offset[j])
+        keys, old_keys = self.keys.tolist(), before.keys[source_variable].tolist()
+        sizes, old_sizes, begins, firsts = (array.tolist() for array in (self.sizes, width, base, first))
         factors = []
         for variable in np.unique(target_variable).tolist():
-            here = source_variable[first[variable] : first[variable + 1]]
-            matrix = flat[base[variable] : base[variable + 1]].reshape(-1, self.sizes[variable]).T
-            keys = [int(self.keys[variable]), *before.keys[here].tolist()]
-            factors.append(native_factor(keys, [int(self.sizes[variable]), *before.sizes[here].tolist()], matrix))
+            here, size = slice(firsts[variable], firsts[variable + 1]), sizes[variable]
+            matrix = flat[begins[variable] : begins[variable + 1]].reshape(-1, size).T
+            factors.append(native_factor([keys[variable], *old_keys[here]], [size, *old_sizes[here]], matrix))
         return factors
 
     def posterior(self, isam: gtsam.ISAM2, x: BlockGaussian, rows: IntArray) -> BlockGaussian:
@@ -181,51 +182,40 @@ class BlockVariables:
         again to hand it over; the sum of its factors is the same information. Raises RuntimeError or LinAlgError where
         the tree has lost its digits.
         """
-        components, own = x.partition, self.partition.label
-        mean, blocks = x.mean.copy(), unflattened(np.array(x.flat), components)
-        read = np.unique(components.label[rows])
-        node = first_nodes(components.label)[read]
-        cut = np.bincount(components.label[first_nodes(own)])[read] > 1
-        information = self._information(isam, components, read[cut])
-        for number in np.unique(components.group[node]).tolist():
-            mine = np.flatnonzero(components.group[node] == number)
-            at = components.row[node[mine]]
-            places = components.groups[number][at]
-            order = np.broadcast_to(np.arange(places.shape[1]), places.shape).copy()
-            y, roots = np.empty(places.shape), np.empty((*places.shape, places.shape[1]))  # in the order of variables
-            for k, component in enumerate(mine.tolist()):
-                if cut[component]:
-                    order[k], variables = self._variables_of(places[k])
-                    roots[k] = np.linalg.cholesky(information[int(read[component])]).T
-                else:
-                    variables = own[node[component]][None]
-                    conditional = isam.marginalFactor(int(self.keys[variables[0]]))
-                    roots[k] = conditional.R()  # a view into what must stay alive
-                y[k] = np.concatenate([isam.calculateEstimateVector(key) for key in self.keys[variables].tolist()])
-            ordered = np.take_along_axis(places, order, axis=1)
-            mean[ordered] = self.origin[ordered] + self.scale[ordered] * y
-            half = _inverted(roots) * self.scale[ordered][:, :, None]
-            back = np.argsort(order, axis=1)
-            half = np.take_along_axis(half, back[:, :, None], axis=1)
-            P = half @ np.swapaxes(half, 1, 2)
-            if not (np.isfinite(P).all() and np.isfinite(y).all()):
-                raise RuntimeError("the Bayes tree holds numbers that are not finite")
-            blocks[number][at] = P
+        components, mean, flat = x.partition, x.mean.copy(), np.array(x.flat)
+        blocks, first = unflattened(flat, components), np.unique(components.label[rows], return_index=True)[1]
+        for node in rows[first].tolist():
+            group, row = components.group[node], components.row[node]
+            places = components.groups[group][row]
+            variable, order = self.partition.label[node], np.arange(len(places))
+            if self.sizes[variable] == len(places):
+                conditional = isam.marginalFactor(int(self.keys[variable]))
+                R, d = conditional.R(), conditional.d()  # views into what must stay alive
+            else:
+                order, variables = self._variables_of(places)
+                R, d = self._root(isam, variables)
+            inverse, singular = scipy.linalg.lapack.dtrtri(R)
+            if singular:
+                raise np.linalg.LinAlgError("the Bayes tree is singular")
+            half = np.empty_like(inverse)
+            half[order] = self.scale[places[order], None] * inverse
+            mean[places] = self.origin[places] + half @ d
+            np.matmul(half, half.T, out=blocks[group][row])
+        if not (np.isfinite(mean).all() and np.isfinite(flat).all()):
+            raise RuntimeError("the Bayes tree holds numbers that are not finite")
         return BlockGaussian(components, mean, blocks)
 
-    def _information(self, isam: gtsam.ISAM2, components: Partition, labels: IntArray) -> dict[int, FloatArray]:
-        """Information matrices of components by label, in the order of their variables, from all factors on them."""
-        variables = {
-            k: self.keys[np.unique(self.partition.label[components.label == k])].tolist() for k in labels.tolist()
-        }
-        number = {key: k for k, keys in variables.items() for key in keys}
-        linear = {k: gtsam.GaussianFactorGraph() for k in variables}
-        factors = isam.getFactorsUnsafe()
-        for i in range(factors.size()) if variables else ():
-            factor = factors.at(i) if factors.exists(i) else None
-            if isinstance(factor, gtsam.LinearContainerFactor) and (k := number.get(factor.keys()[0])) is not None:
-                linear[k].push_back(factor.factor())
-        return {k: np.asarray(linear[k].hessian(gtsam.Ordering(keys))[0]) for k, keys in variables.items()}
+    def _root(self, isam: gtsam.ISAM2, variables: IntArray) -> tuple[FloatArray, FloatArray]:
+        """R and d of || R x - d || for a component, of variables in this order, from all factors on them."""
+        keys, index, factors = self.keys[variables].tolist(), isam.getVariableIndex(), isam.getFactorsUnsafe()
+        linear = gtsam.GaussianFactorGraph()
+        for i in sorted({i for key in keys for i in index.at(key)}):
+            factor = factors.at(i)
+            assert isinstance(factor, gtsam.LinearContainerFactor)
+            linear.push_back(factor.factor())
+        information, vector = linear.hessian(gtsam.Ordering(keys))
+        L = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
+        return L.T, scipy.linalg.solve_triangular(L, vector, lower=True)
 
     def _variables_of(self, places: IntArray) -> tuple[IntArray, IntArray]:
         """Order of the entries of a component, at `places` of the joint state, by variable; and its variables."""
@@ -238,13 +228,6 @@ class BlockVariables:
 def first_nodes(label: IntArray) -> IntArray:
     """A node of each label."""
     return np.unique(label, return_index=True)[1]
-
-
-def _inverted(roots: FloatArray) -> FloatArray:
-    """Inverses of upper triangular matrices (c, s, s)."""
-    if roots.shape[1] < _WHOLE:
-        return np.asarray(np.linalg.inv(roots), dtype=np.float64)
-    return np.stack([scipy.linalg.lapack.dtrtri(root)[0] for root in roots])
 
 
 def _divided(components: Partition, dynamics: Dynamics | None) -> Partition:

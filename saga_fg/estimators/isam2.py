@@ -1,14 +1,18 @@
 r"""The filter as an incremental factor graph: `gtsam.ISAM2` with interaction factors, the past marginalised.
 
 Every interval adds variables for the new states and the interaction factors that lead to them; measurements add
-detection factors; then the old variables are marginalised, so that the graph always holds one epoch and cost and memory
-of a frame do not grow. Means and covariances are read from the Bayes tree. The variables are those of
+detection factors, with which the tree is updated; then the old variables are marginalised, so that the graph always
+holds one epoch and cost and memory of a frame do not grow. The variables are those of
 `saga_fg.estimators.block_variables`.
+
+A tree is eliminated once a frame, at the first measurements: what is predicted is read before that, by covariances,
+P <- F P F^T + Q, from the posterior that the tree has given. Then it gives the means and covariances of the components
+that were measured; those of others have not changed.
 
 Interaction factors are information: noise without variance has none, and noise of variance Q between states of
 variance P costs Cholesky elimination log10(P/Q) digits, QR half as many. So small components are eliminated by QR,
-large ones by Cholesky while that leaves enough digits, and an interval that would leave fewer (Q singular, or many
-million times smaller than P) is predicted by covariances, P <- F P F^T + Q, after which iSAM2 begins anew.
+large ones by Cholesky while that leaves enough digits. Components that an interval would leave fewer (Q singular, or
+many million times smaller than P), and those that have come apart, begin anew: the prediction is their prior.
 """
 
 from __future__ import annotations
@@ -201,7 +205,7 @@ def _tree_moved(state: _State, x: BlockGaussian, dynamics: Dynamics, separated: 
     if state.tree is None or state.tree.qr != small or chosen.all():
         return None
     try:
-        tree = state.tree.updated() if state.tree.leaving else state.tree
+        tree = state.tree.updated(copied=True) if state.tree.leaving else state.tree
         rows = state.x.layout.rows(x.layout.nodes)
         return tree.predicted(x, rows, dynamics, np.flatnonzero(~chosen), np.flatnonzero(chosen))
     except (RuntimeError, np.linalg.LinAlgError) as error:
