@@ -27,7 +27,7 @@ import gtsam
 import numpy as np
 
 from factors.errors import FactorError, SingularSystemError
-from factors.gaussian import check_dimensions, native_factor
+from factors.gaussian import check_dimensions
 from factors.marginal import block_covariances, marginal_moments
 from factors.nonlinear import Linearisable
 from factors.singular import singular_system
@@ -295,8 +295,8 @@ def _step(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, damping: 
         for i in range(ordering.size()):
             key = ordering.at(i)
             if (dim := zero.dim(key)) not in rows:
-                rows[dim] = np.asfortranarray(np.sqrt(damping) * np.eye(dim, dim + 1))
-            system.push_back(native_factor([key], [dim], rows[dim]))
+                rows[dim] = np.sqrt(damping) * np.eye(dim), np.zeros(dim), gtsam.noiseModel.Unit.Create(dim)
+            system.push_back(gtsam.JacobianFactor(key, *rows[dim]))
     step: gtsam.VectorValues | None
     try:
         step = system.optimize(ordering)
@@ -313,19 +313,22 @@ def _step_by_qr(system: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> 
         return None
     step, keys = tree.optimize(), sorted(system.keyVector())
     ends = np.cumsum([step.dim(key) for key in keys])
-    _, columns, entries = system.sparseJacobian_()
-    lengths = np.sqrt(np.bincount(columns.astype(int) - 1, entries**2, ends[-1] + 1))
-    of_key = dict(zip(keys, np.split(lengths, ends), strict=False))
+    _, column, entries = system.sparseJacobian_()
+    lengths = np.sqrt(np.bincount(column.astype(int) - 1, entries**2, ends[-1] + 1)).tolist()
+    of_key = {key: lengths[end - step.dim(key) : end] for key, end in zip(keys, ends.tolist(), strict=True)}
     cliques = list(tree.roots())
+    pivots: list[float] = []
+    columns: list[float] = []
     while cliques:
         clique = cliques.pop()
         conditional = clique.conditional()
-        pivots = np.abs(np.diagonal(conditional.R()))
-        columns = np.concatenate([of_key[key] for key in conditional.keys()])[: len(pivots)]  # noqa: SIM118
-        if not (pivots > _PIVOT * columns).all():
-            return None
+        pivots += conditional.R().diagonal().tolist()
+        for key in conditional.keys():  # noqa: SIM118
+            if len(columns) < len(pivots):  # the others are eliminated later
+                columns += of_key[key]
         cliques += [clique[k] for k in range(clique.nrChildren())]
-    return step
+    determined = np.abs(pivots) > _PIVOT * np.array(columns)
+    return step if determined.all() else None
 
 
 def _length(linear: gtsam.GaussianFactorGraph, step: gtsam.VectorValues, damping: float) -> float:
