@@ -43,13 +43,14 @@ _PIVOT = 1e-14  # relative to its column
 @dataclass(frozen=True)
 class SolverSettings:
     """method: "levenberg-marquardt" or "gauss-newton"; max_iterations: linearisations; tolerance: length of the step,
-    in posterior standard deviations, below which the solution counts as reached; damping: first lambda tried when a
-    plain step fails.
+    in posterior standard deviations, below which the solution counts as reached; relative_tolerance: decrease of the
+    error by a step, as a share of it, below which it does, too; damping: first lambda tried when a plain step fails.
     """
 
     method: Literal["levenberg-marquardt", "gauss-newton"] = "levenberg-marquardt"
     max_iterations: int = 100
     tolerance: float = 1e-6
+    relative_tolerance: float = 0.0
     damping: float = 1e-4
 
     def __post_init__(self) -> None:
@@ -57,6 +58,8 @@ class SolverSettings:
             raise FactorError(f"method: expected levenberg-marquardt or gauss-newton, got {self.method!r}")
         if self.max_iterations < 1 or not self.tolerance > 0 or not self.damping > 0:
             raise FactorError("settings: expected max_iterations >= 1, tolerance > 0 and damping > 0")
+        if not self.relative_tolerance >= 0:
+            raise FactorError(f"relative_tolerance: expected a number >= 0, got {self.relative_tolerance:g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +134,11 @@ def solve(
         if move is None:  # no damping helps: error and linearisation contradict each other
             return Solution(values, error, iteration, False, graph, factors)
         _LOG.debug("iteration %d: error %.9g, damping %.3g", iteration, move.error, move.damping)
+        reached = (
+            move.length <= settings.tolerance or move.exact or error - move.error < settings.relative_tolerance * error
+        )
         values, error, damping = move.values, move.error, move.damping
-        if damping == 0 and (move.length <= settings.tolerance or move.exact):
+        if damping == 0 and reached:
             return Solution(values, _final(graph, factors, values, error), iteration, True, graph, factors)
         damping = damping / 10 if damping > settings.damping else 0.0
     error = _final(graph, factors, values, error)
@@ -251,7 +257,8 @@ def _move(
             length = float("inf") if gained else _length(linear, step, damping)
             if undetermined and length <= settings.tolerance and damping <= settings.damping:
                 raise singular_system(linear)  # standing still, but only the damping says where
-            if moved_error <= error * (1 + _EXACT) or (length <= settings.tolerance and damping == 0):
+            unchanged = max(_EXACT, settings.relative_tolerance if damping == 0 else 0.0)
+            if moved_error <= error * (1 + unchanged) or (length <= settings.tolerance and damping == 0):
                 exact = abs(moved_error - linear.error(step)) <= _EXACT * error
                 return _Move(moved, moved_error, length, damping, exact)
         damping = max(10 * damping, settings.damping)
