@@ -82,7 +82,7 @@ def test_damping_saves_a_step_that_gauss_newton_loses():
 
 def test_slow_convergence_ends_where_the_error_hardly_falls():
     factor = on_vector(
-        lambda x: np.array([x[0] - 1, 3 + 0.15 * x[0] ** 2]), dim=1
+        lambda x: np.array([x[0] - 1, 3 + 0.1 * x[0] ** 2]), dim=1
     )  # a large residual: linear convergence
     start = values_of({0: np.zeros(1)})
     exact, soon = (solve(EMPTY, [factor], start, SolverSettings(relative_tolerance=share)) for share in (0.0, 1e-5))
