@@ -15,10 +15,10 @@ from saga_fg.numerics.arrays import FloatArray
 
 
 class Contender(Protocol):
-    """One of those that are compared. `prepare` is not timed, `step` is."""
+    """A method in the comparison. `prepare` is not timed, `step` is."""
 
     def prepare(self, frame: FlockFrame) -> None:
-        """Whatever is not the contender's own work."""
+        """Do work of the benchmark that is not timed."""
 
     def step(self) -> None:
         """Take the frame in and read out what is asked of all of them."""

@@ -29,7 +29,7 @@ from saga_fg.estimators.protocol import LatestMarginals, Measurements
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, shallow_copy
 from saga_fg.types.frame import Frame
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
@@ -74,6 +74,9 @@ class JointKalmanFilter(LatestMarginals):
         self._frame: Frame | None = None
         self._origin = np.zeros(2)
 
+    def __copy__(self) -> JointKalmanFilter:
+        return shallow_copy(self)
+
     @property
     def nodes(self) -> IntArray:
         nodes, others = self._state.layout.nodes, self.others
@@ -91,7 +94,7 @@ class JointKalmanFilter(LatestMarginals):
     def extend(
         self, nodes: ArrayLike, mean: FloatArray, covariance: FloatArray, labels: Mapping[int, str] | None = None
     ) -> None:
-        """As `add`, of numbers that were checked where they came in."""
+        """Add nodes as `add` does, without checking the numbers again."""
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
         if self.providers:
             self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})

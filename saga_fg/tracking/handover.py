@@ -65,10 +65,10 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     resolved, detected = table.unresolved == 0, np.zeros(len(table), dtype=bool)
     detected[matching.track] = settings.association.relink_above < 1
     detections = table.sensors.hits.sum(axis=1)
-    new = np.flatnonzero(detected & resolved & (detections > 1) & (detections <= settings.confirming_detections))
+    new = (detected & resolved & (detections > 1) & (detections <= settings.confirming_detections)).nonzero()[0]
     if len(new) == 0:
         return new, new, new
-    old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.max_coasting))
+    old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
     return _returned(state, new, old)
 
 

@@ -64,8 +64,7 @@ class FirstVehicles(Columns):
         return cls(ids, ids, times, times, np.empty((0, 2)), times, states, times, states)
 
     def later(self, nodes: NodeTable, rules: Sequence[EdgeRule], detected: BoolArray, time: float) -> FirstVehicles:
-        """Those of a node table whose tracks, its first rows, were `detected` at `time`, and others seen shortly
-        before."""
+        """First vehicles of a node table: tracks (its first rows) `detected` at `time`, and others seen just before."""
         stop, go = _first(rules, RedLight), _first(rules, GreenLight)
         if stop is None:
             return self

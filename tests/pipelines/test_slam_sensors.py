@@ -116,10 +116,10 @@ def test_fixes_are_placed_where_the_recording_begins(tmp_path: Path) -> None:
     assert log is not None
     np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, 11.132, 3], [0, 22.264, 3]], rtol=1e-3, atol=1e-6)
     of_map = (49.001, 8.4, 90.0)  # 111 m north of the records, 10 m below
-    log = sensor_log(records, "", [f"gps={table}"], 0, TIMES, of_map)
+    log = sensor_log(records, "", [f"gps={table}"], 0, TIMES, lambda: of_map)
     assert log is not None
     np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, -100.19, 13], [0, -89.06, 13]], rtol=1e-3, atol=1e-6)
     records.write_text(11 * records.read_text())
-    from_records = sensor_log(records, "gps", [], 0, TIMES, of_map)
+    from_records = sensor_log(records, "gps", [], 0, TIMES, lambda: of_map)
     assert from_records is not None
     np.testing.assert_allclose(from_records.tables["gps"][:, 1:].mean(axis=0), [0, -111.32, 10], atol=2.0)
