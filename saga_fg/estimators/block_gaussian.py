@@ -64,7 +64,7 @@ class BlockGaussian:
             return self
         keep = np.ones(len(self.layout), dtype=bool)
         keep[rows] = False
-        kept = np.flatnonzero(keep)
+        kept = keep.nonzero()[0]
         old = self.partition
         partition = old.restricted(self.layout.without(rows), kept)
         blocks = _left(self.blocks, old, partition, rows, kept)

@@ -108,7 +108,7 @@ class Partition:
     @cached_property
     def nodes_by_group(self) -> tuple[tuple[IntArray, IntArray, IntArray], ...]:
         """For each group, the nodes in it, the rows of their components and their slots there. Only with `size`."""
-        nodes = [np.flatnonzero(self.group == number) for number in range(len(self.groups))]
+        nodes = [(self.group == number).nonzero()[0] for number in range(len(self.groups))]
         return tuple((of_group, self.row[of_group], self.slot[of_group]) for of_group in nodes)
 
     @cached_property
@@ -140,7 +140,7 @@ class Partition:
             return [(0, np.arange(len(rows)), at)]
         group = self.group[rows]
         numbers = np.unique(group).tolist()
-        members = [np.flatnonzero(group == number) for number in numbers]
+        members = [(group == number).nonzero()[0] for number in numbers]
         return [(number, mine, at[mine]) for number, mine in zip(numbers, members, strict=True)]
 
     def joined(self, target: IntArray, source: IntArray) -> Partition:
@@ -178,7 +178,7 @@ class Partition:
         """
         nodes = np.bincount(self.label)
         size = np.bincount(self.label, weights=self.layout.dims).astype(np.int64)
-        rare = np.flatnonzero((nodes > 1) & (np.bincount(size)[size] < _FEW))
+        rare = ((nodes > 1) & (np.bincount(size)[size] < _FEW)).nonzero()[0]
         order = rare[np.argsort(size[rare], kind="stable")]
         chosen = order[np.cumsum(size[order]) <= _PACK]
         if len(chosen) < 2:
@@ -217,12 +217,12 @@ def _made_tables(partition: Partition) -> _Tables:
     offset = np.empty(len(label), dtype=np.int64)
     offset[order] = first - start[label[order]]
     places = np.repeat(layout.offsets[:-1][order] - first, layout.dims[order]) + np.arange(layout.size)
-    sizes = np.flatnonzero(np.bincount(size))
+    sizes = np.bincount(size).nonzero()[0]
     group = np.searchsorted(sizes, size)
     row = np.empty(len(size), dtype=np.int64)
     groups = []
     for number, s in enumerate(sizes.tolist()):
-        members = np.flatnonzero(group == number)
+        members = (group == number).nonzero()[0]
         row[members] = np.arange(len(members))
         groups.append(places[start[members][:, None] + np.arange(s)])
     return tuple(groups), group[label], row[label], offset
@@ -295,7 +295,7 @@ def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: Int
     in different components of either partition are zero.
     """
     result = zeros(new)
-    to = np.flatnonzero(source >= 0)
+    to = (source >= 0).nonzero()[0]
     if len(to) == 0:
         return result
     # a piece: nodes that share a component, before and after
@@ -312,7 +312,7 @@ def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: Int
     first = np.searchsorted(piece, np.arange(len(size)))  # a node of each piece
     kind = (old.group[origin[first]] * len(new.groups) + new.group[to[first]]) * (new.layout.size + 1) + size
     for number in np.unique(kind).tolist():
-        alike = np.flatnonzero(kind == number)
+        alike = (kind == number).nonzero()[0]
         i, j = origin[first[alike]], to[first[alike]]
         s = int(size[alike[0]])
         places = start[alike][:, None] + np.arange(s)

@@ -69,7 +69,7 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
     F: list[Blocks] = []
     Q: list[Blocks] = []
     alike: dict[tuple[int, bool], list[int]] = {}  # nodes without incoming edges share their kind's dynamics
-    for k in np.flatnonzero(np.bincount(kind[~coupled])).tolist():
+    for k in np.bincount(kind[~coupled]).nonzero()[0].tolist():
         alike.setdefault((kinds[k].dim, kinds[k].nilpotency is None), []).append(k)
     for numbers in alike.values():
         place = np.full(len(kinds), -1)
@@ -82,7 +82,7 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         Q.append(Blocks(rows, rows, noise.take(of_row, 0) * graph.diffusion_scale[rows, None, None]))
     order = max(1, *(t.nilpotency or 0 for t in kinds))
     for d in np.unique(graph.dims[coupled]).tolist():
-        rows = np.flatnonzero(coupled & (graph.dims == d))
+        rows = (coupled & (graph.dims == d)).nonzero()[0]
         M, Qc, c = _own_dynamics(graph, rows, kinds, kind)
         phi, noise = _phi_and_noise(M, Qc, dt, order)
         F.append(Blocks(rows, rows, phi[0]))
@@ -191,7 +191,7 @@ def _own_dynamics(
     graph: SceneGraph, rows: IntArray, kinds: list[NodeType], kind: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """M (m, d, d), Qc (m, d, d), c (m, d) of the nodes `rows`, whose states have equal size."""
-    numbers = np.flatnonzero(np.bincount(kind[rows]))
+    numbers = np.bincount(kind[rows]).nonzero()[0]
     of_row = np.searchsorted(numbers, kind[rows])
     M = np.stack([kinds[k].generator for k in numbers]).take(of_row, 0)
     Qc = np.stack([kinds[k].diffusion for k in numbers]).take(of_row, 0) * graph.diffusion_scale[rows, None, None]
@@ -268,7 +268,7 @@ def _coupling_blocks(
     kind: IntArray,
 ) -> Blocks:
     """The off-diagonal blocks F_ij of some edges; M and phi are of the coupled nodes, `position` their rows there."""
-    acting = np.flatnonzero(edges.rate > 0)
+    acting = (edges.rate > 0).nonzero()[0]
     target, source = edges.target[acting], edges.source[acting]
     C = edges.rate[acting, None, None] * edges.A_other[acting]
     at = position[target]

@@ -49,8 +49,12 @@ class EdgeInformation(Settings):
 
     def gains(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """Information gains (E,), in [0, 1], of the edges source[k] -> target[k] (rows of `nodes`)."""
-        variance = nodes.velocity_variance
-        if nodes.unseen is not None:
-            variance = variance + (self.unseen_acceleration * nodes.unseen) ** 2
+        variance = self.variances(nodes)
         total = variance[target] + variance[source] + self.spread**2
         return np.divide(variance[target], total, out=np.zeros(len(target)), where=total > 0)
+
+    def variances(self, nodes: NodeTable) -> FloatArray:
+        """s^2 (n,) of the module."""
+        if nodes.unseen is None:
+            return nodes.velocity_variance
+        return np.asarray(nodes.velocity_variance + (self.unseen_acceleration * nodes.unseen) ** 2)

@@ -18,17 +18,17 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from saga_fg.kernels import lanes
+from saga_fg.kernels import edges
 from saga_fg.kernels.compilation import compiled_by
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
-from saga_fg.model.edge_features import EdgeFeatures, features_of
+from saga_fg.model.edge_features import STEEPEST, EdgeFeatures, features_of
 from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
+from saga_fg.model.edge_pairs import LEAST, none_before, pairs_ahead, pairs_within, strongest
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
 from saga_fg.model.paths import NO_PATHS, SHARP
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.settings import (
     NonNegative,
     NonNegativeInt,
@@ -38,7 +38,6 @@ from saga_fg.settings import (
     settings_group,
 )
 
-_LEAST = 1e-9  # probability that a certain object does not exist
 Leaders = Literal["any", "moving", "stationary"]
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
 
@@ -49,6 +48,9 @@ class Pairs(NamedTuple):
     target: IntArray
     source: IntArray
     rate: FloatArray
+
+
+NO_PAIRS = Pairs(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
 
 
 class EdgeRule(Protocol):
@@ -118,10 +120,7 @@ class Neighbours(Settings):
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= nodes.has_moved == 0 if nodes.has_moved is not None else False
         target, source = pairs_within(nodes.position, _acted(nodes, able), able, self.max_distance)
-        rate = weighted_by_gain(
-            self.strength(features_of(nodes, target, source)), self.information_gain, nodes, target, source
-        )
-        return strongest(Pairs(target, source, rate), len(nodes), self.max_degree)
+        return _neighbours(self, nodes, target, source) if len(target) else NO_PAIRS
 
 
 @dataclass(frozen=True)
@@ -196,15 +195,7 @@ class Following(Settings):
     def pairs(self, nodes: NodeTable) -> Pairs:
         seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
         target, source = self._ahead(seen)
-        features = features_of(seen, target, source)
-        near = self.min_separation * (nodes.length[target] + nodes.length[source]) / 2
-        between = self.in_lane(features) & (features.ahead >= near)
-        ahead = np.flatnonzero(between)
-        exists = np.ones(len(nodes)) if nodes.existence is None else nodes.existence
-        rate = weighted_by_gain(self.strength(features), self.information_gain, nodes, target, source)[ahead]
-        rate = rate * _none_before(target[ahead], self.remoteness(features)[ahead], exists[source[ahead]])
-        target, source, led = target[ahead], source[ahead], rate > 0
-        return Pairs(target[led], source[led], rate[led])
+        return _leaders(self, seen, target, source) if len(target) else NO_PAIRS
 
     def _ahead(self, nodes: NodeTable) -> tuple[IntArray, IntArray]:
         """All pairs that may be in a lane: target rows, source rows."""
@@ -241,15 +232,15 @@ class Repulsion(Settings):
         return self.sources
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        pushed, pushing = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.classes, self.sources))
+        pushed, pushing = (of_classes(nodes.label, names).nonzero()[0] for names in (self.classes, self.sources))
         target, source = np.repeat(pushed, len(pushing)), np.tile(pushing, len(pushed))
         target, source = target[target != source], source[target != source]
         given = self.interaction.given(nodes, target, source)
         apart, _ = nearest_offset(nodes.position[target] - nodes.position[source], given)
         distance = np.hypot(*apart.T)
-        near = np.flatnonzero(distance <= self.max_distance)
-        closest = strongest(Pairs(target[near], source[near], -distance[near]), len(nodes), self.max_degree)
-        return closest._replace(rate=np.full(len(closest.rate), self.rate))
+        near = (distance <= self.max_distance).nonzero()[0]
+        near = near[strongest(target[near], -distance[near], len(nodes), self.max_degree)]
+        return Pairs(target[near], source[near], np.full(len(near), self.rate))
 
 
 HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
@@ -286,65 +277,52 @@ def _acted(nodes: NodeTable, able: BoolArray) -> BoolArray:
     return able if nodes.acted is None else able & nodes.acted
 
 
-def pairs_within(
-    position: FloatArray, targets: BoolArray, sources: BoolArray, radius: float
-) -> tuple[IntArray, IntArray]:
-    """All pairs (E,) of different rows of two masks (n,) within `radius` m: target rows, source rows."""
-    to, of = np.flatnonzero(targets), np.flatnonzero(sources)
-    if len(to) == 0 or len(of) < 2:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    i, j = near_pairs(position[to], position[of], np.full(len(to), radius))
-    target, source = to[i], of[j]
-    different = target != source
-    return target[different], source[different]
+def _columns(nodes: NodeTable, information: EdgeInformation | None) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Of n nodes existence, whether they have moved, and variances of velocities, each (n,); the spread, -1: no gain"""
+    ones = np.ones(len(nodes))
+    exists = ones if nodes.existence is None else nodes.existence
+    moved = ones if nodes.has_moved is None else np.asarray(nodes.has_moved, dtype=np.float64)
+    if information is None:
+        return exists, moved, ones, -1.0
+    return exists, moved, information.variances(nodes), information.spread
 
 
-@compiled_by(lanes.pairs_ahead)
-def pairs_ahead(
-    position: FloatArray,
-    heading: FloatArray,
-    follows: BoolArray,
-    able: BoolArray,
-    farthest: float,
-    aside: float,
-    widening: float,
-    path: IntArray,
-    begin: FloatArray,
-    direction: FloatArray,
-    turn: FloatArray,
-    margin: FloatArray,
-    sharp: float,
-) -> tuple[IntArray, IntArray]:
-    target, source = pairs_within(position, follows, able, farthest)
-    c, s, (x, y), of = np.cos(heading), np.sin(heading), position.T, path[target]
-    dx, dy, c, s = x[source] - x[target], y[source] - y[target], c[target], s[target]
-    ahead = dx * c + dy * s
-    inside = (ahead > 0) & (np.abs(dy * c - dx * s) <= aside + widening * ahead)
-    bent = np.flatnonzero(of >= 0)
-    of, (dx, dy) = of[bent], (position[source[bent]] - begin[of[bent]]).T
-    c, s = np.cos(direction[of]), np.sin(direction[of])
-    ahead, beside = dx * c + dy * s, np.abs(dy * c - dx * s)
-    near = (ahead >= -margin[of]) & (beside * np.cos(turn[of]) - ahead * np.sin(turn[of]) <= margin[of])
-    inside[bent] = near | (turn[of] > sharp)
-    front = np.flatnonzero(inside)
-    return target[front], source[front]
+def _neighbours_by_kernel(rule: Neighbours, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
+    _, moved, variance, spread = _columns(nodes, rule.information_gain)
+    direction = nodes.along(target, source).direction
+    columns = nodes.position, nodes.velocity, nodes.heading, moved, variance
+    scales = rule.rate, rule.distance_scale, rule.heading_scale, rule.speed_scale
+    limits = rule.max_distance, rule.min_speed, rule.parked, rule.max_degree
+    return Pairs(*edges.neighbour_rates(target, source, direction, *columns, *scales, *limits, spread))
 
 
-def strongest(pairs: Pairs, n: int, degree: int) -> Pairs:
-    """At most `degree` edges into each node, the strongest."""
-    order = np.lexsort((-pairs.rate, pairs.target))
-    rank = np.arange(len(order)) - np.searchsorted(pairs.target[order], np.arange(n))[pairs.target[order]]
-    kept = order[rank < degree]
-    return Pairs(pairs.target[kept], pairs.source[kept], pairs.rate[kept])
+@compiled_by(_neighbours_by_kernel, where=lambda rule, nodes, target, source: type(rule) is Neighbours)
+def _neighbours(rule: Neighbours, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
+    """The strongest of these pairs, with their rates."""
+    strength = rule.strength(features_of(nodes, target, source))
+    rate = weighted_by_gain(strength, rule.information_gain, nodes, target, source)
+    kept = strongest(target, rate, len(nodes), rule.max_degree)
+    return Pairs(target[kept], source[kept], rate[kept])
 
 
-def _none_before(target: IntArray, remoteness: FloatArray, exists: FloatArray) -> FloatArray:
-    """Probabilities (E,) that no source of the same target with a lower remoteness exists, given those of sources."""
-    order = np.lexsort((remoteness, target))
-    first = np.flatnonzero(np.diff(target[order], prepend=-1))
-    missing = np.log1p(-np.minimum(exists[order], 1 - _LEAST))
-    before = np.cumsum(missing) - missing
-    nearer = np.exp(before - np.repeat(before[first], np.diff(first, append=len(order))))
-    result = np.empty(len(order))
-    result[order] = np.where(nearer > 2 * _LEAST, nearer, 0.0)
-    return result
+def _leaders_by_kernel(rule: Following, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
+    exists, moved, variance, spread = _columns(nodes, rule.information_gain)
+    columns = nodes.position, nodes.heading, nodes.length, moved, exists, variance
+    scales = rule.rate, rule.max_gap, rule.gap_scale, rule.lateral_scale, rule.heading_scale
+    leaders = ("any", "moving", "stationary").index(rule.leaders)
+    leading = rule.parked, leaders, rule.min_separation
+    ends = target, source, *nodes.along(target, source)
+    return Pairs(*edges.leader_rates(*ends, *columns, *scales, *leading, spread, STEEPEST, LEAST))
+
+
+@compiled_by(_leaders_by_kernel, where=lambda rule, nodes, target, source: type(rule) is Following)
+def _leaders(rule: Following, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
+    """Those of these pairs whose sources lead, with their rates."""
+    features = features_of(nodes, target, source)
+    near = rule.min_separation * (nodes.length[target] + nodes.length[source]) / 2
+    ahead = (rule.in_lane(features) & (features.ahead >= near)).nonzero()[0]
+    exists = np.ones(len(nodes)) if nodes.existence is None else nodes.existence
+    rate = weighted_by_gain(rule.strength(features), rule.information_gain, nodes, target, source)[ahead]
+    rate = rate * none_before(target[ahead], rule.remoteness(features)[ahead], exists[source[ahead]])
+    target, source, led = target[ahead], source[ahead], rate > 0
+    return Pairs(target[led], source[led], rate[led])

@@ -11,7 +11,6 @@ from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import NodeTable, applies
 from saga_fg.model.motion import distinct_types
-from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.scene_graph import Edges, ModeRecord, NonlinearEdges, SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, checked, checked_rows, unchecked
 
@@ -64,12 +63,12 @@ def build_graph(
                 if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
                     continue
                 ends = {"target": row[t], "source": row[s], "rate": rate[mine]}
-                if isinstance(law, AccelerationLaw):
-                    ends["given"] = law.given(nodes, t, s)
-                    nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
-                else:
+                if hasattr(law, "triples"):
                     triples = law.triples(nodes, t, s)._asdict()
                     groups.append(_made(Edges, shipped, interaction=type(law).__name__, **ends, **triples))
+                else:
+                    ends["given"] = law.given(nodes, t, s)
+                    nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
                 np.add.at(total_rate, row[t], rate[mine])
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:

@@ -6,13 +6,13 @@ heading.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.polyline import Polylines
 
@@ -61,9 +61,9 @@ class Paths(Columns):
 
     def of_nodes(self, rows: IntArray) -> Paths:
         """The paths of the nodes `rows` (k,), ascending, which are counted from 0 then."""
-        place = np.searchsorted(rows, self.row).clip(max=max(len(rows) - 1, 0))
-        kept = np.flatnonzero(rows[place] == self.row) if len(rows) else np.empty(0, dtype=np.int64)
-        return replace(self.select(kept), row=place[kept])
+        place = np.minimum(np.searchsorted(rows, self.row), max(len(rows) - 1, 0))
+        kept = (rows[place] == self.row).nonzero()[0] if len(rows) else np.empty(0, dtype=np.int64)
+        return unchecked(Paths, **vars(self.select(kept)) | {"row": place[kept]})
 
 
 NO_PATHS = Paths(
@@ -99,7 +99,7 @@ def along_paths(
     if paths is not None and len(paths) and len(target):
         line = np.minimum(np.searchsorted(paths.row, target), len(paths) - 1)
         predicted = paths.row[line] == target
-        bent = np.flatnonzero(predicted)
+        bent = predicted.nonzero()[0]
         at = paths.lines.feet(line[bent], position[source[bent]])
         ahead[bent], aside[bent] = at.s, at.e
         direction[bent] = np.arctan2(at.direction[:, 1], at.direction[:, 0])

@@ -61,6 +61,13 @@ def unchecked(kind: type[T], **values: Any) -> T:
     return made
 
 
+def shallow_copy(value: T) -> T:
+    """A copy of an object that has nothing but attributes, which both share."""
+    twin = object.__new__(type(value))
+    twin.__dict__.update(value.__dict__)
+    return twin
+
+
 def checked_covariances(name: str, value: ArrayLike, count: int, dim: int) -> FloatArray:
     """Return `value` as read-only symmetric positive definite matrices (count, dim, dim).
 

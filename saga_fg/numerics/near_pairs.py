@@ -25,15 +25,15 @@ def near_pairs(
 
     a (n, 2), b (m, 2), reach (n,) and further (m,) in m; where one of these is NaN there is no pair
     """
-    reach, further = np.asarray(reach, dtype=np.float64), np.broadcast_to(np.asarray(further, dtype=np.float64), len(b))
-    return _near_pairs(a, b, reach, further)
+    reach, further = np.asarray(reach, dtype=np.float64), np.asarray(further, dtype=np.float64)
+    return _near_pairs(a, b, reach, further if further.ndim else np.full(len(b), further))
 
 
 @compiled_by(compared_pairs, where=lambda a, b, reach, further: len(a) * len(b) <= MOST_LOOPED)
 def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
     if len(a) * len(b) <= MOST_COMPARED:
         return _compared(a, b, reach, further)
-    i, j = np.flatnonzero(~np.isnan(reach)), np.flatnonzero(~np.isnan(further))
+    i, j = (~np.isnan(reach)).nonzero()[0], (~np.isnan(further)).nonzero()[0]
     if len(i) == 0 or len(j) == 0:
         return i[:0], j[:0]
     widest = reach[i] + further[j].max()
@@ -43,7 +43,7 @@ def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatA
     i, widest = i[bounded], widest[bounded]
     octave = np.ceil(np.log2(np.maximum(widest, _LEAST)))
     for level in np.unique(octave).tolist():
-        alike = np.flatnonzero(octave == level)
+        alike = (octave == level).nonzero()[0]
         radius = float(widest[alike].max()) * (1 + 1e-9)
         near = cKDTree(a[i[alike]]).sparse_distance_matrix(tree, radius, output_type="ndarray")
         row, column = i[alike[near["i"]]], j[near["j"]]

@@ -107,6 +107,7 @@ class EgoNode:
             None if moved is None else np.append(moved, self.has_moved),
             unseen=None if unseen is None else np.append(unseen, 0.0),
             existence=None if existence is None else np.append(existence, 1.0),
+            paths=tracks.paths,
         )
 
 

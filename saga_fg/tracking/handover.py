@@ -26,7 +26,6 @@ import math
 
 import numpy as np
 
-from saga_fg.estimators import JointKalmanFilter
 from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.returns import return_evidence, returned_pairs
 from saga_fg.model.interactions import POSITION, VELOCITY
@@ -66,10 +65,10 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     resolved, detected = table.unresolved == 0, np.zeros(len(table), dtype=bool)
     detected[matching.track] = settings.association.relink_above < 1
     detections = table.sensors.hits.sum(axis=1)
-    new = np.flatnonzero(detected & resolved & (detections > 1) & (detections <= settings.confirming_detections))
+    new = (detected & resolved & (detections > 1) & (detections <= settings.confirming_detections)).nonzero()[0]
     if len(new) == 0:
         return new, new, new
-    old = np.flatnonzero(~detected & resolved & (table.coasting(state.time) <= settings.max_coasting))
+    old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
     return _returned(state, new, old)
 
 
@@ -117,16 +116,13 @@ def _evidence_by_kernel(
     state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     estimator, table, still = state.joint.estimator, state.table, state.table.stationarity
-    assert isinstance(estimator, JointKalmanFilter)
     places, place, D, s = state.joint.places(table.label), still.position, still.P, still.probability
     (x, P), (x_old, P_old) = (estimator.planar_marginals(table.id[k], places[k]) for k in (new, old))
     if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
     return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0, p, *if_still)
 
 
-@compiled_by(
-    _evidence_by_kernel, where=lambda state, new, old, V_0, p: isinstance(state.joint.estimator, JointKalmanFilter)
-)
+@compiled_by(_evidence_by_kernel)
 def _evidence(
     state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -22,7 +22,7 @@ from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.modes import Mixture, ModeTable
 from saga_fg.model.motion import Motion, NodeType
 from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct, shallow_copy
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.providers import RelativeDetections
 from saga_fg.tracking.kinematics import Kinematics, RelativePositions
@@ -249,7 +249,7 @@ class JointTrackState:
 
     def copied(self) -> JointTrackState:
         """Return a state that changes independently of this one."""
-        twin = copy.copy(self)
+        twin = shallow_copy(self)
         twin.estimator, twin._initiated = copy.copy(self.estimator), dict(self._initiated)
         twin._modes = dict(self._modes)
         return twin
@@ -320,12 +320,11 @@ def _local_pose(graph: SceneFactorGraph) -> FloatArray | None:
 
 
 def _kinematics_by_kernel(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
-    assert isinstance(joint.estimator, JointKalmanFilter)
     x, P = joint.estimator.planar_marginals(ids, joint.places(label))
     return Kinematics(x[:, :2], x[:, 2:], P[:, :2, :2], P[:, 2:, 2:])
 
 
-@compiled_by(_kinematics_by_kernel, where=lambda joint, ids, label: isinstance(joint.estimator, JointKalmanFilter))
+@compiled_by(_kinematics_by_kernel)
 def _kinematics(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
     n = len(ids)
     result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))

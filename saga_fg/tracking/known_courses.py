@@ -7,14 +7,12 @@ its leaders are found. All is found anew for every interval and recorded with it
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from saga_fg.model.known_course import KnownCourses, turning_time
 from saga_fg.model.motion import Curvilinear
 from saga_fg.model.paths import Paths
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, unchecked
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.box_filter import MOVING
 from saga_fg.tracking.kinematics import Kinematics
@@ -36,7 +34,7 @@ _LEAST = 1e-9
 
 def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
     """The paths of the `unseen` (n,) vehicles that keep to their courses, of `STEPS` steps, in local positions."""
-    table, rows = state.table, np.flatnonzero(unseen & np.isfinite(state.table.box.yaw))
+    table, rows = state.table, (unseen & np.isfinite(state.table.box.yaw)).nonzero()[0]
     rate = np.zeros(len(table))
     able = np.zeros(len(table), dtype=np.bool_)
     for node_type, of_type in state.joint.rows_by_type(table.label[rows], moving=True):
@@ -44,13 +42,13 @@ def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
             able[rows[of_type]] = True
             if node_type.motion.turn_time > 0:
                 rate[rows[of_type]] = table.turn.known(rows[of_type], node_type.motion.turning_share)[0]
-    rows = np.flatnonzero(able)
+    rows = able.nonzero()[0]
     now = state.kinematics().select(rows)
     speed = np.hypot(*now.velocity.T)
     curvature = np.where(speed > MOVING, rate[rows], 0.0) / np.maximum(speed, MOVING)
     heading = _course(table.box.yaw[rows], table.box.yaw_variance[rows], now)
     found = paths(state.traffic, table.id[rows], now.position + state.origin, heading, curvature, STEPS)
-    return replace(found, row=rows, position=found.position - state.origin)
+    return unchecked(Paths, **vars(found) | {"row": rows, "position": found.position - state.origin})
 
 
 def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[KnownCourses, ...], FloatArray]:
@@ -75,7 +73,7 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
         turns = (motion.turn_time > 0) & (speed > MOVING)
         rate, variance = np.where(turns, rate, 0.0), np.where(turns, variance, 0.0)
         heading, (settling, across, pull) = table.box.yaw[rows], np.zeros((3, len(rows)))
-        led = np.flatnonzero(path[rows] >= 0)
+        led = (path[rows] >= 0).nonzero()[0]
         if len(led):
             own, way = paths.select(path[rows[led]]), speed[led] * dt
             turn = _at(own.heading, way) - own.heading[:, 0]

@@ -128,7 +128,7 @@ class MapNodes:
         if STOP_LINE not in self.classes or roads.keys() <= self._known.keys():
             return
         known = {**roads, **self._known}
-        nodes = [known.get(self.name[k]) for k in np.flatnonzero(self.label == STOP_LINE).tolist()]
+        nodes = [known.get(self.name[k]) for k in (self.label == STOP_LINE).nonzero()[0].tolist()]
         lanes = [each for each in known.values() if isinstance(each, Lane)]
         lines = [each for each in nodes if isinstance(each, StopLine)]
         self.across = LanesAcross.of(lanes, lines) if lines else None
@@ -157,7 +157,7 @@ class MapNodes:
 
     def update(self, frame: Frame, sensor: Sensor, origin: FloatArray, joint: JointTrackState, delay: float) -> None:
         """Take in the colours and positions of lights in a frame taken `delay` s ago."""
-        lights = np.flatnonzero(self.label == LIGHT)
+        lights = (self.label == LIGHT).nonzero()[0] if len(self) else self.id
         if len(lights) == 0 or not of_classes(frame.detections.boxes.label, COLOUR_LABELS).any():
             return
         seen = sensor.in_world(frame)
@@ -198,7 +198,7 @@ class MapNodes:
         closed[governed], opened[governed] = self.settings.closed(states), self.settings.open(states)
         lanes = None
         if self.across is not None:
-            lines = np.flatnonzero(self.label == STOP_LINE)
+            lines = (self.label == STOP_LINE).nonzero()[0]
             middles = np.array([self.place[k].middle for k in lines.tolist()])
             lanes = self.across.placed(origin, position[lines] + origin - middles, n + lines)
         outline = {n + k: place.outline + position[k] for k, place in enumerate(self.place) if len(place.outline)}
@@ -220,6 +220,7 @@ class MapNodes:
             None if existence is None else np.concatenate([existence, np.ones(m)]),
             opened,
             lanes,
+            tracks.paths,
         )
 
 

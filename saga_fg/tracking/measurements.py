@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes, unchecked
 from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.tracking.kinematics import RelativePositions
 from saga_fg.tracking.settings import ClassSettings
@@ -72,6 +72,13 @@ class FrameMeasurements:
     def __len__(self) -> int:
         return len(self.boxes)
 
+    def with_context(
+        self, delay: float, class_likelihood: FloatArray, relative: RelativePositions | None
+    ) -> FrameMeasurements:
+        """Add what the tracker knows of them."""
+        known = {"delay": delay, "class_likelihood": class_likelihood, "relative": relative}
+        return unchecked(FrameMeasurements, **vars(self) | known)
+
 
 def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) -> FrameMeasurements:
     """Return the detections that are probable enough for their class and no duplicates."""
@@ -79,13 +86,16 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     label = detections.boxes.label
     probability = sensor.probability(detections.score, label)
     objects = ~of_classes(label, COLOUR_LABELS)  # the colours of lights are not objects of their own
-    keep = np.flatnonzero(objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0]))
-    names = ("nms_distance", "weak_nms_distance", "weak_nms_ratio", "cross_class_nms_iou")
-    *limits, overlap = class_values(classes, ClassSettings, label[keep], *names)
-    kept = suppress_duplicates(detections.boxes.select(keep), probability[keep], *limits)
-    keep, overlap = keep[kept], overlap[kept]
-    keep = keep[suppress_other_classes(detections.boxes.select(keep), probability[keep], overlap)]
+    keep = (objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0])).nonzero()[0]
     detections, probability, viewpoint = detections.select(keep), probability[keep], sensor.origin(frame)
+    names = ("nms_distance", "weak_nms_distance", "weak_nms_ratio", "cross_class_nms_iou")
+    *limits, overlap = class_values(classes, ClassSettings, detections.boxes.label, *names)
+    kept = suppress_duplicates(detections.boxes, probability, *limits)
+    if len(kept) < len(keep):
+        keep, detections, probability, overlap = keep[kept], detections.select(kept), probability[kept], overlap[kept]
+    kept = suppress_other_classes(detections.boxes, probability, overlap)
+    if len(kept) < len(keep):
+        keep, detections, probability = keep[kept], detections.select(kept), probability[kept]
     boxes = detections.boxes
     R = np.zeros((len(boxes), 4, 4))
     R[:, :2, :2] = sensor.detection_covariance(detections, viewpoint, probability)
@@ -164,4 +174,4 @@ def _survivors(strong: IntArray, weak: IntArray, probability: FloatArray) -> Int
     for k in np.argsort(-probability[strong], kind="stable"):
         if alive[strong[k]]:
             alive[weak[k]] = False
-    return np.flatnonzero(alive)
+    return alive.nonzero()[0]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -92,6 +91,6 @@ def node_table(state: TrackerState, paths: Paths | None = None) -> NodeTable:
         np.where(table.has_moved, 1.0, moves),
         unseen=table.coasting(state.time),
         existence=np.where(table.confirmed, 1.0, table.existence),
+        paths=paths,
     )
-    nodes = state.map_nodes.appended_to(state.ego.appended_to(tracks, state.joint), state.origin, state.joint)
-    return replace(nodes, paths=paths)
+    return state.map_nodes.appended_to(state.ego.appended_to(tracks, state.joint), state.origin, state.joint)

@@ -52,7 +52,7 @@ def relinked(
         return matching
     free = relinkable(state)
     free[matching.track] = False
-    tracks, label = np.flatnonzero(free), measurements.boxes.label[rows]
+    tracks, label = free.nonzero()[0], measurements.boxes.label[rows]
     if len(tracks) == 0:
         return matching
     places, noise = measurements.boxes.position[rows, :2] - state.origin, measurements.R[rows, :2, :2]
@@ -151,7 +151,8 @@ def initiating(state: TrackerState, measurements: FrameMeasurements, matching: M
     free = np.ones(len(measurements), dtype=bool)
     free[matching.detection] = False
     initiation_score = state.class_values(measurements.boxes.label, "initiation_score")[0]
-    return np.flatnonzero(free & (measurements.probability >= initiation_score))
+    probable: IntArray = (free & (measurements.probability >= initiation_score)).nonzero()[0]
+    return probable
 
 
 def area(state: TrackerState) -> float:

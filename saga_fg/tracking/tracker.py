@@ -160,12 +160,9 @@ class Tracker:
         self._notify("predict", state, frame.sensor)
 
         measurements = frame_measurements(frame, sensor, self.settings.classes)
-        measurements = replace(
-            measurements,
-            delay=delay,
-            class_likelihood=state.class_groups.likelihood(measurements.boxes.label, sensor),
-            relative=state.ego.relative_positions(measurements, frame),
-        )
+        likelihood = state.class_groups.likelihood(measurements.boxes.label, sensor)
+        relative = state.ego.relative_positions(measurements, frame)
+        measurements = measurements.with_context(delay, likelihood, relative)
         state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
         self._notify("measure", state, frame.sensor, measurements)
 

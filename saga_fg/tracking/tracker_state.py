@@ -11,18 +11,17 @@ Times, in s:
 
 from __future__ import annotations
 
-import copy
 import logging
 import math
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
@@ -39,7 +38,6 @@ from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import MAP_CLASSES
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,32 +179,30 @@ class TrackerState:
     def remove(self, deleted: BoolArray) -> None:
         """Marginalise tracks (n,)."""
         if deleted.any():
-            kept = np.flatnonzero(~deleted)
+            kept = (~deleted).nonzero()[0]
             self.joint.remove(self.table.id[deleted], kept)
             self.table = self.table.select(kept)
 
     def copied(self) -> TrackerState:
         """Return a state that changes independently of this one."""
-        twin = copy.copy(self)
+        twin = shallow_copy(self)
         twin.joint = self.joint.copied()
-        for name in _VALUES:
-            setattr(twin, name, _copied(getattr(self, name)))
+        twin._part_from_others()
         return twin
+
+    def _part_from_others(self) -> None:
+        """Copy what is changed in place: the table, the map, the vehicle and traffic; all else is never changed."""
+        self.table, self.map_nodes = self.table.copied(), shallow_copy(self.map_nodes)
+        self.ego, self.traffic = shallow_copy(self.ego), self.traffic.copied()
 
     def snapshot(self) -> TrackerSnapshot:
         """The state as a value."""
-        values = {name: _copied(getattr(self, name)) for name in _VALUES}
-        return TrackerSnapshot(**values, joint=self.joint.snapshot())
+        twin = self.copied()
+        return TrackerSnapshot(**{name: getattr(twin, name) for name in _VALUES}, joint=self.joint.snapshot())
 
     def restore(self, snapshot: TrackerSnapshot) -> None:
         """Continue from a snapshot, which stays as it is."""
         self.joint.restore(snapshot.joint)
         for name in _VALUES:
-            setattr(self, name, _copied(getattr(snapshot, name)))
-
-
-def _copied(value: T) -> T:
-    """Copy what is changed in place: the table, the map, the vehicle and traffic; all else is never changed."""
-    if isinstance(value, TrackTable):
-        return value.snapshot()
-    return copy.copy(value) if isinstance(value, MapNodes | EgoNode | Traffic) else value
+            setattr(self, name, getattr(snapshot, name))
+        self._part_from_others()

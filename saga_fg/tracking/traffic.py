@@ -10,7 +10,7 @@ go, at no speed, and are never forgotten.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
 
@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from saga_fg.errors import InputError
 from saga_fg.kernels.trails import points_by_cell
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.columns import Columns
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.kinematics import Kinematics
@@ -181,9 +181,11 @@ class Traffic:
     _map: RoadMap | None = None
     _trails: Trails | None = field(default=None, init=False, repr=False)
 
-    def __copy__(self) -> Traffic:
+    def copied(self) -> Traffic:
         """A memory that changes independently of this one."""
-        return replace(self)
+        twin = shallow_copy(self)
+        twin._trails = None
+        return twin
 
     def update(self, passing: Passages, time: float) -> None:
         """Remember where tracks are at `time`, s, every `SPACING` m, and forget what is older than `memory`."""

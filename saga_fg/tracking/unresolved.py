@@ -75,12 +75,12 @@ def resolve_tracks(state: TrackerState, matching: Matching) -> None:
     table = state.table
     detected = np.zeros(len(table), dtype=bool)
     detected[matching.track] = True
-    rows = np.flatnonzero(table.unresolved > 0)
+    rows = (table.unresolved > 0).nonzero()[0]
     if len(rows) == 0:
         return
     now = state.kinematics()
     boxes = state.boxes(now.position, now.velocity)
-    sure = np.flatnonzero((table.unresolved == 0) & (table.existence >= table.existence[rows].min()))
+    sure = ((table.unresolved == 0) & (table.existence >= table.existence[rows].min())).nonzero()[0]
     mine, theirs = boxes.select(rows), boxes.select(sure)
     row, column = touching_pairs(mine, theirs)
     surer = table.existence[sure[column]] >= table.existence[rows[row]]
@@ -96,10 +96,10 @@ def resolve_tracks(state: TrackerState, matching: Matching) -> None:
 def over_confirmed(state: TrackerState, predicted: Boxes) -> BoolArray:
     """(n,) unresolved tracks whose predicted box overlaps that of a confirmed track; predicted (n), world."""
     table = state.table
-    rows = np.flatnonzero(table.unresolved > 0)
+    rows = (table.unresolved > 0).nonzero()[0]
     result = np.zeros(len(table), dtype=bool)
     if len(rows):
-        sure = np.flatnonzero(table.confirmed & (table.unresolved == 0))
+        sure = (table.confirmed & (table.unresolved == 0)).nonzero()[0]
         mine, theirs = predicted.select(rows), predicted.select(sure)
         row, column = touching_pairs(mine, theirs)
         result[rows] = _largest(_overlaps(state, mine, theirs, row, column), row, len(rows)) > OVERLAP
@@ -109,7 +109,7 @@ def over_confirmed(state: TrackerState, predicted: Boxes) -> BoolArray:
 def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, row: IntArray, column: IntArray) -> FloatArray:
     """(K,) bird's-eye IoU of boxes[row] with others[column] of their class or group, 0 with those of other classes."""
     overlap = np.zeros(len(row))
-    alike = np.flatnonzero(state.class_groups.pairs_of_group(boxes.label, others.label, row, column))
+    alike = state.class_groups.pairs_of_group(boxes.label, others.label, row, column).nonzero()[0]
     overlap[alike] = np.nan_to_num(paired_bev_iou(boxes.select(row[alike]), others.select(column[alike])))
     return overlap
 

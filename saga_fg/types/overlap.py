@@ -79,7 +79,7 @@ def paired_giou_3d(a: Boxes, b: Boxes) -> FloatArray:
     result = np.full(len(a), -1.0)
     a, b = a.select(known), b.select(known)
     common = np.zeros(len(a))
-    near = np.flatnonzero(_may_touch(a, b))
+    near = _may_touch(a, b).nonzero()[0]
     common[near] = paired_intersection(a.select(near), b.select(near))
     common = common * _common_height(a, b)
     hull = paired_hull(a, b) * _spanned_height(a, b)

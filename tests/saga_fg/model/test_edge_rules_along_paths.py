@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from saga_fg.model.edge_rules import Following, pairs_ahead
+from saga_fg.model.edge_pairs import pairs_ahead
+from saga_fg.model.edge_rules import Following
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.paths import SHARP, Paths

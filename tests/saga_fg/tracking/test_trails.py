@@ -1,6 +1,5 @@
 """Paths along the trails of earlier traffic and lanes, and tracks that follow them unseen."""
 
-import copy
 import pickle
 from dataclasses import replace
 
@@ -218,7 +217,7 @@ def test_lanes_are_indexed_once_and_what_finds_them_is_no_part_of_a_state():
     path(traffic)
     found, tree = traffic.lanes, traffic.lanes.tree
     traffic.update(passing([(0.0, 0.0)], 0.0), 0.0)
-    twin = copy.copy(traffic)
+    twin = traffic.copied()
     assert twin.lanes is traffic.lanes is found
     assert twin.lanes.tree is tree
     assert len(pickle.dumps(traffic.lanes)) == len(pickle.dumps(of_map(BEND).lanes))
@@ -229,7 +228,7 @@ def test_trails_are_found_anew_after_an_update():
     traffic = along(*arc(np.arange(-20, 0, 2.1)))
     before = traffic.trails()
     assert traffic.trails() is before
-    assert copy.copy(traffic)._trails is None
+    assert traffic.copied()._trails is None
     traffic.update(passing([(0.0, 0.0)], 0.0, 5.0, [3]), 5.0)
     assert len(traffic.trails()) > len(before)
 

@@ -1,0 +1,171 @@
+"""Rates of edges by the shipped rules, see `saga_fg.model.edge_rules`.
+
+Of E pairs: rows `target` (E,), ascending, and `source` (E,) of n nodes, and where the source is along the path of the
+target: ahead, aside, direction there, and whether the path is a predicted one (E,).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from saga_fg.kernels.array_types import BoolArray, FloatArray, IntArray
+from saga_fg.kernels.compilation import kernel, kernel_part
+
+Led = tuple[IntArray, IntArray, FloatArray]
+
+
+@kernel_part
+def wrapped(angle: float) -> float:
+    """An angle in [-pi, pi), rad."""
+    angle = (angle + math.pi) % (2 * math.pi) - math.pi
+    return -math.pi if angle >= math.pi else angle
+
+
+@kernel_part
+def gain(own: float, other: float, spread: float) -> float:
+    """Information gain by variances of velocities; 1 for a `spread` below 0."""
+    if spread < 0:
+        return 1.0
+    total = own + other + spread * spread
+    return own / total if total > 0 else 0.0
+
+
+@kernel("i1 i1 f1 f1 f1 b1 f2 f1 f1 f1 f1 f1 f f f f f b i f f f f")
+def leader_rates(
+    target: IntArray,
+    source: IntArray,
+    ahead: FloatArray,
+    aside: FloatArray,
+    direction: FloatArray,
+    predicted: BoolArray,
+    position: FloatArray,
+    heading: FloatArray,
+    length: FloatArray,
+    moved: FloatArray,
+    exists: FloatArray,
+    variance: FloatArray,
+    rate: float,
+    max_gap: float,
+    gap_scale: float,
+    lateral_scale: float,
+    heading_scale: float,
+    parked: bool,
+    leaders: int,
+    min_separation: float,
+    spread: float,
+    steepest: float,
+    least: float,
+) -> Led:
+    """The pairs (k,) whose sources lead, with their rates.
+
+    Of n nodes: position (n, 2), heading, length, moved, exists, variance of the velocity (n,); leaders: 0 any, 1 those
+    that have moved, 2 others; spread: that of the information gain, below 0 without it; steepest: largest turn of an
+    arc; least: probability below which it is certain that a source exists
+    """
+    E, k = len(target), 0
+    chosen, strength, remoteness = np.empty(E, dtype=np.int64), np.empty(E), np.empty(E)
+    for e in range(E):
+        i, j = target[e], source[e]
+        turn = wrapped(direction[e] - heading[j])
+        lateral = aside[e]
+        if not predicted[e]:
+            lateral += ahead[e] * math.tan(min(max(turn, -steepest), steepest) / 2)
+        if not (abs(lateral) < 3 * lateral_scale and abs(turn) < 3 * heading_scale and ahead[e] > 0):
+            continue
+        if not math.hypot(position[j, 0] - position[i, 0], position[j, 1] - position[i, 1]) <= max_gap:
+            continue
+        if not ahead[e] >= min_separation * (length[i] + length[j]) / 2:
+            continue
+        share = 1.0 if parked and abs(lateral) <= lateral_scale else moved[i]
+        if leaders > 0:
+            share *= moved[j] if leaders == 1 else 1 - moved[j]
+        exponent = (turn / heading_scale) ** 2 + (lateral / lateral_scale) ** 2
+        strength[k] = share * (rate * math.exp(-ahead[e] / gap_scale - exponent / 2))
+        strength[k] *= gain(variance[i], variance[j], spread)
+        chosen[k], remoteness[k] = e, ahead[e] + 10 * abs(lateral)
+        k += 1
+    order, begin = np.empty(k, dtype=np.int64), 0
+    while begin < k:  # of each target the nearest first: those behind it lead if it does not exist
+        end = begin
+        while end < k and target[chosen[end]] == target[chosen[begin]]:
+            at = end
+            while at > begin and remoteness[order[at - 1]] > remoteness[end]:
+                order[at] = order[at - 1]
+                at -= 1
+            order[at] = end
+            end += 1
+        missing = 0.0
+        for at in range(begin, end):
+            nearer = math.exp(missing)
+            missing += math.log1p(-min(exists[source[chosen[order[at]]]], 1 - least))
+            strength[order[at]] *= nearer if nearer > 2 * least else 0.0
+        begin = end
+    count = 0
+    for e in range(k):
+        if strength[e] > 0:
+            chosen[count], strength[count] = chosen[e], strength[e]
+            count += 1
+    return target[chosen[:count]], source[chosen[:count]], strength[:count].copy()
+
+
+@kernel("i1 i1 f1 f2 f2 f1 f1 f1 f f f f f f b i f")
+def neighbour_rates(
+    target: IntArray,
+    source: IntArray,
+    direction: FloatArray,
+    position: FloatArray,
+    velocity: FloatArray,
+    heading: FloatArray,
+    moved: FloatArray,
+    variance: FloatArray,
+    rate: float,
+    distance_scale: float,
+    heading_scale: float,
+    speed_scale: float,
+    max_distance: float,
+    min_speed: float,
+    parked: bool,
+    degree: int,
+    spread: float,
+) -> Led:
+    """At most `degree` pairs (k,) into each node, the strongest first, with their rates.
+
+    Of n nodes: position, velocity (n, 2), heading, moved, variance of the velocity (n,); spread as above
+    """
+    E, k = len(target), 0
+    strength, order = np.empty(E), np.empty(E, dtype=np.int64)
+    for e in range(E):
+        i, j = target[e], source[e]
+        own = math.hypot(velocity[i, 0], velocity[i, 1])
+        other = math.hypot(velocity[j, 0], velocity[j, 1])
+        apart = math.hypot(position[j, 0] - position[i, 0], position[j, 1] - position[i, 1])
+        faster = math.hypot(velocity[j, 0] - velocity[i, 0], velocity[j, 1] - velocity[i, 1])
+        turn = wrapped(direction[e] - heading[j])
+        exponent = (apart / distance_scale) ** 2 + (turn / heading_scale) ** 2
+        if parked:
+            able = moved[i] == 0 and moved[j] == 0
+            exponent += (own**2 + other**2) / speed_scale**2
+        else:
+            able = own >= min_speed and other >= min_speed
+        strength[e] = 0.0
+        if able and apart <= max_distance:
+            strength[e] = rate * math.exp(-(exponent + (faster / speed_scale) ** 2) / 2)
+        strength[e] *= gain(variance[i], variance[j], spread)
+    begin = 0
+    while begin < E:
+        end, kept = begin, k
+        while end < E and target[end] == target[begin]:
+            at = k
+            while at > kept and strength[order[at - 1]] < strength[end]:
+                at -= 1
+            if at - kept < degree:
+                k = min(k + 1, kept + degree)
+                for later in range(k - 1, at, -1):
+                    order[later] = order[later - 1]
+                order[at] = end
+            end += 1
+        begin = end
+    order = order[:k]
+    return target[order], source[order], strength[order]
