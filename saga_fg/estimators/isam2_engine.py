@@ -57,6 +57,7 @@ class Engine:
         parameters.findUnusedFactorSlots = True
         self.isam, self.elimination = gtsam.ISAM2(parameters), elimination
         self.points = Displacements()
+        self._delta = gtsam.VectorValues()  # increments from the base, at the last update
         self.slots: dict[int, IntArray] = {}
         self._held: dict[int, HeldGroup] = {}  # groups as they were at the last update
         self.converged = True
@@ -177,7 +178,7 @@ class Engine:
 
     def _relinearised(self, graph: SceneFactorGraph, threshold: float) -> bool:
         """Exchange the factors on variables that have moved; whether there were any."""
-        moved = set(self.points.moved(self.isam.getDelta(), threshold))
+        moved = set(self.points.moved(self._delta, threshold))
         rows: list[tuple[int, IntArray]] = []
         linear: list[gtsam.JacobianFactor] = []
         removed: list[int] = []
@@ -225,10 +226,10 @@ class Engine:
             # without a linearisation point: increments are those that iSAM2 counts, from the base
             added = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)
             result = self.isam.update(added, values, parameters)
-            estimate, length = self.isam.calculateEstimate(), self.isam.getDelta().norm()
+            estimate, self._delta = self.isam.calculateEstimate(), self.isam.getDelta()
         except RuntimeError as error:
             raise self._undetermined(graph, error) from error
-        if not np.isfinite(length):
+        if not np.isfinite(self._delta.norm()):
             raise self._undetermined(graph, None)
         slots = list(result.getNewFactorsIndices())
         start = 0

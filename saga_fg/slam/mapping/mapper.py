@@ -225,7 +225,7 @@ class LandmarkMapper:
     def _come_near(self) -> None:
         """Take in the landmarks that can be seen from where the vehicle has come to."""
         place = self._place()
-        if np.linalg.norm(place - self._centre) > self._near.reach:
+        if np.linalg.norm(place - self._centre) > self._near.travel:
             near = self._near.near(place, self.local.covariance([POSE])).tolist()
             if self.local.kinds.keys() >= set(near):
                 self._centre = place

@@ -21,6 +21,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.mapping.jacobians import initial_state
 from saga_fg.types.landmark import Observation
 
+_TRAVEL = 2.0  # of the reach
 _SIGMAS = 4.0  # standard deviations, of a sum of variances over all axes
 
 
@@ -37,6 +38,11 @@ class NearbyLandmarks:
         self._box = np.empty((64, 2, 2))  # smallest and largest x and y
         self._then = np.empty((64, 3))  # `_way` when each was seen last
         self._sigma = np.full(64, -1.0)  # of its place in the world, m; below 0 where there is no such landmark
+
+    @property
+    def travel(self) -> float:
+        """Metres on which the landmarks near a place are all that can be seen."""
+        return _TRAVEL * self.reach
 
     def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
         """Go on by odometry: a_T_b (d + 1, d + 1), covariance of its tangent."""
@@ -73,7 +79,7 @@ class NearbyLandmarks:
         return np.asarray(self._box[landmark].mean(axis=0))
 
     def near(self, place: FloatArray, covariance: FloatArray) -> IntArray:
-        """Numbers of the landmarks that can be seen from within `reach` of a place (2,); covariance: of the pose."""
+        """Numbers of the landmarks that can be seen from within `travel` of a place (2,); covariance: of the pose."""
         numbers = np.flatnonzero(self._sigma >= 0)
         box, since = self._box[numbers], self._way - self._then[numbers]
         distance = np.linalg.norm(np.maximum(box[:, 0] - place, place - box[:, 1]).clip(0), axis=1)
@@ -81,7 +87,7 @@ class NearbyLandmarks:
         if self._by_odometry:
             since_seen = (since[:, 0] + since[:, 1] * since[:, 2] ** 2, since[:, 1])
             sigma = np.minimum(sigma, _sigma(since_seen, self.reach))
-        return np.asarray(numbers[distance <= 2 * self.reach + _SIGMAS * sigma])
+        return np.asarray(numbers[distance <= self.reach + self.travel + _SIGMAS * sigma])
 
 
 def place_of(observation: Observation) -> FloatArray:

@@ -47,7 +47,7 @@ def test_a_filter_of_some_landmarks_is_that_of_all_marginalised() -> None:
 
 def test_near_is_what_can_be_seen_before_the_next_question() -> None:
     near = NearbyLandmarks()
-    for number, x in enumerate([5.0, 18.0, 25.0, 100.0], start=1):
+    for number, x in enumerate([5.0, 18.0, 30.0, 100.0], start=1):
         near.see(number, np.array([5.0, 0.0]), np.array([[1.0, 0, x - 5.0], [0, 1, 0], [0, 0, 1]]), SURE)
     assert near.reach == 5.0
     assert near.near(np.array([10.0, 0.0]), SURE).tolist() == [1, 2]
