@@ -183,8 +183,9 @@ class LidarSlam:
             self._moving.check(scan, detections)
             moving = self._moving.boxes(time, detections, self._path.expected(time) if len(self._path) else self._start)
             scan = without_objects(scan, moving)
+        velocity = self._sensors.velocity(self._sensors.corrected(wheels))
         if isinstance(self._odometry, LidarOdometry):
-            placed = self._odometry.step(scan, time, self._sensors.velocity(wheels))
+            placed = self._odometry.step(scan, time, velocity)
         else:
             placed = checked_step(self._odometry.step(scan, time))
         if not self._keyframes:
@@ -192,7 +193,7 @@ class LidarSlam:
         self._degenerate.append(placed.degenerate)
         self._boxes.append(moving)
         self._path.add(time, self._start @ placed.map_T_lidar, placed)
-        self._measured.add(time, measured)
+        self._measured.add(time, self._sensors.compared(measured, placed))
         self._online.append(self._path.poses[-1])
         row, submap, known = len(self._path) - 1, None, len(self._closed.loops)
         if placed.keyframe:
