@@ -18,6 +18,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from saga_fg.errors import InputError
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.covariances import speeds_ahead
 from saga_fg.kernels.trails import points_by_cell
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.columns import Columns
@@ -106,10 +108,7 @@ class Passages(Columns):
         Those of unknown `yaw` head where they go; if they do not move either, they have none. stationary: 0 if not
         given.
         """
-        v = now.velocity
-        heading = np.where(np.isfinite(yaw) | ~moves, yaw, np.arctan2(v[:, 1], v[:, 0]))
-        ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        speed, variance = np.einsum("ni,ni->n", ahead, v), np.einsum("ni,nij,nj->n", ahead, now.P_velocity, ahead)
+        heading, speed, variance = _ahead(yaw, moves, now.velocity, now.P_velocity)
         stationary = np.zeros(len(ids)) if stationary is None else stationary
         found = cls(ids, label, now.position, heading, speed, variance, stationary, np.full(len(ids), time), moves)
         return found if np.isfinite(heading).all() else found.select(np.isfinite(heading))
@@ -231,6 +230,16 @@ class Traffic:
         if self._trails is None:
             self._trails = Trails(self.left.select(self.left.moves).append(self.latest.select(self.latest.moves)))
         return self._trails
+
+
+@compiled_by(speeds_ahead)
+def _ahead(
+    yaw: FloatArray, moves: BoolArray, velocity: FloatArray, P: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    heading = np.where(np.isfinite(yaw) | ~moves, yaw, np.arctan2(velocity[:, 1], velocity[:, 0]))
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    variance = np.einsum("ni,nij,nj->n", ahead, P, ahead)
+    return heading, np.einsum("ni,ni->n", ahead, velocity), variance
 
 
 def _since(passages: Passages, time: float) -> Passages:
