@@ -248,7 +248,7 @@ def with_edges(
     M: FloatArray, c: FloatArray, at: IntArray, rate: FloatArray, A_self: FloatArray, b: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """M (n, d, d) and c (n, d) with what E edges of a rate (E,) > 0 add to the nodes `at` (E,): rate A_self, rate b."""
-    n, d = c.shape
+    d = c.shape[1]
     sums, constants = M.copy(), c.copy()
     for e in range(len(at)):
         if rate[e] > 0:
