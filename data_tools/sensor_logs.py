@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -49,13 +49,13 @@ _HEADER = re.compile(r"\s*([A-Za-z_]+)\s*\[\s*([^\]]*?)\s*\]\s*")
 
 
 def read_sensor_log(
-    path: str | Path, sensor: SensorName, origin: tuple[float, float, float] | None = None
+    path: str | Path, sensor: SensorName, origin: Callable[[], tuple[float, float, float]] | None = None
 ) -> FloatArray:
     """Read a log: times (n,), s, and what was measured then, (n, 1 + d), in SI units.
 
-    origin: latitude, longitude (deg) and altitude (m) of the world's origin; None: the first fix. Raises `InputError`
-    naming the file and the line for a column without unit, an unknown unit, a missing column, and time that runs
-    backwards.
+    origin: gives latitude, longitude (deg) and altitude (m) of the world's origin, asked for where fixes are so; None:
+    the first fix. Raises `InputError` naming the file and the line for a column without unit, an unknown unit, a
+    missing column, and time that runs backwards.
     """
     path = Path(path)
     lines = [(number, line) for number, line in enumerate(read_lines(path), start=1) if line.strip()]
@@ -91,7 +91,7 @@ def read_sensor_log(
         raise table.fault(at, f"time: expected one after {numbers[at - 1, 0]:.6f} s, got {numbers[at, 0]:.6f} s")
     if names == _GEODETIC and len(numbers):
         degrees = numbers[:, 1:] * [180 / math.pi, 180 / math.pi, 1.0]
-        begin = degrees[0] if origin is None else np.array(origin)
+        begin = degrees[0] if origin is None else np.array(origin())
         numbers[:, 1:] = world_position(degrees[:, 0], degrees[:, 1], degrees[:, 2], begin)
     return numbers
 

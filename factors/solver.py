@@ -27,7 +27,7 @@ import gtsam
 import numpy as np
 
 from factors.errors import FactorError, SingularSystemError
-from factors.gaussian import check_dimensions, native_factor
+from factors.gaussian import check_dimensions
 from factors.marginal import block_covariances, marginal_moments
 from factors.nonlinear import Linearisable
 from factors.singular import singular_system
@@ -43,13 +43,14 @@ _PIVOT = 1e-14  # relative to its column
 @dataclass(frozen=True)
 class SolverSettings:
     """method: "levenberg-marquardt" or "gauss-newton"; max_iterations: linearisations; tolerance: length of the step,
-    in posterior standard deviations, below which the solution counts as reached; damping: first lambda tried when a
-    plain step fails.
+    in posterior standard deviations, below which the solution counts as reached; relative_tolerance: decrease of the
+    error by a step, as a share of it, below which it does, too; damping: first lambda tried when a plain step fails.
     """
 
     method: Literal["levenberg-marquardt", "gauss-newton"] = "levenberg-marquardt"
     max_iterations: int = 100
     tolerance: float = 1e-6
+    relative_tolerance: float = 0.0
     damping: float = 1e-4
 
     def __post_init__(self) -> None:
@@ -57,6 +58,8 @@ class SolverSettings:
             raise FactorError(f"method: expected levenberg-marquardt or gauss-newton, got {self.method!r}")
         if self.max_iterations < 1 or not self.tolerance > 0 or not self.damping > 0:
             raise FactorError("settings: expected max_iterations >= 1, tolerance > 0 and damping > 0")
+        if not self.relative_tolerance >= 0:
+            raise FactorError(f"relative_tolerance: expected a number >= 0, got {self.relative_tolerance:g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +134,11 @@ def solve(
         if move is None:  # no damping helps: error and linearisation contradict each other
             return Solution(values, error, iteration, False, graph, factors)
         _LOG.debug("iteration %d: error %.9g, damping %.3g", iteration, move.error, move.damping)
+        reached = (
+            move.length <= settings.tolerance or move.exact or error - move.error < settings.relative_tolerance * error
+        )
         values, error, damping = move.values, move.error, move.damping
-        if damping == 0 and (move.length <= settings.tolerance or move.exact):
+        if damping == 0 and reached:
             return Solution(values, _final(graph, factors, values, error), iteration, True, graph, factors)
         damping = damping / 10 if damping > settings.damping else 0.0
     error = _final(graph, factors, values, error)
@@ -251,7 +257,8 @@ def _move(
             length = float("inf") if gained else _length(linear, step, damping)
             if undetermined and length <= settings.tolerance and damping <= settings.damping:
                 raise singular_system(linear)  # standing still, but only the damping says where
-            if moved_error <= error * (1 + _EXACT) or (length <= settings.tolerance and damping == 0):
+            unchanged = max(_EXACT, settings.relative_tolerance if damping == 0 else 0.0)
+            if moved_error <= error * (1 + unchanged) or (length <= settings.tolerance and damping == 0):
                 exact = abs(moved_error - linear.error(step)) <= _EXACT * error
                 return _Move(moved, moved_error, length, damping, exact)
         damping = max(10 * damping, settings.damping)
@@ -295,8 +302,8 @@ def _step(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, damping: 
         for i in range(ordering.size()):
             key = ordering.at(i)
             if (dim := zero.dim(key)) not in rows:
-                rows[dim] = np.asfortranarray(np.sqrt(damping) * np.eye(dim, dim + 1))
-            system.push_back(native_factor([key], [dim], rows[dim]))
+                rows[dim] = np.sqrt(damping) * np.eye(dim), np.zeros(dim), gtsam.noiseModel.Unit.Create(dim)
+            system.push_back(gtsam.JacobianFactor(key, *rows[dim]))
     step: gtsam.VectorValues | None
     try:
         step = system.optimize(ordering)
@@ -313,19 +320,22 @@ def _step_by_qr(system: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> 
         return None
     step, keys = tree.optimize(), sorted(system.keyVector())
     ends = np.cumsum([step.dim(key) for key in keys])
-    _, columns, entries = system.sparseJacobian_()
-    lengths = np.sqrt(np.bincount(columns.astype(int) - 1, entries**2, ends[-1] + 1))
-    of_key = dict(zip(keys, np.split(lengths, ends), strict=False))
+    _, column, entries = system.sparseJacobian_()
+    lengths = np.sqrt(np.bincount(column.astype(int) - 1, entries**2, ends[-1] + 1)).tolist()
+    of_key = {key: lengths[end - step.dim(key) : end] for key, end in zip(keys, ends.tolist(), strict=True)}
     cliques = list(tree.roots())
+    pivots: list[float] = []
+    columns: list[float] = []
     while cliques:
         clique = cliques.pop()
         conditional = clique.conditional()
-        pivots = np.abs(np.diagonal(conditional.R()))
-        columns = np.concatenate([of_key[key] for key in conditional.keys()])[: len(pivots)]  # noqa: SIM118
-        if not (pivots > _PIVOT * columns).all():
-            return None
+        pivots += conditional.R().diagonal().tolist()
+        for key in conditional.keys():  # noqa: SIM118
+            if len(columns) < len(pivots):  # the others are eliminated later
+                columns += of_key[key]
         cliques += [clique[k] for k in range(clique.nrChildren())]
-    return step
+    determined = np.abs(pivots) > _PIVOT * np.array(columns)
+    return step if determined.all() else None
 
 
 def _length(linear: gtsam.GaussianFactorGraph, step: gtsam.VectorValues, damping: float) -> float:

@@ -11,6 +11,8 @@ from data_tools.simulator.table_export import write_tables
 from pipelines.config import load_config
 from pipelines.configuration import write_settings
 
+_TABLES = tuple(f"scene-[0-9]*/{name}" for name in ("detections.csv", "truth.csv", "settings.yaml"))
+
 
 def write_simulated_tables(directory: str | Path, dataset: SimulatedTraffic) -> None:
     """`SCENE/detections.csv`, `truth.csv` and `settings.yaml` for every scene; all appear when the last one is done.
@@ -18,7 +20,7 @@ def write_simulated_tables(directory: str | Path, dataset: SimulatedTraffic) -> 
     Raises `InputError` for a directory that is not writable.
     """
     shipped = load_config("heterogeneous")
-    with atomic_directory(directory) as folder:
+    with atomic_directory(directory, _TABLES) as folder:
         for name in dataset.scenes:
             scene = dataset.scene(name)
             (folder / name).mkdir()

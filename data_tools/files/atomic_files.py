@@ -13,7 +13,7 @@ import re
 import secrets
 import shutil
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -46,17 +46,19 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def atomic_directory(path: str | Path) -> Iterator[Path]:
+def atomic_directory(path: str | Path, known: Collection[str] = ()) -> Iterator[Path]:
     """Yield an empty folder to fill; its files appear under `path` when the block ends without an exception.
 
     A `path` that does not exist, or is empty, appears in one step. In one that has files already, each new file
-    replaces its namesake in one step and other files stay. Raises `InputError` as `atomic_file` does.
+    replaces its namesake in one step. Files by the names or patterns `known`, which are all that such a run may write,
+    and which this one has not written, are of an earlier run and are removed; others stay. Without `known` a folder
+    collects the files of several runs. Raises `InputError` as `atomic_file` does.
     """
     final, temporary = _opened_folder(path)
     try:
         with _disk_full(final):
             yield temporary
-        _move_into_place(temporary, final)
+        _move_into_place(temporary, final, known)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -174,7 +176,7 @@ def _disk_full(path: Path) -> Iterator[None]:
         raise
 
 
-def _move_into_place(source: Path, final: Path) -> None:
+def _move_into_place(source: Path, final: Path, known: Collection[str]) -> None:
     if not final.exists() or not any(final.iterdir()):
         with suppress(FileNotFoundError):
             final.rmdir()
@@ -183,7 +185,14 @@ def _move_into_place(source: Path, final: Path) -> None:
     for folder in (final / p.relative_to(source) for p in source.rglob("*") if p.is_dir()):
         if folder.is_symlink():
             raise InputError(f"{folder}: not writable: expected a folder, this is a link")
-    for file in sorted(p for p in source.rglob("*") if not p.is_dir()):
-        target = final / file.relative_to(source)
+    written = {file.relative_to(source) for file in source.rglob("*") if not file.is_dir()}
+    for name in sorted(written):
+        target = final / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(file, target)  # noqa: PTH105 (the call this module is about)
+        os.replace(source / name, target)  # noqa: PTH105 (the call this module is about)
+    for old in {file for pattern in known for file in final.glob(pattern)}:
+        linked = any((final / parent).is_symlink() for parent in old.relative_to(final).parents)
+        if old.relative_to(final) not in written and not linked and not old.is_dir():
+            old.unlink()
+            with suppress(OSError):  # others are in it
+                old.parent.rmdir()

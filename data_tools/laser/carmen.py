@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import logging
+import re
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,11 +30,15 @@ from saga_fg.numerics.arrays import FloatArray
 
 _RECORDS = ("FLASER", "ROBOTLASER1")
 _UNPACK: dict[str, Callable[[bytes], bytes]] = {".bz2": bz2.decompress, ".gz": gzip.decompress}
+_TAG = "[A-Z][A-Z0-9_]*"
+_OTHER_LASERS = {"RLASER", "ROBOTLASER2", *(f"{kind}{k}" for kind in ("LASER", "RAWLASER") for k in range(1, 6))}
+_NAMED = 8  # records that are named where none can be read
 _LEAST_READINGS = 10
 _RECURS = 1e-3  # share of all readings that a value must have to mean that nothing was hit; beyond it there are fewer
 _PEAK = 10.0  # how much more frequent it is than the values near it, on average
 _RIGID = 1e-3  # m and rad, that the mounting may vary by
 _LARGEST = 1e6  # m
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +68,7 @@ class LaserLog:
 
 
 def read_carmen(path: str | Path) -> LaserLog:
-    """Read the front laser of a log; .bz2 and .gz are unpacked.
+    """Read the front laser of a log; .bz2 and .gz are unpacked. Warns of other lasers, which are left out.
 
     Raises `InputError` naming the line of a record with a wrong number of values, a number that is none or too large,
     or another number of readings than the first.
@@ -70,10 +76,13 @@ def read_carmen(path: str | Path) -> LaserLog:
     file = Path(path)
     rows: list[FloatArray] = []
     angles: FloatArray | None = None
+    others: set[str] = set()
     chosen, largest = "", np.inf
     for number, line in enumerate(_lines(file), start=1):
         tag = line[: line.find(" ")]
         if tag not in _RECORDS or (chosen and tag != chosen):  # a log with both says the same twice
+            if re.fullmatch(_TAG, tag):
+                others.add(tag)
             continue
         where = f"{file}: line {number}"
         fields = line.split()[1:]
@@ -84,7 +93,10 @@ def read_carmen(path: str | Path) -> LaserLog:
             raise InputError(f"{where}: expected {len(angles)} readings as before, got {len(here)}")
         rows.append(found)
     if angles is None:
-        raise InputError(f"{file}: expected records {' or '.join(_RECORDS)}, there are none")
+        there = f"only {', '.join(sorted(others)[:_NAMED])}" if others else "none"
+        raise InputError(f"{file}: expected records {' or '.join(_RECORDS)}, there are {there}")
+    if ignored := sorted(others & _OTHER_LASERS):
+        _log.warning("%s: the readings of %s are left out, %s are taken", file, ", ".join(ignored), chosen)
     table, m = np.array(rows), len(angles)
     ranges, laser, robot = table[:, 1 : 1 + m], table[:, 1 + m : 4 + m], table[:, 4 + m :]
     largest = min(largest, 0.999 * _nothing(ranges))
@@ -153,8 +165,10 @@ def _mounting(robot: FloatArray, laser: FloatArray) -> FloatArray:
     """The laser's pose on the robot, if it is the same throughout; corrected logs have other poses there."""
     c, s = np.cos(robot[:, 2]), np.sin(robot[:, 2])
     dx, dy = (laser - robot)[:, :2].T
-    turn = laser[:, 2] - robot[:, 2]
-    offset = np.stack([c * dx + s * dy, c * dy - s * dx, np.arctan2(np.sin(turn), np.cos(turn))], axis=1)
+    turned = laser[:, 2] - robot[:, 2]
+    about = turned - turned[0]  # one that looks back is turned by pi or by -pi
+    turn = turned[0] + np.arctan2(np.sin(about), np.cos(about))
+    offset = np.stack([c * dx + s * dy, c * dy - s * dx, turn], axis=1)
     middle = np.median(offset, axis=0)
     return middle if np.abs(offset - middle).max() < _RIGID else np.zeros(3)
 

@@ -14,7 +14,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
@@ -22,7 +21,7 @@ from data_tools.files.text_tables import TextTable
 from data_tools.pose_graphs.g2o_records import RECORDS, information, read_records, record_values, transforms
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import rotation_quaternion
+from saga_fg.numerics.geometry import adjoint, rotation_quaternion
 from saga_fg.slam.pose_graph import (
     LandmarkObservations,
     ObservationKind,
@@ -111,8 +110,8 @@ def _priors(tables: Tables, d: int, ids: IntArray) -> PosePriors | None:
     poses, weights = transforms(table, RECORDS[tag]), _information(table, tag)
     if d == 3:  # measured is pose T offset, with errors in the sensor's frame
         sensor_T_pose = np.linalg.inv(_offsets(tables, table, 1))
-        adjoint = np.stack([gtsam.Pose3(T).AdjointMap() for T in sensor_T_pose])
-        poses, weights = poses @ sensor_T_pose, adjoint.swapaxes(1, 2) @ weights @ adjoint
+        Ad = adjoint(np.asarray(sensor_T_pose, dtype=np.float64))
+        poses, weights = poses @ sensor_T_pose, Ad.swapaxes(1, 2) @ weights @ Ad
     return PosePriors(rows, poses, weights)
 
 

@@ -109,11 +109,14 @@ def g2o(
             if graph.poses_alone:
                 errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch or 10)
     write_pose_graph(output, graph, optimised, rows, blocks, errors, rejected)
-    poses, edges = counted(len(graph), "pose"), counted(len(graph.first), "measurement")
+    poses, count = counted(len(graph), "pose"), len(graph.first)
+    count += sum(len(one.pose) for one in (graph.priors, graph.places) if one is not None)
     if graph.landmarks is not None:
         poses += f", {counted(len(graph.landmarks.ids), 'landmark')}"
-        edges = counted(len(graph.first) + sum(len(seen.pose) for seen in graph.landmarks.observations), "measurement")
-    typer.echo(f"{output}: {poses}, {edges}, error {optimised.error:.6g} (at the start {guess:.6g})")
+        count += sum(len(seen.pose) for seen in graph.landmarks.observations)
+    typer.echo(
+        f"{output}: {poses}, {counted(count, 'measurement')}, error {optimised.error:.6g} (at the start {guess:.6g})"
+    )
     if robust == "consensus":
         typer.echo(f"left out as false: {counted(len(rejected), 'loop')}")
     if (minimum := optimised.chordal) is not None:

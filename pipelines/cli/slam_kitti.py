@@ -14,8 +14,12 @@ from pipelines.cli.summary import counted
 if TYPE_CHECKING:
     from data_tools.lidar.scan import ScanSequence
     from data_tools.sensor_logs import SensorLog
+    from pipelines.slam.lidar_slam_types import LidarSlamResult
     from pipelines.slam.localisation import LocaliserSettings
-    from pipelines.slam.slam_map import SlamMap
+    from pipelines.slam.slam_map import Origin, SlamMap
+    from pipelines.slam.with_objects import SlamWithObjects
+    from saga_fg.numerics.arrays import FloatArray
+    from saga_fg.slam.sensors import SensorSettings
 
 
 def kitti(
@@ -125,12 +129,20 @@ def kitti(
     recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans, blind=blind)
     records = training / "oxts" / f"{sequence}.txt"
     slam_map = None if known_map is None else read_map(known_map)
-    origin = None if slam_map is None else slam_map.origin
+    if slam_map is not None and (slam.providers or slam.landmarks):
+        raise InputError("--config: slam.providers, slam.landmarks: expected without --map, where nothing reads them")
+
+    def origin() -> Origin:
+        """Latitude, longitude and altitude of the origin of a map, or else of the recording's world."""
+        if slam_map is None:
+            return read_origin(records)
+        if slam_map.origin is None:
+            raise InputError(f"{known_map}: expected a map with origin.csv, its place on Earth, which fixes need")
+        return slam_map.origin
+
     log = sensor_log(records, sensors, sensor_logs or (), seed or 0, recorded.timestamps, origin)
     if slam_map is not None:
-        if origin is None and log is not None and "gps" in log.tables:
-            raise InputError(f"{known_map}: expected a map with origin.csv, its place on Earth, as fixes are given")
-        _localise(recorded, slam_map, guess, slam.localisation, output, log)
+        _localise(recorded, slam_map, guess, slam.localisation, output, log, slam.sensors)
         return
     with progress_bar() as progress:
         lidar = replace(
@@ -139,15 +151,17 @@ def kitti(
             loop_closures=slam.lidar.loop_closures and not blind,
         )
         tracker = path_tracker(settings) if objects and not blind else None
+        providers, detectors = slam.new_providers(), slam.new_detectors()
         result = lidar_slam(
-            recorded, odometry, lidar, progress, slam.new_providers(), slam.new_detectors(), log, frames, tracker
+            recorded, odometry, lidar, progress, providers, detectors, log, frames, tracker, slam.sensors
         )
+    found: LidarSlamResult | SlamWithObjects = result
     if objects:
         with working("objects"):
-            together = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers, log)
-            figures = write_lidar_slam(output, together, recorded, odometry=lidar.odometry, origin=read_origin(records))
-    else:
-        figures = write_lidar_slam(output, result, recorded, odometry=lidar.odometry, origin=read_origin(records))
+            found = with_objects(
+                result, recorded, frames, settings, lidar, window, slam.new_providers, log, slam.sensors
+            )
+    figures = write_lidar_slam(output, found, recorded, odometry=lidar.odometry, origin=origin())
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
     counts.append(counted(figures["loops"], "loop"))
@@ -174,12 +188,13 @@ def _localise(
     settings: LocaliserSettings,
     output: Path,
     log: SensorLog | None,
+    sensors: SensorSettings,
 ) -> None:
-    from pipelines.slam.localisation import guess_of
     from pipelines.slam.localised_drive import localise, write_localised
 
     with progress_bar() as progress:
-        found = localise(scans, slam_map, None if guess is None else guess_of(guess), settings, progress, log)
+        start = None if guess is None else _guess(guess)
+        found = localise(scans, slam_map, start, settings, progress, log, sensors)
     figures = write_localised(output, found, scans, slam_map)
     registered = (
         f"{figures['registered']} registered with the map, the first of them scan {figures['first_registered']}"
@@ -187,3 +202,19 @@ def _localise(
     typer.echo(f"{output}: {counted(figures['scans'], 'scan')}, {registered}")
     for name, what in (("trajectory", "in the map's frame"), ("aligned", "aligned with it")):
         typer.echo(f"against GPS/IMU, {what}: ATE {figures[name]['ate']:.3f} m, end {figures[name]['end_error']:.3f} m")
+
+
+def _guess(numbers: str) -> FloatArray:
+    """A pose (4, 4) of x, y, z, yaw as a text "1.5,-3,1.8,0.2", m and rad."""
+    import numpy as np
+
+    from saga_fg.errors import InputError
+    from saga_fg.numerics.geometry import yaw_transform
+
+    try:
+        values = [float(word) for word in numbers.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 4 or not np.isfinite(values).all():
+        raise InputError(f"--guess: expected x,y,z,yaw, m and rad, got {numbers[:60]!r}")
+    return yaw_transform(*values)

@@ -9,16 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 from saga_fg.types.frame import Detections, Frame
 
 _LOG = logging.getLogger(__name__)
-
-
-def velocity_ahead(wheels: WheelSpeed, ego_T_lidar: FloatArray) -> FloatArray:
-    """The velocity (6,) of a sensor on the vehicle by its wheels, as `LidarOdometry.step` takes it."""
-    return np.concatenate([np.full(3, np.nan), ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]])
 
 
 class BetweenKeyframes:

@@ -15,6 +15,7 @@ from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.settings import setting, settings_group
 from saga_fg.slam.joint import JointSettings
+from saga_fg.slam.sensors import SensorSettings
 from saga_fg.tracking.provider_names import made_by_name, new_provider
 
 
@@ -27,6 +28,7 @@ class SlamSettings:
     )
     landmarks: tuple[str, ...] = setting((), "your own detectors of landmarks, MODULE:NAME, asked at every pose")
     joint: JointSettings = settings_group(JointSettings, "simulated: ego path and objects together")
+    sensors: SensorSettings = settings_group(SensorSettings, "kitti: GPS, IMU and wheels of the vehicle, also in a map")
     lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, with objects")
     localisation: LocaliserSettings = settings_group(LocaliserSettings, "kitti --map: localisation in a map")
     laser: LaserSettings = settings_group(LaserSettings, "laser: planar laser and wheels")

@@ -16,7 +16,7 @@ from data_tools.lidar.scan import ScanSequence
 from pipelines.slam.odometry import OdometrySettings, OdometryStep, moved_on
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.numerics.geometry import checked_transform, inverse_transform
+from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform
 from saga_fg.types.boxes import Boxes
 
 LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: the best accuracy of a registration, rad and m
@@ -48,6 +48,47 @@ class Drive:
         return np.asarray(world_T_lidar[of] @ inverse_transform(self.poses[known[of]]) @ self.poses)
 
 
+class OdometryPath:
+    """Odometry of a drive that goes on, scan by scan.
+
+    times (K), s; poses K times (4, 4) of the sensor; covariances K times (6, 6), as of `Drive`; ways (K), m, driven
+    """
+
+    def __init__(self) -> None:
+        self.times, self.ways = list[float](), list[float]()
+        self.poses, self.covariances = list[FloatArray](), list[FloatArray]()
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def add(self, time: float, pose: FloatArray, step: OdometryStep) -> None:
+        """Add the scan at `time` with its pose (4, 4), which stands for the poses of the scans lost before, too."""
+        moved = float(np.linalg.norm(pose[:3, 3] - self.poses[-1][:3, 3])) if self.poses else 0.0
+        self.times.append(time)
+        self.poses.append(pose)
+        self.ways.append(moved + (self.ways[-1] if self.ways else 0.0))
+        covariances = shared(self.poses, step)
+        self.covariances[len(self.poses) - len(covariances) :] = covariances
+
+    def moved(self, first: int, last: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """The motion (4, 4) from a scan to another, by default the newest, and its covariance (6, 6) at the end."""
+        end = len(self.poses) if last is None else last + 1
+        return motion(self.poses[first:end], self.covariances[first + 1 : end])
+
+    def expected(self, time: float) -> FloatArray:
+        """The pose (4, 4) at `time` by the motion between the last two scans; there is one scan at least."""
+        if len(self.poses) < 2:
+            return self.poses[-1]
+        before, last = (gtsam.Pose3(pose) for pose in self.poses[-2:])
+        share = (time - self.times[-1]) / (self.times[-1] - self.times[-2])
+        pose: FloatArray = last.retract(share * before.localCoordinates(last)).matrix()
+        return pose
+
+    def drive(self, keyframes: Sequence[int]) -> Drive:
+        """The drive so far, its keyframes by their rows."""
+        return Drive(np.array(self.poses), np.array(self.covariances), list(keyframes))
+
+
 def motion(
     poses: Sequence[FloatArray] | FloatArray, covariances: Sequence[FloatArray] | FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -55,10 +96,8 @@ def motion(
 
     covariances: n - 1 of the motions from each to the next, each in the frame of the later one
     """
-    total, last = np.zeros((6, 6)), inverse_transform(poses[-1])
-    for pose, covariance in zip(poses[1:], covariances, strict=True):
-        Ad = gtsam.Pose3(last @ pose).AdjointMap()
-        total += Ad @ covariance @ Ad.T
+    later = np.reshape(poses[1:], (-1, 4, 4))
+    total = carried_covariance(inverse_transform(poses[-1]) @ later, np.reshape(covariances, (-1, 6, 6))).sum(axis=0)
     return inverse_transform(poses[0]) @ poses[-1], (total + total.T) / 2
 
 
@@ -66,8 +105,7 @@ def moved_pose(
     pose: FloatArray, covariance: FloatArray, since: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return a pose (4, 4) and the covariance (6, 6) of its tangent after the motion `since`, as `motion` gives it."""
-    Ad = gtsam.Pose3(inverse_transform(since[0])).AdjointMap()
-    return pose @ since[0], Ad @ covariance @ Ad.T + since[1]
+    return pose @ since[0], carried_covariance(inverse_transform(since[0]), covariance) + since[1]
 
 
 def shared(poses: Sequence[FloatArray], step: OdometryStep) -> list[FloatArray]:
@@ -76,11 +114,8 @@ def shared(poses: Sequence[FloatArray], step: OdometryStep) -> list[FloatArray]:
     They have equal shares of that of the whole motion, which registration in the map knows; `motion` adds them up.
     """
     lost = min(step.lost, len(poses) - 1)
-    share, found = (step.covariance + LEAST) / (lost + 1), list[FloatArray]()
-    for pose in poses[len(poses) - 1 - lost :]:
-        Ad = gtsam.Pose3(inverse_transform(pose) @ poses[-1]).AdjointMap()
-        found.append(Ad @ share @ Ad.T)
-    return found
+    them = np.array(poses[len(poses) - 1 - lost :])
+    return list(carried_covariance(inverse_transform(them) @ poses[-1], (step.covariance + LEAST) / (lost + 1)))
 
 
 def checked_step(step: object) -> OdometryStep:

@@ -3,26 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from pipelines.slam.lidar_slam_types import LidarSlamResult
-from saga_fg.graph import Additions, GraphView
 from saga_fg.slam.mapping import LandmarkObservations
-from saga_fg.slam.submaps import LoopClosure, SubmapSettings, loop_factors
+from saga_fg.slam.submaps import Loops, SubmapSettings
 from saga_fg.types.landmark import Observation
-
-
-@dataclass(frozen=True, eq=False)
-class Loops:
-    """Loops between keyframes, whose poses are those of `epochs`."""
-
-    loops: Sequence[LoopClosure]
-    epochs: Sequence[int]
-    name: str = "loops"
-
-    def factors(self, view: GraphView) -> Additions:
-        mine = [loop for loop in self.loops if self.epochs[loop.second] == view.epoch]
-        return Additions(factors=loop_factors(mine, self.epochs, None))
 
 
 def known_providers(

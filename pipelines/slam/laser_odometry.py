@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.laser import LaserLog
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.planar_poses import transforms, vectors
 
@@ -22,6 +23,7 @@ _SCALE = 0.05  # standard deviation of the scale of wheels
 _STEP_NOISE = 0.02  # m, of a step that registration determines: it errs with the map
 _KNOWN = 0.005  # standard deviation at which the scale is as good as known
 _BELIEVED = 0.3  # share of a step by which registration may differ: beyond, wheels slipped, or it erred
+_STILL, _CHANGED, _MANY = 1e-6, 0.3, 0.3  # m of the wheels; m of a reading, and the share of a scan, that show motion
 _log = logging.getLogger(__name__)
 
 
@@ -56,6 +58,18 @@ def warn_of_times(time: FloatArray) -> None:
             "which are taken in the order of the log, with poses written in the order of time",
             int(back[0]) + 2, time[back[0]] - time[back[0] + 1], len(back), len(time),
         )  # fmt: skip
+
+
+def check_wheels(log: LaserLog) -> None:
+    """Raise `InputError` where the wheels say one pose throughout while what the laser sees changes."""
+    if len(log) < 2 or np.ptp(log.odometry, axis=0).max() > _STILL:
+        return
+    changed = (np.abs(log.ranges - log.ranges[0]) > _CHANGED).mean(axis=1)
+    if (moved := int(np.argmax(changed > _MANY))) > 0:
+        raise InputError(
+            f"scan {moved + 1}: {100 * changed[moved]:.0f} % of the readings differ from those of the first scan, but "
+            "the wheels stand still throughout: expected odometry"
+        )
 
 
 @dataclass(eq=False)

@@ -20,7 +20,7 @@ from data_tools.laser.score_grid import ScoreGrid
 from pipelines.slam.laser_interpolation import between_keyframes
 from pipelines.slam.laser_keyframes import Keyframe, covariance_of
 from pipelines.slam.laser_loops import LoopSearch
-from pipelines.slam.laser_odometry import WheelScale, warn_of_times, without_jumps
+from pipelines.slam.laser_odometry import WheelScale, check_wheels, warn_of_times, without_jumps
 from pipelines.slam.laser_passes import registered_passes
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
@@ -206,9 +206,10 @@ class LaserSlam:
 
 
 def laser_slam(log: LaserLog, settings: LaserSettings | None = None, progress: Progress | None = None) -> LaserPath:
-    """The path of a log."""
+    """The path of a log. Raises `InputError` for one without odometry, and where no scan has enough points."""
     settings = settings or LaserSettings()
     warn_of_times(log.time)
+    check_wheels(log)
     odometry, jumps = without_jumps(log, settings.largest_speed)
     slam = LaserSlam(settings, transform(log.robot_T_laser), _wheel_scale(log, odometry, settings))
     for row in range(len(log)):

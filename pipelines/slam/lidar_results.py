@@ -37,7 +37,14 @@ from pipelines.slam.drive import KeyframeClouds
 from pipelines.slam.graph_export import write_landmark_table
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.odometry import OdometrySettings
-from pipelines.slam.results import confirmed_paths, landmark_rows, object_paths, write_covariances, write_objects
+from pipelines.slam.results import (
+    SLAM_FILES,
+    confirmed_paths,
+    landmark_rows,
+    object_paths,
+    write_covariances,
+    write_objects,
+)
 from pipelines.slam.saved_graph import write_graph
 from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
 from pipelines.slam.slam_map import Origin, SlamMap, write_map
@@ -116,7 +123,7 @@ def write_lidar_slam(
         figures["objects"] = len(object_paths(found.estimate))
         truth = Trajectory(scans.timestamps, scans.world_T_ego)
         figures["without_objects"] = asdict(trajectory_errors(found.alone.trajectory, truth, "start"))
-    with atomic_directory(output) as folder:
+    with atomic_directory(output, SLAM_FILES) as folder:
         write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
         for name, trajectory in (
             ("trajectory", result.trajectory), ("odometry", result.odometry), ("online", result.online)

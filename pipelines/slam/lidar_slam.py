@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
-import gtsam
 import numpy as np
 
 from data_tools.lidar import Scan, Submap, voxel_downsample
@@ -30,15 +29,15 @@ from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
-from pipelines.slam.between_keyframes import BetweenKeyframes, velocity_ahead
-from pipelines.slam.drive import LEAST, Drive, Odometry, RecordedOdometry, checked_step, motion, moved_pose, shared
+from pipelines.slam.drive import Odometry, OdometryPath, RecordedOdometry, checked_step, moved_pose
 from pipelines.slam.lidar_slam_types import START, LidarSlamResult, SlamStep
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.moving_objects import MovingObjects, frames_at
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmarks
-from pipelines.slam.submap_loops import SubmapLoops
+from pipelines.slam.submap_loops import ClosedSubmaps, SubmapLoops
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
+from pipelines.slam.vehicle_sensors import VehicleSensors
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError, require_type
 from saga_fg.graph import FactorProvider
@@ -48,15 +47,8 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
 from saga_fg.slam.mapping import MapperSettings
-from saga_fg.slam.sensors import (
-    SensorBuffer,
-    SensorName,
-    SensorSettings,
-    false_fixes,
-    misfits,
-    sensor_providers,
-)
-from saga_fg.slam.submaps import LoopClosure, SubmapGraph, SubmapSettings
+from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings
+from saga_fg.slam.submaps import SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
@@ -86,7 +78,6 @@ class LidarSlamSettings(Settings):
     submaps: SubmapSettings = settings_group(SubmapSettings, "submaps and their landmarks")
     loops: LoopSettings = settings_group(LoopSettings, "loop closures by place")
     landmarks: bool = setting(True, "use landmarks as nodes of the graph")
-    sensors: SensorSettings = settings_group(SensorSettings, "GPS, IMU and wheels of the vehicle")
     loop_closures: bool = setting(True, "search for loop closures")
     map_spacing: Positive = setting(0.25, "spacing of the points of the map, m; higher: less memory, smaller files")
     mapper: MapperSettings = settings_group(
@@ -94,10 +85,12 @@ class LidarSlamSettings(Settings):
     )
     objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "objects in the same graph")
     oxts_rotation: Positive = setting(
-        1e-3, "standard deviation of the rotation of a GPS/IMU increment between scans, rad"
+        2e-4, "standard deviation of the rotation of a GPS/IMU increment between scans, rad; usual 1e-4 to 1e-3"
     )
     oxts_translation: Positive = setting(
-        0.03, "standard deviation of the translation of a GPS/IMU increment between scans, m"
+        0.005,
+        "standard deviation of the translation of a GPS/IMU increment between scans, m; accuracy of the velocity that "
+        "the records state (KITTI: 0.01 to 0.05 m/s) times the period; higher: landmarks and objects move the path",
     )
 
 
@@ -106,7 +99,7 @@ class LidarSlam:
 
     start       (4, 4) the sensor's first pose in the world, z up
     providers   of other factors, asked at every keyframe
-    sensors     of the vehicle whose measurements `step` gets
+    sensors     of the vehicle whose measurements `step` gets; sensor_settings: noise and places of these
     moving      leaves points on moving objects out of the scans, by the detections that `step` gets
     detectors   of other landmarks in the points of keyframes
     loops       search for loops, by default by place as the settings say
@@ -128,29 +121,23 @@ class LidarSlam:
         ego_T_lidar: FloatArray | None = None,
         sensors: Collection[SensorName] = (),
         moving: MovingObjects | None = None,
+        sensor_settings: SensorSettings | None = None,
     ) -> None:
         self.settings = s = settings or LidarSlamSettings()
         self._start = np.eye(4) if start is None else checked_transform("start", start)
-        self._ego_T_lidar = np.eye(4) if ego_T_lidar is None else checked_transform("ego_T_lidar", ego_T_lidar)
         self._odometry = LidarOdometry(s.odometry) if odometry is None else odometry
-        if isinstance(sensors, str):
-            raise InputError(f"sensors: expected a list of names, such as [{sensors!r}], got a string")
-        self._sensors, self._moving = tuple(sensors), moving
-        lidar_T_ego = inverse_transform(self._ego_T_lidar)
-        of_sensors = sensor_providers(s.sensors, sensors, lidar_T_ego)
-        self._providers = tuple(providers)
-        self._new_graph = partial(SubmapGraph, settings=s.submaps, providers=[*of_sensors, *providers])
+        self._sensors, self._moving = VehicleSensors(sensors, sensor_settings, ego_T_lidar, bool(providers)), moving
+        self._measured = self._sensors.since_keyframe
+        both = [*self._sensors.new_providers(), *providers]
+        self._new_graph = partial(SubmapGraph, settings=s.submaps, providers=both)
         self._graph = self._new_graph(self._start, START)
         self._detectors = tuple(detectors)
-        self._loops: SubmapLoops | None = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
+        self._closed = ClosedSubmaps(PlaceLoops(s.loops) if loops is None and s.loop_closures else loops)
         self._builder = SubmapBuilder(s.map_spacing, straighten=not isinstance(self._odometry, LidarOdometry))
-        self._submaps = list[Submap]()
-        self._poses, self._covariances = list[FloatArray](), list[FloatArray]()  # by odometry, of all scans
-        self._times, self._keyframes, self._online = list[float](), list[int](), list[FloatArray]()
+        self._path = OdometryPath()
+        self._keyframes, self._online = list[int](), list[FloatArray]()
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
-        self._measured = BetweenKeyframes(self._sensors, bool(self._providers), s.sensors.wheels.deviation)
-        self._finished = False
-        self._closed, self._covariance = list[LoopClosure](), START  # of the last keyframe's pose
+        self._finished, self._covariance = False, START  # of the last keyframe's pose
 
     @property
     def graph(self) -> SubmapGraph:
@@ -177,42 +164,44 @@ class LidarSlam:
         """
         if self._finished:
             raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
+        if scan is None:
+            raise InputError(
+                "scan: expected one in every step: what sensors measure between scans comes with the next scan, as "
+                "SensorBuffer gives it; of detections between scans give those nearest to a scan"
+            )
         require_type("scan", scan, Scan)
         if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
             raise InputError(f"time: expected a finite number of seconds, got {time!r}")
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
-        if self._times and not time > self._times[-1]:
-            raise InputError(f"time: expected one after {self._times[-1]:.6f} s, got {time:.6f} s")
-        if not self._times and not len(scan) and isinstance(self._odometry, LidarOdometry):
+        if self._path.times and not time > self._path.times[-1]:
+            raise InputError(f"time: expected one after {self._path.times[-1]:.6f} s, got {time:.6f} s")
+        if not self._path.times and not len(scan) and isinstance(self._odometry, LidarOdometry):
             raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
         moving = Boxes.empty()
         if self._moving is not None and detections is not None:
             self._moving.check(scan, detections)
-            moving = self._moving.boxes(time, detections, self._expected(time))
+            moving = self._moving.boxes(time, detections, self._path.expected(time) if len(self._path) else self._start)
             scan = without_objects(scan, moving)
-        if wheels is not None and "wheels" in self._sensors and isinstance(self._odometry, LidarOdometry):
-            placed = self._odometry.step(scan, time, velocity_ahead(wheels, self._ego_T_lidar))
+        velocity = self._sensors.velocity(self._sensors.corrected(wheels))
+        if isinstance(self._odometry, LidarOdometry):
+            placed = self._odometry.step(scan, time, velocity)
         else:
             placed = checked_step(self._odometry.step(scan, time))
         if not self._keyframes:
             placed = replace(placed, keyframe=True)
         self._degenerate.append(placed.degenerate)
         self._boxes.append(moving)
-        self._times.append(time)
-        self._poses.append(self._start @ placed.map_T_lidar)
-        covariances = shared(self._poses, placed)
-        self._covariances[len(self._poses) - len(covariances) :] = covariances
-        self._measured.add(time, measured)
-        self._online.append(self._poses[-1])
-        row, submap, found = len(self._poses) - 1, None, list[LoopClosure]()
+        self._path.add(time, self._start @ placed.map_T_lidar, placed)
+        self._measured.add(time, self._sensors.compared(measured, placed))
+        self._online.append(self._path.poses[-1])
+        row, submap, known = len(self._path) - 1, None, len(self._closed.loops)
         if placed.keyframe:
-            submap, found = self._add_keyframe(row, placed, detections)
-        last = self._keyframes[-1]
-        since = motion(self._poses[last:], self._covariances[last + 1 :])
+            submap = self._add_keyframe(row, placed, detections)
+        since = self._path.moved(self._keyframes[-1])
         self._online[-1], now = moved_pose(self._graph.pose(len(self._graph) - 1), self._covariance, since)
         number = len(self._keyframes) - 1 if placed.keyframe else None
-        return SlamStep(self._online[-1], now, placed, number, submap, tuple(found))
+        return SlamStep(self._online[-1], now, placed, number, submap, tuple(self._closed.loops[known:]))
 
     def finish(self) -> LidarSlamResult:
         """Close the last submap, and solve everything together."""
@@ -221,19 +210,19 @@ class LidarSlam:
         if not self._keyframes:
             raise InputError("expected at least one scan before the end, and a keyframe")
         if len(self._builder):
-            self._close(self._graph.poses())
+            self._closed.close(self._builder, self._graph, self._graph.poses())
         solved = self._graph.finish()
         self._finished, chosen = True, solved.loops.kept.tolist()
         if not all(chosen):
             out, taken = chosen.count(False), chosen.count(True)
             _LOG.warning("%d of %d loops contradict the other %d, and are left out", out, len(chosen), taken)
-        unfit, unknown = misfits(solved.graph, self._sensors, self.settings.sensors)
-        far = false_fixes(solved.graph, self.settings.sensors) if "gps" in self._sensors else ""
-        for text in filter(None, (*unfit.values(), *unknown.values(), far)):
-            _LOG.warning(text)
-        drive = Drive(np.array(self._poses), np.array(self._covariances), list(self._keyframes))
-        anchors = solved.world_T_pose[[submap.anchor for submap in self._submaps]]
-        times, lidar_T_ego = np.array(self._times), inverse_transform(self._ego_T_lidar)
+        fit = self._sensors.consistency
+        fit.observe(solved.graph)
+        fit.warn()
+        drive = self._path.drive(self._keyframes)
+        submaps, loops = self._closed.submaps, list(zip(self._closed.loops, chosen, strict=True))
+        anchors = solved.world_T_pose[[submap.anchor for submap in submaps]]
+        times, lidar_T_ego = np.array(self._path.times), self._sensors.lidar_T_ego
         return LidarSlamResult(
             drive,
             Trajectory(times, drive.poses @ lidar_T_ego),
@@ -242,78 +231,36 @@ class LidarSlam:
             solved.covariances,
             solved.landmarks,
             self._graph.observations(),
-            [loop for loop, kept in zip(self._closed, chosen, strict=True) if kept],
-            [loop for loop, kept in zip(self._closed, chosen, strict=True) if not kept],
+            [loop for loop, kept in loops if kept],
+            [loop for loop, kept in loops if not kept],
             solved.loops,
             self._degenerate,
             self._boxes,
-            unfit,
-            unknown,
-            self._submaps,
-            np.array([world_T_submap(*each) for each in zip(self._submaps, anchors, strict=True)]),
+            fit.misfits,
+            fit.unjudged,
+            submaps,
+            np.array([world_T_submap(*each) for each in zip(submaps, anchors, strict=True)]),
             solved.world_T_pose,
         )
 
-    def _expected(self, time: float) -> FloatArray:
-        """The pose (4, 4) at `time` by the motion between the last two scans."""
-        if len(self._poses) < 2:
-            return self._poses[-1] if self._poses else self._start
-        before, last = (gtsam.Pose3(pose) for pose in self._poses[-2:])
-        share = (time - self._times[-1]) / (self._times[-1] - self._times[-2])
-        expected: FloatArray = last.retract(share * before.localCoordinates(last)).matrix()
-        return expected
-
-    def _add_keyframe(
-        self, row: int, placed: OdometryStep, detections: Detections | None
-    ) -> tuple[Submap | None, list[LoopClosure]]:
+    def _add_keyframe(self, row: int, placed: OdometryStep, detections: Detections | None) -> Submap | None:
         s, points = self.settings, placed.scan.points
         seen = observe_landmarks(points, s.observations, self._detectors) if s.landmarks else []
         moved = None
         if self._keyframes:
-            last = self._keyframes[-1]
-            moved = motion(self._poses[last:], self._covariances[last + 1 :])
+            moved = self._path.moved(self._keyframes[-1])
         elif row:  # a detector or provider raised at the scans before
-            self._graph = self._new_graph(self._poses[row], START + motion(self._poses, self._covariances[1:])[1])
-        frame = self._measured.frame(self._times[row], detections)
-        closes = self._graph.append(self._times[row], moved, seen, frame)
+            self._graph = self._new_graph(self._path.poses[row], START + self._path.moved(0)[1])
+        frame = self._measured.frame(self._path.times[row], detections)
+        closes = self._graph.append(self._path.times[row], moved, seen, frame)
         self._measured.clear()
         self._keyframes.append(row)
-        submap, found = None, list[LoopClosure]()
-        if closes:
-            submap, found = self._close(self._graph.poses()[:-1])
+        submap = self._closed.close(self._builder, self._graph, self._graph.poses()[:-1]) if closes else None
         pose = self._graph.pose(len(self._graph) - 1)
         driven = 0.0 if moved is None else float(np.linalg.norm(moved[0][:3, 3]))
         self._builder.add(points[voxel_downsample(points, s.map_spacing)], pose, driven)
         self._covariance = self._graph.covariance()
-        return submap, found
-
-    def _close(self, poses: FloatArray) -> tuple[Submap, list[LoopClosure]]:
-        """Close the running submap, poses (n, 4, 4) of all keyframes up to its last, and search for loops in it."""
-        submap = self._builder.close(poses[-len(self._builder) :])
-        self._submaps.append(submap)
-        if self._loops is None:
-            return submap, []
-        frames = np.array([world_T_submap(one, poses[one.anchor]) for one in self._submaps])
-        found = [self._between_anchors(loop) for loop in self._loops.add(submap, frames)]
-        self._graph.close_loops(found)
-        anchors = [submap.anchor for submap in self._submaps]
-        closed = [
-            LoopClosure(anchors[k.first], anchors[k.second], k.first_T_second, k.covariance, k.confirmed) for k in found
-        ]
-        self._closed += closed
-        return submap, closed
-
-    def _between_anchors(self, loop: LoopClosure) -> LoopClosure:
-        """A loop between frames of submaps as one between their anchors."""
-        first, second = (self._submaps[n].anchor_T_submap for n in (loop.first, loop.second))
-        Ad = gtsam.Pose3(second).AdjointMap()
-        return LoopClosure(
-            loop.first,
-            loop.second,
-            first @ loop.first_T_second @ inverse_transform(second),
-            Ad @ loop.covariance @ Ad.T + LEAST,
-            loop.confirmed,
-        )
+        return submap
 
 
 def lidar_slam(
@@ -326,11 +273,14 @@ def lidar_slam(
     log: SensorLog | None = None,
     frames: Sequence[Frame] = (),
     tracker: Tracker | None = None,
+    sensors: SensorSettings | None = None,
 ) -> LidarSlamResult:
     """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
-    counts is the first, unless the source is "oxts". providers, detectors: as of `LidarSlam`; log: of the vehicle's
-    sensors, in the recording's world; frames: with detections at the times of all scans, and a new tracker: moving
-    objects leave the scans. Raises `InputError` for a scan without a frame.
+    counts is the first, unless the source is "oxts".
+
+    providers, detectors: as of `LidarSlam`; log: of the vehicle's sensors, in the recording's world; sensors: their
+    settings; frames: with detections at the times of all scans, and a new tracker: moving objects leave the scans.
+    Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
     recorded = RecordedOdometry(scans, s.oxts_rotation, s.oxts_translation, s.odometry) if source == "oxts" else None
@@ -340,7 +290,8 @@ def lidar_slam(
     seen: Sequence[Frame | None] = [None] * len(scans.timestamps)
     if tracker is not None:
         seen = frames_at(frames, scans.timestamps, inverse_transform(scans.ego_T_lidar), tracker)
-    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar, tuple(log.tables), moving)
+    named = tuple(log.tables)
+    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar, named, moving, sensors)
     for k, time in enumerate(scans.timestamps.tolist()):
         log.feed(buffer, time)
         ego = buffer.take(time)

@@ -3,12 +3,13 @@
 trajectory.tum, trajectory.txt, times.txt   poses of the vehicle in the map's frame
 reference.tum                               the recording's own poses
 metrics.json    errors against these, as they are and with the path aligned; scans, those registered with the map, and
-                the first that was
+                the first that was; sensors that do not fit or measured too little to tell
 above.png       map and paths from above
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,20 +24,27 @@ from data_tools.plots import png, scan_map_from_above
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.localisation import Localiser, LocaliserSettings
+from pipelines.slam.results import SLAM_FILES
 from pipelines.slam.slam_map import SlamMap
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.slam.sensors import SensorBuffer
+from saga_fg.slam.sensors import SensorBuffer, SensorSettings
 
 
 @dataclass(frozen=True, eq=False)
 class LocalisedDrive:
-    """Poses (K) of the vehicle in the map, and whether each scan (K,) was registered with it."""
+    """Poses (K) of the vehicle in the map, and whether each scan (K,) was registered with it.
+
+    misfits   what does not fit of the vehicle's sensors, in words, by their names
+    unjudged  sensors that have measured too little to tell, likewise
+    """
 
     trajectory: Trajectory
     registered: BoolArray
+    misfits: Mapping[str, str]
+    unjudged: Mapping[str, str]
 
 
 def localise(
@@ -46,17 +54,18 @@ def localise(
     settings: LocaliserSettings | None = None,
     progress: Progress | None = None,
     log: SensorLog | None = None,
+    sensors: SensorSettings | None = None,
 ) -> LocalisedDrive:
     """Localise a recording in a map.
 
     guess: map_T_ego (4, 4) of the vehicle at the first scan, good to a metre or two and 0.1 rad. None: it is looked
     for, as it is where the scans do not fit the map at the guess. log: of the vehicle's sensors, fixes in the map's
-    frame. Of the recording's poses none is used. Raises
-    `InputError` where no place of the map was found, or several, and where no scan fits the map.
+    frame; sensors: their settings. Of the recording's poses none is used.
+    Raises `InputError` where no place of the map was found, or several, and where no scan fits the map.
     """
     log, buffer = log or SensorLog({}), SensorBuffer()
     start = None if guess is None else guess @ scans.ego_T_lidar
-    localiser = Localiser(slam_map, start, settings, tuple(log.tables), scans.ego_T_lidar)
+    localiser = Localiser(slam_map, start, settings, tuple(log.tables), scans.ego_T_lidar, sensors)
     for k, time in enumerate(scans.timestamps.tolist()):
         log.feed(buffer, time)
         ego = buffer.take(time)
@@ -78,7 +87,8 @@ def localise(
             f"map: expected one that shows a place of this drive, {where} in {localiser.way:.0f} m of way; a longer "
             "drive, or a guess good to a metre or two and 0.1 rad, may help"
         )
-    return LocalisedDrive(Trajectory(scans.timestamps, path @ inverse_transform(scans.ego_T_lidar)), registered)
+    trajectory = Trajectory(scans.timestamps, path @ inverse_transform(scans.ego_T_lidar))
+    return LocalisedDrive(trajectory, registered, localiser.consistency.misfits, localiser.consistency.unjudged)
 
 
 def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, slam_map: SlamMap) -> dict[str, Any]:
@@ -88,13 +98,15 @@ def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, sl
         "scans": len(scans),
         "registered": int(found.registered.sum()),
         "first_registered": int(np.argmax(found.registered)) if found.registered.any() else None,
+        "misfits": dict(found.misfits),
+        "unjudged": dict(found.unjudged),
         "trajectory": asdict(trajectory_errors(path, truth, "none")),
         "aligned": asdict(trajectory_errors(path, truth, "rigid")),
     }
     placed = zip(slam_map.map_T_submap, slam_map.points, strict=True)
     points = np.concatenate([transform_points(pose, cloud.astype(np.float64)) for pose, cloud in placed])
     points = points[voxel_downsample(points, 0.3)]
-    with atomic_directory(output) as folder:
+    with atomic_directory(output, SLAM_FILES) as folder:
         write_kitti_poses(folder / "trajectory.txt", path, folder / "times.txt")
         write_tum_poses(folder / "trajectory.tum", path)
         write_tum_poses(folder / "reference.tum", truth)

@@ -5,7 +5,8 @@ observations.csv   keyframe, landmark, kind, value, covariance: all observations
                    the kind has it (a wall nx ny nz d, a pole x y z), the covariance as its upper triangle
 
     saved = read_graph("slam")
-    world_T_lidar, landmarks = saved.solved()
+    solved = saved.solved()
+    solved.world_T_pose, solved.landmarks
 """
 
 from __future__ import annotations
@@ -13,26 +14,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import gtsam
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
 from data_tools.files.text_tables import read_lines
 from data_tools.pose_graphs import read_g2o, write_g2o
-from factors import SolverSettings
 from pipelines.slam.graph_export import pose_graph_of
 from pipelines.slam.lidar_slam_types import START, LidarSlamResult
 from pipelines.slam.scan_landmarks import GROUND, LINE, POLE, WALL
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch_solver import BatchSolver
-from saga_fg.graph import Additions, GraphView, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, pose_key
+from saga_fg.numerics.geometry import carried_covariance, inverse_transform
+from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations
 from saga_fg.slam.pose_graph import PoseGraph
-from saga_fg.slam.submaps import LoopClosure, SubmapSettings, loop_factors
-from saga_fg.types.landmark import Landmark, LandmarkType, Observation
+from saga_fg.slam.submaps import (
+    LoopClosure,
+    Loops,
+    LoopSelection,
+    SolvedDrive,
+    SubmapSettings,
+    measurement_graph,
+    solve_drive,
+)
+from saga_fg.types.landmark import LandmarkType, Observation
 
 Motion = tuple[FloatArray, FloatArray]
 
@@ -46,12 +52,12 @@ class SavedGraph:
     poses: PoseGraph
     observations: Sequence[AssociatedObservation]
 
-    def solved(self, settings: SubmapSettings | None = None) -> tuple[FloatArray, list[Landmark]]:
-        """Poses (M, 4, 4) and landmarks of the whole graph; settings: of the run, for the losses of landmarks.
+    def solved(self, settings: SubmapSettings | None = None) -> SolvedDrive:
+        """Solve the whole graph; settings: of the run, for the losses of landmarks.
 
         Objects, other sensors and providers of the run are in no file, and are not in it.
         """
-        s, graph, others = settings or SubmapSettings(), SceneFactorGraph(), list[LoopClosure]()
+        s, loops = settings or SubmapSettings(), list[LoopClosure]()
         motions: list[Motion | None] = [self._prior(), *[None] * (len(self.poses) - 1)]
         covariances = np.linalg.inv(self.poses.information)
         for row, (a, b) in enumerate(zip(self.poses.first.tolist(), self.poses.second.tolist(), strict=True)):
@@ -59,26 +65,22 @@ class SavedGraph:
             if abs(b - a) == 1 and motions[max(a, b)] is None:
                 motions[max(a, b)] = _motion(edge)
             else:
-                others.append(edge)
+                loops.append(edge)
+        known = [motion for motion in motions if motion is not None]
+        if len(known) < len(motions):
+            k = motions.index(None)
+            raise InputError(f"graph: expected odometry from keyframe {k - 1} to keyframe {k}")
         seen: dict[int, list[tuple[int, Observation]]] = {}
-        start = {}
+        start: dict[int, Any] = {}
         for one in self.observations:
             seen.setdefault(one.pose, []).append((one.landmark, one.observation))
             if one.landmark not in start:
-                start[one.landmark] = one.observation.kind.initialise(
-                    self.poses.world_T_pose[one.pose], one.observation.value
-                )
-        marks = LandmarkObservations(seen, start, s.robust)
-        for k, pose in enumerate(self.poses.world_T_pose):
-            graph.advance(float(k))
-            motion = motions[k]
-            if motion is None:
-                raise InputError(f"graph: expected odometry from keyframe {k - 1} to keyframe {k}")
-            loops = [loop for loop in others if max(loop.first, loop.second) == k]
-            ask_all([MeasuredMotion(*motion, pose), marks, _Loops(loops)], graph)
-        solution = BatchSolver(graph=graph, settings=SolverSettings(tolerance=1e-4, max_iterations=30)).solve()
-        poses = [solution.values.atPose3(pose_key(k)).matrix() for k in range(len(self.poses))]
-        return np.array(poses), marks.landmarks(solution, s.confirm_after)
+                pose = self.poses.world_T_pose[one.pose]
+                start[one.landmark] = one.observation.kind.initialise(pose, one.observation.value)
+        numbers, landmarks = range(len(known)), LandmarkObservations(seen, start, s.robust)
+        graph = measurement_graph(numbers, known, self.poses.world_T_pose, landmarks, Loops(loops, numbers))
+        all_kept = LoopSelection(np.ones(len(loops), dtype=bool), np.ones(2))
+        return solve_drive(graph, landmarks, s.confirm_after, all_kept)
 
     def _prior(self) -> Motion:
         """Of the first keyframe: that of the file, or where it stands."""
@@ -94,17 +96,8 @@ def _motion(edge: LoopClosure) -> Motion:
     """Odometry to the later keyframe, as an edge has it forwards or backwards."""
     if edge.first < edge.second:
         return edge.first_T_second, edge.covariance
-    Ad = gtsam.Pose3(edge.first_T_second).AdjointMap()
-    return inverse_transform(edge.first_T_second), Ad @ edge.covariance @ Ad.T
-
-
-@dataclass(frozen=True, eq=False)
-class _Loops:
-    loops: Sequence[LoopClosure]
-    name: str = "loops"
-
-    def factors(self, view: GraphView) -> Additions:
-        return Additions(factors=loop_factors(self.loops, range(view.epoch + 1), None))
+    back = carried_covariance(edge.first_T_second, edge.covariance)
+    return inverse_transform(edge.first_T_second), (back + back.T) / 2
 
 
 def write_graph(folder: Path, result: LidarSlamResult) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast, get_args
 
@@ -24,13 +24,13 @@ def sensor_log(
     files: Sequence[str],
     seed: int,
     timestamps: FloatArray,
-    origin: tuple[float, float, float] | None = None,
+    origin: Callable[[], tuple[float, float, float]] | None = None,
 ) -> SensorLog | None:
     """Measurements of the sensors named, like "gps,imu", from KITTI's GPS/IMU records, and of files like "imu=FILE".
 
-    timestamps: (K,) s, of the drive; origin: latitude, longitude (deg) and altitude (m) of the world's origin, by
-    default where the records begin. Raises
-    `InputError` for an unknown sensor, for one that is named twice, and for a file without a row within the drive.
+    timestamps: (K,) s, of the drive; origin: gives latitude, longitude (deg) and altitude (m) of the world's origin,
+    asked for where fixes are so; by default where the records begin. Raises `InputError` for an unknown sensor, for one
+    that is named twice, and for a file without a row within the drive.
     """
     named = [one.strip() for one in sensors.split(",") if one.strip()]
     given = [one.partition("=") for one in files]
@@ -51,11 +51,10 @@ def sensor_log(
         tables |= kitti_sensor_log(records, chosen, FRAME_PERIOD, GPS_NOISE, WHEELS_NOISE, seed).tables
         if origin is not None and "gps" in tables:
             latitude, longitude, altitude = (np.array([value]) for value in read_origin(records))
-            off = world_position(latitude, longitude, altitude, np.array(origin))[0]
+            off = world_position(latitude, longitude, altitude, np.array(origin()))[0]
             tables["gps"] = tables["gps"] + np.concatenate([[0.0], off])
     for name, _, path in given:
-        begin = (origin or read_origin(records)) if name == "gps" else None
-        table = read_sensor_log(path, cast(SensorName, name), begin)
+        table = read_sensor_log(path, cast(SensorName, name), origin or (lambda: read_origin(records)))
         _check_times(path, table[:, 0], timestamps)
         tables[cast(SensorName, name)] = table
     return SensorLog({name: np.asarray(table) for name, table in tables.items()})

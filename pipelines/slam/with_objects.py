@@ -26,7 +26,7 @@ from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import JointEstimate, OdometryIncrements, estimate_jointly, estimate_online
-from saga_fg.slam.sensors import SensorBuffer, sensor_providers
+from saga_fg.slam.sensors import SensorBuffer, SensorSettings, sensor_providers
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
@@ -53,11 +53,12 @@ def with_objects(
     lag: float | None = None,
     new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
     log: SensorLog | None = None,
+    sensors: SensorSettings | None = None,
 ) -> SlamWithObjects:
     """Solve again with the objects in `frames`, which cover the times of all scans; config: of the tracker.
 
     lag: s, to estimate poses, landmarks and objects online as well, in a window so long; `slam.online` is then by that.
-    new_providers: gives fresh providers of other factors; log: of the vehicle's sensors, as of `lidar_slam`.
+    new_providers: gives fresh providers of other factors; log, sensors: of the vehicle's sensors, as of `lidar_slam`.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
@@ -78,7 +79,7 @@ def with_objects(
     at = np.searchsorted(rows, result.keyframes)
     known = known_providers(result, at.tolist(), s.submaps)
     named = () if log is None else tuple(log.tables)
-    of_sensors = sensor_providers(s.sensors, named, lidar_T_ego)
+    of_sensors = sensor_providers(sensors or SensorSettings(), named, lidar_T_ego)
     start = result.drive.poses[0]
     estimate = estimate_jointly(
         seen, odometry, new_tracker, s.objects, start, new_providers=lambda: [*known, *of_sensors, *new_providers()]

@@ -81,22 +81,6 @@ def innovation_likelihood(x: BlockGaussian, rows: IntArray, z: FloatArray, H: Fl
     return likelihood
 
 
-def posterior_likelihood(
-    x: BlockGaussian, prior_mean: FloatArray, rows: IntArray, z: FloatArray, H: FloatArray, log_det: float
-) -> float:
-    """Log-likelihood of the innovation from the posterior `x` and the mean before it, (D,).
-
-    z and H are whitened, R = 1, with log_det the sum of the logarithms of the determinants of R before. With
-    v = z - H m the inverse of the innovation's covariance is then T = 1 - H P H^T.
-    """
-    likelihood = -0.5 * (z.size * math.log(2 * math.pi) + log_det)
-    R = np.broadcast_to(np.eye(H.shape[1]), (len(rows), H.shape[1], H.shape[1]))
-    for stacked in _stacks(x, prior_mean, rows, z, H, R):
-        v, T = stacked.innovation, stacked.R - stacked.H_P @ np.swapaxes(stacked.H, 1, 2)
-        likelihood -= 0.5 * float(np.vdot(v, T @ v) - np.linalg.slogdet(T)[1].sum())
-    return likelihood
-
-
 class _Stacked(NamedTuple):
     """Measurements of c components of equal size s, a values each (rows of zeros fill up).
 

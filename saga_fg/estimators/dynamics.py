@@ -215,46 +215,15 @@ def predict(x: BlockGaussian, dynamics: Dynamics, partition: Partition | None = 
     return BlockGaussian(partition, mean, blocks)
 
 
-@dataclass(frozen=True, eq=False)
-class PredictionSummary:
-    """Mean, scale and noise of a prediction, without its covariance.
+def noise_ratio(x: BlockGaussian, dynamics: Dynamics) -> FloatArray:
+    """(n,) size of each node's covariance in the prediction `x` in units of its process noise, the trace of Q^-1 P.
 
-    components  what will be correlated
-    mean        (D,), exact
-    scale       (D,) standard deviations as if nodes were not correlated yet
-    ratio       (n,) largest variance of a node's state in units of its process noise; infinite where it has none
+    Infinite where it has none.
     """
-
-    components: Partition
-    mean: FloatArray
-    scale: FloatArray
-    ratio: FloatArray
-
-    @staticmethod
-    def of(x: BlockGaussian, dynamics: Dynamics) -> PredictionSummary:
-        """Raises `InputError` where the prediction is not finite."""
-        layout = x.layout
-        own = {d: np.zeros((len(layout), d, d)) for d in np.unique(layout.dims).tolist()}
-        predicted = {d: np.zeros_like(blocks) for d, blocks in own.items()}
-        for d, blocks in own.items():
-            rows = np.flatnonzero(layout.dims == d)
-            blocks[rows] = x.covariances(rows)
-        for F in dynamics.F:
-            _, d_i, d_j = F.values.shape
-            np.add.at(predicted[d_i], F.target, F.values @ own[d_j][F.source] @ np.swapaxes(F.values, 1, 2))
-        ratio = np.full(len(layout), np.inf)
-        for Q in dynamics.Q:
-            d = Q.values.shape[1]
-            predicted[d][Q.target] += Q.values
-            ratio[Q.target] = _ratio(predicted[d][Q.target], Q.values)
-        variances = np.empty(layout.size)
-        for d, blocks in predicted.items():
-            rows = np.flatnonzero(layout.dims == d)
-            variances[layout.spans(rows)] = np.diagonal(blocks[rows], axis1=1, axis2=2)
-        mean = dynamics.times(x.mean) + dynamics.b
-        if not (np.isfinite(mean).all() and np.isfinite(variances).all() and (variances > 0).all()):
-            raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
-        return PredictionSummary(dynamics.joined(x.partition), mean, np.sqrt(variances), ratio)
+    ratio = np.full(len(x.layout), np.inf)
+    for Q in dynamics.Q:
+        ratio[Q.target] = _ratio(x.covariances(Q.target), Q.values)
+    return ratio
 
 
 def identity(layout: StateLayout, rows: IntArray) -> tuple[Blocks, ...]:

@@ -50,6 +50,21 @@ def transform_points(target_T_source: FloatArray, points: FloatArray) -> FloatAr
     return points @ target_T_source[:3, :3].T + target_T_source[:3, 3]
 
 
+def adjoint(a_T_b: FloatArray) -> FloatArray:
+    """Adjoints (..., 6, 6) of rigid transforms: tangents (rotation, translation) in the frame of b to those in a's."""
+    R, t = a_T_b[..., :3, :3], a_T_b[..., :3, 3]
+    result = np.zeros((*a_T_b.shape[:-2], 6, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = R
+    result[..., 3:, :3] = np.cross(t[..., None, :], np.swapaxes(R, -1, -2)).swapaxes(-1, -2)
+    return result
+
+
+def carried_covariance(a_T_b: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariances (..., 6, 6) of tangents (rotation, translation) in the frame of b, brought into that of a."""
+    Ad = adjoint(a_T_b)
+    return np.asarray(Ad @ covariance @ np.swapaxes(Ad, -1, -2))
+
+
 def yaw_of(rotation: FloatArray) -> FloatArray:
     """Yaw (rad) of rotation matrices (..., 3, 3): direction of the rotated x axis in the horizontal plane."""
     return np.asarray(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]))

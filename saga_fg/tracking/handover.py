@@ -26,7 +26,6 @@ import math
 
 import numpy as np
 
-from saga_fg.estimators import JointKalmanFilter
 from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.returns import return_evidence, returned_pairs
 from saga_fg.model.interactions import POSITION, VELOCITY
@@ -120,16 +119,13 @@ def _evidence_by_kernel(
     state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     estimator, table, still = state.joint.estimator, state.table, state.table.stationarity
-    assert isinstance(estimator, JointKalmanFilter)
     places, place, D, s = state.joint.places(table.label), still.position, still.P, still.probability
     (x, P), (x_old, P_old) = (estimator.planar_marginals(table.id[k], places[k]) for k in (new, old))
     if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
     return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0, p, *if_still)
 
 
-@compiled_by(
-    _evidence_by_kernel, where=lambda state, new, old, V_0, p: isinstance(state.joint.estimator, JointKalmanFilter)
-)
+@compiled_by(_evidence_by_kernel)
 def _evidence(
     state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -322,12 +322,11 @@ def _local_pose(graph: SceneFactorGraph) -> FloatArray | None:
 
 
 def _kinematics_by_kernel(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
-    assert isinstance(joint.estimator, JointKalmanFilter)
     x, P = joint.estimator.planar_marginals(ids, joint.places(label))
     return Kinematics(x[:, :2], x[:, 2:], P[:, :2, :2], P[:, 2:, 2:])
 
 
-@compiled_by(_kinematics_by_kernel, where=lambda joint, ids, label: isinstance(joint.estimator, JointKalmanFilter))
+@compiled_by(_kinematics_by_kernel)
 def _kinematics(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
     n = len(ids)
     result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))

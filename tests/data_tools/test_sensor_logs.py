@@ -40,7 +40,7 @@ def test_latitude_and_longitude_become_metres(tmp_path: Path) -> None:
     np.testing.assert_allclose(first[1:], 0, atol=1e-9)
     radius = 6378137.0 * np.pi / 180 * 1e-4
     np.testing.assert_allclose(second[1:], [radius * np.cos(np.radians(49)), radius, 1.0], rtol=1e-4)
-    moved = read_sensor_log(path, "gps", (49.0, 8.4, 100.0))
+    moved = read_sensor_log(path, "gps", lambda: (49.0, 8.4, 100.0))
     np.testing.assert_allclose(moved[:, 3], [10, 11])
 
 

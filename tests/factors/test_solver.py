@@ -80,6 +80,18 @@ def test_damping_saves_a_step_that_gauss_newton_loses():
     assert solution.values.atVector(0)[0] == pytest.approx(0.0, abs=1e-8)
 
 
+def test_slow_convergence_ends_where_the_error_hardly_falls():
+    factor = on_vector(
+        lambda x: np.array([x[0] - 1, 3 + 0.1 * x[0] ** 2]), dim=1
+    )  # a large residual: linear convergence
+    start = values_of({0: np.zeros(1)})
+    exact, soon = (solve(EMPTY, [factor], start, SolverSettings(relative_tolerance=share)) for share in (0.0, 1e-5))
+    assert exact.converged
+    assert soon.converged
+    assert soon.iterations < exact.iterations - 3
+    assert soon.error == pytest.approx(exact.error, rel=2e-5)
+
+
 def test_running_out_of_iterations_is_reported():
     solution = solve(
         EMPTY, [on_vector(rosenbrock)], values_of({0: np.array([-1.2, 1.0])}), SolverSettings(max_iterations=2)
@@ -230,7 +242,15 @@ def test_solution_passes_on_its_linear_factors():
 
 
 @pytest.mark.parametrize(
-    "given", [{"method": "newton"}, {"max_iterations": 0}, {"tolerance": 0.0}, {"damping": -1.0}, {"tolerance": np.nan}]
+    "given",
+    [
+        {"method": "newton"},
+        {"max_iterations": 0},
+        {"tolerance": 0.0},
+        {"damping": -1.0},
+        {"tolerance": np.nan},
+        {"relative_tolerance": -1e-9},
+    ],
 )
 def test_bad_settings_are_refused(given):
     with pytest.raises(FactorError):

@@ -18,6 +18,7 @@ from saga_fg.errors import InputError
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, WheelSpeed
+from saga_fg.types.frame import Detections
 from saga_fg.types.landmark import Observation
 
 NOTHING = Scan.of(np.empty((0, 3)))
@@ -245,3 +246,12 @@ def test_a_turn_on_the_spot_makes_keyframes_of_recorded_poses_too() -> None:
 def test_sensors_are_a_list_of_names() -> None:
     with pytest.raises(InputError, match=r"sensors: expected a list of names, such as \['gps'\], got a string"):
         LidarSlam(sensors="gps")  # type: ignore[arg-type]
+
+
+def test_detections_without_a_scan_are_refused_and_the_drive_goes_on(scans: SimulatedScans) -> None:
+    """As of a camera that is between two scans."""
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN)
+    slam.step(scans[0], 0.0)
+    with pytest.raises(InputError, match=r"scan: expected one in every step: .* give those nearest to a scan"):
+        slam.step(None, 0.05, detections=Detections.empty())  # type: ignore[arg-type]
+    assert slam.step(scans[1], 0.1, detections=Detections.empty()).keyframe == 1

@@ -10,19 +10,21 @@ import pytest
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from data_tools.lidar import Scan, read_scan
+from data_tools.lidar import Scan, Submap, read_scan
 from data_tools.simulator.street import CURB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
+from pipelines.slam.drive import RecordedOdometry
 from pipelines.slam.lidar_results import covered_spans, metrics, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.lidar_slam_types import LidarSlamResult
-from pipelines.slam.loop_closures import LoopSettings
+from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.odometry import OdometrySettings
+from pipelines.slam.saved_graph import read_graph, write_graph
 from pipelines.slam.scan_landmarks import LINE, POLE
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
-from saga_fg.slam.submaps import SubmapSettings
+from saga_fg.slam.submaps import LoopClosure, SubmapSettings
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +106,42 @@ def test_a_place_that_is_come_back_to_closes_a_loop() -> None:
         assert np.linalg.norm((inverse_transform(true) @ loop.first_T_second)[:3, 3]) < 0.6  # scans are skewed here
     before = trajectory_errors(found.odometry, truth, "start").ate
     assert trajectory_errors(found.trajectory, truth, "start").ate < 0.4 * before
+
+
+class WithFalseLoop:
+    """Loops by place, and one that is false."""
+
+    def __init__(self) -> None:
+        self.search = PlaceLoops(LoopSettings(min_path=10.0))
+        self.false = LoopClosure(1, 5, yaw_transform(6.0, 5.0), 1e-4 * np.eye(6), confirmed=True)
+
+    def add(self, submap: Submap, world_T_submap: np.ndarray) -> list[LoopClosure]:
+        false = [self.false] if len(world_T_submap) == 6 else []
+        return [*self.search.add(submap, world_T_submap), *false]
+
+
+def test_loops_and_inflation_go_through_the_files(tmp_path: Path) -> None:
+    """There and back by an odometry that drifts more than it says; a false loop is not in the graph that is read."""
+    there = drive(36, speed=8.0)
+    poses = np.concatenate([there, there[-2::-1]])
+    scans = SimulatedScans(0, world_T_lidar=poses)
+    scans.world_T_ego = np.array([yaw_transform(y=0.02 * k) for k in range(len(poses))]) @ poses
+    settings = LidarSlamSettings(submaps=SubmapSettings(length=8.0))
+    odometry = RecordedOdometry(scans, 1e-3, 5e-3, settings.odometry)
+    slam = LidarSlam(scans.world_T_ego[0], settings, loops=WithFalseLoop(), odometry=odometry)
+    for k, time in enumerate(scans.timestamps.tolist()):
+        slam.step(scans[k], time)
+    found = slam.finish()
+    assert len(found.false_loops) == 1
+    assert found.selection.inflation.max() > 1.5
+    write_graph(tmp_path, found)
+    saved = read_graph(tmp_path)
+    assert len(saved.poses.first) == len(found.keyframes) - 1 + len(found.loops)
+    assert found.loops
+    solved = saved.solved(settings.submaps)
+    np.testing.assert_allclose(solved.world_T_pose, found.world_T_lidar, atol=1e-3)
+    np.testing.assert_allclose(solved.covariances[-1], found.covariances[-1], rtol=0.02, atol=1e-9)
+    assert [mark.number for mark in solved.landmarks] == [mark.number for mark in found.landmarks]
 
 
 def test_step_by_step_is_what_the_recording_gives(scans: SimulatedScans, result: LidarSlamResult) -> None:

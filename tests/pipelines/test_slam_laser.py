@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from data_tools.trajectories import read_tum_poses
 from pipelines.cli import app
 from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam
 from saga_fg import InputError
+from saga_fg.numerics.planar_poses import transform, transforms, vectors
 
 
 def test_loops_are_closed_and_the_path_is_right(tmp_path: Path) -> None:
@@ -101,6 +103,33 @@ def test_jumps_of_the_wheels_are_counted_and_not_believed(caplog: pytest.LogCapt
     assert path.jumps == 1
     assert "scan 21: the wheels moved 100 m in 0.2 s" in caplog.text
     assert np.linalg.norm(path.poses[:, :2, 2] - true[:, :2, 2], axis=1).max() < 0.2
+
+
+def test_a_log_without_odometry_is_refused_by_name() -> None:
+    log, _ = laser_drive(2, rounds=0.1)
+    log.odometry[:] = log.odometry[0]
+    with pytest.raises(
+        InputError, match=r"scan \d+: \d+ % of the readings differ .* the wheels stand still throughout"
+    ):
+        laser_slam(log)
+
+
+@pytest.mark.parametrize("mounted", [(0.25, -0.1, 0.4), (-0.2, 0.0, np.pi)], ids=["ahead and aslant", "looks back"])
+def test_where_the_laser_is_mounted_does_not_matter(mounted: tuple[float, float, float]) -> None:
+    log, true = laser_drive(2, rounds=0.12)
+    inverse = np.linalg.inv(transform(np.array(mounted)))
+    robot = vectors(transforms(log.odometry) @ inverse)  # the simulated poses are the laser's
+    path = laser_slam(replace(log, odometry=robot, robot_T_laser=np.array(mounted)))
+    laser = path.poses @ transform(np.array(mounted))
+    off = (np.linalg.inv(laser[0]) @ laser)[:, :2, 2] - true[:, :2, 2]
+    assert np.linalg.norm(off, axis=1).max() < 0.15
+
+
+def test_a_gap_in_the_log_is_driven_by_the_wheels() -> None:
+    log, true = laser_drive(2, rounds=0.15)
+    kept = np.r_[0:40, 60 : len(log)]  # 3 m, 4 s
+    path = laser_slam(replace(log, time=log.time[kept], ranges=log.ranges[kept], odometry=log.odometry[kept]))
+    assert np.linalg.norm(path.poses[:, :2, 2] - true[kept, :2, 2], axis=1).max() < 0.15
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans
 from pipelines.cli import app
 from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
-from pipelines.slam.localisation import Localiser, LocaliserSettings, guess_of
+from pipelines.slam.localisation import Localiser, LocaliserSettings
 from pipelines.slam.localised_drive import localise, write_localised
 from pipelines.slam.saved_graph import read_graph
 from pipelines.slam.slam_map import SlamMap, read_map, write_map
@@ -24,7 +24,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.pose_graph import optimise_poses
 from saga_fg.slam.submaps import SubmapSettings
-from saga_fg.types.ego_measurements import WheelSpeed
+from saga_fg.types.ego_measurements import GpsFix, WheelSpeed
 
 PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False, submaps=SubmapSettings(length=20.0))
 
@@ -68,7 +68,7 @@ def test_a_guess_takes_the_place_of_the_search(known: SlamMap, tmp_path: Path) -
     np.testing.assert_allclose(again.map_T_submap, known.map_T_submap, atol=1e-8)
     np.testing.assert_array_equal(again.points[1], known.points[1])
     poses = drive(0.0, 0.5, 8)
-    _, errors, registered = localised(again, poses, guess_of("0.8,0.0,1.6,0.05"))
+    _, errors, registered = localised(again, poses, yaw_transform(0.8, 0.0, 1.6, 0.05))
     assert errors.max() < 0.2
     assert registered == 8
 
@@ -142,6 +142,67 @@ def test_wheels_and_imu_are_heard_in_a_map(known: SlamMap) -> None:
         Localiser(known).step(scans[0], 0.0, wheels=WheelSpeed(9.0, 0.1))
 
 
+@pytest.mark.parametrize("wrong", ["", "gps", "imu"])
+def test_a_sensor_that_does_not_fit_is_named_in_a_map(
+    known: SlamMap, tmp_path: Path, caplog: pytest.LogCaptureFixture, wrong: str
+) -> None:
+    """Fixes 200 m off, or samples without gravity: the path stays, and a warning names the sensor."""
+    poses, rng = drive(5.0, 0.5, 30), np.random.default_rng(0)
+    scans, times = SimulatedScans(3, world_T_lidar=poses), 0.1 * np.arange(30)
+    fixes = poses[:, :3, 3] + rng.normal(0, 1.0, (30, 3)) + (200.0 if wrong == "gps" else 0.0)
+    force = [0.0, 0.0, 0.0 if wrong == "imu" else 9.81, 0.0, 0.0, 0.0]
+    log = SensorLog({"gps": np.column_stack([times, fixes]), "imu": np.column_stack([times, np.tile(force, (30, 1))])})
+    found = localise(scans, known, poses[0], log=log)
+    assert np.linalg.norm(found.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
+    figures = write_localised(tmp_path / "run", found, scans, known)
+    assert list(figures["misfits"]) == ([wrong] if wrong else [])
+    assert figures["unjudged"] == {}
+    assert all(text in caplog.text for text in found.misfits.values())
+    assert ("fixes lie more than 9 deviations off" in caplog.text) == (wrong == "gps")
+
+
+@pytest.mark.parametrize(
+    ("way", "wait", "last"), [(8, 0.0, [True, False]), (50, 0.0, [False, False]), (8, 100.0, [False])]
+)
+def test_a_fix_counts_as_long_as_the_vehicle_is_near(known: SlamMap, way: int, wait: float, last: list[bool]) -> None:
+    """Places are looked for around a fix, then everywhere; an old fix is forgotten, by way or by time."""
+    poses = drive(0.0, 0.5, way)
+    scans, localiser, asked = SimulatedScans(8, world_T_lidar=poses), Localiser(known, sensors=["gps"]), []
+
+    def recognised(query: np.ndarray, place: np.ndarray | None = None) -> None:
+        asked.append(place is not None)
+
+    localiser._places.recognised = recognised  # type: ignore[method-assign]
+    for k in range(way):
+        fix = GpsFix(np.array([500.0, 0.0, 0.0])) if k == 0 else None
+        localiser.step(scans[k], 0.1 * k + (wait if k > 5 else 0.0), gps=fix)
+    localiser.finish()
+    assert asked[-2:] == last
+
+
+@pytest.mark.parametrize("name", ["providers", "landmarks"])
+def test_what_a_configuration_adds_is_refused_in_a_map(
+    recordings: Path, known: SlamMap, tmp_path: Path, name: str
+) -> None:
+    write_map(tmp_path, known)
+    (tmp_path / "own.yaml").write_text(f"slam: {{{name}: [own:Own]}}\n")
+    command = ["slam", "kitti", "--dataroot", str(recordings / "kitti"), "--map", str(tmp_path)]
+    outcome = CliRunner().invoke(
+        app, [*command, "--config", str(tmp_path / "own.yaml"), "--output", str(tmp_path / "out")]
+    )
+    assert outcome.exit_code != 0
+    assert "--config: slam.providers, slam.landmarks: expected without --map" in " ".join(outcome.output.split())
+
+
+@pytest.mark.parametrize("guess", ["1,2", "1,2,3,x", "1,2,3,nan"])
+def test_a_guess_that_is_none_is_named(recordings: Path, known: SlamMap, tmp_path: Path, guess: str) -> None:
+    write_map(tmp_path, known)
+    command = ["slam", "kitti", "--dataroot", str(recordings / "kitti"), "--map", str(tmp_path), "--guess", guess]
+    outcome = CliRunner().invoke(app, [*command, "--output", str(tmp_path / "out")])
+    assert outcome.exit_code != 0
+    assert f"--guess: expected x,y,z,yaw, m and rad, got '{guess}'" in " ".join(outcome.output.split())
+
+
 @pytest.mark.parametrize("option", [["--odometry", "oxts"], ["--no-landmarks"]])
 def test_options_that_a_map_has_no_use_for_are_refused(tmp_path: Path, option: list[str]) -> None:
     command = ["slam", "kitti", "--dataroot", str(tmp_path), "--map", str(tmp_path), "--output", str(tmp_path / "o")]
@@ -170,9 +231,9 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     assert np.linalg.norm(settled[-1, :3, 3] - result.world_T_lidar[-1, :3, 3]) < 0.5
     assert graph.landmarks is not None
     assert len(graph.landmarks.ids) == sum(mark.kind.name == "pole" for mark in result.landmarks)
-    poses, landmarks = read_graph(tmp_path / "first").solved()
-    np.testing.assert_allclose(poses, result.world_T_lidar, atol=1e-4)
-    assert [(mark.number, mark.kind, mark.observations) for mark in landmarks] == [
+    solved = read_graph(tmp_path / "first").solved()
+    np.testing.assert_allclose(solved.world_T_pose, result.world_T_lidar, atol=1e-4)
+    assert [(mark.number, mark.kind, mark.observations) for mark in solved.landmarks] == [
         (mark.number, mark.kind, mark.observations) for mark in result.landmarks
     ]
     header, *rows = (tmp_path / "first" / "landmarks.csv").read_text().splitlines()
@@ -183,7 +244,12 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     second = SimulatedScans(3, world_T_lidar=drive(10.0, 0.5, 26))
     slam_map = read_map(tmp_path / "first")
     found = localise(second, slam_map)
+    shutil.copytree(tmp_path / "first", tmp_path / "second")
+    (tmp_path / "second" / "notes.txt").write_text("mine")
     figures = write_localised(tmp_path / "second", found, second, slam_map)
+    of_second = ["above.png", "metrics.json", "notes.txt", "reference.tum", "times.txt"]
+    of_second += ["trajectory.tum", "trajectory.txt"]  # nothing of the first run is left
+    assert sorted(file.name for file in (tmp_path / "second").iterdir()) == of_second
     assert figures["trajectory"]["ate"] < 0.2
     assert figures["registered"] > 5
     assert (tmp_path / "second" / "trajectory.tum").is_file()
@@ -216,6 +282,11 @@ def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_pat
     outcome = CliRunner().invoke(app, [*options, *again, str(tmp_path / "nowhere")])
     assert outcome.exit_code != 0
     assert "expected a map with origin.csv" in " ".join(outcome.output.split())
+    fixes = tmp_path / "fixes.csv"
+    fixes.write_text("time [s],x [m],y [m],z [m]\n0.1,0.1,0,0\n0.5,0.2,0,0\n")
+    own = [*again[: again.index("--sensors")], "--sensor-log", f"gps={fixes}", "--output", str(tmp_path / "metres")]
+    outcome = CliRunner().invoke(app, [*options, *own])
+    assert outcome.exit_code == 0, outcome.output
 
 
 def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
@@ -233,8 +304,6 @@ def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
         read_map(tmp_path)
     with pytest.raises(InputError, match="expected points in at least one submap"):
         SlamMap([np.empty((0, 3), dtype=np.float32)], np.eye(4)[None])
-    with pytest.raises(InputError, match=r"guess: expected x,y,z,yaw, m and rad, got '1,2'"):
-        guess_of("1,2")
 
 
 @pytest.mark.parametrize(
@@ -262,7 +331,7 @@ def test_all_measurements_of_a_read_graph_count(tmp_path: Path, backwards: bool)
     lines = [f"{pair} {eye}", f"EDGE_SE3:QUAT 0 1 2 0 0 0 0 0 1 {eye}", f"EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1 {eye}"]
     (tmp_path / "graph.g2o").write_text("".join(f"{line}\n" for line in lines))
     (tmp_path / "observations.csv").write_text("keyframe,landmark,kind,value,covariance\n")
-    poses, _ = read_graph(tmp_path).solved()
+    poses = read_graph(tmp_path).solved().world_T_pose
     np.testing.assert_allclose(poses[:, 0, 3], [0.0, 1.5, 2.5], atol=1e-6)
 
 

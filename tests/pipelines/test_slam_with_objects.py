@@ -93,12 +93,12 @@ def test_the_sensors_of_the_vehicle_are_in_the_same_graph(sensors: tuple[SensorN
     }
     log = SensorLog({name: tables[name] for name in sensors})
     gps = replace(SensorSettings().gps, deviation=0.02, height_deviation=0.02)
-    settings = replace(
-        LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05),
-        sensors=replace(SensorSettings(), gps=gps),
+    settings = LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05)
+    own, config = replace(SensorSettings(), gps=gps), load_config("kitti")
+    alone = lidar_slam(scans, "oxts", settings, log=log, sensors=own)
+    without, found = (
+        with_objects(alone, scans, frames, config, settings, 1.0, log=one, sensors=own).slam for one in (None, log)
     )
-    alone, config = lidar_slam(scans, "oxts", settings, log=log), load_config("kitti")
-    without, found = (with_objects(alone, scans, frames, config, settings, 1.0, log=one).slam for one in (None, log))
 
     def error(path: Trajectory) -> float:
         return float(np.linalg.norm(path.positions - truth[:, :3, 3], axis=1).mean())

@@ -35,6 +35,7 @@ GAP = 1e-6  # relative difference between the cost and its proven bound at which
 MOST_DIMENSIONS = 7  # more than d of the frames; the staircase ends far lower, where it ends at all
 _ROUNDING = 1e-11  # of the largest entry of S: eigenvalues nearer to 0 can't be told from it
 _CONVERGED = 1e-14  # decrease that a step still promises, relative to the cost: rounding
+_NEARLY = 1e-10  # the same for frames of more dimensions: slow where some are superfluous, and the bound holds anyhow
 _SHORTEST = 1e-8  # step along an eigenvector, of a length of sqrt(N d) in all
 _ACCURACY = 1e-4  # of an eigenvalue, relative to the shift
 _LARGER = 10.0  # ratio of successive shifts, until no eigenvalue is below
@@ -96,7 +97,7 @@ def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
 
 def descend(cost: ChordalCost, Y: FloatArray) -> Frames:
     """The local minimum from frames Y (N, d, r)."""
-    return best_frames(cost.times, cost.preconditioned, Y, _CONVERGED)
+    return best_frames(cost.times, cost.preconditioned, Y, _CONVERGED if Y.shape[2] == cost.dim else _NEARLY)
 
 
 @dataclass(frozen=True, eq=False)

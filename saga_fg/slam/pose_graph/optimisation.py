@@ -34,7 +34,7 @@ from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
 HELD = 1e-8  # variance (m^2, rad^2) of the first pose
 _FEW = 10  # covariances that are found one by one, at a solution each; more of them all together
 _UNLIKE = "expected coordinates and information of sizes that numbers can hold together"
-SOLVER = SolverSettings(tolerance=1e-3)  # steps below a thousandth of a standard deviation are rounding in long chains
+SOLVER = SolverSettings(tolerance=3e-3, relative_tolerance=1e-9)  # about where GTSAM stops: a gain of 1e-5, or 1e-9
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,7 @@ import numpy as np
 from factors import Vector, pose
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import assign, gate
+from saga_fg.numerics.geometry import carried_covariance, inverse_transform
 from saga_fg.slam.mapping.association import log_odds
 from saga_fg.slam.mapping.jacobians import whitened_jacobians
 from saga_fg.types.landmark import LandmarkType, Observation
@@ -67,9 +68,9 @@ class SubmapLandmarks:
 
     def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
         """Go on to the next pose: covariance (6, 6) of the motion's tangent."""
-        Ad = pose("a_T_b", a_T_b).inverse().AdjointMap()
+        back = inverse_transform(a_T_b)
         for known in self._known.values():
-            known.since = list(Ad @ np.stack(known.since) @ Ad.T + covariance)
+            known.since = list(carried_covariance(back, np.stack(known.since)) + covariance)
 
     def observe(self, world_T_pose: FloatArray, observations: Sequence[Observation], first: int) -> list[int]:
         """Return the number of the landmark of each observation; new ones are numbered from `first` on."""

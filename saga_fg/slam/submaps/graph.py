@@ -21,80 +21,29 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
-from factors import Robust, SolverSettings, pose, pose_prior_factor
+from factors import pose, pose_prior_factor
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch_solver import BatchSolver
-from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView, NewVariable, SceneFactorGraph, ask_all
+from saga_fg.graph import EGO_POSE, Additions, FactorProvider, NewVariable, SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, landmark_key, pose_key
 from saga_fg.slam.submaps.association import SubmapLandmarks
 from saga_fg.slam.submaps.condensing import CondensedSubmap
-from saga_fg.slam.submaps.loop_selection import LoopSelection, select_loops
-from saga_fg.slam.submaps.loops import LoopClosure, loop_factors
-from saga_fg.slam.submaps.recording import recorded
+from saga_fg.slam.submaps.loop_selection import LoopSelection, Motion, select_loops
+from saga_fg.slam.submaps.loops import LoopClosure, Loops, loop_factors
+from saga_fg.slam.submaps.recording import Given, recorded
+from saga_fg.slam.submaps.settings import SubmapSettings
+from saga_fg.slam.submaps.whole_drive import SolvedDrive, measurement_graph, solve_drive
 from saga_fg.types.frame import Frame
-from saga_fg.types.landmark import Landmark, Observation
+from saga_fg.types.landmark import Observation
 
 _AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
-_SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
-
-
-@dataclass(frozen=True)
-class SubmapSettings(Settings):
-    """Size of submaps, association and confirmation of landmarks."""
-
-    length: Positive = setting(30.0, "way after which the next submap begins, m; usual 20 to 50; higher: slower")
-    keyframes: Annotated[int, Range(2, 1000)] = setting(
-        80, "keyframes after which the next submap begins, on a shorter way; higher: slower"
-    )
-    gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
-        0.999, "gate probability of association; higher: fewer duplicates, more wrong matches"
-    )
-    confirm_after: Annotated[int, Range(1, 10**9)] = setting(4, "observations that confirm a landmark")
-    relinearise_above: Positive = setting(
-        0.5, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
-    )
-    robust_scale: Positive = setting(
-        3.0,
-        "residual from which losses discount poles and curbs (Geman-McClure) and loops (Cauchy, which pulls from far), "
-        "standard deviations",
-    )
-
-    @property
-    def robust(self) -> Robust:
-        """The loss of landmarks."""
-        return Robust("geman-mcclure", self.robust_scale)
-
-    @property
-    def robust_loops(self) -> Robust:
-        """The loss of loops."""
-        return Robust("cauchy", self.robust_scale)
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedDrive:
-    """Everything solved together: N poses (N, 4, 4), their covariances (N, 6, 6), and the landmarks seen often enough.
-
-    solution: of the whole graph, with all variables; graph: that, at its solution; loops: which of those that came are
-    in it, and with what deviations of odometry
-    """
-
-    world_T_pose: FloatArray
-    covariances: FloatArray
-    landmarks: list[Landmark]
-    solution: GraphSolution
-    graph: SceneFactorGraph
-    loops: LoopSelection
 
 
 class SubmapGraph:
@@ -120,14 +69,14 @@ class SubmapGraph:
         self.settings = settings or SubmapSettings()
         self._providers = recorded(providers)
         self._smoother = self._new_smoother()
-        self._motions: list[tuple[FloatArray, FloatArray]] = [(world_T_first, covariance)]
+        self._motions: list[Motion] = [(world_T_first, covariance)]
         self._times: list[float] = []
         self._seen: list[Sequence[tuple[int, Observation]]] = []
         self._anchors: list[int] = []
         self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
         self._by_anchors = self._new_smoother()  # one epoch for each anchor, once a submap was closed
         self._closed: CondensedSubmap | None = None  # the newest one
-        self._loops: list[tuple[int, LoopClosure]] = []  # with the keyframe at which they came
+        self._loops: list[LoopClosure] = []  # between submaps, by their numbers
         self._landmarks = SubmapLandmarks(self.settings.gate)
         self._numbers, self._way = 0, 0.0
 
@@ -152,7 +101,7 @@ class SubmapGraph:
     def append(
         self,
         time: float,
-        motion: tuple[FloatArray, FloatArray] | None,
+        motion: Motion | None,
         observations: Sequence[Observation] = (),
         frame: Frame | None = None,
     ) -> bool:
@@ -190,9 +139,9 @@ class SubmapGraph:
                 raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
         if not loops:
             return
-        numbers = range(len(self._anchors))
-        self._by_anchors.extend([_Loops(loops, numbers, self.settings.robust_loops)], _AFTER_LOOPS)
-        self._loops += [(len(self) - 1, loop) for loop in loops]
+        factors = loop_factors(loops, range(len(self._anchors)), self.settings.robust_loops)
+        self._by_anchors.extend([Given(Additions(factors=factors), "loops")], _AFTER_LOOPS)
+        self._loops += loops
         self._move_running()
 
     def pose(self, k: int) -> FloatArray:
@@ -226,45 +175,37 @@ class SubmapGraph:
 
     def select_loops(self) -> LoopSelection:
         """Judge all loops that came, in this order."""
-        return select_loops(self._motions[1:], self._anchors, [loop for _, loop in self._loops])
+        return select_loops(self._motions[1:], self._anchors, self._loops)
 
     def measurements(self, loops: LoopSelection | None = None) -> SceneFactorGraph:
         """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed.
 
         loops: by default as `select_loops` has it
         """
-        graph, poses, chosen = SceneFactorGraph(), self.poses(), self.select_loops() if loops is None else loops
-        seen = LandmarkObservations(self._confirmed(), self._starts(poses), self.settings.robust)
-        came: dict[int, list[LoopClosure]] = {}
-        for (k, loop), kept in zip(self._loops, chosen.kept.tolist(), strict=True):
-            came.setdefault(k, []).extend([loop] if kept else [])
-        for k, (time, motion) in enumerate(zip(self._times, self._motions, strict=True)):
-            graph.advance(time)
-            covariance = chosen.inflated(motion[1]) if k else motion[1]
-            own: list[FactorProvider] = [MeasuredMotion(motion[0], covariance, poses[k]), seen]
-            if came.get(k):
-                own.append(_Loops(came[k], self._anchors, None))
-            ask_all([*own, *(again for provider in self._providers for again in provider.again(k))], graph)
-        return graph
+        return self._measurements(self.select_loops() if loops is None else loops)[0]
 
     def finish(self) -> SolvedDrive:
         """Solve all measurements together."""
         if not len(self):
             raise InputError("expected at least one keyframe before the end")
         loops = self.select_loops()
-        solver = BatchSolver(graph=self.measurements(loops), settings=_SOLVER)
-        solution = solver.solve()
-        keys = [pose_key(k) for k in range(len(self))]
-        seen = LandmarkObservations(self._confirmed(), {})
-        marks = seen.landmarks(solution, self.settings.confirm_after)
-        return SolvedDrive(
-            np.array([solution.values.atPose3(key).matrix() for key in keys]),
-            np.array([solution.marginal(key) for key in keys]),
-            marks,
-            solution,
-            solver.graph(),
+        graph, landmarks = self._measurements(loops)
+        return solve_drive(graph, landmarks, self.settings.confirm_after, loops)
+
+    def _measurements(self, chosen: LoopSelection) -> tuple[SceneFactorGraph, LandmarkObservations]:
+        poses, (first, *motions) = self.poses(), self._motions
+        inflated = [first, *((moved, chosen.inflated(covariance)) for moved, covariance in motions)]
+        landmarks = LandmarkObservations(self._confirmed(), self._starts(poses), self.settings.robust)
+        loops = Loops([loop for loop, kept in zip(self._loops, chosen.kept, strict=True) if kept], self._anchors)
+        graph = measurement_graph(
+            self._times,
+            inflated,
+            poses,
+            landmarks,
             loops,
+            lambda k: (again for provider in self._providers for again in provider.again(k)),
         )
+        return graph, landmarks
 
     def _new_smoother(self) -> IncrementalSmoother:
         settings = RelinearisationSettings(self.settings.relinearise_above)
@@ -287,13 +228,13 @@ class SubmapGraph:
         state: Any = self._by_anchors.state(number)
         prior = pose_prior_factor(self._closed.successor, state.matrix(), self._by_anchors.covariance(number))
         given = Additions(named={self._closed.name: [prior, *self._closed.others]})
-        self._smoother.extend([_Given(given, self._closed.name)], _AFTER_LOOPS)
+        self._smoother.extend([Given(given, self._closed.name)], _AFTER_LOOPS)
         self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
 
     def _associated(
         self,
         begins: bool,
-        motion: tuple[FloatArray, FloatArray] | None,
+        motion: Motion | None,
         start: FloatArray,
         observations: Sequence[Observation],
     ) -> tuple[SubmapLandmarks, list[int]]:
@@ -324,11 +265,11 @@ class SubmapGraph:
         self._smoother.marginalise([*old, *map(landmark_key, mine)], into)
         epochs: list[tuple[float, Sequence[FactorProvider]]] = []
         if number == 0:
-            epochs.append((self._times[anchor], [_Given(_anchor_pose(begin))]))
+            epochs.append((self._times[anchor], [_anchor_pose(begin)]))
         else:
             state: Any = self._by_anchors.state(into.named[0])
             begin = np.asarray(state.matrix())
-        given = [_Given(_anchor_pose(begin @ moved)), _Given(Additions(factors=into.between))]
+        given = [_anchor_pose(begin @ moved), Given(Additions(factors=into.between), into.name)]
         epochs.append((self._times[successor], given))
         self._by_anchors.steps(epochs)
 
@@ -351,29 +292,6 @@ class SubmapGraph:
         return start
 
 
-@dataclass(frozen=True, eq=False)
-class _Loops:
-    """Factors of loops between anchors."""
-
-    loops: Sequence[LoopClosure]
-    anchors: Sequence[int]
-    robust: Robust | None
-    name: str = "loops"
-
-    def factors(self, view: GraphView) -> Additions:
-        return Additions(factors=loop_factors(self.loops, self.anchors, self.robust))
-
-
-@dataclass(frozen=True, eq=False)
-class _Given:
-    """What is known already."""
-
-    added: Additions
-    name: str = "submaps"
-
-    def factors(self, view: GraphView) -> Additions:
-        return self.added
-
-
-def _anchor_pose(world_T_anchor: FloatArray) -> Additions:
-    return Additions([NewVariable(EGO_POSE, 0, pose("world_T_anchor", world_T_anchor), label="anchor")])
+def _anchor_pose(world_T_anchor: FloatArray) -> Given:
+    variable = NewVariable(EGO_POSE, 0, pose("world_T_anchor", world_T_anchor), label="anchor")
+    return Given(Additions([variable]), "submaps")

@@ -20,22 +20,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
 import gtsam
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.slam.submaps.loop_misfits import Misfits, Solution
 from saga_fg.slam.submaps.loops import LoopClosure
 
 _FALSE = 1e-3  # probability that a proven loop is false
 _MOST = np.log(1e3)  # log of the largest inflation
-_STARTS = (0.0, np.log(10.0))
-_TRIED = 5  # loops whose leaving is tried, the worst first
+_STARTS = np.ones(2), np.full(2, 10.0)  # inflations
+_TRIED, _FITTED = 5, 2  # loops whose leaving is tried, the worst first, and choices whose inflation is fitted
 _STEPS, _SETTLED = 10, 1e-4
+_NUDGE, _PRECISION = 1e-3, {"ftol": 1e-7, "gtol": 1e-3}  # of logarithms of inflations, for slopes; of their fit
 _LOG = logging.getLogger(__name__)
 
 Motion = tuple[FloatArray, FloatArray]
@@ -58,12 +59,16 @@ def select_loops(motions: Sequence[Motion], anchors: Sequence[int], loops: Seque
     """Judge loops between anchors, by their numbers; motions: from each keyframe to the next."""
     if not loops:
         return LoopSelection(np.ones(0, dtype=bool), np.ones(2))
-    steps = [_step(motions[a:b]) for a, b in pairwise(anchors)]
+    begin, end = min(loop.first for loop in loops), max(loop.second for loop in loops)
+    steps = [_step(motions[a:b]) for a, b in pairwise(anchors[begin : end + 1])]
+    loops = [replace(loop, first=loop.first - begin, second=loop.second - begin) for loop in loops]
     problem = _Problem(np.array([T for T, _ in steps]), np.array([parts for _, parts in steps]), loops)
     everyone = _searched(problem, np.ones(len(loops), dtype=bool))
     if everyone.kept.all() and np.isclose(everyone.inflation, 1.0).all():
         return LoopSelection(everyone.kept, everyone.inflation)
-    alone = problem.at(np.zeros((len(steps), 6))).alone()
+    misfits, none = problem.at(np.zeros((len(steps), 6))), np.zeros(len(loops), dtype=bool)
+    dead_reckoning = misfits.solved(none, np.ones(2), misfits.loops(none))
+    alone = _judged(dead_reckoning, none, np.arange(len(loops)))[0]
     one = _searched(problem, np.arange(len(loops)) == int(np.argmin(alone)))
     best = min(everyone, one, key=lambda found: found.cost)
     return LoopSelection(best.kept, best.inflation)
@@ -84,11 +89,12 @@ def _step(motions: Sequence[Motion]) -> Motion:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """Loops (M,), the inflation (2,) with which they fit, and their cost."""
+    """Loops (M,), the inflation (2,) with which they fit, their cost, and the solution with them."""
 
     kept: BoolArray
     inflation: FloatArray
     cost: float
+    solution: Solution
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,109 +105,69 @@ class _Problem:
     parts: FloatArray
     loops: Sequence[LoopClosure]
 
-    def at(self, errors: FloatArray) -> _Misfits:
+    def at(self, errors: FloatArray) -> Misfits:
         """Linearised where odometry's steps are off by errors (S, 6)."""
-        poses = [gtsam.Pose3()]
-        for T, error in zip(self.steps, errors, strict=True):
-            poses.append(poses[-1].compose(gtsam.Pose3(T).retract(error)))
-        own = np.array([pose.AdjointMap() for pose in poses])
-        J = np.zeros((len(self.loops), 6, len(self.steps), 6))
-        m = np.empty((len(self.loops), 6))
-        for row, loop in enumerate(self.loops):
-            a, b = loop.first, loop.second
-            J[row, :, a:b] = (np.linalg.inv(own[b]) @ own[a + 1 : b + 1]).swapaxes(0, 1)
-            r = gtsam.Pose3(loop.first_T_second).localCoordinates(poses[a].between(poses[b]))
-            m[row] = r - np.einsum("isj,sj->i", J[row], errors)
-        size, flat = 6 * len(self.loops), J.reshape(6 * len(self.loops), -1)
-        spread = [np.einsum("asj,sjk->ask", J.reshape(size, -1, 6), self.parts[:, g]) for g in range(3)]
-        C = np.array([part.reshape(size, -1) @ flat.T for part in spread])
-        R = np.zeros((size, size))
-        for row, loop in enumerate(self.loops):
-            R[6 * row : 6 * row + 6, 6 * row : 6 * row + 6] = loop.covariance
-        return _Misfits(m.ravel(), C, R, np.array([part.reshape(size, -1) for part in spread]))
+        steps = [gtsam.Pose3(T).retract(error) for T, error in zip(self.steps, errors, strict=True)]
+        poses = list(accumulate(steps, lambda pose, step: pose.compose(step), initial=gtsam.Pose3()))
+        ends = np.array([(loop.first, loop.second) for loop in self.loops])
+        between = [poses[a].between(poses[b]) for a, b in ends.tolist()]
+        r = [gtsam.Pose3(loop.first_T_second).localCoordinates(T) for loop, T in zip(self.loops, between, strict=True)]
+        moved, turned = (np.array([T.inverse().AdjointMap() for T in each]) for each in (steps, between))
+        d = np.zeros((len(poses), 6))
+        for j, error in enumerate(errors):
+            d[j + 1] = moved[j] @ d[j] + error
+        m = np.array(r) - d[ends[:, 1]] + np.einsum("kij,kj->ki", turned, d[ends[:, 0]])
+        return Misfits(m, ends, turned, moved, self.parts, np.array([loop.covariance for loop in self.loops]))
 
-    def solved(self, found: _Found) -> tuple[_Misfits, _Found]:
+    def solved(self, found: _Found) -> tuple[Misfits, _Found]:
         """Linearised at the solution of some of the loops, with the inflation that fits there."""
         errors = np.zeros((len(self.steps), 6))
         misfits = self.at(errors)
+        found = _fitted(misfits, found.kept, [found.inflation])
         for _ in range(_STEPS):
-            before, errors = errors, misfits.errors(found).reshape(-1, 6)
+            before, errors = errors, found.solution.errors
             misfits = self.at(errors)
-            found = misfits.fitted(found.kept, found.inflation)
+            found = _fitted(misfits, found.kept, [found.inflation])
             if np.abs(errors - before).max() < _SETTLED:
                 break
         return misfits, found
 
 
-@dataclass(frozen=True, eq=False)
-class _Misfits:
-    """m (6M,) of all loops; C (3, 6M, 6M): their covariance by parts of odometry's; R (6M, 6M): by the loops' own;
-    spread (3, 6M, 6S): with odometry's errors."""
+def _costed(misfits: Misfits, kept: BoolArray, inflation: FloatArray) -> _Found:
+    """Loops (M,) with some inflation, as it is."""
+    solution = misfits.solved(kept, inflation, misfits.loops(kept))
+    false = _judged(solution, kept, np.flatnonzero(~kept))[1].sum()
+    return _Found(kept, inflation, float(solution.cost + 2 * np.log(inflation).sum() + false), solution)
 
-    m: FloatArray
-    C: FloatArray
-    R: FloatArray
-    spread: FloatArray
 
-    def covariance(self, inflation: FloatArray, rows: IntArray) -> FloatArray:
-        parts = np.ix_(rows, rows)
-        return np.asarray(np.tensordot(_scales(inflation), [C[parts] for C in self.C], 1) + self.R[parts])
+def _fitted(misfits: Misfits, kept: BoolArray, starts: Sequence[FloatArray]) -> _Found:
+    """The inflation with which loops (M,) fit, from one or several."""
+    loops = misfits.loops(kept)
 
-    def fitted(self, kept: BoolArray, start: FloatArray | None = None) -> _Found:
-        """The inflation with which loops (M,) fit, from some inflation, or from several."""
-        rows = _rows(kept)
-        C, R, m = [part[np.ix_(rows, rows)] for part in self.C], self.R[np.ix_(rows, rows)], self.m[rows]
+    def cost(logs: FloatArray) -> float:
+        return misfits.solved(kept, np.exp(logs), loops).cost + 2 * float(logs.sum())
 
-        def cost(logs: FloatArray) -> tuple[float, FloatArray]:
-            a, b = s = np.exp(logs)
-            factor = cho_factor(np.tensordot(_scales(s), C, 1) + R)
-            x, inverse = cho_solve(factor, m), cho_solve(factor, np.eye(len(m)))
-            slopes = [(inverse * D).sum() - x @ D @ x for D in C]
-            own = np.array([2 * a**2 * slopes[0], 2 * b**2 * slopes[1]]) + a * b * slopes[2]
-            return float(m @ x + 2 * np.log(np.diag(factor[0])).sum() + 2 * logs.sum()), own + 2
+    def slopes(logs: FloatArray) -> FloatArray:
+        return np.array([cost(logs + step) - cost(logs - step) for step in _NUDGE * np.eye(2)]) / (2 * _NUDGE)
 
-        begin = [np.full(2, x) for x in _STARTS] if start is None else [np.log(start)]
-        ends = [minimize(cost, x, jac=True, method="L-BFGS-B", bounds=[(0.0, _MOST)] * 2) for x in begin]
-        best = min(ends, key=lambda end: float(end.fun))
-        inflation = np.exp(best.x)
-        return _Found(kept, inflation, float(best.fun) + float(self.judged(kept, inflation)[1][~kept].sum()))
+    ends = [
+        minimize(cost, np.log(x), jac=slopes, method="L-BFGS-B", bounds=[(0.0, _MOST)] * 2, options=_PRECISION)
+        for x in starts
+    ]
+    return _costed(misfits, kept, np.exp(min(ends, key=lambda end: float(end.fun)).x))
 
-    def alone(self) -> FloatArray:
-        """-2 log likelihood (M,) of each loop by odometry as it is stated."""
-        C = self.covariance(np.ones(2), np.arange(len(self.m)))
-        own = [slice(row, row + 6) for row in range(0, len(self.m), 6)]
-        return np.array([_cost(self.m[at], C[at, at]) for at in own])
 
-    def errors(self, found: _Found) -> FloatArray:
-        """Errors (6S,) of odometry's steps by these loops."""
-        rows = _rows(found.kept)
-        x = np.linalg.solve(self.covariance(found.inflation, rows), self.m[rows])
-        return np.asarray(-np.tensordot(_scales(found.inflation), self.spread[:, rows], 1).T @ x)
-
-    def judged(self, kept: BoolArray, inflation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Costs (M,) of each loop by the kept ones without it: if it is true, and if it is false."""
-        rows = _rows(kept)
-        C = self.covariance(inflation, np.arange(len(self.m)))
-        inverse = np.linalg.inv(C[np.ix_(rows, rows)])
-        x = inverse @ self.m[rows]
-        place = {row: 6 * n for n, row in enumerate(np.flatnonzero(kept).tolist())}
-        costs = np.empty((2, len(kept)))
-        for row in range(len(kept)):
-            own = slice(6 * row, 6 * row + 6)
-            if row in place:
-                at = slice(place[row], place[row] + 6)
-                V = np.linalg.inv(inverse[at, at])
-                v = V @ x[at]
-            else:
-                across = C[own][:, rows]
-                V, v = C[own, own] - across @ inverse @ across.T, self.m[own] - across @ x
-            costs[:, row] = _cost(v, V), _cost(v, V + _more(v, V)) - 2 * np.log(_FALSE)
-        return costs[0], costs[1]
+def _judged(solution: Solution, kept: BoolArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Costs (n,) of some loops by the kept ones without them: if they are true, and if they are false."""
+    v, V = solution.left_out(rows, kept)
+    squares = (v**2 - np.diagonal(V, axis1=1, axis2=2)).reshape(-1, 2, 3).mean(axis=2)
+    more = np.repeat(np.maximum(squares, 0.0), 3, axis=1)  # covariance of further errors, by moments
+    return _cost(v, V), _cost(v, V + more[:, None] * np.eye(6)) - 2 * np.log(_FALSE)
 
 
 def _searched(problem: _Problem, kept: BoolArray) -> _Found:
     """Loops leave and return while the cost falls."""
-    misfits, found = problem.solved(problem.at(np.zeros((len(problem.steps), 6))).fitted(kept))
+    misfits, found = problem.solved(_fitted(problem.at(np.zeros((len(problem.steps), 6))), kept, _STARTS))
     for _ in range(4 * len(kept)):
         better = _better(misfits, found)
         if better is None:
@@ -211,35 +177,32 @@ def _searched(problem: _Problem, kept: BoolArray) -> _Found:
     return found
 
 
-def _better(misfits: _Misfits, found: _Found) -> _Found | None:
-    """The cheapest of the choices next to this one, if it is cheaper: those that agree return, or the worst leaves."""
-    true, false = misfits.judged(found.kept, found.inflation)
+def _better(misfits: Misfits, found: _Found) -> _Found | None:
+    """The cheapest of the choices next to this one, if it is cheaper: those that agree return, or the worst leave."""
+    kept = found.kept
+    true, false = _judged(found.solution, kept, np.arange(len(kept)))
     score = true - false
-    agreeing = ~found.kept & (score < 0)
-    tried = [found.kept | agreeing] if agreeing.sum() > 1 else []
-    for group in (np.flatnonzero(~found.kept), np.flatnonzero(found.kept)[::-1]):
-        inside = bool(len(group) and found.kept[group[0]])
+    returning = np.flatnonzero(~kept & (score < 0))
+    returning, tried = returning[np.argsort(score[returning], kind="stable")], []
+    while len(returning) > 1:  # the best half of them, and so on
+        tried.append(kept | np.isin(np.arange(len(kept)), returning))
+        returning = returning[: len(returning) // 2]
+    leaving = kept & (score > max(score[kept].max() / 2, 0.0))
+    tried += [kept & ~leaving] if leaving.sum() > 1 else []
+    for group in (np.flatnonzero(~kept), np.flatnonzero(kept)[::-1]):
+        inside = bool(len(group) and kept[group[0]])
         order = group[np.argsort(-score[group] if inside else score[group], kind="stable")][:_TRIED]
-        tried += [found.kept ^ (np.arange(len(score)) == row) for row in order]
-    choices = [misfits.fitted(kept) for kept in tried if kept.any()]
-    best = min(choices, key=lambda choice: choice.cost, default=found)
+        tried += [kept ^ (np.arange(len(score)) == row) for row in order]
+    guesses = [found.inflation**share for share in (1.0, 0.5, 0.0)[: 1 if (found.inflation == 1).all() else 3]]
+    rough = [[_costed(misfits, choice, guess) for guess in guesses] for choice in tried if choice.any()]
+    chosen = sorted((min(costs, key=_by_cost) for costs in rough), key=_by_cost)[:_FITTED]
+    best = min((_fitted(misfits, one.kept, [one.inflation]) for one in chosen), key=_by_cost, default=found)
     return best if best.cost < found.cost - 1e-3 else None
 
 
-def _cost(v: FloatArray, V: FloatArray) -> float:
-    return float(v @ np.linalg.solve(V, v) + np.linalg.slogdet(V)[1])
+def _by_cost(found: _Found) -> float:
+    return found.cost
 
 
-def _more(v: FloatArray, V: FloatArray) -> FloatArray:
-    """The covariance (6, 6) of further errors of rotation and of translation, by moments."""
-    squares = (v**2 - np.diag(V)).reshape(2, 3).mean(axis=1)
-    return np.diag(np.repeat(np.maximum(squares, 0.0), 3))
-
-
-def _rows(kept: BoolArray) -> IntArray:
-    return np.flatnonzero(np.repeat(kept, 6))
-
-
-def _scales(inflation: FloatArray) -> FloatArray:
-    a, b = inflation
-    return np.array([a**2, b**2, a * b])
+def _cost(v: FloatArray, V: FloatArray) -> FloatArray:
+    return np.asarray((v * np.linalg.solve(V, v[..., None])[..., 0]).sum(axis=1) + np.linalg.slogdet(V)[1])

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
+import numpy as np
 
 from factors import Robust, between_factor
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.errors import InputError
+from saga_fg.graph import Additions, GraphView
+from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics.geometry import checked_transform
 from saga_fg.slam.mapping import pose_key
 
 
@@ -18,6 +22,8 @@ class LoopClosure:
     tangent.
 
     confirmed: by another loop or by its proof, where odometry says otherwise; it is under no robust loss
+    Raises `InputError`, naming both ends, for what is no rigid transform, and for a covariance that is not positive
+    definite.
     """
 
     first: int
@@ -25,6 +31,13 @@ class LoopClosure:
     first_T_second: FloatArray
     covariance: FloatArray
     confirmed: bool = False
+
+    def __post_init__(self) -> None:
+        name = f"loop from {self.first} to {self.second}"
+        checked_transform(f"{name}: first_T_second", self.first_T_second)
+        P = checked(f"{name}: covariance", self.covariance, (6, 6))
+        if np.abs(P - P.T).max() > 1e-6 * np.abs(P).max() or np.linalg.eigvalsh((P + P.T) / 2)[0] <= 0:
+            raise InputError(f"{name}: covariance: expected a symmetric matrix, positive definite")
 
 
 def loop_factors(
@@ -41,3 +54,21 @@ def loop_factors(
         )
         for one in loops
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class Loops:
+    """Provider of loops, without a loss; `epochs` are those of the poses by their numbers `first` and `second`."""
+
+    loops: Sequence[LoopClosure]
+    epochs: Sequence[int]
+    name: str = "loops"
+    _by_epoch: dict[int, list[LoopClosure]] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        for loop in self.loops:
+            later = max(self.epochs[loop.first], self.epochs[loop.second])
+            self._by_epoch.setdefault(later, []).append(loop)
+
+    def factors(self, view: GraphView) -> Additions:
+        return Additions(factors=loop_factors(self._by_epoch.get(view.epoch, ()), self.epochs, None))

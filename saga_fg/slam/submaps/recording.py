@@ -9,6 +9,17 @@ from typing import Any
 from saga_fg.graph import Additions, FactorProvider, GraphView
 
 
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Provider of what is known already."""
+
+    added: Additions
+    name: str
+
+    def factors(self, view: GraphView) -> Additions:
+        return self.added
+
+
 @dataclass(eq=False)
 class Recorded:
     """A provider whose additions are kept, by epoch."""
@@ -25,7 +36,7 @@ class Recorded:
 
     def again(self, epoch: int) -> list[FactorProvider]:
         """Providers of what this one gave at an epoch."""
-        return [_Again(self.name, one) for one in self.additions.get(epoch, ())]
+        return [Given(one, self.name) for one in self.additions.get(epoch, ())]
 
     def _kept(self, view: GraphView, added: Additions) -> Additions:
         if isinstance(added, Additions) and (added.variables or len(_list(added.factors)) or added.named):
@@ -48,15 +59,6 @@ def recorded(providers: Iterable[FactorProvider]) -> list[Recorded]:
         (RecordedPredictor if callable(getattr(provider, "predict", None)) else Recorded)(provider)
         for provider in providers
     ]
-
-
-@dataclass(frozen=True, eq=False)
-class _Again:
-    name: str
-    added: Additions
-
-    def factors(self, view: GraphView) -> Additions:
-        return self.added
 
 
 def _list(factors: Any) -> Sequence[Any]:

@@ -137,6 +137,25 @@ def test_directory_with_files_keeps_the_others(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out"]
 
 
+def test_known_files_of_an_earlier_run_go(tmp_path: Path) -> None:
+    final, known = tmp_path / "out", ("tracks.csv", "map/[0-9]*.ply", "linked/[0-9]*.ply", "own")
+    elsewhere = tmp_path / "elsewhere"
+    for name in ("out/map/0.ply", "out/map/1.ply", "out/old/0.ply", "out/tracks.csv", "out/notes", "elsewhere/0.ply"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("old")
+    (final / "linked").symlink_to(elsewhere)
+    (final / "own").mkdir()
+    with atomic_directory(final, known) as folder:
+        (folder / "map").mkdir()
+        (folder / "map" / "0.ply").write_text("new")
+    assert names(final) == ["linked", "map", "notes", "old", "own"]
+    assert names(final / "map") == ["0.ply"]
+    assert names(elsewhere) == ["0.ply"]
+    with atomic_directory(final, known) as folder:
+        (folder / "a").write_text("a")
+    assert names(final) == ["a", "linked", "notes", "old", "own"]
+
+
 @pytest.mark.parametrize("exists", [True, False])
 def test_interrupted_directory_leaves_nothing(tmp_path: Path, exists: bool) -> None:
     final = tmp_path / "out"

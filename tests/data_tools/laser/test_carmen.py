@@ -84,10 +84,24 @@ def test_a_laser_ahead_of_the_robot_is_mounted_there(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_carmen(tmp_path / "ahead.log").robot_T_laser, [0.2, 0, 0], atol=1e-9)
 
 
+def test_a_laser_that_looks_back_is_mounted_so(tmp_path: Path) -> None:
+    turned = [FLASER.replace("1.2 2.0 0 1.0 2.0 0", f"{0.9} 2.0 {way} 1.0 2.0 0") for way in ("3.141592", "-3.141592")]
+    (tmp_path / "back.log").write_text("".join(turned))
+    mounted = read_carmen(tmp_path / "back.log").robot_T_laser
+    np.testing.assert_allclose([*mounted[:2], abs(mounted[2])], [-0.1, 0, np.pi], atol=1e-5)
+
+
+def test_other_lasers_are_named_and_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "two.log").write_text(FLASER + FLASER.replace("FLASER", "RLASER") + "PARAM robot_width 0.5 nohost 0\n")
+    assert len(read_carmen(tmp_path / "two.log")) == 1
+    assert "two.log: the readings of RLASER are left out, FLASER are taken" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("ODOM 1 2 3\n", "expected records FLASER or ROBOTLASER1, there are none"),
+        ("# nothing\n", "expected records FLASER or ROBOTLASER1, there are none"),
+        ("ODOM 1 2 3\nRAWLASER1 0 0\n", "expected records FLASER or ROBOTLASER1, there are only ODOM, RAWLASER1"),
         (FLASER + FLASER.replace("1.50", "east"), "line 2: expected numbers, .*east"),
         (FLASER.replace("1.50", "nan"), "line 1: expected finite numbers .*'nan'"),
         (FLASER.replace("FLASER 11", "FLASER 12"), "line 1: expected 22 values after FLASER, for 12 readings, got 21"),

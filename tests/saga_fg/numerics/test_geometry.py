@@ -1,5 +1,6 @@
 """Rigid transforms, angles and quaternions: laws, and known cases."""
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from saga_fg import InputError
 from saga_fg.numerics.geometry import (
+    adjoint,
+    carried_covariance,
     checked_quaternions,
     checked_transform,
     inverse_transform,
@@ -147,3 +150,13 @@ def test_quaternions_are_normalised_when_nearly_unit_and_refused_otherwise():
 
 def test_a_matrix_whose_determinant_underflows_is_no_rotation() -> None:
     assert not is_rotation(np.array([[1.0, 0, 0], [0, 0, 1], [0, 1e-320, 1]]), 1e-4)
+
+
+def test_adjoints_are_those_of_gtsam_and_carry_covariances():
+    rng = np.random.default_rng(0)
+    poses = [gtsam.Pose3.Expmap(rng.normal(size=6)) for _ in range(4)]
+    Ad = adjoint(np.array([pose.matrix() for pose in poses]))
+    np.testing.assert_allclose(Ad, [pose.AdjointMap() for pose in poses], atol=1e-12)
+    A = rng.normal(size=(6, 6))
+    np.testing.assert_allclose(carried_covariance(poses[1].matrix(), A @ A.T), Ad[1] @ A @ A.T @ Ad[1].T, atol=1e-12)
+    assert adjoint(np.empty((0, 4, 4))).shape == (0, 6, 6)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from itertools import accumulate
+
 import gtsam
 import numpy as np
 import pytest
@@ -60,6 +63,30 @@ def test_a_false_loop_is_left_out_where_odometry_is_worse_than_it_says(count: in
     found = selected(count, noise=3.0, false=(0.0, 0.0, 0.1, 20.0, 10.0, 0.0))
     np.testing.assert_array_equal(found.kept, [True] * count + [False])
     assert 1.5 < found.inflation.max() < 6.0
+
+
+def many(loops: int, anchors: int, false: int) -> tuple[LoopSelection, float]:
+    """Lap after lap of a circle, loops to all laps before, the first `false` of them false; and CPU seconds."""
+    rng = np.random.default_rng(loops)
+    step = gtsam.Pose3(gtsam.Rot3.Yaw(2 * np.pi / PER_LAP), [6.0, 0.0, 0.0])
+    true = list(accumulate([step] * (EVERY * anchors), lambda pose, moved: pose.compose(moved), initial=gtsam.Pose3()))
+    odometry = [(step.retract(STATED * rng.normal(size=6)).matrix(), np.diag(STATED**2)) for _ in true[1:]]
+    found, lap = [], PER_LAP // EVERY
+    for row in range(loops):
+        second = int(rng.integers(lap, anchors))
+        first = second - lap * int(rng.integers(1, second // lap + 1))
+        error = np.array([0.0, 0.0, 0.1, 10.0, 5.0, 0.0]) * rng.normal(size=6) * (row < false)
+        between = true[EVERY * first].between(true[EVERY * second]).retract(error).retract(OWN * rng.normal(size=6))
+        found.append(LoopClosure(first, second, between.matrix(), np.diag(OWN**2)))
+    began = time.process_time()
+    return select_loops(odometry, range(0, EVERY * anchors, EVERY), found), time.process_time() - began
+
+
+def test_hundreds_of_loops_take_time_by_their_number() -> None:
+    (few, short), (all_of_them, long) = many(50, 60, 2), many(500, 120, 2)
+    for selection in (few, all_of_them):
+        np.testing.assert_array_equal(selection.kept, np.arange(len(selection.kept)) >= 2)
+    assert long < 100 * short  # by the dense covariance of all loops 1000
 
 
 def test_nothing_is_known_without_loops() -> None:

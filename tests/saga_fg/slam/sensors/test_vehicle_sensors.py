@@ -17,7 +17,7 @@ from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Imu, StartSettings, Wheels
 from saga_fg.providers.mounting import ANTENNA, INERTIAL, WHEELS, mounting
 from saga_fg.slam.mapping.providers import MeasuredMotion
-from saga_fg.slam.sensors import SensorBuffer, SensorSettings, misfits, sensor_providers
+from saga_fg.slam.sensors import SensorBuffer, SensorConsistency, SensorSettings, sensor_providers
 
 H, PERIOD, GRAVITY = 0.01, 0.2, 9.81
 START = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2
@@ -59,7 +59,9 @@ class Run:
         return np.linalg.norm(self.path[:, :3, 3] - self.truth[:, :3, 3], axis=1)
 
     def misfits(self, sensors: tuple[str, ...], settings: SensorSettings) -> dict[str, str]:
-        return misfits(self.smoother.graph(), sensors, settings)[0]
+        consistency = SensorConsistency(sensors, settings)
+        consistency.observe(self.smoother.graph())
+        return consistency.misfits
 
     def static(self, number: int) -> np.ndarray:
         return np.asarray(self.smoother.state(self.smoother.graph().of(EGO_CALIBRATION, None)[number].key))
