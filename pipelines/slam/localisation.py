@@ -133,8 +133,8 @@ class Localiser:
         """
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
-        placed = self._odometry.step(scan, time, self._sensors.velocity(wheels))
-        self._measured.add(time, measured)
+        placed = self._odometry.step(scan, time, self._sensors.velocity(self._sensors.corrected(wheels)))
+        self._measured.add(time, self._sensors.compared(measured, placed))
         self._path.add(time, placed.map_T_lidar, placed)
         row = len(self._path) - 1
         if gps is not None:

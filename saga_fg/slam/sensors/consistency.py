@@ -38,6 +38,12 @@ class SensorConsistency:
         self._sensors, self._settings = tuple(sensors), settings
         self._scores: dict[str, dict[tuple[float, str, int], float]] = {sensor: {} for sensor in sensors}
         self._bias: FloatArray | None = None  # (6,), the newest
+        self._stated: dict[str, str] = {}  # what is known of sensors without the graph
+
+    def state(self, sensor: str, misfit: str) -> None:
+        """Take an explanation why a sensor does not fit from elsewhere, and warn at once."""
+        self._stated[sensor] = misfit
+        _LOG.warning(misfit)
 
     def observe(self, graph: SceneFactorGraph) -> None:
         """Take the residuals of a graph at its solution, and its newest biases."""
@@ -76,7 +82,8 @@ class SensorConsistency:
                         "check how its settings turn it on the vehicle, its units, and gravity"
                     ),
                 )
-        return {sensor: text for sensor, (_, text) in sorted(found.items(), key=lambda one: -one[1][0])}
+        ranked = {sensor: text for sensor, (_, text) in sorted(found.items(), key=lambda one: -one[1][0])}
+        return {**ranked, **self._stated}
 
     @property
     def unjudged(self) -> dict[str, str]:
@@ -99,9 +106,10 @@ class SensorConsistency:
         return f"{gps.name}: {off} of {len(scores)} fixes lie more than {3 * loss:.0f} deviations off, and hardly count"
 
     def warn(self) -> None:
-        """Log all of these."""
+        """Log all of these, but for those that were stated before."""
         for text in filter(None, (*self.misfits.values(), *self.unjudged.values(), self.false_fixes)):
-            _LOG.warning(text)
+            if text not in self._stated.values():
+                _LOG.warning(text)
 
     def _newest(self, sensor: str) -> list[float]:
         return list(self._scores[sensor].values())[-WINDOW:]
