@@ -6,7 +6,7 @@ odometry.tum                by odometry alone; online.tum: as estimated when eac
 covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
 reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
-map/                        the points of each submap and its place, to localise in (`pipelines.slam.slam_map`)
+map/                        the points of each submap (PLY or PCD) and its place (`pipelines.slam.slam_map`)
 graph.g2o, observations.csv keyframes, odometry, loops, landmarks: the whole graph (`pipelines.slam.saved_graph`)
 landmarks.json              each landmark; landmarks.csv: the same as a table, with shapes as WKT
 landmarks.ply               points along the poles and on the observed pieces of the walls
@@ -35,6 +35,7 @@ from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.drive import KeyframeClouds
 from pipelines.slam.graph_export import write_landmark_table
+from pipelines.slam.lidar_slam import LidarSlamSettings
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.results import (
@@ -109,16 +110,17 @@ def write_lidar_slam(
     found: LidarSlamResult | SlamWithObjects,
     scans: ScanSequence,
     spacing: float = 0.2,
-    odometry: OdometrySettings | None = None,
+    settings: LidarSlamSettings | None = None,
     origin: Origin | None = None,
 ) -> dict[str, Any]:
     """Write all files of a run to a folder, or none; returns the metrics.
 
-    spacing: of the map's points, m; odometry: settings of the run; origin: of the world, on Earth
+    spacing: of the map's points, m; settings: of the run; origin: of the world, on Earth
     """
+    s = settings or LidarSlamSettings()
     result, objects = (found, None) if isinstance(found, LidarSlamResult) else (found.slam, found.estimate)
     points = accumulated_map(result, spacing)
-    figures = metrics(result, scans, odometry)
+    figures = metrics(result, scans, s.odometry)
     if isinstance(found, SlamWithObjects):
         figures["objects"] = len(object_paths(found.estimate))
         truth = Trajectory(scans.timestamps, scans.world_T_ego)
@@ -133,7 +135,7 @@ def write_lidar_slam(
         if len(points):
             (folder / "map").mkdir()
             clouds = [submap.points for submap in result.submaps]
-            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin))
+            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin), s.map_format)
         write_graph(folder, result)
         times = result.trajectory.timestamps[result.keyframes].tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)

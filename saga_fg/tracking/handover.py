@@ -106,9 +106,12 @@ def _near(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
     """(k,) logs of `moving` and `stationary`, see the module."""
-    now, prior = state.kinematics(), state.settings.stationarity.prior
-    each, of_pair = np.unique(new, return_inverse=True)  # a new track is in many pairs
-    _, V_0, p = unmeasured_velocity(state, state.boxes(now.position, now.velocity).select(each), prior)
+    table, prior = state.table, state.settings.stationarity.prior
+    first = np.ones(len(new), dtype=bool)
+    first[1:] = new[1:] != new[:-1]  # a new track is in many pairs, one after the other
+    each, of_pair = new[first], first.cumsum() - 1
+    place = state.kinematics().position[each] + state.origin
+    _, V_0, p = unmeasured_velocity(state, table.label[each], place, table.box.yaw[each], prior)
     return _evidence(state, new, old, V_0[of_pair], p[of_pair])
 
 

@@ -106,6 +106,23 @@ def test_a_place_that_turns_out_wrong_is_given_up(known: SlamMap) -> None:
     assert not lost[-1]
 
 
+def test_outside_the_map_odometry_goes_on_and_back_in_it_the_place_is_found(known: SlamMap) -> None:
+    """The map ends at x = 50 m, and scans fit 30 m further; the vehicle goes on to 105 m, and backs up."""
+    poses = np.array([yaw_transform(25 + 80 * np.sin(np.pi * k / 130), 0.5, SENSOR_HEIGHT) for k in range(131)])
+    scans = SimulatedScans(3, world_T_lidar=poses)
+    localiser = Localiser(known, poses[0], LocaliserSettings(lost_after=20.0))
+    steps = [localiser.step(scans[k], time) for k, time in enumerate(scans.timestamps.tolist())]
+    localiser.finish()
+    path = localiser.path()
+    assert path is not None
+    off = np.linalg.norm(path[:, :3, 3] - poses[:, :3, 3], axis=1)
+    lost = [step.map_T_lidar is None for step in steps]
+    assert lost[65]
+    assert not lost[-1]
+    assert off.max() < 1.0
+    assert off[-10:].max() < 0.3
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_of_two_like_streets_none_is_taken(known: SlamMap, turned: bool) -> None:
     further = known.map_T_submap.copy()
@@ -223,7 +240,8 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     """What SLAM has written is read back: submaps, pose graph, landmarks; a second drive finds itself in it."""
     scans = SimulatedScans(3, world_T_lidar=drive(0.0, -1.5, 40))
     result = lidar_slam(scans, settings=LidarSlamSettings(submaps=SubmapSettings(length=20.0)))
-    write_lidar_slam(tmp_path / "first", result, scans)
+    write_lidar_slam(tmp_path / "first", result, scans, settings=LidarSlamSettings(map_format="pcd"))
+    assert len(list((tmp_path / "first" / "map").glob("*.pcd"))) == len(result.submaps)
     graph = read_g2o(tmp_path / "first" / "graph.g2o")
     assert len(graph) == len(result.keyframes)
     np.testing.assert_allclose(graph.world_T_pose, result.world_T_lidar, atol=1e-9)
