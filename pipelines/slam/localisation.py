@@ -113,10 +113,9 @@ class Localiser:
         self._fits = set[int]()  # keyframes registered with the map
         self._unproved = list[int]()  # keyframes since the structure was compared
         self._clouds: list[tuple[int, FloatArray]] = []  # of the last keyframes, thinned, with their rows
-        self._time = 0.0  # of the last keyframe
         self._searched, self._proved = 0.0, 0.0  # m, way of the last search, and of the last comparison
         self._smoother: IncrementalSmoother | None = None
-        self._last, self._fitted = 0, 0.0  # keyframe in the graph; way of the last that fitted, m
+        self._last, self._time, self._fitted = 0, 0.0, 0.0  # keyframe in the graph, time of it; way of the last fit, m
         self._pose, self._covariance = np.eye(4), _GUESSED  # of that keyframe
 
     def step(
