@@ -61,7 +61,7 @@ class OdometryPath:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def check(self, scan: object, time: float, points_first: bool) -> None:
+    def check(self, scan: Scan | None, time: float, points_first: bool) -> None:
         """Raise `InputError` for what cannot be the next scan; points_first: whether the first one must have some."""
         if scan is None:
             raise InputError(
