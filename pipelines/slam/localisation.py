@@ -170,7 +170,7 @@ class Localiser:
 
     @property
     def way(self) -> float:
-        """Way so far by odometry, m."""
+        """Way by odometry, m."""
         return self._path.ways[-1] if len(self._path) else 0.0
 
     @property
@@ -180,15 +180,13 @@ class Localiser:
 
     @property
     def consistency(self) -> SensorConsistency:
-        """Whether the sensors of the vehicle fit the path in the map."""
+        """Whether the sensors of the vehicle fit the path in the map, also in the warnings of `finish`."""
         return self._sensors.consistency
 
     def finish(self) -> None:
-        """After the last scan: look for the place with the points there are, or compare the last ones with the map.
-
-        Sensors that do not fit are named by warnings, and under `consistency`.
-        """
+        """After the last scan: look for the place with the points there are, or compare the last ones with the map."""
         if self._smoother is not None:
+            self.consistency.observe(self._smoother.graph())
             self._compare()
         if self._smoother is None and self._clouds and self.way > self._searched:
             self._search(*self._clouds[-1], self._time)
@@ -257,6 +255,8 @@ class Localiser:
 
     def _give_up(self, why: str) -> None:
         _LOG.warning("at %.1f m: %s; the place is looked for", self.way, why)
+        if self._unproved:
+            self.consistency.forget(self._path.times[self._unproved[0]])
         for row in self._unproved:
             self._found.pop(row, None)
             self._fits.discard(row)
@@ -283,7 +283,7 @@ class Localiser:
             self._fitted = self.way
             self._fits.add(row)
         self._smoother.step(time, [*given, *self._of_sensors], self._measured.frame(time, None))
-        self.consistency.observe(self._smoother.graph())
+        self.consistency.observe(self._smoother.graph(), s.lag / 2)
         (pose,) = self._smoother.graph().of(EGO_POSE, self._smoother.graph().epoch).values()
         self._pose, self._covariance = (
             self._smoother.graph().state(pose.key).matrix(),

@@ -74,11 +74,19 @@ def test_a_guess_takes_the_place_of_the_search(known: SlamMap, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("ahead", [6.0, 500.0])
-def test_a_wrong_guess_is_noticed_and_the_place_is_looked_for(known: SlamMap, ahead: float) -> None:
-    """Ground and parallel walls fit 6 m ahead as well, what stands there does not; 500 m ahead there is no map."""
+def test_a_wrong_guess_is_noticed_and_the_place_is_looked_for(
+    known: SlamMap, caplog: pytest.LogCaptureFixture, ahead: float
+) -> None:
+    """Ground and parallel walls fit 6 m ahead as well, what stands there does not; 500 m ahead there is no map.
+
+    Fixes are not blamed for the guess.
+    """
     poses = drive(5.0, 0.5, 25)
-    guess = poses[0] @ yaw_transform(ahead)
-    found = localise(SimulatedScans(3, world_T_lidar=poses), known, guess)
+    scans, guess = SimulatedScans(3, world_T_lidar=poses), poses[0] @ yaw_transform(ahead)
+    fixes = poses[:, :3, 3] + np.random.default_rng(0).normal(0, 0.3, (25, 3))
+    found = localise(scans, known, guess, log=SensorLog({"gps": np.column_stack([scans.timestamps, fixes])}))
+    assert found.misfits == {}
+    assert "fixes lie more than" not in caplog.text
     assert np.linalg.norm(found.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
     assert not found.registered[0]
     assert found.registered.sum() > 5
