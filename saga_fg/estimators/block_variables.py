@@ -30,7 +30,7 @@ from saga_fg.estimators.correction import rank
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import WhitenedMeasurements
-from saga_fg.estimators.partition import Partition
+from saga_fg.estimators.partition import Partition, unflattened
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _WHOLE = 64  # size of a component up to which it is one variable
@@ -71,25 +71,9 @@ class BlockVariables:
         sizes = np.bincount(self.partition.label, weights=self.partition.layout.dims, minlength=len(self.keys))
         return sizes.astype(np.int64)
 
-    @cached_property
-    def places(self) -> list[IntArray]:
-        """Places of each variable in the joint state."""
-        partition = self.partition
-        places: list[IntArray] = [np.empty(0, dtype=np.int64)] * len(self.keys)
-        for node in np.unique(partition.label, return_index=True)[1].tolist():
-            places[partition.label[node]] = partition.groups[partition.group[node]][partition.row[node]]
-        return places
-
     def dims(self) -> dict[int, int]:
         """Size of each variable, by key."""
         return dict(zip(self.keys.tolist(), self.sizes.tolist(), strict=True))
-
-    def mean(self, delta: gtsam.VectorValues) -> FloatArray:
-        """(D,) the joint state at the solution `delta`."""
-        y = np.empty(len(self.origin))
-        if len(self.keys):
-            y[np.concatenate(self.places)] = delta.vector(self.keys.tolist())
-        return self.origin + self.scale * y
 
     def priors(self, x: BlockGaussian, rows: IntArray) -> list[gtsam.JacobianFactor]:
         """One factor a component of `x`, whose nodes are at `rows` here; no variable belongs to two components."""
@@ -182,48 +166,56 @@ class BlockVariables:
             span = old.layout.offsets[j][:, None] + np.arange(d_j)
             values = -(W[d_i][i] @ blocks.values) * before.scale[span][:, None, :]
             put(values, i, column[pair[mine]] + old.offset[j])
+        keys, old_keys = self.keys.tolist(), before.keys[source_variable].tolist()
+        sizes, old_sizes, begins, firsts = (array.tolist() for array in (self.sizes, width, base, first))
         factors = []
         for variable in np.unique(target_variable).tolist():
-            here = source_variable[first[variable] : first[variable + 1]]
-            matrix = flat[base[variable] : base[variable + 1]].reshape(-1, self.sizes[variable]).T
-            keys = [int(self.keys[variable]), *before.keys[here].tolist()]
-            factors.append(native_factor(keys, [int(self.sizes[variable]), *before.sizes[here].tolist()], matrix))
+            here, size = slice(firsts[variable], firsts[variable + 1]), sizes[variable]
+            matrix = flat[begins[variable] : begins[variable + 1]].reshape(-1, size).T
+            factors.append(native_factor([keys[variable], *old_keys[here]], [size, *old_sizes[here]], matrix))
         return factors
 
-    def marginals(self, isam: gtsam.ISAM2, components: Partition) -> tuple[FloatArray, ...]:
-        """Covariances of the components; no variable belongs to two of them.
+    def posterior(self, isam: gtsam.ISAM2, x: BlockGaussian, rows: IntArray) -> BlockGaussian:
+        """Read the components of the nodes at `rows` from the Bayes tree; the others are those of `x`.
 
         A component of one variable is a root of the Bayes tree. One of several is too, but GTSAM would eliminate it
-        again to hand it over; the sum of its factors is the same information.
+        again to hand it over; the sum of its factors is the same information. Raises RuntimeError or LinAlgError where
+        the tree has lost its digits.
         """
-        blocks = []
-        factors = isam.getFactorsUnsafe()
-        first = np.unique(components.label, return_index=True)[1]  # a node of each component
-        count = np.bincount(components.label[np.unique(self.partition.label, return_index=True)[1]])
-        for number, places in enumerate(components.groups):
-            nodes = np.empty(len(places), dtype=np.int64)
-            here = first[components.group[first] == number]
-            nodes[components.row[here]] = here
-            order = np.broadcast_to(np.arange(places.shape[1]), places.shape).copy()
-            roots = np.empty((*places.shape, places.shape[1]))  # upper triangular in the order of the variables
-            single = count[components.label[nodes]] == 1
-            for component in np.flatnonzero(single).tolist():
-                conditional = isam.marginalFactor(int(self.keys[self.partition.label[nodes[component]]]))
-                roots[component] = conditional.R()  # a view into what must stay alive
-            for component in np.flatnonzero(~single).tolist():
-                order[component], variables = self._variables_of(places[component])
-                information = _information(factors, self.keys[variables].tolist())
-                roots[component] = np.linalg.cholesky(information).T
-            half = _inverted(roots) * np.take_along_axis(self.scale[places], order, axis=1)[:, :, None]
-            P = half @ np.swapaxes(half, 1, 2)
-            if not single.all():
-                ordered, which = P, np.arange(len(places))[:, None, None]
-                P = np.empty_like(ordered)
-                P[which, order[:, :, None], order[:, None, :]] = ordered
-            if not np.isfinite(P).all():
-                raise RuntimeError("the Bayes tree holds numbers that are not finite")
-            blocks.append(P)
-        return tuple(blocks)
+        components, mean, flat = x.partition, x.mean.copy(), np.array(x.flat)
+        blocks, first = unflattened(flat, components), np.unique(components.label[rows], return_index=True)[1]
+        for node in rows[first].tolist():
+            group, row = components.group[node], components.row[node]
+            places = components.groups[group][row]
+            variable, order = self.partition.label[node], np.arange(len(places))
+            if self.sizes[variable] == len(places):
+                conditional = isam.marginalFactor(int(self.keys[variable]))
+                R, d = conditional.R(), conditional.d()  # views into what must stay alive
+            else:
+                order, variables = self._variables_of(places)
+                R, d = self._root(isam, variables)
+            inverse, singular = scipy.linalg.lapack.dtrtri(R)
+            if singular:
+                raise np.linalg.LinAlgError("the Bayes tree is singular")
+            half = np.empty_like(inverse)
+            half[order] = self.scale[places[order], None] * inverse
+            mean[places] = self.origin[places] + half @ d
+            np.matmul(half, half.T, out=blocks[group][row])
+        if not (np.isfinite(mean).all() and np.isfinite(flat).all()):
+            raise RuntimeError("the Bayes tree holds numbers that are not finite")
+        return BlockGaussian(components, mean, blocks)
+
+    def _root(self, isam: gtsam.ISAM2, variables: IntArray) -> tuple[FloatArray, FloatArray]:
+        """R and d of || R x - d || for a component, of variables in this order, from all factors on them."""
+        keys, index, factors = self.keys[variables].tolist(), isam.getVariableIndex(), isam.getFactorsUnsafe()
+        linear = gtsam.GaussianFactorGraph()
+        for i in sorted({i for key in keys for i in index.at(key)}):
+            factor = factors.at(i)
+            assert isinstance(factor, gtsam.LinearContainerFactor)
+            linear.push_back(factor.factor())
+        information, vector = linear.hessian(gtsam.Ordering(keys))
+        L = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
+        return L.T, scipy.linalg.solve_triangular(L, vector, lower=True)
 
     def _variables_of(self, places: IntArray) -> tuple[IntArray, IntArray]:
         """Order of the entries of a component, at `places` of the joint state, by variable; and its variables."""
@@ -233,23 +225,9 @@ class BlockVariables:
         return np.argsort(variable, kind="stable"), np.unique(variable)
 
 
-def _information(factors: gtsam.NonlinearFactorGraph, keys: list[int]) -> FloatArray:
-    """Information matrix of the variables `keys`, in this order, from all factors on them."""
-    wanted = set(keys)
-    linear = gtsam.GaussianFactorGraph()
-    for i in range(factors.size()):
-        factor = factors.at(i) if factors.exists(i) else None
-        if isinstance(factor, gtsam.LinearContainerFactor) and wanted.issuperset(factor.keys()):
-            linear.push_back(factor.factor())
-    information, _ = linear.hessian(gtsam.Ordering(keys))
-    return np.asarray(information)
-
-
-def _inverted(roots: FloatArray) -> FloatArray:
-    """Inverses of upper triangular matrices (c, s, s)."""
-    if roots.shape[1] < _WHOLE:
-        return np.asarray(np.linalg.inv(roots), dtype=np.float64)
-    return np.stack([scipy.linalg.lapack.dtrtri(root)[0] for root in roots])
+def first_nodes(label: IntArray) -> IntArray:
+    """A node of each label."""
+    return np.unique(label, return_index=True)[1]
 
 
 def _divided(components: Partition, dynamics: Dynamics | None) -> Partition:

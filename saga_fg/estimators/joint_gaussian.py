@@ -20,7 +20,8 @@ from factors import FactorError, joint_prior_factor, marginal_factors, marginal_
 from factors.marginal import Elimination
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.dynamics import Dynamics, PredictionSummary, predict
+from saga_fg.estimators.dynamics import Dynamics, noise_ratio, predict
+from saga_fg.estimators.filter_steps import predicted
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import Partition, zeros
 from saga_fg.graph.messages import solver_error, with_names
@@ -90,10 +91,9 @@ def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, window: bool) 
 
     window: whether there is one to be lost, so that wide components are to keep their factors while that can be.
     """
-    prediction = PredictionSummary.of(x, dynamics)
-    label = prediction.components.label
+    label, ratio = dynamics.joined(x.partition).label, noise_ratio(predicted(x, dynamics, None, False), dynamics)
     wide = np.bincount(label, weights=x.layout.dims)[label] > (np.inf if window else _SMALL)
-    return np.isin(label, label[(prediction.ratio > np.where(wide, _LIMIT_WIDE, _LIMIT)) & ~still])
+    return np.isin(label, label[(ratio > np.where(wide, _LIMIT_WIDE, _LIMIT)) & ~still])
 
 
 def by_covariance(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> BlockGaussian:

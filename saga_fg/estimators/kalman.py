@@ -28,7 +28,6 @@ from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.protocol import LatestMarginals, Measurements
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.kernels.components import planar_marginals
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray, shallow_copy
 from saga_fg.types.frame import Frame
@@ -144,15 +143,6 @@ class JointKalmanFilter(LatestMarginals):
             leaving = set(np.asarray(nodes).tolist())
             labels = {node: label for node, label in self._auxiliary.labels.items() if node not in leaving}
             self._auxiliary = replace(self._auxiliary, labels=labels)
-
-    def planar_marginals(self, nodes: ArrayLike, places: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Positions and velocities (k, 4) with their covariances (k, 4, 4), by a kernel.
-
-        places (k, 4): where x, y, vx, vy are in the states, -1 for none, which gives zeros
-        """
-        x, rows = self._at(nodes)
-        at = x.partition.block_places
-        return planar_marginals(x.mean, x.flat, x.layout.offsets, at.start, at.size, at.offset, rows, places)
 
     def posterior(self) -> BlockGaussian:
         """The joint Gaussian."""

@@ -49,8 +49,9 @@ class StateLayout:
         """Places (k,) of ids (k,) in the ascending order, and which of them (k,) are in the layout."""
         if len(self) == 0 or len(ids) == 0:
             return np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=bool)
-        at = np.minimum(np.searchsorted(self._sorted, ids.astype(np.int64, copy=False)), len(self) - 1)
-        return at, self._sorted[at] == ids
+        nodes = self._sorted
+        at = np.minimum(nodes.searchsorted(ids.astype(np.int64, copy=False)), len(nodes) - 1)
+        return at, nodes[at] == ids
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -65,7 +66,7 @@ class StateLayout:
         ids = np.asarray(nodes)
         if ids.ndim != 1 or (ids.size and ids.dtype.kind not in "iu"):
             raise InputError(f"nodes: expected a list of integer ids, got {nodes!r}")
-        if len(ids) == len(self.nodes) and (ids == self.nodes).all():
+        if len(ids) == len(self.nodes) and not np.count_nonzero(ids != self.nodes):
             return np.arange(len(ids))
         at, known = self._places(ids)
         if not known.all():

@@ -58,20 +58,18 @@ class LinearisedMeasurements(NamedTuple):
 
 
 class WhitenedMeasurements(NamedTuple):
-    """Measurements in units of their noise, R = 1; log_det: the sum of the logarithms of the determinants of R."""
+    """Measurements in units of their noise, R = 1: rows (m,) of the nodes; z (m, k); H (m, k, d)."""
 
     rows: IntArray
     z: FloatArray
     H: FloatArray
-    log_det: float
 
 
 def whitened(linear: LinearisedMeasurements) -> WhitenedMeasurements:
     """W z and W H, W R W^T = 1."""
     L = np.linalg.cholesky(linear.R)
     white = np.linalg.solve(L, np.concatenate([linear.H, linear.z[:, :, None]], axis=2))
-    log_det = 2 * float(np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
-    return WhitenedMeasurements(linear.rows, white[:, :, -1], white[:, :, :-1], log_det)
+    return WhitenedMeasurements(linear.rows, white[:, :, -1], white[:, :, :-1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.kernels.components import planar_marginals
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
 
@@ -144,6 +145,15 @@ class LatestMarginals:
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         x, rows = self._at(nodes)
         return x.joint(rows)
+
+    def planar_marginals(self, nodes: ArrayLike, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Positions and velocities (k, 4) with their covariances (k, 4, 4), by a kernel.
+
+        places (k, 4): where x, y, vx, vy are in the states, -1 for none, which gives zeros
+        """
+        x, rows = self._at(nodes)
+        at = x.partition.block_places
+        return planar_marginals(x.mean, x.flat, x.layout.offsets, at.start, at.size, at.offset, rows, places)
 
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
         """A Gaussian, and which of its rows are these nodes."""

@@ -185,27 +185,75 @@ def coupling_integrals(
         _set_scaled(A_j, A[j], 1.0)
         _exponential_series(second[j], A_j, h)
         _squares(doubled[j], second[j, 0])
-    result = np.empty((m, p, q))
-    corner, product, own = np.empty((p, q)), np.empty((p, q)), np.empty((degree + 1, p, p))
-    M_i, C_e = np.empty((p, p)), np.empty((p, q))  # parts are compiled once for arrays like these
-    for e in range(m):
-        i, j = at[e], of[e]
-        _set_scaled(M_i, M[i], 1.0)
-        _set_scaled(C_e, C[e], 1.0)
-        if doublings > 0 and not made[i]:
-            made[i] = True
-            _exponential_series(own, M_i, h)
-            _squares(first[i], own[0])
-        _set_scaled(corner, C_e, 0.0)
-        for t in range(degree, 0, -1):
-            _set_product(product, M_i, corner)
-            _add_product(product, C_e, second[j, t])
+    result, begin, most = np.empty((m, p, q)), 0, 1
+    while begin < m:
+        end = begin + 1
+        while end < m and at[end] == at[begin] and of[end] == of[begin]:
+            end += 1
+        most, begin = max(most, end - begin), end
+    corner, product, own = np.empty((p, most * q)), np.empty((p, most * q)), np.empty((degree + 1, p, p))
+    place, value = np.empty((most * p * q, 3), dtype=np.int64), np.empty(most * p * q)
+    M_i, C_e, whole = np.empty((p, p)), np.empty((p, q)), np.empty((p, q))  # parts are compiled once for such arrays
+    begin = 0
+    while begin < m:  # the edges of a node at once, side by side
+        i, j, end, known = at[begin], of[begin], begin, 0
+        while end < m and at[end] == i and of[end] == j:
             for a in range(p):
                 for b in range(q):
+                    if C[end, a, b] != 0.0:
+                        place[known, 0], place[known, 1], place[known, 2] = a, b, (end - begin) * q
+                        value[known] = C[end, a, b]
+                        known += 1
+            end += 1
+        width = (end - begin) * q
+        for a in range(p):
+            for b in range(width):
+                corner[a, b] = 0.0
+        for t in range(degree, 0, -1):
+            for a in range(p):
+                for b in range(width):
+                    product[a, b] = 0.0
+                for c in range(p):
+                    z = M[i, a, c]
+                    if z != 0.0:
+                        for b in range(width):
+                            product[a, b] += z * corner[c, b]
+            for k in range(known):
+                a, c, first_column, z = place[k, 0], place[k, 1], place[k, 2], value[k]
+                for b in range(q):
+                    product[a, first_column + b] += z * second[j, t, c, b]
+            for a in range(p):
+                for b in range(width):
                     corner[a, b] = product[a, b] * h / t
-        for t in range(doublings):
-            _set_product(product, first[i, t], corner)
-            _add_product(product, corner, doubled[j, t])
-            _set_scaled(corner, product, 1.0)
-        _set_scaled(result[e], corner, 1.0)
+        if doublings > 0 and not made[i]:
+            made[i] = True
+            _set_scaled(M_i, M[i], 1.0)
+            _exponential_series(own, M_i, h)
+            _squares(first[i], own[0])
+        for e in range(begin, end):
+            for a in range(p):
+                for b in range(q):
+                    C_e[a, b] = corner[a, (e - begin) * q + b]
+            for t in range(doublings):
+                _set_product(whole, first[i, t], C_e)
+                _add_product(whole, C_e, doubled[j, t])
+                _set_scaled(C_e, whole, 1.0)
+            _set_scaled(result[e], C_e, 1.0)
+        begin = end
     return result
+
+
+@kernel("f3 f2 i1 f1 f3 f2")
+def with_edges(
+    M: FloatArray, c: FloatArray, at: IntArray, rate: FloatArray, A_self: FloatArray, b: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """M (n, d, d) and c (n, d) with what E edges of a rate (E,) > 0 add to the nodes `at` (E,): rate A_self, rate b."""
+    d = c.shape[1]
+    sums, constants = M.copy(), c.copy()
+    for e in range(len(at)):
+        if rate[e] > 0:
+            for p in range(d):
+                constants[at[e], p] += rate[e] * b[e, p]
+                for q in range(d):
+                    sums[at[e], p, q] += rate[e] * A_self[e, p, q]
+    return sums, constants

@@ -32,12 +32,10 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
 
 from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import compiled_by
-from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise
+from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise, with_edges
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.transition import Blocks, Transition
@@ -167,26 +165,6 @@ def _moved_back(node_type: NodeType, dt: float) -> FloatArray:
     return _exponential(-node_type.generator * dt)
 
 
-def joint_generator(graph: SceneGraph) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The whole graph as one linear system dx/dt = G x + c + w: G (D, D), c (D,), Qc (D, D), dense.
-
-    exp(G dt) is the reference that `discretise` approximates to second order in the coupling.
-    """
-    offsets = np.concatenate([[0], np.cumsum(graph.dims)])
-    G = scipy.linalg.block_diag(*(t.generator for t in graph.types)) if len(graph) else np.empty((0, 0))
-    scaled = (t.diffusion * scale for t, scale in zip(graph.types, graph.diffusion_scale, strict=True))
-    Qc = scipy.linalg.block_diag(*scaled) if len(graph) else np.empty((0, 0))
-    c = np.zeros(int(offsets[-1]))
-    for edges in graph.edges:
-        for k, (i, j, rate) in enumerate(zip(edges.target, edges.source, edges.rate, strict=True)):
-            at_i = slice(offsets[i], offsets[i + 1])
-            at_j = slice(offsets[j], offsets[j + 1])
-            G[at_i, at_i] += rate * edges.A_self[k]
-            G[at_i, at_j] += rate * edges.A_other[k]
-            c[at_i] += rate * edges.b[k]
-    return G, c, Qc
-
-
 def _own_dynamics(
     graph: SceneGraph, rows: IntArray, kinds: list[NodeType], kind: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -201,10 +179,18 @@ def _own_dynamics(
     for edges in graph.edges:
         at = position[edges.target]
         if edges.A_self.shape[1] == M.shape[1] and len(at):
-            acting = edges.rate > 0
-            np.add.at(M, at[acting], edges.rate[acting, None, None] * edges.A_self[acting])
-            np.add.at(c, at[acting], edges.rate[acting, None] * edges.b[acting])
+            M, c = _with_edges(M, c, at, edges.rate, edges.A_self, edges.b)
     return M, Qc, c
+
+
+@compiled_by(with_edges)
+def _with_edges(
+    M: FloatArray, c: FloatArray, at: IntArray, rate: FloatArray, A_self: FloatArray, b: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    M, c, acting = M.copy(), c.copy(), rate > 0
+    np.add.at(M, at[acting], rate[acting, None, None] * A_self[acting])
+    np.add.at(c, at[acting], rate[acting, None] * b[acting])
+    return M, c
 
 
 def _nilpotency(kinds: Sequence[NodeType]) -> int | None:

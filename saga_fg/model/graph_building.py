@@ -69,7 +69,7 @@ def build_graph(
                 else:
                     ends["given"] = law.given(nodes, t, s)
                     nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
-                np.add.at(total_rate, row[t], rate[mine])
+                total_rate += np.bincount(row[t], weights=rate[mine], minlength=len(total_rate))
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:
         scale = scale * noise_scale

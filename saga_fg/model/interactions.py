@@ -89,6 +89,7 @@ class NodeTable:
         for name, value in self.__dict__.items():
             if isinstance(value, np.ndarray):
                 columns[name] = value.take(rows, 0)
+                columns[name].flags.writeable = False  # labels that are never changed are looked up once
             elif isinstance(value, Paths | LanesAcross):
                 columns[name] = value.of_nodes(rows)
             elif isinstance(value, Mapping):

@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.paths import path_cones, places_along
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.polyline import Polylines
@@ -50,14 +52,7 @@ class Paths(Columns):
         from that cone than the margin, or the path turns by more than `SHARP`. At a corner a place may be farther from
         the path than aside.
         """
-        if len(self) == 0:
-            return np.empty(0), np.empty(0), np.empty(0)
-        angle = self.lines.angle.reshape(len(self), -1)
-        turn, corner = (
-            np.abs(angle - angle[:, :1]).max(1, initial=0.0),
-            np.abs(np.diff(angle, axis=1)).max(1, initial=0.0),
-        )
-        return angle[:, 0], turn, _ROUNDING * most / np.cos(np.minimum(corner, SHARP))
+        return _cones(self, most)
 
     def of_nodes(self, rows: IntArray) -> Paths:
         """The paths of the nodes `rows` (k,), ascending, which are counted from 0 then."""
@@ -87,6 +82,29 @@ class Along(NamedTuple):
     predicted: BoolArray
 
 
+def _cones_by_kernel(paths: Paths, most: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return path_cones(paths.position, most, SHARP, _ROUNDING)
+
+
+@compiled_by(_cones_by_kernel)
+def _cones(paths: Paths, most: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`Paths.cones`."""
+    if len(paths) == 0:
+        return np.empty(0), np.empty(0), np.empty(0)
+    angle = paths.lines.angle.reshape(len(paths), -1)
+    turn, corner = np.abs(angle - angle[:, :1]).max(1), np.abs(np.diff(angle, axis=1)).max(1, initial=0.0)
+    return angle[:, 0], turn, _ROUNDING * most / np.cos(np.minimum(corner, SHARP))
+
+
+def _along_by_kernel(
+    position: FloatArray, heading: FloatArray, paths: Paths | None, target: IntArray, source: IntArray
+) -> Along:
+    paths, path = NO_PATHS if paths is None else paths, np.full(len(position), -1)
+    path[paths.row] = np.arange(len(paths.row))
+    return Along(*places_along(position, heading, path, paths.position, target, source))
+
+
+@compiled_by(_along_by_kernel)
 def along_paths(
     position: FloatArray, heading: FloatArray, paths: Paths | None, target: IntArray, source: IntArray
 ) -> Along:

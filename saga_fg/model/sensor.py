@@ -23,6 +23,8 @@ from typing import Annotated, Literal
 import numpy as np
 
 from saga_fg.errors import InputError, require_type
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.covariances import measured_covariances
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, distinct
 from saga_fg.numerics.geometry import inverse_transform, wrap_angle, yaw_transform
 from saga_fg.settings import (
@@ -195,11 +197,10 @@ class Sensor(Settings):
 
     def logit(self, score: FloatArray) -> FloatArray:
         """The logits (N,) of the detector's own scores, before calibration; of probabilities in [0.001, 0.999]."""
-        raw = np.asarray(score, dtype=np.float64)
         if self.score == "probability":
-            p = np.clip(raw, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+            p = np.asarray(score, dtype=np.float64).clip(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
             return np.asarray(np.log(p / (1 - p)))
-        return np.clip(raw, -_LARGEST_LOGIT, _LARGEST_LOGIT)
+        return np.asarray(score, dtype=np.float64).clip(-_LARGEST_LOGIT, _LARGEST_LOGIT)
 
     def probability(self, score: FloatArray, label: StrArray) -> FloatArray:
         """The detector's scores (N,) of objects of these classes (N,) as probabilities in [0.001, 0.999]."""
@@ -208,8 +209,8 @@ class Sensor(Settings):
     def calibrated(self, logit: FloatArray, label: StrArray) -> FloatArray:
         """The probabilities (N,) of scores with these logits (N,) before calibration."""
         slope, offset = class_values(self.calibration, ScoreCalibration, label, "slope", "offset")
-        p = 1 / (1 + np.exp(-np.clip(offset + slope * logit, -50, 50)))
-        return np.asarray(np.clip(p, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY))
+        p = 1 / (1 + np.exp(-(offset + slope * logit).clip(-50, 50)))
+        return np.asarray(p.clip(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY))
 
     def detection_chance(self, label: StrArray) -> FloatArray:
         """(N,) chance that a visible object of each class in the field of view is detected."""
@@ -292,9 +293,8 @@ class Sensor(Settings):
 
     def origin(self, frame: Frame) -> FloatArray | None:
         """Place of the sensor (2,), world, m; None where the pose is unknown."""
-        if frame.world_T_ego is None:
-            return None
-        return np.asarray((frame.world_T_ego @ self.extrinsics.ego_T_sensor)[:2, 3])
+        pose = frame.world_T_ego
+        return None if pose is None else np.asarray((pose @ self.extrinsics.ego_T_sensor)[:2, 3])
 
     def sees(self, position: FloatArray, world_T_ego: FloatArray | None) -> BoolArray:
         """Mask (N,) of positions (N, 2), world, in the field of view; all where the pose is unknown."""
@@ -309,6 +309,27 @@ class Sensor(Settings):
         sensor_T_world = inverse_transform(world_T_ego @ self.extrinsics.ego_T_sensor)
         local = position @ sensor_T_world[:2, :2].T + sensor_T_world[:2, 3]
         return np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
+
+
+def _noise_by_kernel(
+    sensor: Sensor, detections: Detections, origin: FloatArray | None, probability: FloatArray
+) -> FloatArray:
+    boxes, reported = detections.boxes, detections.position_covariance
+    names = "position", "range_noise", "bearing_noise", "velocity", "low_score_growth"
+    own, along, across, velocity, growth = sensor.deviations(boxes.label, *names)
+    offset = boxes.position[:, :2] - (boxes.position[:, :2] if origin is None else origin)
+    return measured_covariances(offset, own, along, across, velocity, growth, probability, reported)
+
+
+@compiled_by(_noise_by_kernel)
+def measurement_covariance(
+    sensor: Sensor, detections: Detections, origin: FloatArray | None, probability: FloatArray
+) -> FloatArray:
+    """R (N, 4, 4) of positions, m^2, and velocities, (m/s)^2, as by `detection_covariance`, `velocity_covariance`."""
+    R = np.zeros((len(detections), 4, 4))
+    R[:, :2, :2] = sensor.detection_covariance(detections, origin, probability)
+    R[:, 2:, 2:] = sensor.velocity_covariance(detections.boxes.label, probability)
+    return R
 
 
 def _score_factor(low_score_growth: FloatArray, probability: FloatArray) -> FloatArray:

@@ -19,9 +19,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import scipy.linalg
 
 from saga_fg.errors import InputError
-from saga_fg.model.discretisation import discretise, joint_generator
+from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours
 from saga_fg.model.interactions import NodeTable, applies, unit
 from saga_fg.model.motion import ConstantVelocity, NodeType
@@ -72,6 +73,26 @@ def highest_rate(rule: MovingRule) -> float:
             return rule.rate * rule.max_degree
         case _:
             return rule.rate
+
+
+def joint_generator(graph: SceneGraph) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The whole graph as one linear system dx/dt = G x + c + w: G (D, D), c (D,), Qc (D, D), dense.
+
+    exp(G dt) is the reference that `discretise` approximates to second order in the coupling.
+    """
+    offsets = np.concatenate([[0], np.cumsum(graph.dims)])
+    G = scipy.linalg.block_diag(*(t.generator for t in graph.types)) if len(graph) else np.empty((0, 0))
+    scaled = (t.diffusion * scale for t, scale in zip(graph.types, graph.diffusion_scale, strict=True))
+    Qc = scipy.linalg.block_diag(*scaled) if len(graph) else np.empty((0, 0))
+    c = np.zeros(int(offsets[-1]))
+    for edges in graph.edges:
+        for k, (i, j, rate) in enumerate(zip(edges.target, edges.source, edges.rate, strict=True)):
+            at_i = slice(offsets[i], offsets[i + 1])
+            at_j = slice(offsets[j], offsets[j + 1])
+            G[at_i, at_i] += rate * edges.A_self[k]
+            G[at_i, at_j] += rate * edges.A_other[k]
+            c[at_i] += rate * edges.b[k]
+    return G, c, Qc
 
 
 def _acting_together(rules: Mapping[int, MovingRule]) -> list[tuple[int, ...]]:

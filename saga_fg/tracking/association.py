@@ -162,10 +162,10 @@ def _gated_by_kernel(
     measurements: FrameMeasurements,
     evidence: ClassEvidence | None,
 ) -> CandidatePairs:
-    boxes, n = measurements.boxes, len(predicted)
+    boxes = measurements.boxes
     if evidence is None:
-        _, number = distinct(np.concatenate([predicted.label, boxes.label]))
-        of_track, of_detection = number[:n], number[n:]
+        (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(boxes.label)
+        of_detection = np.array([classes.index(c) if c in classes else -1 for c in seen], dtype=np.int64)[of_detection]
         belief = likelihood = np.empty((1, 0))
     else:
         of_track, of_detection = (evidence.groups.numbers(label) for label in (predicted.label, boxes.label))

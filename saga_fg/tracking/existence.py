@@ -21,7 +21,9 @@ import math
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.covariances import existences
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.numerics.near_pairs import near_pairs
@@ -53,11 +55,9 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
         p_detect, visible = p_detect * (1 - hidden), visible & (hidden < HIDDEN)
     # a track that another sensor has just detected exists, whether this one misses it or not
     excused = table.sensors.detected_by_others(measurements.name, time, memory)
-    p_miss = np.where(excused, 0.0, p_detect)[missed]
-    p = measurements.probability[d]
-    table.existence[missed] = after_miss(table.existence[missed], p_miss, elapsed, settings)
-    resolved = t[table.unresolved[t] == 0]  # a detection of the others may be of the track that they overlap
-    table.existence[resolved] = after_hit(table.existence[resolved], p[table.unresolved[t] == 0], settings)
+    p, p_miss, resolved = measurements.probability[d], np.where(excused, 0.0, p_detect), table.unresolved[t] == 0
+    # a detection of an unresolved track may be of the track that it overlaps
+    table.existence = _existence(table.existence, missed, p_miss, t[resolved], p[resolved], elapsed, settings)
     table.last_existence[t] = table.existence[t]
     table.confirmed |= table.existence >= settings.confirm_above
     table.sensors.update(measurements.name, time, t, p, missed & visible, p_detect)
@@ -68,6 +68,37 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     table.covariance_scale[t], table.position_bias[t] = measurements.covariance_scale[d], measurements.position_bias[d]
     table.last_detected[t] = np.maximum(table.last_detected[t], time)
     table.last_in_view[t] = state.time
+
+
+def _existence_by_kernel(
+    before: FloatArray,
+    missed: BoolArray,
+    chance: FloatArray,
+    rows: IntArray,
+    probability: FloatArray,
+    elapsed: float,
+    settings: ExistenceSettings,
+) -> FloatArray:
+    survival = math.exp(-elapsed / settings.lifetime)
+    return existences(before, missed, chance, rows, probability, survival, settings.neutral_score)
+
+
+@compiled_by(_existence_by_kernel)
+def _existence(
+    before: FloatArray,
+    missed: BoolArray,
+    chance: FloatArray,
+    rows: IntArray,
+    probability: FloatArray,
+    elapsed: float,
+    settings: ExistenceSettings,
+) -> FloatArray:
+    """Existence (n,) after a frame in which tracks are `missed` (n,), by the chance (n,) to detect them, and those of
+    `rows` (k,) have detections of a probability (k,)."""
+    after = before.copy()
+    after[missed] = after_miss(before[missed], chance[missed], elapsed, settings)
+    after[rows] = after_hit(before[rows], probability, settings)
+    return after
 
 
 def after_miss(existence: FloatArray, p_detect: FloatArray, elapsed: float, settings: ExistenceSettings) -> FloatArray:

@@ -26,7 +26,6 @@ import math
 
 import numpy as np
 
-from saga_fg.estimators import JointKalmanFilter
 from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.returns import return_evidence, returned_pairs
 from saga_fg.model.interactions import POSITION, VELOCITY
@@ -107,9 +106,12 @@ def _near(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
     """(k,) logs of `moving` and `stationary`, see the module."""
-    now, prior = state.kinematics(), state.settings.stationarity.prior
-    each, of_pair = np.unique(new, return_inverse=True)  # a new track is in many pairs
-    _, V_0, p = unmeasured_velocity(state, state.boxes(now.position, now.velocity).select(each), prior)
+    table, prior = state.table, state.settings.stationarity.prior
+    first = np.ones(len(new), dtype=bool)
+    first[1:] = new[1:] != new[:-1]  # a new track is in many pairs, one after the other
+    each, of_pair = new[first], first.cumsum() - 1
+    place = state.kinematics().position[each] + state.origin
+    _, V_0, p = unmeasured_velocity(state, table.label[each], place, table.box.yaw[each], prior)
     return _evidence(state, new, old, V_0[of_pair], p[of_pair])
 
 
@@ -117,16 +119,13 @@ def _evidence_by_kernel(
     state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     estimator, table, still = state.joint.estimator, state.table, state.table.stationarity
-    assert isinstance(estimator, JointKalmanFilter)
     places, place, D, s = state.joint.places(table.label), still.position, still.P, still.probability
     (x, P), (x_old, P_old) = (estimator.planar_marginals(table.id[k], places[k]) for k in (new, old))
     if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
     return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0, p, *if_still)
 
 
-@compiled_by(
-    _evidence_by_kernel, where=lambda state, new, old, V_0, p: isinstance(state.joint.estimator, JointKalmanFilter)
-)
+@compiled_by(_evidence_by_kernel)
 def _evidence(
     state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

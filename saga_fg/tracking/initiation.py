@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.covariances import velocities_along
 from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.tracking.box_filter import BoxFilter
 from saga_fg.tracking.kinematics import Kinematics
@@ -30,7 +32,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     ids = np.arange(state.next_id, state.next_id + k, dtype=np.int64)
     state.next_id += k
     unresolved = unresolved_frames(state, matching, boxes, p, measurements.R[rows, :2, :2])
-    kinematics, stationary = initial_kinematics(state, measurements, rows)
+    kinematics, stationary = initial_kinematics(state, measurements, rows, boxes)
     relative = None if measurements.relative is None else measurements.relative.select(rows)
     state.joint.add(ids, boxes.label, kinematics, delay, relative, appended=True)
     update_range_rates(state, measurements, rows, ids, boxes.label)
@@ -71,19 +73,21 @@ def required_hits(state: TrackerState, sensor: Sensor) -> float:
 
 
 def initial_kinematics(
-    state: TrackerState, measurements: FrameMeasurements, rows: IntArray
+    state: TrackerState, measurements: FrameMeasurements, rows: IntArray, boxes: Boxes
 ) -> tuple[Kinematics, FloatArray]:
-    """The kinematics of new tracks from the measurements `rows` (k,), if they move; and the probability (k,) that they
-    are stationary."""
-    boxes, measured = measurements.boxes.select(rows), measurements.with_velocity[rows]
-    R, prior = measurements.R[rows], state.settings.stationarity.prior
-    velocity, P_velocity, stationary = unmeasured_velocity(state, boxes, prior)
+    """The kinematics of new tracks from the measurements `rows` (k,), with their boxes, if they move; and the
+    probability (k,) that they are stationary."""
+    R, prior, measured = measurements.R[rows], state.settings.stationarity.prior, measurements.with_velocity[rows]
+    place = boxes.position[:, :2]
+    velocity, P_velocity, stationary = unmeasured_velocity(state, boxes.label, place, boxes.yaw, prior)
+    if not measured.any():
+        return Kinematics(place - state.origin, velocity, R[:, :2, :2], P_velocity), stationary
     if prior > 0:
         z, R_v = np.nan_to_num(boxes.velocity), R[:, 2:, 2:]
         evidence = log_density(z, R_v) - log_density(z - velocity, P_velocity + R_v)
         stationary = np.where(measured, after_evidence(stationary, evidence), stationary)
     kinematics = Kinematics(
-        boxes.position[:, :2] - state.origin,
+        place - state.origin,
         np.where(measured[:, None], boxes.velocity, velocity),
         R[:, :2, :2],
         np.where(measured[:, None, None], R[:, 2:, 2:], P_velocity),
@@ -91,14 +95,22 @@ def initial_kinematics(
     return kinematics, stationary
 
 
-def unmeasured_velocity(state: TrackerState, boxes: Boxes, prior: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Velocity (k, 2), its covariance (k, 2, 2) and the probability (k,) to be stationary, by class, heading and
-    traffic."""
-    speed, drift = state.class_values(boxes.label, "initial_speed_deviation", "initial_lateral_speed_deviation")
-    place = boxes.position[:, :2]
-    stationary, mean, variance = speed_prior(state.traffic, boxes.label, place, boxes.yaw, speed**2, prior)
-    known = np.isfinite(boxes.yaw)
-    ahead = np.nan_to_num(np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], axis=-1))
-    along = np.where(known, variance - drift**2, 0.0)[:, None, None] * (ahead[:, :, None] * ahead[:, None])
-    P = along + (np.where(known, drift, speed) ** 2)[:, None, None] * np.eye(2)
-    return mean[:, None] * ahead, P, stationary
+def unmeasured_velocity(
+    state: TrackerState, label: StrArray, place: FloatArray, yaw: FloatArray, prior: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Velocity (k, 2), its covariance (k, 2, 2) and the probability (k,) to be stationary, by class, place (k, 2) in
+    the world, heading (k,), rad, and traffic."""
+    speed, drift = state.class_values(label, "initial_speed_deviation", "initial_lateral_speed_deviation")
+    stationary, mean, variance = speed_prior(state.traffic, label, place, yaw, speed**2, prior)
+    return *_velocities(yaw, mean, variance, speed, drift), stationary
+
+
+@compiled_by(velocities_along)
+def _velocities(
+    yaw: FloatArray, speed: FloatArray, variance: FloatArray, any_way: FloatArray, lateral: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    known = np.isfinite(yaw)
+    ahead = np.nan_to_num(np.stack([np.cos(yaw), np.sin(yaw)], axis=-1))
+    along = np.where(known, variance - lateral**2, 0.0)[:, None, None] * (ahead[:, :, None] * ahead[:, None])
+    P = along + (np.where(known, lateral, any_way) ** 2)[:, None, None] * np.eye(2)
+    return speed[:, None] * ahead, P

@@ -98,7 +98,8 @@ class JointTrackState:
             now = now._replace(P=np.tile(_UNKNOWN_POSITION**2 * np.eye(2), (len(ids), 1, 1)))
         for node_type, rows in self.rows_by_type(label, delay > 0):
             mean = np.zeros((len(rows), node_type.dim))
-            P = np.tile(np.diag(node_type.initial_deviation**2), (len(rows), 1, 1))
+            P = np.zeros((len(rows), node_type.dim, node_type.dim))
+            P.reshape(len(rows), -1)[:, :: node_type.dim + 1] = node_type.initial_deviation**2
             at_p = node_type.index(POSITION)
             mean[:, at_p], P[:, at_p[:, None], at_p] = now.position[rows], now.P[rows]
             if node_type.has(VELOCITY):
@@ -121,7 +122,8 @@ class JointTrackState:
         if relative is not None:
             self._add_relative(ids, label, relative)
         if before is not None:
-            self._kinematics = before.append(self.kinematics_of(ids, label))
+            exact = isinstance(self.estimator, JointKalmanFilter) and delay == 0 and (self.places(label) >= 0).all()
+            self._kinematics = before.append(now if exact else self.kinematics_of(ids, label))
 
     def remove(self, ids: IntArray, kept: IntArray | None = None) -> None:
         """Marginalise tracks; their information on their neighbours stays, and so do the estimates of all others.
@@ -320,12 +322,11 @@ def _local_pose(graph: SceneFactorGraph) -> FloatArray | None:
 
 
 def _kinematics_by_kernel(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
-    assert isinstance(joint.estimator, JointKalmanFilter)
     x, P = joint.estimator.planar_marginals(ids, joint.places(label))
     return Kinematics(x[:, :2], x[:, 2:], P[:, :2, :2], P[:, 2:, 2:])
 
 
-@compiled_by(_kinematics_by_kernel, where=lambda joint, ids, label: isinstance(joint.estimator, JointKalmanFilter))
+@compiled_by(_kinematics_by_kernel)
 def _kinematics(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
     n = len(ids)
     result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from saga_fg.model.sensor import Sensor
+from saga_fg.model.sensor import Sensor, measurement_covariance
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes, unchecked
 from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.tracking.kinematics import RelativePositions
@@ -97,9 +97,7 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     if len(kept) < len(keep):
         keep, detections, probability = keep[kept], detections.select(kept), probability[kept]
     boxes = detections.boxes
-    R = np.zeros((len(boxes), 4, 4))
-    R[:, :2, :2] = sensor.detection_covariance(detections, viewpoint, probability)
-    R[:, 2:, 2:] = sensor.velocity_covariance(boxes.label, probability)
+    R = measurement_covariance(sensor, detections, viewpoint, probability)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
     limit = sensor.max_speed if sensor.use_velocity else -1.0
     covariance_scale, position_bias = sensor.covariance_calibration(boxes.label, probability)

@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.covariances import biased_covariances
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.settings import ExistenceSettings
@@ -92,6 +94,7 @@ def reported_score(
     return np.asarray(evidence * hit_ratio * np.where(coasting, table.existence[rows], 1.0))
 
 
+@compiled_by(biased_covariances)
 def calibrated_covariance(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:
     """Reported covariances (n, 2, 2), m^2, of positions.
 

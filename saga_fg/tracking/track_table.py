@@ -102,13 +102,18 @@ class TrackTable(Columns):
 
     def coasting(self, now: float) -> FloatArray:
         """(n,) time since the latest detection, s, rounded to the microsecond."""
-        return np.maximum((now - self.last_detected).round(6), 0.0)
+        return np.maximum(_rounded(now - self.last_detected), 0.0)
 
     def out_of_view(self, now: float) -> FloatArray:
         """(n,) time since it was last in a sensor's field of view, s, rounded to the microsecond."""
-        return np.asarray((now - self.last_in_view).round(6))
+        return _rounded(now - self.last_in_view)
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks at positions (n, 2), world, with velocities (n, 2), which are not checked."""
         centre = np.concatenate([position, self.box.z[:, None]], axis=1)
         return Boxes.unchecked(self.label, centre, self.box.size, self.box.yaw, velocity)
+
+
+def _rounded(seconds: FloatArray) -> FloatArray:
+    """Times (n,), s, to the microsecond: as by `round`, in half the time."""
+    return np.asarray(np.rint(seconds * 1e6) / 1e6)

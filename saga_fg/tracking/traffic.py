@@ -1,8 +1,8 @@
 """Memory of traffic: where vehicles went lately and how fast, for the paths and speeds of others.
 
 A passage is a place of a track with its heading and speed there: where it was last, and every `SPACING` m. Passages
-outlive their tracks and are forgotten after `memory` s. The lanes of the road map are among them: they tell where to
-go, at no speed, and are never forgotten.
+outlive their tracks and are forgotten after `memory` s. The passages of those that move make trails, and so do the
+lanes of the road map: they tell where to go, at no speed, and are never forgotten.
 
 `saga_fg.tracking.trails` predicts paths from this memory, `saga_fg.tracking.speed_prior` the speeds of new tracks.
 """
@@ -12,18 +12,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from saga_fg.errors import InputError
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.covariances import speeds_ahead
 from saga_fg.kernels.trails import points_by_cell
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.columns import Columns
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.kinematics import Kinematics
-from saga_fg.types.road_map import LANE, Lane, RoadMap
+from saga_fg.types.road_map import Lane, RoadMap
 
 SPACING = 2.0  # m between the passages of a track
 FIRST_LANE = -2  # ids of lanes count down from here, so that they are never those of tracks
@@ -78,7 +80,7 @@ class TrafficSettings(Settings):
 @dataclass(frozen=True, eq=False)
 class Passages(Columns):
     """n passages of tracks: id, class, position (n, 2), world, m, heading, rad, speed along it, m/s, its
-    variance, infinite for a lane, probability of being stationary, time, s, and whether it moves."""
+    variance, probability of being stationary, time, s, and whether it moves."""
 
     id: IntArray
     label: StrArray
@@ -106,10 +108,7 @@ class Passages(Columns):
         Those of unknown `yaw` head where they go; if they do not move either, they have none. stationary: 0 if not
         given.
         """
-        v = now.velocity
-        heading = np.where(np.isfinite(yaw) | ~moves, yaw, np.arctan2(v[:, 1], v[:, 0]))
-        ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        speed, variance = np.einsum("ni,ni->n", ahead, v), np.einsum("ni,nij,nj->n", ahead, now.P_velocity, ahead)
+        heading, speed, variance = _ahead(yaw, moves, now.velocity, now.P_velocity)
         stationary = np.zeros(len(ids)) if stationary is None else stationary
         found = cls(ids, label, now.position, heading, speed, variance, stationary, np.full(len(ids), time), moves)
         return found if np.isfinite(heading).all() else found.select(np.isfinite(heading))
@@ -120,19 +119,59 @@ class Passages(Columns):
         ids, none, moves = np.empty(0, dtype=np.int64), np.empty(0), np.empty(0, dtype=np.bool_)
         return cls(ids, np.empty(0, dtype="U1"), np.empty((0, 2)), none, none, none, none, none, moves)
 
+
+@dataclass(frozen=True, eq=False)
+class Marks(Columns):
+    """n places (n, 2) from which tracks `id` (n,), ascending, go `SPACING` m to their next passage; time (n,), s."""
+
+    id: IntArray
+    position: FloatArray
+    time: FloatArray
+
+    @classmethod
+    def of(cls, passages: Passages) -> Self:
+        """The marks of passages, in their order."""
+        return cls(passages.id, passages.position, passages.time)
+
+
+@dataclass(frozen=True, eq=False)
+class TrailPoints(Columns):
+    """n points of trails: track (n,), position (n, 2), world, m, heading (n,), rad, speed (n,), m/s, and whether it is
+    known (n,)."""
+
+    id: IntArray
+    position: FloatArray
+    heading: FloatArray
+    speed: FloatArray
+    timed: BoolArray
+
+    @classmethod
+    def empty(cls) -> Self:
+        """No points."""
+        none = np.empty(0)
+        return cls(np.empty(0, dtype=np.int64), np.empty((0, 2)), none, none, np.empty(0, dtype=np.bool_))
+
+    @classmethod
+    def of(cls, passages: Passages) -> Self:
+        """The passages of those that move."""
+        rows = passages.moves.nonzero()[0]
+        timed = np.isfinite(passages.variance[rows])
+        return cls(
+            passages.id[rows], passages.position.take(rows, 0), passages.heading[rows], passages.speed[rows], timed
+        )
+
     @classmethod
     def of_lane(cls, lane: Lane, ids: int) -> Self:
-        """The passages along a lane."""
+        """The points along a lane."""
         centre = np.array(lane.centre)
         way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
         at = np.linspace(0.0, way[-1], max(2, round(way[-1] / SPACING) + 1))
         place = np.stack([np.interp(at, way, each) for each in centre.T], axis=-1)
         heading = np.arctan2(*np.gradient(place, axis=0)[:, ::-1].T)
-        n = len(at)
-        none, always = np.zeros(n), np.full(n, np.inf)
-        return cls(
-            np.full(n, ids), np.full(n, LANE), place, heading, none, always, none, always, np.ones(n, dtype=np.bool_)
-        )
+        return cls(np.full(len(at), ids), place, heading, np.zeros(len(at)), np.zeros(len(at), dtype=np.bool_))
+
+
+P = TypeVar("P", Passages, Marks)
 
 
 @dataclass(eq=False)
@@ -140,19 +179,14 @@ class Trails:
     """Points of trails, found by their places: by a tree, or by cells for kernels. What finds them is no part of a
     state: it is made at need."""
 
-    points: Passages
+    points: TrailPoints
     _cells: tuple[float, IntArray, IntArray] | None = field(default=None, init=False, repr=False)
 
-    def __reduce__(self) -> tuple[type[Trails], tuple[Passages]]:
+    def __reduce__(self) -> tuple[type[Trails], tuple[TrailPoints]]:
         return Trails, (self.points,)
 
     def __len__(self) -> int:
         return len(self.points)
-
-    @cached_property
-    def timed(self) -> BoolArray:
-        """(n,) whether the speeds are known."""
-        return np.isfinite(self.points.variance)
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -168,14 +202,14 @@ class Trails:
 
 @dataclass(eq=False)
 class Traffic:
-    """The passages of the last `memory` seconds: those that tracks have left behind, in the order of time, the
-    last of these of each track, by id, and where tracks were last; and those along the lanes of the map."""
+    """The passages of the last `memory` seconds: those that tracks have left behind, in the order of time, and where
+    tracks were last; the marks of all tracks, by id; and the trails along the lanes of the map."""
 
     settings: TrafficSettings
     left: Passages = field(default_factory=Passages.empty)
-    marked: Passages = field(default_factory=Passages.empty)
+    marked: Marks = field(default_factory=lambda: Marks.of(Passages.empty()))
     latest: Passages = field(default_factory=Passages.empty)
-    lanes: Trails = field(default_factory=lambda: Trails(Passages.empty()))
+    lanes: Trails = field(default_factory=lambda: Trails(TrailPoints.empty()))
     _known: Mapping[str, tuple[tuple[int, Lane], ...]] = field(default_factory=dict)
     _next_lane: int = FIRST_LANE
     _map: RoadMap | None = None
@@ -193,12 +227,12 @@ class Traffic:
             return
         self._trails = None
         since = time - self.settings.memory
-        left, marked, latest = (_since(each, since) for each in (self.left, self.marked, self.latest))
+        left, marked, latest = _since(self.left, since), _since(self.marked, since), _since(self.latest, since)
         self.latest = latest.select(_others(latest.id, passing.id)).append(passing)
         moved = _moved(passing, marked).nonzero()[0]
         if len(moved):
             new = passing.select(moved)
-            left, marked = left.append(new), marked.select(_others(marked.id, new.id)).append(new)
+            left, marked = left.append(new), marked.select(_others(marked.id, new.id)).append(Marks.of(new))
             marked = marked.select(np.argsort(marked.id))
         self.left, self.marked = left, marked
 
@@ -219,21 +253,31 @@ class Traffic:
             replaced |= before
             kept = tuple(each for each in alike if each[0] not in before)
             known[lane.name] = (*kept, (self._next_lane, lane))
-            new.append(Passages.of_lane(lane, self._next_lane))
+            new.append(TrailPoints.of_lane(lane, self._next_lane))
             self._next_lane -= 1
         if new:
             points = self.lanes.points
             points = points.select(~np.isin(points.id, list(replaced))) if replaced else points
-            self.lanes, self._known = Trails(Passages.concatenate([points, *new])), known
+            self.lanes, self._known = Trails(TrailPoints.concatenate([points, *new])), known
 
     def trails(self) -> Trails:
         """The passages of those that move."""
         if self._trails is None:
-            self._trails = Trails(self.left.select(self.left.moves).append(self.latest.select(self.latest.moves)))
+            self._trails = Trails(TrailPoints.of(self.left).append(TrailPoints.of(self.latest)))
         return self._trails
 
 
-def _since(passages: Passages, time: float) -> Passages:
+@compiled_by(speeds_ahead)
+def _ahead(
+    yaw: FloatArray, moves: BoolArray, velocity: FloatArray, P: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    heading = np.where(np.isfinite(yaw) | ~moves, yaw, np.arctan2(velocity[:, 1], velocity[:, 0]))
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    variance = np.einsum("ni,nij,nj->n", ahead, P, ahead)
+    return heading, np.einsum("ni,ni->n", ahead, velocity), variance
+
+
+def _since(passages: P, time: float) -> P:
     """The passages at or after a time, s."""
     old = passages.time < time
     return passages.select(~old) if old.any() else passages
@@ -247,13 +291,13 @@ def _others(ids: IntArray, known: IntArray) -> IntArray:
 
 def _beside(a: Lane, b: Lane) -> bool:
     """True if the middle of each of two lanes is within the width of the other."""
-    p, q = Passages.of_lane(a, FIRST_LANE).position, Passages.of_lane(b, FIRST_LANE).position
+    p, q = (TrailPoints.of_lane(each, FIRST_LANE).position for each in (a, b))
     apart = min(a.width, b.width)
     return all(np.hypot(*(x - y[len(y) // 2]).T).min() < apart for x, y in ((p, q), (q, p)))
 
 
-def _moved(passing: Passages, marked: Passages) -> BoolArray:
-    """(n,) whether tracks are at least `SPACING` m from their marked passages, or have none."""
+def _moved(passing: Passages, marked: Marks) -> BoolArray:
+    """(n,) whether tracks are at least `SPACING` m from their marks, or have none."""
     if len(marked) == 0:
         return np.ones(len(passing), dtype=np.bool_)
     at = np.minimum(np.searchsorted(marked.id, passing.id), len(marked) - 1)

@@ -24,7 +24,7 @@ from saga_fg.model.interactions import unit
 from saga_fg.model.paths import Paths
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.tracking.traffic import Passages, Traffic, Trails
+from saga_fg.tracking.traffic import Traffic, TrailPoints, Trails
 
 STEP = 3.0  # m between the points of a predicted path
 NEAREST = 12  # passages that are compared with a place
@@ -33,7 +33,7 @@ TURN = 0.3  # rad, sigma of the kernel on the difference of headings
 AGREEMENT = 0.2  # rad, deviation of the headings of trails from which they say little
 _BEND = 20.0  # m, along which a curvature of one's own fades
 _LEAST = 1e-9
-_NONE = Trails(Passages.empty())
+_NONE = Trails(TrailPoints.empty())
 _NEARER = np.tril(np.ones((NEAREST, NEAREST), dtype=np.bool_), -1)
 
 
@@ -88,7 +88,7 @@ def _found(traffic: Traffic) -> tuple[Trails, Trails]:
 def _columns(trails: Trails, cell: float) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray, Any, Any]:
     """Trails as arrays for the kernel: tracks, places, headings, speeds, flags of known speeds, and grid cells."""
     points = trails.points
-    return points.id, points.position, points.heading, points.speed, trails.timed, *trails.cells(cell)
+    return points.id, points.position, points.heading, points.speed, points.timed, *trails.cells(cell)
 
 
 def _beside(traffic: Traffic, ids: IntArray, position: FloatArray, heading: FloatArray) -> _Beside:
@@ -126,4 +126,4 @@ def _nearest(
     this is known."""
     apart, at = trails.tree.query(position, k=NEAREST, distance_upper_bound=farthest)
     at, points = np.minimum(at, len(trails) - 1), trails.points
-    return apart, points.id[at], points.heading[at], points.speed[at], trails.timed[at]
+    return apart, points.id[at], points.heading[at], points.speed[at], points.timed[at]

@@ -110,7 +110,8 @@ def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, row: IntArray, c
     """(K,) bird's-eye IoU of boxes[row] with others[column] of their class or group, 0 with those of other classes."""
     overlap = np.zeros(len(row))
     alike = state.class_groups.pairs_of_group(boxes.label, others.label, row, column).nonzero()[0]
-    overlap[alike] = np.nan_to_num(paired_bev_iou(boxes.select(row[alike]), others.select(column[alike])))
+    found = paired_bev_iou(boxes.select(row[alike]), others.select(column[alike]))
+    overlap[alike] = np.where(np.isnan(found), 0.0, found)
     return overlap
 
 

@@ -13,13 +13,14 @@ from typer.testing import CliRunner
 from data_tools.sensor_logs import SensorLog
 from data_tools.simulator.featureless import open_field, tunnel
 from data_tools.simulator.scanner import ScannerSettings, StaticWorld
-from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans
+from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans, drive
 from pipelines.cli import app
 from pipelines.slam.lidar_results import degenerate_spans, metrics
-from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.sensor_options import sensor_log
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.ego_measurements import WheelSpeed
 
 PERIOD = 0.1
 TIMES = PERIOD * np.arange(10)
@@ -49,6 +50,31 @@ def test_in_a_tunnel_the_wheels_say_how_far() -> None:
     assert last["last"] == len(speed) - 1
     assert alone.covariances[-1, 3, 3] > 1.0
     assert helped.covariances[-1, 3, 3] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (1.1, r"1\.\d+ times that by the scans, .*; it is multiplied by 0\.9\d+ from here on"),
+        (-1.0, "they are left out"),
+    ],
+)
+def test_wheels_of_another_scale_are_named_at_once_and_corrected(
+    factor: float, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    scans = SimulatedScans(0, world_T_lidar=drive(60, speed=8.0))
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN, sensors=["wheels"])
+    rng, named = np.random.default_rng(0), []
+    for k, time in enumerate(scans.timestamps.tolist()):
+        speed = factor * 8.0 + float(rng.normal(0, 0.05))
+        slam.step(scans[k], time, wheels=WheelSpeed(speed, PERIOD if k else 0.0))
+        named += [k] if re.search(said, caplog.text) else []
+    assert 25 < named[0] < 40
+    result = slam.finish()
+    assert re.search(said, result.misfits["wheels"])
+    assert caplog.text.count("times that by the scans") == 1
+    off = np.linalg.norm(result.trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1)
+    assert off.max() < 0.2
 
 
 def test_over_a_field_gps_and_wheels_carry_the_pose(caplog: pytest.LogCaptureFixture) -> None:

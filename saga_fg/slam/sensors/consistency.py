@@ -11,6 +11,7 @@ is a misfit; with half of the residuals wrong, outliers are no excuse. Biases ar
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Collection
 
 import numpy as np
@@ -38,15 +39,31 @@ class SensorConsistency:
         self._sensors, self._settings = tuple(sensors), settings
         self._scores: dict[str, dict[tuple[float, str, int], float]] = {sensor: {} for sensor in sensors}
         self._bias: FloatArray | None = None  # (6,), the newest
+        self._observed = -math.inf  # s
+        self._stated: dict[str, str] = {}  # what is known of sensors without the graph
 
-    def observe(self, graph: SceneFactorGraph) -> None:
-        """Take the residuals of a graph at its solution, and its newest biases."""
+    def state(self, sensor: str, misfit: str) -> None:
+        """Take an explanation why a sensor does not fit from elsewhere, and warn at once."""
+        self._stated[sensor] = misfit
+        _LOG.warning(misfit)
+
+    def observe(self, graph: SceneFactorGraph, every: float = 0.0) -> None:
+        """Take the residuals of a graph at its solution, and its newest biases; at most once in `every` s."""
+        if graph.time < self._observed + every:
+            return
+        self._observed = graph.time
         for sensor, scores in self._scores.items():
             name = getattr(self._settings, sensor).name
             found = _residual_scores(graph, name, None if sensor == "gps" else WINDOW)
             scores |= dict(sorted(found.items()))
         if "imu" in self._sensors and (known := graph.of(EGO_BIAS, graph.epoch)):
             self._bias = np.asarray(graph.state(known[0].key).vector())
+
+    def forget(self, since: float) -> None:
+        """Drop the residuals from a time on, s, as the poses there turned out wrong."""
+        for scores in self._scores.values():
+            for key in [key for key in scores if key[0] >= since]:
+                del scores[key]
 
     @property
     def misfits(self) -> dict[str, str]:
@@ -76,7 +93,8 @@ class SensorConsistency:
                         "check how its settings turn it on the vehicle, its units, and gravity"
                     ),
                 )
-        return {sensor: text for sensor, (_, text) in sorted(found.items(), key=lambda one: -one[1][0])}
+        ranked = {sensor: text for sensor, (_, text) in sorted(found.items(), key=lambda one: -one[1][0])}
+        return {**ranked, **self._stated}
 
     @property
     def unjudged(self) -> dict[str, str]:
@@ -99,9 +117,10 @@ class SensorConsistency:
         return f"{gps.name}: {off} of {len(scores)} fixes lie more than {3 * loss:.0f} deviations off, and hardly count"
 
     def warn(self) -> None:
-        """Log all of these."""
+        """Log all of these, but for those that were stated before."""
         for text in filter(None, (*self.misfits.values(), *self.unjudged.values(), self.false_fixes)):
-            _LOG.warning(text)
+            if text not in self._stated.values():
+                _LOG.warning(text)
 
     def _newest(self, sensor: str) -> list[float]:
         return list(self._scores[sensor].values())[-WINDOW:]

@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import Edges, InputError, SceneGraph
-from saga_fg.model.discretisation import discretise, joint_generator
+from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
+from saga_fg.model.stability import joint_generator
 from tests.saga_fg.random_graphs import (
     BUS,
     CAR,
