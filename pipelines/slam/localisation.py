@@ -32,6 +32,7 @@ from pipelines.slam.map_registration import MapRegistration, MeasuredPose
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.slam.slam_map import SlamMap
 from pipelines.slam.vehicle_sensors import VehicleSensors
+from saga_fg.errors import require_type
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, FactorProvider
 from saga_fg.numerics.arrays import BoolArray, FloatArray
@@ -98,10 +99,10 @@ class Localiser:
         ego_T_lidar: FloatArray | None = None,
         sensor_settings: SensorSettings | None = None,
     ) -> None:
-        self.settings = settings or LocaliserSettings()
+        require_type("slam_map", slam_map, SlamMap)
+        self.settings = s = settings or LocaliserSettings()
         self._odometry = LidarOdometry(self.settings.odometry)
         self._guess = None if guess is None else checked_transform("guess", guess)
-        s = self.settings
         self._sensors = VehicleSensors(sensors, sensor_settings, ego_T_lidar)
         self._measured, self._of_sensors = self._sensors.since_keyframe, self._sensors.new_providers()
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
@@ -112,11 +113,9 @@ class Localiser:
         self._fits = set[int]()  # keyframes registered with the map
         self._unproved = list[int]()  # keyframes since the structure was compared
         self._clouds: list[tuple[int, FloatArray]] = []  # of the last keyframes, thinned, with their rows
-        self._time = 0.0  # of the last keyframe
         self._searched, self._proved = 0.0, 0.0  # m, way of the last search, and of the last comparison
-        self._ambiguous = False
         self._smoother: IncrementalSmoother | None = None
-        self._last, self._fitted = 0, 0.0  # keyframe in the graph; way of the last that fitted, m
+        self._last, self._time, self._fitted = 0, 0.0, 0.0  # keyframe in the graph, time of it; way of the last fit, m
         self._pose, self._covariance = np.eye(4), _GUESSED  # of that keyframe
 
     def step(
@@ -129,8 +128,9 @@ class Localiser:
     ) -> LocalisedStep:
         """Place the next scan; measurements of the vehicle's sensors as of `LidarSlam.step`.
 
-        Raises `InputError` for a scan that is not later than the one before, and for a sensor that was not named.
+        Raises `InputError` as that, too.
         """
+        self._path.check(scan, time, True)
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
         placed = self._odometry.step(scan, time, self._sensors.velocity(self._sensors.corrected(wheels)))
@@ -176,7 +176,7 @@ class Localiser:
     @property
     def ambiguous(self) -> bool:
         """True if the last cloud searched for fits several places of the map."""
-        return self._ambiguous
+        return self._places.ambiguous
 
     @property
     def consistency(self) -> SensorConsistency:
@@ -213,7 +213,7 @@ class Localiser:
         map_T_frame = None if fix is None else self._places.recognised(thin, fix)
         if map_T_frame is None:
             map_T_frame = self._places.recognised(thin)
-        self._ambiguous, self._searched = self._places.ambiguous, self.way
+        self._searched = self.way
         if map_T_frame is None:
             self._clouds = self._clouds[len(self._clouds) // 2 :]
         else:
@@ -239,7 +239,7 @@ class Localiser:
         self._smoother, self._fitted = IncrementalSmoother(lag=self.settings.lag), self.way
         self._of_sensors = self._sensors.new_providers()
         self._pose, self._covariance = map_T_lidar, _GUESSED
-        self._proved, self._ambiguous = self.way, False
+        self._proved = self.way
 
     def _compare(self) -> None:
         """Give the place up if what stands above the ground around the last keyframes is not what the map has."""
