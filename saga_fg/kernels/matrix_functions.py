@@ -238,3 +238,49 @@ def with_edges(
                 for q in range(d):
                     sums[at[e], p, q] += rate[e] * A_self[e, p, q]
     return sums, constants
+
+
+@kernel("f3 f3 i1 f3 f2 f3 f2 b")
+def with_motions(
+    values: FloatArray,
+    noise: FloatArray,
+    at: IntArray,
+    F: FloatArray,
+    b: FloatArray,
+    Q: FloatArray,
+    back: FloatArray,
+    coupled: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Blocks of F and Q (m, d, d) with the motions F, b, Q (n, d, d), (n, d), at (m,): row of the motion, -1 for none;
+    and b: if `coupled`, G F, G b and G Q G^T with G = `values` `back` (d, d)."""
+    m, d, _ = values.shape
+    own, noises, constants = values.copy(), noise.copy(), b.copy()
+    G, other, product, turned = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
+    for k in range(m):
+        i = at[k]
+        if i < 0:
+            continue
+        if not coupled:
+            _set_scaled(own[k], F[i], 1.0)
+            for p in range(d):
+                for q in range(d):
+                    noises[k, p, q] = (Q[i, p, q] + Q[i, q, p]) / 2
+            continue
+        _set_scaled(turned, values[k], 1.0)
+        _set_scaled(other, back, 1.0)
+        _set_product(G, turned, other)
+        _set_scaled(other, F[i], 1.0)
+        _set_product(product, G, other)
+        _set_scaled(own[k], product, 1.0)
+        _set_scaled(other, Q[i], 1.0)
+        _set_product(product, G, other)
+        for p in range(d):
+            constants[i, p] = 0.0
+            for q in range(d):
+                constants[i, p] += G[p, q] * b[i, q]
+                turned[p, q] = G[q, p]
+        _set_product(other, product, turned)
+        for p in range(d):
+            for q in range(d):
+                noises[k, p, q] = (other[p, q] + other[q, p]) / 2
+    return own, noises, constants
