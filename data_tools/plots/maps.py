@@ -17,16 +17,16 @@ MARGIN = 30.0  # m around the paths
 def paths_from_above(paths: Mapping[str, FloatArray], points: Mapping[str, FloatArray] | None = None) -> Any:
     """Return a matplotlib `Figure` of paths (N, 2 or 3) and sets of points (K, 2 or 3), m, each under its name.
 
-    The first path is grey, for comparison with the others.
+    The first path is grey and wide, to be seen under those that lie on it.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.0, 8.0), layout="constrained")
     ax = figure.subplots()
-    colours = ("#b0b0b0", *COLOURS)
-    for (name, path), colour in zip(paths.items(), colours, strict=False):
-        ax.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.0, label=name)
-    for (name, set_), colour, marker in zip((points or {}).items(), COLOURS[1:], "^x+os", strict=False):
+    for row, ((name, path), colour) in enumerate(zip(paths.items(), ("#c0c0c0", *COLOURS), strict=False)):
+        ax.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.0 if row else 5.0, label=name)
+    others = COLOURS[max(len(paths) - 1, 1) :]
+    for (name, set_), colour, marker in zip((points or {}).items(), others, "^x+os", strict=False):
         ax.plot(set_[:, 0], set_[:, 1], marker, color=colour, markersize=5, label=name)
     ax.set(aspect="equal", xlabel="x, m", ylabel="y, m")
     ax.grid(color="#e6e6e6", linewidth=0.6)
@@ -70,8 +70,8 @@ def scan_map_from_above(
     if tracks:
         ax.add_collection(LineCollection(list(tracks), colors="#2ca02c", linewidths=1.2, label="objects"))
         ax.plot(*np.array([track[-1] for track in tracks]).T, "s", color="#2ca02c", markersize=3)
-    for (name, path), colour in zip(paths.items(), ("black", "#1f77b4", "#e377c2"), strict=False):
-        ax.plot(*path[:, :2].T, color=colour, linewidth=1.5, label=name)
+    for row, ((name, path), colour) in enumerate(zip(paths.items(), ("black", "#1f77b4", "#e377c2"), strict=False)):
+        ax.plot(*path[:, :2].T, color=colour, linewidth=1.5 if row else 4.0, label=name)
     driven = np.concatenate([path[:, :2] for path in paths.values()])
     (left, bottom), (right, top) = driven.min(axis=0) - MARGIN, driven.max(axis=0) + MARGIN
     ax.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(left, right), ylim=(bottom, top))

@@ -33,6 +33,10 @@ def slam(
         int | None,
         typer.Option("--drive", min=100, help="Instead: cost of so many keyframes in a simulated town, without scans."),
     ] = None,
+    landmarks: Annotated[
+        int | None,
+        typer.Option("--landmarks", min=20, help="Instead: cost of `LandmarkMapper` up to so many landmarks."),
+    ] = None,
     dense: Annotated[
         int | None,
         typer.Option("--dense", min=2, help="Instead: SLAM all in on so many simulated scans of full density."),
@@ -40,7 +44,7 @@ def slam(
     firings: Annotated[
         int, typer.Option("--columns", min=100, help="With --dense: points of a beam; 2000 are full density.")
     ] = 2000,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of --drive and --dense.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of --drive, --landmarks and --dense.")] = 0,
     json_file: JsonFile = None,
     verbose: Verbose = False,
 ) -> None:
@@ -55,6 +59,7 @@ def slam(
       saga-fg bench slam --dataroot data/kitti --sequence 0000
       saga-fg bench slam --dense 40
       saga-fg bench slam --drive 10000
+      saga-fg bench slam --landmarks 3000
     """
     from data_tools.datasets.kitti import KittiScans
     from data_tools.figures import FigureTable, cell
@@ -62,10 +67,12 @@ def slam(
     from pipelines.bench.slam_all_in import bench_all_in
     from saga_fg.errors import InputError
 
-    if (dataroot is not None) + (drive is not None) + (dense is not None) != 1:
-        raise InputError("expected one of --dataroot, --drive and --dense")
+    if sum(one is not None for one in (dataroot, drive, landmarks, dense)) != 1:
+        raise InputError("expected one of --dataroot, --drive, --landmarks and --dense")
     if drive is not None:
         _drive(drive, seed, json_file)
+    elif landmarks is not None:
+        _landmarks(landmarks, seed, json_file)
     elif dense is not None:
         _dense(dense, firings, seed, json_file)
     if dataroot is None:
@@ -157,4 +164,22 @@ def _drive(keyframes: int, seed: int, json_file: Path | None) -> None:
     typer.echo(
         f"last lap to first one: {cost.ratio:.3f} of the time; memory at most {cost.memory:.0f} MB; error "
         f"{cost.error:.2f} m (odometry {cost.before:.2f} m); everything together at the end: {cost.finish:.1f} s"
+    )
+
+
+def _landmarks(landmarks: int, seed: int, json_file: Path | None) -> None:
+    from data_tools.figures import FigureTable, cell
+    from pipelines.bench.landmark_drive import bench_landmarks
+
+    with progress_bar() as progress:
+        cost = bench_landmarks(landmarks, seed, progress)
+    columns = ("poses", "ms a pose", "landmarks of the map", "in the local Gaussian")
+    rows = [
+        (f"{part.first} to {part.last}", cell(part.pose), str(part.landmarks), str(part.local)) for part in cost.parts
+    ]
+    title = f"{cost.poses} poses, {cost.observations} observations, {cost.landmarks} landmarks of {landmarks}"
+    report([FigureTable(title, columns, tuple(rows))], [cost], json_file)
+    typer.echo(
+        f"last tenth to second one: {cost.ratio:.2f} of the time at {cost.growth:.1f} times the landmarks; "
+        f"F1 over pairs {cost.f1:.4f}; error {cost.error:.2f} m; memory at most {cost.memory:.0f} MB"
     )

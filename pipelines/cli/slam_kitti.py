@@ -161,7 +161,7 @@ def kitti(
             found = with_objects(
                 result, recorded, frames, settings, lidar, window, slam.new_providers, log, slam.sensors
             )
-    figures = write_lidar_slam(output, found, recorded, odometry=lidar.odometry, origin=origin())
+    figures = write_lidar_slam(output, found, recorded, settings=lidar, origin=origin())
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
     counts.append(counted(figures["loops"], "loop"))

@@ -6,7 +6,7 @@ odometry.tum                by odometry alone; online.tum: as estimated when eac
 covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
 reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
-map/                        the points of each submap and its place, to localise in (`pipelines.slam.slam_map`)
+map/                        the points of each submap (PLY or PCD) and its place (`pipelines.slam.slam_map`)
 graph.g2o, observations.csv keyframes, odometry, loops, landmarks: the whole graph (`pipelines.slam.saved_graph`)
 landmarks.json              each landmark; landmarks.csv: the same as a table, with shapes as WKT
 landmarks.ply               points along the poles and on the observed pieces of the walls
@@ -35,10 +35,10 @@ from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.drive import KeyframeClouds
 from pipelines.slam.graph_export import write_landmark_table
+from pipelines.slam.lidar_slam import LidarSlamSettings
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.results import (
-    SLAM_FILES,
     confirmed_paths,
     landmark_rows,
     object_paths,
@@ -53,6 +53,13 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
 from saga_fg.types.landmark import Landmark
 
+# all that a run may write, also in a map of an earlier one: a folder holds the files of its last run
+LIDAR_FILES = (
+    *("trajectory.txt", "times.txt", "trajectory.tum", "odometry.tum", "online.tum", "reference.tum"),
+    *("map.ply", "map/submaps.csv", "map/origin.csv", "map/[0-9]*.ply", "map/[0-9]*.pcd"),
+    *("graph.g2o", "observations.csv", "landmarks.json", "landmarks.csv", "landmarks.ply"),
+    *("covariances.csv", "tracks.csv", "above.png", "metrics.json"),
+)
 HEIGHT = 3.0  # m above the first pose, to which poles and walls are drawn
 _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
 _LINED = (WALL.name, LINE.name)
@@ -109,21 +116,22 @@ def write_lidar_slam(
     found: LidarSlamResult | SlamWithObjects,
     scans: ScanSequence,
     spacing: float = 0.2,
-    odometry: OdometrySettings | None = None,
+    settings: LidarSlamSettings | None = None,
     origin: Origin | None = None,
 ) -> dict[str, Any]:
     """Write all files of a run to a folder, or none; returns the metrics.
 
-    spacing: of the map's points, m; odometry: settings of the run; origin: of the world, on Earth
+    spacing: of the map's points, m; settings: of the run; origin: of the world, on Earth
     """
+    s = settings or LidarSlamSettings()
     result, objects = (found, None) if isinstance(found, LidarSlamResult) else (found.slam, found.estimate)
     points = accumulated_map(result, spacing)
-    figures = metrics(result, scans, odometry)
+    figures = metrics(result, scans, s.odometry)
     if isinstance(found, SlamWithObjects):
         figures["objects"] = len(object_paths(found.estimate))
         truth = Trajectory(scans.timestamps, scans.world_T_ego)
         figures["without_objects"] = asdict(trajectory_errors(found.alone.trajectory, truth, "start"))
-    with atomic_directory(output, SLAM_FILES) as folder:
+    with atomic_directory(output, known=LIDAR_FILES) as folder:
         write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
         for name, trajectory in (
             ("trajectory", result.trajectory), ("odometry", result.odometry), ("online", result.online)
@@ -133,7 +141,7 @@ def write_lidar_slam(
         if len(points):
             (folder / "map").mkdir()
             clouds = [submap.points for submap in result.submaps]
-            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin))
+            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin), s.map_format)
         write_graph(folder, result)
         times = result.trajectory.timestamps[result.keyframes].tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)

@@ -16,7 +16,6 @@ Odometry is that of the LiDAR, or the recording's own poses, for comparison and 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,11 +34,12 @@ from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.moving_objects import MovingObjects, frames_at
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmarks
+from pipelines.slam.slam_map import CloudFormat
 from pipelines.slam.submap_loops import ClosedSubmaps, SubmapLoops
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.slam.vehicle_sensors import VehicleSensors
 from pipelines.tracking import Progress
-from saga_fg.errors import InputError, require_type
+from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray
@@ -54,7 +54,6 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 from saga_fg.types.frame import Detections, Frame
 
-_LOG = logging.getLogger(__name__)
 OdometrySource = Literal["lidar", "oxts"]
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
 CALIBRATED = OdometryNoise(
@@ -80,6 +79,7 @@ class LidarSlamSettings(Settings):
     landmarks: bool = setting(True, "use landmarks as nodes of the graph")
     loop_closures: bool = setting(True, "search for loop closures")
     map_spacing: Positive = setting(0.25, "spacing of the points of the map, m; higher: less memory, smaller files")
+    map_format: CloudFormat = setting("ply", "format of the files of the map's submaps: ply or pcd")
     mapper: MapperSettings = settings_group(
         lambda: MapperSettings(confirm_after=4), "association of landmarks where objects are estimated online"
     )
@@ -164,20 +164,9 @@ class LidarSlam:
         """
         if self._finished:
             raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
-        if scan is None:
-            raise InputError(
-                "scan: expected one in every step: what sensors measure between scans comes with the next scan, as "
-                "SensorBuffer gives it; of detections between scans give those nearest to a scan"
-            )
-        require_type("scan", scan, Scan)
-        if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
-            raise InputError(f"time: expected a finite number of seconds, got {time!r}")
+        self._path.check(scan, time, isinstance(self._odometry, LidarOdometry))
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
-        if self._path.times and not time > self._path.times[-1]:
-            raise InputError(f"time: expected one after {self._path.times[-1]:.6f} s, got {time:.6f} s")
-        if not self._path.times and not len(scan) and isinstance(self._odometry, LidarOdometry):
-            raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
         moving = Boxes.empty()
         if self._moving is not None and detections is not None:
             self._moving.check(scan, detections)
@@ -212,15 +201,12 @@ class LidarSlam:
         if len(self._builder):
             self._closed.close(self._builder, self._graph, self._graph.poses())
         solved = self._graph.finish()
-        self._finished, chosen = True, solved.loops.kept.tolist()
-        if not all(chosen):
-            out, taken = chosen.count(False), chosen.count(True)
-            _LOG.warning("%d of %d loops contradict the other %d, and are left out", out, len(chosen), taken)
+        self._finished = True
         fit = self._sensors.consistency
         fit.observe(solved.graph)
         fit.warn()
         drive = self._path.drive(self._keyframes)
-        submaps, loops = self._closed.submaps, list(zip(self._closed.loops, chosen, strict=True))
+        submaps, (true_loops, false_loops) = self._closed.submaps, self._closed.judged(solved.loops)
         anchors = solved.world_T_pose[[submap.anchor for submap in submaps]]
         times, lidar_T_ego = np.array(self._path.times), self._sensors.lidar_T_ego
         return LidarSlamResult(
@@ -231,8 +217,8 @@ class LidarSlam:
             solved.covariances,
             solved.landmarks,
             self._graph.observations(),
-            [loop for loop, kept in loops if kept],
-            [loop for loop, kept in loops if not kept],
+            true_loops,
+            false_loops,
             solved.loops,
             self._degenerate,
             self._boxes,

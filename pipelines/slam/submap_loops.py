@@ -8,6 +8,7 @@ anchors, under a robust loss.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol
@@ -19,7 +20,9 @@ from pipelines.slam.drive import LEAST
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import carried_covariance, inverse_transform
-from saga_fg.slam.submaps import LoopClosure, SubmapGraph
+from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
+
+_LOG = logging.getLogger(__name__)
 
 
 class SubmapLoops(Protocol):
@@ -50,6 +53,14 @@ class ClosedSubmaps:
             anchors = [one.anchor for one in self.submaps]
             self.loops += [replace(one, first=anchors[one.first], second=anchors[one.second]) for one in found]
         return submap
+
+    def judged(self, selection: LoopSelection) -> tuple[list[LoopClosure], list[LoopClosure]]:
+        """The loops between keyframes that are true, and those that are false, which a warning counts."""
+        kept = selection.kept
+        true, false = ([self.loops[row] for row in np.flatnonzero(rows).tolist()] for rows in (kept, ~kept))
+        if false:
+            _LOG.warning("%d of %d loops contradict the other %d, and are left out", len(false), len(kept), len(true))
+        return true, false
 
     def _between_anchors(self, loop: LoopClosure) -> LoopClosure:
         """A loop between frames of submaps as one between their anchors."""

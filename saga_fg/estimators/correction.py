@@ -10,7 +10,8 @@ H P = R K^T, so that the measured rows are as exact as in Joseph's form.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,9 +20,11 @@ import scipy.linalg
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.partition import Partition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
+_AT_ONCE = 25_000  # entries of components that are corrected at once where memory counts
 _BATCHED_BELOW = 10  # size from which a triangular system is worth a call of its own
 
 
@@ -48,11 +51,17 @@ def correct(
     rows (m,) of the measured nodes, may repeat; z (m, k); H (m, k, d); R (m, k, k) positive definite. Raises
     `InputError` where a covariance has grown so large that R no longer counts among its digits.
     """
-    posterior, gains = _posterior(x, _stacks(x, x.mean, rows, z, H, R))
-    log_likelihood = -0.5 * z.size * math.log(2 * math.pi)
-    for gain in gains:
-        log_likelihood -= _half_mahalanobis(gain.L, gain.whitened)
-    return posterior, gains, log_likelihood
+    gains: list[Gain] = []
+    posterior, misfit = _posterior(x, _stacks(x, rows, z, H, R), gains.append)
+    return posterior, tuple(gains), -0.5 * z.size * math.log(2 * math.pi) - misfit
+
+
+def posterior_of(
+    x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray
+) -> tuple[BlockGaussian, float]:
+    """Return the posterior and the log-likelihood of the innovation, as `correct`; no gains, in little memory."""
+    posterior, misfit = _posterior(x, _stacks(x, rows, z, H, R, _AT_ONCE))
+    return posterior, -0.5 * z.size * math.log(2 * math.pi) - misfit
 
 
 class WhitenedFactor(NamedTuple):
@@ -75,7 +84,7 @@ def correct_whitened(x: BlockGaussian, factors: Sequence[WhitenedFactor]) -> Blo
 def innovation_likelihood(x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray) -> float:
     """Log-likelihood of the innovation, as `correct` gives it, without correcting anything."""
     likelihood = -0.5 * z.size * math.log(2 * math.pi)
-    for stacked in _stacks(x, x.mean, rows, z, H, R):
+    for stacked in _stacks(x, rows, z, H, R):
         L = _innovation_root(stacked)
         likelihood -= _half_mahalanobis(L, solve_lower(L, stacked.innovation))
     return likelihood
@@ -98,19 +107,28 @@ class _Stacked(NamedTuple):
     innovation: FloatArray
 
 
-def _posterior(x: BlockGaussian, stacks: Iterable[_Stacked]) -> tuple[BlockGaussian, tuple[Gain, ...]]:
-    """Correct components, each of which is in one stack at most."""
-    mean, blocks, gains = x.mean.copy(), list(x.blocks), []
+def _posterior(
+    x: BlockGaussian, stacks: Iterable[_Stacked], keep: Callable[[Gain], None] | None = None
+) -> tuple[BlockGaussian, float]:
+    """Correct components, each of which is in one stack at most, and `keep` the gains.
+
+    Returns also -log of the density of the innovations, but for its constant.
+    """
+    mean, blocks, misfit = x.mean.copy(), list(x.blocks), 0.0
     for stacked in stacks:
         gain, P = _correct(stacked)
-        gains.append(gain)
+        misfit += _half_mahalanobis(gain.L, gain.whitened)
         mean[gain.places] += (np.swapaxes(gain.W, 1, 2) @ gain.whitened[:, :, None])[:, :, 0]
+        number = stacked.number
         if isinstance(stacked.active, slice):  # all of the group
-            blocks[stacked.number] = P
+            blocks[number] = P
         else:
-            blocks[stacked.number] = blocks[stacked.number].copy()
-            blocks[stacked.number][stacked.active] = P
-    return replace(x, mean=mean, blocks=tuple(blocks)), tuple(gains)
+            if blocks[number] is x.blocks[number]:
+                blocks[number] = blocks[number].copy()
+            blocks[number][stacked.active] = P
+        if keep is not None:
+            keep(gain)
+    return replace(x, mean=mean, blocks=tuple(blocks)), misfit
 
 
 def _half_mahalanobis(L: FloatArray, whitened: FloatArray) -> float:
@@ -119,11 +137,11 @@ def _half_mahalanobis(L: FloatArray, whitened: FloatArray) -> float:
 
 
 def _stacks(
-    x: BlockGaussian, mean: FloatArray, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray
+    x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, most: int = sys.maxsize
 ) -> Iterator[_Stacked]:
-    """Stack the measurements of each group of components; innovations from the joint state `mean`."""
-    partition, (k, d) = x.partition, H.shape[1:]
-    for number, members, at in partition.members(rows, d):
+    """Stack the measurements of each group of components, of `most` entries at once."""
+    partition, mean, (k, d) = x.partition, x.mean, H.shape[1:]
+    for number, members, at in _members(partition, rows, d, most):
         component, places = partition.row[rows[members]], partition.groups[number]
         measured = np.flatnonzero(np.bincount(component, minlength=len(places)))
         active: IntArray | slice = slice(None)
@@ -133,25 +151,39 @@ def _stacks(
         H_own = H[members]
         c, s = places.shape
         slot = rank(component)  # of a measurement among those of its component
-        most = int(slot.max()) + 1
-        H_P, H_all, innovation = np.zeros((c, most, k, s)), np.zeros((c, most, k, s)), np.zeros((c, most, k))
-        R_all = np.zeros((c, most, k, most, k))
+        deep = int(slot.max()) + 1
+        H_P, H_all, innovation = np.zeros((c, deep, k, s)), np.zeros((c, deep, k, s)), np.zeros((c, deep, k))
+        R_all = np.zeros((c, deep, k, deep, k))
         H_P[component, slot] = H_own @ P[component[:, None], at]
         if s % d == 0 and not (at[:, 0] % d).any():  # states of equal size: node by node
-            H_all.reshape(c, most, k, s // d, d)[component, slot, :, at[:, 0] // d, :] = H_own
+            H_all.reshape(c, deep, k, s // d, d)[component, slot, :, at[:, 0] // d, :] = H_own
         else:
             H_all[component[:, None, None], slot[:, None, None], np.arange(k)[:, None], at[:, None, :]] = H_own
         R_all[component, slot, :, slot, :] = R[members]
         expected = H_own @ mean[places[component[:, None], at]][:, :, None]
         innovation[component, slot] = z[members] - expected[:, :, 0]
-        if len(component) < c * most:
-            empty = np.ones((c, most), dtype=bool)
+        if len(component) < c * deep:
+            empty = np.ones((c, deep), dtype=bool)
             empty[component, slot] = False
             i, j = np.nonzero(empty)
             R_all[i, j, :, j, :] = np.eye(k)
-        a = most * k
+        a = deep * k
         stacked = H_P.reshape(c, a, s), H_all.reshape(c, a, s), R_all.reshape(c, a, a), innovation.reshape(c, a, 1)
         yield _Stacked(number, active, places, P, *stacked)
+
+
+def _members(partition: Partition, rows: IntArray, dim: int, most: int) -> Iterator[tuple[int, IntArray, IntArray]]:
+    """`Partition.members`, of components of `most` entries at once."""
+    for number, members, at in partition.members(rows, dim):
+        count, size = partition.groups[number].shape
+        some = max(1, most // size**2)
+        if count <= some:
+            yield number, members, at
+            continue
+        part = partition.row[rows[members]] // some
+        for k in np.unique(part).tolist():
+            mine = np.flatnonzero(part == k)
+            yield number, members[mine], at[mine]
 
 
 def _factor_stacks(x: BlockGaussian, factors: Sequence[WhitenedFactor]) -> Iterator[_Stacked]:

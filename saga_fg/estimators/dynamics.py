@@ -21,6 +21,7 @@ from saga_fg.model.transition import Blocks, Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 _SPARSE_FROM = 100  # size of a component from which its part of F is kept sparse
+_AT_ONCE = 25_000  # entries of components that are multiplied at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,15 +130,18 @@ class Dynamics:
         mean, blocks = np.empty_like(x.mean), []
         for number, (places, P) in enumerate(zip(x.partition.groups, x.blocks, strict=True)):
             if P.shape[1] < _SPARSE_FROM:
-                F = self._dense(x.partition, number)
-                mean[places] = (F @ x.mean[places][:, :, None])[:, :, 0]
-                product = F @ P @ np.swapaxes(F, 1, 2)
+                product, some = np.empty_like(P), max(1, _AT_ONCE // P[0].size)
+                for part in (slice(k, k + some) for k in range(0, len(P), some)):
+                    F = self._dense(x.partition, number, part)
+                    mean[places[part]] = (F @ x.mean[places[part]][:, :, None])[:, :, 0]
+                    product[part] = _symmetric(F @ P[part] @ np.swapaxes(F, 1, 2))
             else:
                 product = np.empty_like(P)
                 for component, factor in enumerate(self._components(x.partition, number)):
                     mean[places[component]] = factor @ x.mean[places[component]]
                     product[component] = factor @ np.ascontiguousarray((factor @ P[component]).T)
-            blocks.append(_symmetric(product))
+                product = _symmetric(product)
+            blocks.append(product)
         return mean, tuple(blocks)
 
     def pulled_back(self, partition: Partition, blocks: BlockDiagonal) -> BlockDiagonal:
@@ -145,7 +149,7 @@ class Dynamics:
         result = []
         for number, X in enumerate(blocks):
             if X.shape[1] < _SPARSE_FROM:
-                F = self._dense(partition, number)
+                F = self._dense(partition, number, slice(0, len(X)))
                 product = np.swapaxes(F, 1, 2) @ X @ F
             else:
                 product = np.empty_like(X)
@@ -166,23 +170,25 @@ class Dynamics:
                 row = partition.row[noise.target[members]]
                 blocks[number][row[:, None, None], at[:, :, None], at[:, None, :]] += noise.values[members]
 
-    def _dense(self, partition: Partition, number: int) -> FloatArray:
-        """F of each component of a group, (c, s, s)."""
+    def _dense(self, partition: Partition, number: int, part: slice) -> FloatArray:
+        """F of some components of a group, (c, s, s)."""
         places = partition.groups[number]
-        F = np.zeros((*places.shape, places.shape[1]))
+        F = np.zeros((*places[part].shape, places.shape[1]))
         for blocks in self.F:
             _, d_i, d_j = blocks.values.shape
             target, source, values = blocks.target, blocks.source, blocks.values
-            if len(partition.groups) > 1:
-                members = np.flatnonzero(partition.group[target] == number)
+            if len(partition.groups) > 1 or len(F) < len(places):
+                row = partition.row[target]
+                mine = (partition.group[target] == number) & (row >= part.start) & (row < part.stop)
+                members = np.flatnonzero(mine)
                 target, source, values = target[members], source[members], values[members]
+            row = partition.row[target] - part.start
             if partition.size:
-                nodes = partition.row[target], partition.slot[target], partition.slot[source]
-                partition.by_nodes(F)[nodes] = values
+                partition.by_nodes(F)[row, partition.slot[target], partition.slot[source]] = values
                 continue
             i = partition.offset[target][:, None, None] + np.arange(d_i)[:, None]
             j = partition.offset[source][:, None, None] + np.arange(d_j)
-            F[partition.row[target][:, None, None], i, j] = values
+            F[row[:, None, None], i, j] = values
         return F
 
     def _components(self, partition: Partition, number: int) -> list[scipy.sparse.csr_array]:

@@ -13,7 +13,7 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.bounds import ComponentBounds
-from saga_fg.estimators.correction import CANCELLATION, correct, lost_in_rounding
+from saga_fg.estimators.correction import CANCELLATION, lost_in_rounding, posterior_of
 from saga_fg.estimators.dynamics import Dynamics, predict
 from saga_fg.estimators.measurements import LinearisedMeasurements
 from saga_fg.estimators.partition import Partition, unflattened
@@ -84,8 +84,7 @@ def _corrected_by_kernel(x: BlockGaussian, seen: LinearisedMeasurements) -> tupl
 @compiled_by(_corrected_by_kernel)
 def corrected(x: BlockGaussian, seen: LinearisedMeasurements) -> tuple[BlockGaussian, float]:
     """The posterior and the log-likelihood of the innovation. Raises `InputError` as `correction.correct` does."""
-    posterior, _, log_likelihood = correct(x, *seen)
-    return posterior, log_likelihood
+    return posterior_of(x, *seen)
 
 
 def _flat(groups: Sequence[Blocks]) -> _FlatBlocks:

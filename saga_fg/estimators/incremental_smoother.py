@@ -61,6 +61,7 @@ class IncrementalSmoother:
         self.providers = tuple(providers)
         self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
         self.frame: Frame | None = None  # of the present epoch
+        self.at_root = frozenset[int]()  # variables whose joint covariance is asked for often, and costs less then
         self._lag, self._settings = lag, settings or RelinearisationSettings()
         self._graph = SceneFactorGraph(elimination)
         self._engine: Engine | None = None
@@ -223,6 +224,7 @@ class IncrementalSmoother:
         start = graph.point().values
         if engine is None or engine.elimination != graph.elimination:
             engine = Engine(graph.elimination)
+        engine.at_root = self.at_root
         try:
             return engine.solved(graph, settings)
         except GraphError:

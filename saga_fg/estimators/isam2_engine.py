@@ -57,10 +57,13 @@ class Engine:
         parameters.findUnusedFactorSlots = True
         self.isam, self.elimination = gtsam.ISAM2(parameters), elimination
         self.points = Displacements()
+        self._delta = gtsam.VectorValues()  # increments from the base, at the last update
         self.slots: dict[int, IntArray] = {}
         self._held: dict[int, HeldGroup] = {}  # groups as they were at the last update
         self.converged = True
         self.elimination_order: dict[int, tuple[bool, int]] = {}
+        self.at_root = frozenset[int]()  # variables to hold there beside the newest
+        self._held_at_root = frozenset[int]()  # at the last update
 
     def solved(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
         """The engine with everything that has changed in the graph, which moves to the solution."""
@@ -175,7 +178,7 @@ class Engine:
 
     def _relinearised(self, graph: SceneFactorGraph, threshold: float) -> bool:
         """Exchange the factors on variables that have moved; whether there were any."""
-        moved = set(self.points.moved(self.isam.getDelta(), threshold))
+        moved = set(self.points.moved(self._delta, threshold))
         rows: list[tuple[int, IntArray]] = []
         linear: list[gtsam.JacobianFactor] = []
         removed: list[int] = []
@@ -209,17 +212,24 @@ class Engine:
             insert_state(values, graph.variable(key), graph.variable(key).type.read(base, key))
         parameters, last = gtsam.ISAM2UpdateParams(), gtsam.KeyGroupMap()
         parameters.removeFactorIndices = removed
-        for key in {*graph.newest, *(graph.carried_over.keys() & graph.variables.keys())}:
+        held = self.at_root & graph.variables.keys()
+        for key in {*graph.newest, *(graph.carried_over.keys() & graph.variables.keys()), *held}:
             last.insert2(key, 1)  # at the root, where the next frame's factors will touch the tree
         parameters.constrainedKeys = last
+        if taken_up := held - self._held_at_root - set(new):
+            moved = gtsam.KeyList()
+            for key in taken_up:
+                moved.push_back(key)
+            parameters.extraReelimKeys = moved
+        self._held_at_root = held
         try:
             # without a linearisation point: increments are those that iSAM2 counts, from the base
             added = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)
             result = self.isam.update(added, values, parameters)
-            estimate, length = self.isam.calculateEstimate(), self.isam.getDelta().norm()
+            estimate, self._delta = self.isam.calculateEstimate(), self.isam.getDelta()
         except RuntimeError as error:
             raise self._undetermined(graph, error) from error
-        if not np.isfinite(length):
+        if not np.isfinite(self._delta.norm()):
             raise self._undetermined(graph, None)
         slots = list(result.getNewFactorsIndices())
         start = 0

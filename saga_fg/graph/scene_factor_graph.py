@@ -236,8 +236,8 @@ class SceneFactorGraph:
             raise factor_error(self._variables, held, rows, error) from error
 
     def moved_to(self, values: gtsam.Values) -> None:
-        """Put the variables where a back end has found them."""
-        self._values = gtsam.Values(values)
+        """Put the variables where a back end has found them; the graph takes the values over."""
+        self._values = values
         self._index.fresh.clear()
 
     def linear(self, number: int, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
@@ -254,7 +254,7 @@ class SceneFactorGraph:
             solution = solve(native, ours, self._values, settings)
         except FactorError as error:
             raise solver_error(self._variables, self._index.groups, error) from error
-        self.moved_to(solution.values)
+        self.moved_to(gtsam.Values(solution.values))
         return solution
 
     def solver_inputs(self) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:

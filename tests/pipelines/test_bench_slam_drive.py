@@ -26,6 +26,17 @@ def test_a_drive_is_measured_and_stays_small(tmp_path: Path) -> None:
     assert row["error"] < row["before"] + 0.3
 
 
+def test_a_map_of_landmarks_is_measured_while_it_grows(tmp_path: Path) -> None:
+    outcome = CliRunner().invoke(app, ["bench", "slam", "--landmarks", "60", "--json", str(tmp_path / "f.json")])
+    assert outcome.exit_code == 0, outcome.output
+    assert "last tenth to second one:" in outcome.stdout
+    text = (tmp_path / "f.json").read_text()
+    (row,) = json.loads(text)["rows"] if "rows" in json.loads(text) else json.loads(text)
+    assert row["landmarks"] == row["parts"][-1]["landmarks"] == 60
+    assert row["f1"] == 1.0
+    assert max(part["local"] for part in row["parts"]) < 45
+
+
 def test_scans_are_counted_and_timed() -> None:
     cost = bench_all_in("street", SimulatedScans(0, 6))
     assert (cost.scans, cost.submaps) == (6, 1)
@@ -36,4 +47,4 @@ def test_scans_are_counted_and_timed() -> None:
 def test_one_thing_is_asked_for_at_a_time() -> None:
     outcome = CliRunner().invoke(app, ["bench", "slam", "--drive", "120", "--dense", "3"])
     assert outcome.exit_code != 0
-    assert "expected one of --dataroot, --drive and --dense" in outcome.output
+    assert "expected one of --dataroot, --drive, --landmarks and --dense" in outcome.output

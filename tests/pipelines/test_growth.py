@@ -32,4 +32,4 @@ def test_no_array_of_a_frame_holds_all_pairs_of_objects(ties: Ties, method: Meth
     few, many = peak(FEW, ties, method), peak(MANY, ties, method)
     assert many < 3.5 * few  # an array of all pairs, of one byte each, would make it more
     if ties == "loose":
-        assert many < 4 * MANY**2  # bytes; without kernels a frame takes 2.5
+        assert many < 2 * MANY**2  # bytes

@@ -2,7 +2,8 @@
 
 Along a path assumed so far an observation belongs to the nearest landmark of its kind, by its last observation, within
 `reach`, else to a new one: a pose drifts little between two views of one thing, and association is repeated along the
-path found. Online the joint Gaussian of the new pose and the landmarks decides (`saga_fg.slam.mapping.associate`).
+path found. Online the joint Gaussian of the new pose and the landmarks of the window that can be seen from it decides
+(`saga_fg.slam.mapping.associate`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,16 @@ import numpy as np
 
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.mapping import EkfSlam, LandmarkObservations, MapperSettings, associate, landmark_key, pose_key
+from saga_fg.slam.mapping import (
+    LandmarkObservations,
+    LocalMap,
+    MapperSettings,
+    NearbyLandmarks,
+    associate,
+    landmark_key,
+    place_of,
+    pose_key,
+)
 from saga_fg.types.landmark import Landmark, LandmarkType, Observation
 
 Observations = Sequence[Sequence[Observation]]
@@ -51,14 +61,16 @@ class WindowLandmarks:
         self._kinds: dict[int, LandmarkType] = {}
         self._count: dict[int, int] = {}
         self._gone: dict[int, Landmark] = {}
+        self._near = NearbyLandmarks(by_odometry=False)
 
     def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> LandmarkObservations:
         """Associate observations from the epoch k; one without a match initiates a new landmark."""
-        numbers = sorted(self._kinds)
+        places = [place_of(observation) for observation in observations]
+        pose, covariance = solution.values.atPose3(pose_key(k)).matrix(), solution.marginal(pose_key(k))
+        numbers = self._near.near(pose[:2, 3], covariance).tolist()
         P = solution.covariance([pose_key(k), *map(landmark_key, numbers)])
         states = {n: (self._kinds[n], self._state(n, solution.values)) for n in numbers}
-        pose = solution.values.atPose3(pose_key(k)).matrix()
-        pairs = associate(EkfSlam(pose, P, states), observations, self._settings.gate)
+        pairs = associate(LocalMap(pose, P, states), observations, self._settings.gate)
         start: dict[int, object] = {}
         seen: list[tuple[int, Observation]] = []
         for row, observation in enumerate(observations):
@@ -70,6 +82,7 @@ class WindowLandmarks:
                 start[number] = observation.kind.initialise(pose, observation.value)
             self._count[number] = self._count.get(number, 0) + 1
             self._last_seen[number] = k
+            self._near.see(number, places[row], pose, covariance)
             seen.append((number, observation))
         return LandmarkObservations({k: seen}, start)
 
@@ -79,6 +92,7 @@ class WindowLandmarks:
         for number in gone:
             self._gone[number] = self._landmark(number, solution)
             del self._kinds[number]
+        self._near.forget(gone)
         return [landmark_key(number) for number in gone]
 
     def all(self, solution: GraphSolution | None) -> list[Landmark]:

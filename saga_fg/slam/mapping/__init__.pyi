@@ -1,21 +1,24 @@
 from .association import associate, log_odds
-from .ekf_slam import EkfSlam, Innovation
+from .local_map import Innovation, LocalMap
 from .mapper import AssociatedObservation, LandmarkMap, LandmarkMapper, MapperSettings
 from .merging import duplicates
+from .nearby import NearbyLandmarks, place_of
 from .providers import LandmarkObservations, MeasuredMotion, landmark_key, pose_key
 
 __all__ = [
     "AssociatedObservation",
-    "EkfSlam",
     "Innovation",
     "LandmarkMap",
     "LandmarkMapper",
     "LandmarkObservations",
+    "LocalMap",
     "MapperSettings",
     "MeasuredMotion",
+    "NearbyLandmarks",
     "associate",
     "duplicates",
     "landmark_key",
     "log_odds",
+    "place_of",
     "pose_key",
 ]

@@ -23,35 +23,36 @@ import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import assign, gate
-from saga_fg.slam.mapping.ekf_slam import EkfSlam, Innovation
+from saga_fg.slam.mapping.local_map import Innovation, LocalMap
 from saga_fg.types.landmark import Observation
 
 
-def associate(ekf: EkfSlam, observations: Sequence[Observation], probability: float) -> dict[int, Innovation]:
+def associate(local: LocalMap, observations: Sequence[Observation], probability: float) -> dict[int, Innovation]:
     """Assign the observations made from the present pose to the landmarks.
 
     probability: of the gates. Returns the innovation of each matched observation, by its row.
     """
-    landmarks = sorted(ekf.kinds)
+    landmarks = sorted(local.kinds)
     column = {landmark: j for j, landmark in enumerate(landmarks)}
     gain = np.zeros((len(observations), len(landmarks)))
     candidates: dict[tuple[int, int], Innovation] = {}
-    for row, observation in enumerate(observations):
-        kind = observation.kind
-        innovations = ekf.innovations(observation, (j for j in landmarks if ekf.kinds[j] == kind))
-        if not innovations:
+    for kind in dict.fromkeys(observation.kind for observation in observations):
+        alike = [number for number in landmarks if local.kinds[number] == kind]
+        own = [row for row, observation in enumerate(observations) if observation.kind == kind]
+        if not alike:
             continue
-        squared, spread = ekf.squared_distances(innovations)
+        innovations = local.innovations([observations[row] for row in own], alike)
+        squared, spread = local.squared_distances(innovations)
         dim = kind.variable.dim
-        spread += np.linalg.slogdet(observation.covariance)[1]
-        won = log_odds(squared, spread, dim, kind.density)
+        noise = np.linalg.slogdet(np.stack([observations[row].covariance for row in own]))[1]
+        won = log_odds(squared, spread + np.repeat(noise, len(alike)), dim, kind.density)
         for k in np.flatnonzero((squared < gate(probability, dim)) & (won > 0)).tolist():
-            j = column[innovations[k].landmark]
+            row, j = own[k // len(alike)], column[innovations.landmarks[k]]
             candidates[row, j] = innovations[k]
             gain[row, j] = won[k]
     rows, columns = assign(-gain, gain > 0, 0.0)
     pairs = {int(i): candidates[int(i), int(j)] for i, j in zip(rows, columns, strict=True)}
-    return _compatible(ekf, pairs, probability)
+    return _compatible(local, pairs, probability)
 
 
 def log_odds(squared: FloatArray, log_det: FloatArray, dim: int, density: float) -> FloatArray:
@@ -59,12 +60,12 @@ def log_odds(squared: FloatArray, log_det: FloatArray, dim: int, density: float)
     return np.asarray(-2 * np.log(density) - squared - log_det - dim * np.log(2 * np.pi))
 
 
-def _compatible(ekf: EkfSlam, pairs: dict[int, Innovation], probability: float) -> dict[int, Innovation]:
+def _compatible(local: LocalMap, pairs: dict[int, Innovation], probability: float) -> dict[int, Innovation]:
     """The pairs without those that contradict the others."""
     while len(pairs) > 1:
         rows = list(pairs)
         innovations = list(pairs.values())
-        S = ekf.innovation_covariance(innovations)
+        S = local.innovation_covariance(innovations)
         r = np.concatenate([i.r for i in innovations])
         if _squared(r, S) < gate(probability, len(r)):
             break

@@ -25,38 +25,38 @@ import numpy as np
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import gate
 from saga_fg.slam.mapping.association import log_odds
-from saga_fg.slam.mapping.ekf_slam import EkfSlam
+from saga_fg.slam.mapping.local_map import LocalMap
 
 _SEEDS = 40  # pairs that sets are grown from, the likeliest
 
 
-def duplicates(ekf: EkfSlam, probability: float, seen_together: Set[tuple[int, int]]) -> dict[int, int]:
+def duplicates(local: LocalMap, probability: float, seen_together: Set[tuple[int, int]]) -> dict[int, int]:
     """Find landmarks to merge: number -> the lower number of the same landmark; each occurs once.
 
     probability: of the gate; seen_together: pairs (lower, higher) of different landmarks, seen from one pose.
     """
     merged: dict[int, int] = {}
-    for kind in dict.fromkeys(ekf.kinds.values()):
-        numbers = sorted(number for number, other in ekf.kinds.items() if other == kind)
-        pairs = _possible(ekf, list(combinations(numbers, 2)), probability, seen_together)
+    for kind in dict.fromkeys(local.kinds.values()):
+        numbers = sorted(number for number, other in local.kinds.items() if other == kind)
+        pairs = _possible(local, list(combinations(numbers, 2)), probability, seen_together)
         if not pairs:
             continue
-        delta, J_i, J_j = ekf.differences(pairs)
-        covariance = ekf.joint_difference_covariance(pairs, J_i, J_j)
+        delta, J_i, J_j = local.differences(pairs)
+        covariance = local.joint_difference_covariance(pairs, J_i, J_j)
         chosen = _likeliest_set(pairs, delta, covariance, kind.density, probability)
         merged |= {pairs[k][1]: pairs[k][0] for k in chosen}
     return merged
 
 
 def _possible(
-    ekf: EkfSlam, every: list[tuple[int, int]], probability: float, seen_together: Set[tuple[int, int]]
+    local: LocalMap, every: list[tuple[int, int]], probability: float, seen_together: Set[tuple[int, int]]
 ) -> list[tuple[int, int]]:
     """Pairs inside the gate."""
     pairs = [pair for pair in every if pair not in seen_together]
     if not pairs:
         return []
-    delta, J_i, J_j = ekf.differences(pairs)
-    S = ekf.difference_covariances(pairs, J_i, J_j)
+    delta, J_i, J_j = local.differences(pairs)
+    S = local.difference_covariances(pairs, J_i, J_j)
     squared = (delta * np.linalg.solve(S, delta[:, :, None])[:, :, 0]).sum(axis=1)
     return [pairs[k] for k in np.flatnonzero(squared < gate(probability, delta.shape[1])).tolist()]
 

@@ -55,9 +55,9 @@ class MeasuredMotion:
 class LandmarkObservations:
     """Add associated observations: by epoch, each with the number of its landmark.
 
-    A landmark is added with its first observation, at its state in `start`; all factors come with the last of these
-    epochs and under its number, so that those of a kind are linearised together. robust: a loss, not for GTSAM's own
-    factors.
+    A landmark is added with its first observation, at its state in `start`, or with the last of these epochs if that
+    was before; all factors come with the last and under its number, so that those of a kind are linearised together.
+    robust: a loss, not for GTSAM's own factors.
     """
 
     seen: Mapping[int, Sequence[tuple[int, Observation]]]
@@ -66,13 +66,14 @@ class LandmarkObservations:
     name: str = "landmarks"
 
     def factors(self, view: GraphView) -> Additions:
-        kinds = {number: observation.kind for number, observation in self.seen.get(view.epoch, ())}
+        last = max(self.seen, default=None)
+        now = [self.seen.get(view.epoch, ())] if last != view.epoch else self.seen.values()
+        kinds = {number: observation.kind for one in now for number, observation in one}
         new = [
             NewVariable(LANDMARK, n, self.start[n], static=True, label=kind.name, type=kind.variable)
             for n, kind in kinds.items()
             if landmark_key(n) not in view.variables
         ]
-        last = max(self.seen, default=None)
         return Additions(new, named={last: observation_factors(self.seen, self.robust)} if last == view.epoch else {})
 
     def landmarks(self, solution: Solution | GraphSolution, confirm: int = 1) -> list[Landmark]:

@@ -64,14 +64,16 @@ def drive(seed: int) -> tuple[dict[str, tuple[float, int]], float]:
     truth = {"pole": list(poles), "plane": planes, "road line": list(lines)}
     found = {}
     for name, things in truth.items():
-        numbers = sorted(n for n, kind in mapper.ekf.kinds.items() if kind.name == name)
+        numbers = sorted(n for n, kind in mapper.local.kinds.items() if kind.name == name)
         assert len(numbers) == len(things), f"{name}: {len(numbers)} landmarks of {len(things)}"
-        variable = mapper.ekf.kinds[numbers[0]].variable
-        errors = np.concatenate([variable.local(mapper.ekf.state(n), t) for n, t in zip(numbers, things, strict=True)])
-        squared = float(errors @ np.linalg.solve(mapper.ekf.covariance(numbers), errors))
+        variable = mapper.local.kinds[numbers[0]].variable
+        errors = np.concatenate(
+            [variable.local(mapper.local.state(n), t) for n, t in zip(numbers, things, strict=True)]
+        )
+        squared = float(errors @ np.linalg.solve(mapper.local.covariance(numbers), errors))
         found[name] = (squared, len(errors))
-    error = mapper.ekf.pose.localCoordinates(pose)
-    return found, float(error @ np.linalg.solve(mapper.ekf.covariance([0]), error))
+    error = mapper.local.pose.localCoordinates(pose)
+    return found, float(error @ np.linalg.solve(mapper.local.covariance([0]), error))
 
 
 @pytest.fixture(scope="module")

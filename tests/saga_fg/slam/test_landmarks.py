@@ -13,7 +13,7 @@ from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import gate
-from saga_fg.slam.mapping import EkfSlam, LandmarkMap, LandmarkMapper, MapperSettings, associate, duplicates
+from saga_fg.slam.mapping import LandmarkMap, LandmarkMapper, LocalMap, MapperSettings, associate, duplicates
 from saga_fg.types.landmark import LandmarkType, Observation
 
 KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark(), LineLandmark()]
@@ -41,18 +41,18 @@ def some_observation(kind: LandmarkType, rng: np.random.Generator) -> FloatArray
 def test_a_landmark_stands_where_its_first_observation_says(kind: LandmarkType, seed: int) -> None:
     rng = np.random.default_rng(seed)
     k, d = kind.pose.dim, kind.variable.dim
-    ekf = EkfSlam(some_pose(kind, rng), 0.01 * np.eye(k))
+    local = LocalMap(some_pose(kind, rng), 0.01 * np.eye(k))
     R = np.diag(rng.uniform(0.01, 0.1, d))
     observation = Observation(kind, some_observation(kind, rng), R)
-    ekf.augment(7, observation)
-    (innovation,) = ekf.innovations(observation, [7])
+    local.augment(7, observation)
+    (innovation,) = local.innovations([observation], [7])
     np.testing.assert_allclose(innovation.r, 0, atol=1e-9)
     # seen again from the same pose, the observation is as uncertain as noise alone: both share the pose's error
-    np.testing.assert_allclose(ekf.innovation_covariance([innovation]), 2 * np.eye(d), atol=1e-6)
-    before = ekf.covariance([7])
-    ekf.update([innovation])
-    assert np.linalg.det(ekf.covariance([7])) < np.linalg.det(before)
-    assert {"x", "y"} <= set(kind.coordinates(ekf.state(7)))
+    np.testing.assert_allclose(local.innovation_covariance([innovation]), 2 * np.eye(d), atol=1e-6)
+    before = local.covariance([7])
+    local.update([innovation])
+    assert np.linalg.det(local.covariance([7])) < np.linalg.det(before)
+    assert {"x", "y"} <= set(kind.coordinates(local.state(7)))
 
 
 def test_the_filter_is_the_smoother_where_everything_is_linear() -> None:
@@ -66,20 +66,20 @@ def test_the_filter_is_the_smoother_where_everything_is_linear() -> None:
         seen = trees - [k, 0] + 0.05 * rng.normal(size=trees.shape)
         mapper.observe([Observation(kind, z, 0.01 * np.eye(2)) for z in seen])
         mapper.move(step, np.diag([1e-3, 1e-3, 1e-12]))
-    filtered = mapper.ekf
+    filtered = mapper.local
     mapper.smooth()
     for number in (1, 2, 3):
-        np.testing.assert_allclose(mapper.ekf.state(number), filtered.state(number), atol=1e-4)
-    np.testing.assert_allclose(mapper.ekf.covariance([1, 2, 3]), filtered.covariance([1, 2, 3]), rtol=1e-2, atol=1e-6)
+        np.testing.assert_allclose(mapper.local.state(number), filtered.state(number), atol=1e-4)
+    np.testing.assert_allclose(mapper.local.covariance([1, 2, 3]), filtered.covariance([1, 2, 3]), rtol=1e-2, atol=1e-6)
 
 
-def poles_at(places: FloatArray, drift: float) -> EkfSlam:
+def poles_at(places: FloatArray, drift: float) -> LocalMap:
     """A map of poles, and a pose that is known to `drift` m within it."""
-    ekf = EkfSlam(np.eye(4), 1e-6 * np.eye(6))
+    local = LocalMap(np.eye(4), 1e-6 * np.eye(6))
     for number, (x, y) in enumerate(places, start=1):
-        ekf.augment(number, Observation(PoleLandmark(), np.array([x, y, 0.5]), NOISE["pole"]))
-    ekf.predict(np.eye(4), np.diag([1e-8, 1e-8, 1e-8, drift**2, drift**2, 1e-8]))
-    return ekf
+        local.augment(number, Observation(PoleLandmark(), np.array([x, y, 0.5]), NOISE["pole"]))
+    local.predict(np.eye(4), np.diag([1e-8, 1e-8, 1e-8, drift**2, drift**2, 1e-8]))
+    return local
 
 
 def seen(*places: tuple[float, float]) -> list[Observation]:
@@ -87,23 +87,23 @@ def seen(*places: tuple[float, float]) -> list[Observation]:
 
 
 def test_each_landmark_is_matched_once_and_by_the_likeliest() -> None:
-    ekf = poles_at(np.array([[10.0, 2.0], [10.0, -2.0]]), drift=0.1)
-    pairs = associate(ekf, seen((10.05, -1.9), (10.4, -2.3), (10.0, 2.1)), 0.999)
+    local = poles_at(np.array([[10.0, 2.0], [10.0, -2.0]]), drift=0.1)
+    pairs = associate(local, seen((10.05, -1.9), (10.4, -2.3), (10.0, 2.1)), 0.999)
     assert {row: pair.landmark for row, pair in pairs.items()} == {0: 2, 2: 1}
 
 
 def test_landmarks_of_another_type_are_no_candidates() -> None:
-    ekf = poles_at(np.array([[10.0, 2.0]]), drift=0.1)
+    local = poles_at(np.array([[10.0, 2.0]]), drift=0.1)
     point = Observation(PointLandmark(dim=3), np.array([10.0, 2.0, 0.5]), 0.01 * np.eye(3))
-    assert associate(ekf, [point], 0.999) == {}
+    assert associate(local, [point], 0.999) == {}
 
 
 def test_pairs_that_contradict_each_other_are_not_taken_together() -> None:
     """Both move by more than a common shift can explain: one to the left, one to the right."""
-    ekf = poles_at(np.array([[10.0, 4.0], [10.0, -4.0]]), drift=0.5)
+    local = poles_at(np.array([[10.0, 4.0], [10.0, -4.0]]), drift=0.5)
     for probability, expected in ((0.999, 1), (1 - 1e-9, 2)):
-        assert len(associate(ekf, seen((10.0, 4.6), (10.0, -4.6)), probability)) == expected
-    assert len(associate(ekf, seen((10.0, 4.4), (10.0, -3.6)), 0.999)) == 2
+        assert len(associate(local, seen((10.0, 4.6), (10.0, -4.6)), probability)) == expected
+    assert len(associate(local, seen((10.0, 4.4), (10.0, -3.6)), 0.999)) == 2
 
 
 def test_where_the_pose_is_badly_known_a_lone_landmark_is_not_matched() -> None:
@@ -112,13 +112,13 @@ def test_where_the_pose_is_badly_known_a_lone_landmark_is_not_matched() -> None:
     assert len(associate(poles_at(places, 8.0), seen((10.3, 2.0)), 0.999)) == 0
 
 
-def revisited(shift: tuple[float, float], drift: float, count: int) -> EkfSlam:
+def revisited(shift: tuple[float, float], drift: float, count: int) -> LocalMap:
     """Poles 1 ... count, and begun anew after a drift of unknown direction, `shift` in truth."""
     places = np.array([[5.0, 5.0], [12.0, -4.0], [20.0, 6.0], [26.0, -7.0]])[:count]
-    ekf = poles_at(places, drift)
+    local = poles_at(places, drift)
     for number, (x, y) in enumerate(places + shift, start=count + 1):
-        ekf.augment(number, Observation(PoleLandmark(), np.array([x, y, 0.5]), NOISE["pole"]))
-    return ekf
+        local.augment(number, Observation(PoleLandmark(), np.array([x, y, 0.5]), NOISE["pole"]))
+    return local
 
 
 def test_a_constellation_is_recognised_where_no_single_landmark_is() -> None:
@@ -127,9 +127,9 @@ def test_a_constellation_is_recognised_where_no_single_landmark_is() -> None:
 
 
 def test_what_was_seen_side_by_side_is_never_one() -> None:
-    ekf = revisited((0.1, 0.0), 0.2, 2)
-    assert duplicates(ekf, 0.999, set()) == {3: 1, 4: 2}
-    assert duplicates(ekf, 0.999, {(1, 3)}) == {4: 2}
+    local = revisited((0.1, 0.0), 0.2, 2)
+    assert duplicates(local, 0.999, set()) == {3: 1, 4: 2}
+    assert duplicates(local, 0.999, {(1, 3)}) == {4: 2}
 
 
 @pytest.mark.parametrize("way", [0.0, np.pi / 2, np.pi, -np.pi + 1e-3], ids=lambda way: f"{way:.3f} rad")
@@ -137,13 +137,13 @@ def test_what_was_seen_side_by_side_is_never_one() -> None:
 def test_an_edge_is_one_whichever_way_its_normal_points(way: float, side: float) -> None:
     """A curb in any direction, seen again a little turned: theta beyond pi, or (theta + pi, -rho)."""
     kind, R = LineLandmark(), 0.01 * np.eye(2)
-    ekf = EkfSlam(np.eye(4), 1e-6 * np.eye(6))
+    local = LocalMap(np.eye(4), 1e-6 * np.eye(6))
     for number, (turn, shift) in enumerate([(0.002, 0.02), (-0.002, -0.02)], start=1):
         along = np.array([np.cos(way + turn), np.sin(way + turn), 0.0])
         foot = (side + shift) * np.array([-along[1], along[0], 0.0])
-        ekf.augment(number, Observation(kind, np.concatenate([foot - 5 * along, foot + 5 * along]), R))
-    ekf.augment(3, Observation(kind, np.array([-5.0, -9.0, 0.0, 5.0, 11.0, 0.0]), R))
-    assert duplicates(ekf, 0.999, set()) == {2: 1}
+        local.augment(number, Observation(kind, np.concatenate([foot - 5 * along, foot + 5 * along]), R))
+    local.augment(3, Observation(kind, np.array([-5.0, -9.0, 0.0, 5.0, 11.0, 0.0]), R))
+    assert duplicates(local, 0.999, set()) == {2: 1}
 
 
 def street(seed: int) -> tuple[LandmarkMap, FloatArray, FloatArray, list[gtsam.OrientedPlane3]]:

@@ -1,7 +1,8 @@
-"""EKF-SLAM: the pose and all landmarks as one Gaussian, kept by an error-state Kalman filter between two smoothings.
+"""The pose and the landmarks near it as one Gaussian, kept by an error-state Kalman filter between two smoothings.
 
-State x = (pose, l_1, ..., l_n) with covariance P of its tangents. With factors linearised and whitened at the state,
-r + A_p dp + A_l dl + w, w ~ N(0, 1):
+What is observed from near the pose says of landmarks farther off only what it says of these, so that a filter of these
+alone is the filter of the whole map, marginalised. State x = (pose, l_1, ..., l_n) with covariance P of its tangents.
+With factors linearised and whitened at the state, r + A_p dp + A_l dl + w, w ~ N(0, 1):
 
     predict   P_pp <- Ad P_pp Ad^T + Q,  P_pl <- Ad P_pl              Ad of the inverse increment
     update    S = A P A^T + 1,  K = P A^T S^-1,  x <- x + (-K r),  P <- P - K A P
@@ -12,7 +13,7 @@ Source: R. Smith, M. Self, P. Cheeseman, "Estimating uncertain spatial relations
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,7 @@ import numpy as np
 from factors import Variable, Vector, pose
 from factors.differences import central_differences
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.slam.mapping.jacobians import whitened_jacobians
+from saga_fg.slam.mapping.jacobians import first_seen, whitened_jacobians
 from saga_fg.types.landmark import LandmarkType, Observation
 
 _SAME = 1e-6  # variance of the difference of a landmark from itself, for the numerics
@@ -39,8 +40,24 @@ class Innovation:
     by_landmark: FloatArray
 
 
-class EkfSlam:
-    """Pose and landmarks; a landmark's key is its number."""
+@dataclass(frozen=True, eq=False)
+class Innovations(Sequence[Innovation]):
+    """Innovations of one kind: landmarks n, r (n, d), A_p (n, d, k), A_l (n, d, d)."""
+
+    landmarks: Sequence[int]
+    r: FloatArray
+    by_pose: FloatArray
+    by_landmark: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.landmarks)
+
+    def __getitem__(self, row: Any) -> Any:
+        return Innovation(self.landmarks[row], self.r[row], self.by_pose[row], self.by_landmark[row])
+
+
+class LocalMap:
+    """Pose and landmarks near it; a landmark's key is its number."""
 
     def __init__(
         self,
@@ -82,30 +99,25 @@ class EkfSlam:
         self.P[:, :k] = self.P[:, :k] @ Ad.T
         self.P[:k, :k] += covariance
 
-    def innovations(self, observation: Observation, landmarks: Iterable[int]) -> list[Innovation]:
-        """The observation against each of these landmarks, which are of its kind."""
-        keys = list(landmarks)
-        if not keys:
-            return []
-        n = len(keys)
-        rows = np.stack([np.full(n, POSE), keys], axis=1)
-        observed = np.broadcast_to(observation.value, (n, len(observation.value)))
-        covariances = np.broadcast_to(observation.covariance, (n, *observation.covariance.shape))
-        whitened = whitened_jacobians(observation.kind, rows, observed, covariances, self.values)
-        return [Innovation(*one) for one in zip(keys, *whitened, strict=True)]
+    def innovations(self, observations: Sequence[Observation], landmarks: Sequence[int]) -> Innovations:
+        """Each of n observations against each of m landmarks, all of one kind: n m innovations, row by row."""
+        n, m = len(observations), len(landmarks)
+        rows = np.stack([np.full(n * m, POSE), np.tile(landmarks, n)], axis=1)
+        observed, R = (np.stack([getattr(z, name) for z in observations]) for name in ("value", "covariance"))
+        repeated = (np.repeat(observed, m, axis=0), np.repeat(R, m, axis=0))
+        return Innovations(rows[:, 1].tolist(), *whitened_jacobians(observations[0].kind, rows, *repeated, self.values))
 
     def innovation_covariance(self, innovations: Sequence[Innovation]) -> FloatArray:
         """S (D, D) of innovations together, whitened: the identity is the noise alone."""
         A, columns = self._stacked(innovations)
         return np.asarray(A @ self.P[np.ix_(columns, columns)] @ A.T + np.eye(len(A)))
 
-    def squared_distances(self, innovations: Sequence[Innovation]) -> tuple[FloatArray, FloatArray]:
-        """d^2 (n,) and log det S (n,) of each of several innovations of one kind."""
+    def squared_distances(self, innovations: Innovations) -> tuple[FloatArray, FloatArray]:
+        """d^2 (n,) and log det S (n,) of each innovation alone."""
         k = self._columns[POSE].stop
-        A_p = np.stack([i.by_pose for i in innovations])
-        A_l = np.stack([i.by_landmark for i in innovations])
-        r = np.stack([i.r for i in innovations])
-        columns = np.stack([np.arange(len(self.P))[self._columns[i.landmark]] for i in innovations])
+        A_p, A_l, r = innovations.by_pose, innovations.by_landmark, innovations.r
+        columns = np.array([self._columns[landmark].start for landmark in innovations.landmarks])[:, None]
+        columns = columns + np.arange(r.shape[1])
         P_ll = self.P[columns[:, :, None], columns[:, None, :]]
         P_pl = self.P[:k][:, columns].swapaxes(0, 1)
         cross = A_p @ P_pl @ A_l.swapaxes(1, 2)
@@ -131,19 +143,20 @@ class EkfSlam:
         Returns the differences, and their derivatives J_i and J_j (K, d, d).
         """
         variable = self.kinds[pairs[0][0]].variable
-        states = [(self.state(i), self.state(j)) for i, j in pairs]
-        delta = np.stack([variable.local(first, second) for first, second in states])
+        states = {number: self.state(number) for number in {number for pair in pairs for number in pair}}
         if isinstance(variable, Vector):
+            first, second = (np.stack([states[pair[side]] for pair in pairs]) for side in (0, 1))
             one = np.broadcast_to(np.eye(variable.dim), (len(pairs), variable.dim, variable.dim))
-            return delta, -one, one
-        J = [central_differences(variable.local, pair, (variable, variable)) for pair in states]
+            return second - first, -one, one
+        both = [(states[i], states[j]) for i, j in pairs]
+        delta = np.stack([variable.local(first, second) for first, second in both])
+        J = [central_differences(variable.local, pair, (variable, variable)) for pair in both]
         return delta, np.stack([first for first, _ in J]), np.stack([second for _, second in J])
 
     def difference_covariances(self, pairs: Sequence[tuple[int, int]], J_i: FloatArray, J_j: FloatArray) -> FloatArray:
         """The covariance (K, d, d) of each difference."""
-        i = np.stack([self._columns_of([pair[0]]) for pair in pairs])
-        j = np.stack([self._columns_of([pair[1]]) for pair in pairs])
-        both = np.concatenate([i, j], axis=1)
+        starts = np.array([[self._columns[number].start for number in pair] for pair in pairs])
+        both = (starts[:, :, None] + np.arange(J_i.shape[2])).reshape(len(pairs), -1)
         J = np.concatenate([J_i, J_j], axis=2)
         return np.asarray(
             J @ self.P[both[:, :, None], both[:, None, :]] @ J.swapaxes(1, 2) + _SAME * np.eye(J.shape[1])
@@ -163,19 +176,25 @@ class EkfSlam:
         return np.asarray(C.reshape(K, d, K, d))
 
     def augment(self, landmark: int, observation: Observation) -> None:
-        """Add a landmark at its first observation, from the present pose."""
+        """Add a landmark at its first observation, from the present pose.
+
+        Raises `InputError`, and adds nothing, where that does not determine it.
+        """
         kind = observation.kind
-        self._insert(landmark, kind, kind.initialise(self.pose.matrix(), observation.value))
+        state, noise, by_pose = first_seen(observation, self.pose.matrix())
+        self._insert(landmark, kind, state)
         n, d, k = len(self.P), kind.variable.dim, self._columns[POSE].stop
-        (first,) = self.innovations(observation, [landmark])
-        G = -np.linalg.solve(first.by_landmark, first.by_pose)
-        noise = np.linalg.inv(first.by_landmark)
+        G = -noise @ by_pose
         P = np.zeros((n + d, n + d))
         P[:n, :n] = self.P
         P[n:, :n] = G @ self.P[:k]
         P[:n, n:] = P[n:, :n].T
         P[n:, n:] = G @ self.P[:k, :k] @ G.T + noise @ noise.T
         self.P = P
+
+    def check(self, observation: Observation) -> None:
+        """Raise `InputError` for an observation that a landmark cannot start with."""
+        first_seen(observation, self.pose.matrix())
 
     def _insert(self, landmark: int, kind: LandmarkType, state: Any) -> None:
         """Its columns of P are the next ones."""
