@@ -20,7 +20,7 @@ def write_simulated_tables(directory: str | Path, dataset: SimulatedTraffic) -> 
     Raises `InputError` for a directory that is not writable.
     """
     shipped = load_config("heterogeneous")
-    with atomic_directory(directory, _TABLES) as folder:
+    with atomic_directory(directory, known=_TABLES) as folder:
         for name in dataset.scenes:
             scene = dataset.scene(name)
             (folder / name).mkdir()

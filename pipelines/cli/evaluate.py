@@ -83,7 +83,7 @@ def _evaluate(
     if markdown is not None:
         write_text(markdown, "\n".join(table.markdown() for table in (*([summary] if summary else ()), *tables)))
     if plots is not None:
-        with atomic_directory(plots) as folder:
+        with atomic_directory(plots, known=("recall.png", "errors.png", "calibration.png")) as folder:
             for name, picture in evaluation.pictures().items():
                 (folder / f"{name}.png").write_bytes(png(picture))
 

@@ -14,7 +14,7 @@ from data_tools.lidar import Scan, constant_velocity, deskewed
 from data_tools.lidar.moving import without_objects
 from data_tools.lidar.scan import ScanSequence
 from pipelines.slam.odometry import OdometrySettings, OdometryStep, moved_on
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform
 from saga_fg.types.boxes import Boxes
@@ -60,6 +60,21 @@ class OdometryPath:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def check(self, scan: Scan | None, time: float, points_first: bool) -> None:
+        """Raise `InputError` for what cannot be the next scan; points_first: whether the first one must have some."""
+        if scan is None:
+            raise InputError(
+                "scan: expected one in every step: what sensors measure between scans comes with the next scan, as "
+                "SensorBuffer gives it; of detections between scans give those nearest to a scan"
+            )
+        require_type("scan", scan, Scan)
+        if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
+            raise InputError(f"time: expected a finite number of seconds, got {time!r}")
+        if self.times and not time > self.times[-1]:
+            raise InputError(f"time: expected one after {self.times[-1]:.6f} s, got {time:.6f} s")
+        if points_first and not self.times and not len(scan):
+            raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
 
     def add(self, time: float, pose: FloatArray, step: OdometryStep) -> None:
         """Add the scan at `time` with its pose (4, 4), which stands for the poses of the scans lost before, too."""

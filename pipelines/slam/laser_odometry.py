@@ -50,7 +50,14 @@ def without_jumps(log: LaserLog, largest_speed: float) -> tuple[FloatArray, int]
 
 
 def warn_of_times(time: FloatArray) -> None:
-    """Warns where times (n,), s, run backwards, as those of logs that are written by several processes do."""
+    """Warns where times (n,), s, run backwards, as those of logs that are written by several processes do, or stay."""
+    same = np.flatnonzero(np.diff(time) == 0)
+    if len(same):
+        _log.warning(
+            "scan %d: its time is that of the scan ahead of it; so for %d of %d scans, "
+            "of which the files have the pose of the first at each time",
+            int(same[0]) + 2, len(same), len(time),
+        )  # fmt: skip
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
         _log.warning(

@@ -18,7 +18,7 @@ from data_tools.plots import occupancy_picture, png
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import write_tum_poses
 from pipelines.slam.laser_slam import LaserPath
-from pipelines.slam.results import SLAM_FILES, planar_trajectory
+from pipelines.slam.results import planar_trajectory
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.planar_poses import transforms
 
@@ -44,7 +44,7 @@ def write_laser_slam(
     _, first = np.unique(log.time, return_index=True)
     wheels = transforms(log.odometry)
     wheels = np.linalg.inv(wheels[0]) @ wheels
-    with atomic_directory(output, SLAM_FILES) as folder:
+    with atomic_directory(output) as folder:
         for name, poses in (("trajectory", path.poses), ("matched", path.matched), ("odometry", wheels)):
             write_tum_poses(folder / f"{name}.tum", planar_trajectory(log.time[first], poses[first]))
         write_g2o(folder / "poses.g2o", path.graph)

@@ -39,7 +39,6 @@ from pipelines.slam.lidar_slam import LidarSlamSettings
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.odometry import OdometrySettings
 from pipelines.slam.results import (
-    SLAM_FILES,
     confirmed_paths,
     landmark_rows,
     object_paths,
@@ -54,6 +53,13 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
 from saga_fg.types.landmark import Landmark
 
+# all that a run may write, also in a map of an earlier one: a folder holds the files of its last run
+LIDAR_FILES = (
+    *("trajectory.txt", "times.txt", "trajectory.tum", "odometry.tum", "online.tum", "reference.tum"),
+    *("map.ply", "map/submaps.csv", "map/origin.csv", "map/[0-9]*.ply", "map/[0-9]*.pcd"),
+    *("graph.g2o", "observations.csv", "landmarks.json", "landmarks.csv", "landmarks.ply"),
+    *("covariances.csv", "tracks.csv", "above.png", "metrics.json"),
+)
 HEIGHT = 3.0  # m above the first pose, to which poles and walls are drawn
 _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
 _LINED = (WALL.name, LINE.name)
@@ -125,7 +131,7 @@ def write_lidar_slam(
         figures["objects"] = len(object_paths(found.estimate))
         truth = Trajectory(scans.timestamps, scans.world_T_ego)
         figures["without_objects"] = asdict(trajectory_errors(found.alone.trajectory, truth, "start"))
-    with atomic_directory(output, SLAM_FILES) as folder:
+    with atomic_directory(output, known=LIDAR_FILES) as folder:
         write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
         for name, trajectory in (
             ("trajectory", result.trajectory), ("odometry", result.odometry), ("online", result.online)

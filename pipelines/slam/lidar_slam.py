@@ -39,7 +39,7 @@ from pipelines.slam.submap_loops import ClosedSubmaps, SubmapLoops
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.slam.vehicle_sensors import VehicleSensors
 from pipelines.tracking import Progress
-from saga_fg.errors import InputError, require_type
+from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray
@@ -164,20 +164,9 @@ class LidarSlam:
         """
         if self._finished:
             raise InputError("step: expected no scan after finish; a new LidarSlam takes the next drive")
-        if scan is None:
-            raise InputError(
-                "scan: expected one in every step: what sensors measure between scans comes with the next scan, as "
-                "SensorBuffer gives it; of detections between scans give those nearest to a scan"
-            )
-        require_type("scan", scan, Scan)
-        if not (isinstance(time, int | float | np.number) and np.isfinite(time)):
-            raise InputError(f"time: expected a finite number of seconds, got {time!r}")
+        self._path.check(scan, time, isinstance(self._odometry, LidarOdometry))
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
-        if self._path.times and not time > self._path.times[-1]:
-            raise InputError(f"time: expected one after {self._path.times[-1]:.6f} s, got {time:.6f} s")
-        if not self._path.times and not len(scan) and isinstance(self._odometry, LidarOdometry):
-            raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
         moving = Boxes.empty()
         if self._moving is not None and detections is not None:
             self._moving.check(scan, detections)

@@ -32,6 +32,7 @@ from pipelines.slam.map_registration import MapRegistration, MeasuredPose
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.slam.slam_map import SlamMap
 from pipelines.slam.vehicle_sensors import VehicleSensors
+from saga_fg.errors import require_type
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, FactorProvider
 from saga_fg.numerics.arrays import BoolArray, FloatArray
@@ -98,10 +99,10 @@ class Localiser:
         ego_T_lidar: FloatArray | None = None,
         sensor_settings: SensorSettings | None = None,
     ) -> None:
-        self.settings = settings or LocaliserSettings()
+        require_type("slam_map", slam_map, SlamMap)
+        self.settings = s = settings or LocaliserSettings()
         self._odometry = LidarOdometry(self.settings.odometry)
         self._guess = None if guess is None else checked_transform("guess", guess)
-        s = self.settings
         self._sensors = VehicleSensors(sensors, sensor_settings, ego_T_lidar)
         self._measured, self._of_sensors = self._sensors.since_keyframe, self._sensors.new_providers()
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
@@ -112,11 +113,9 @@ class Localiser:
         self._fits = set[int]()  # keyframes registered with the map
         self._unproved = list[int]()  # keyframes since the structure was compared
         self._clouds: list[tuple[int, FloatArray]] = []  # of the last keyframes, thinned, with their rows
-        self._time = 0.0  # of the last keyframe
         self._searched, self._proved = 0.0, 0.0  # m, way of the last search, and of the last comparison
-        self._ambiguous = False
         self._smoother: IncrementalSmoother | None = None
-        self._last, self._fitted = 0, 0.0  # keyframe in the graph; way of the last that fitted, m
+        self._last, self._time, self._fitted = 0, 0.0, 0.0  # keyframe in the graph, time of it; way of the last fit, m
         self._pose, self._covariance = np.eye(4), _GUESSED  # of that keyframe
 
     def step(
@@ -129,8 +128,9 @@ class Localiser:
     ) -> LocalisedStep:
         """Place the next scan; measurements of the vehicle's sensors as of `LidarSlam.step`.
 
-        Raises `InputError` for a scan that is not later than the one before, and for a sensor that was not named.
+        Raises `InputError` as that, too.
         """
+        self._path.check(scan, time, True)
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
         placed = self._odometry.step(scan, time, self._sensors.velocity(self._sensors.corrected(wheels)))
@@ -170,25 +170,23 @@ class Localiser:
 
     @property
     def way(self) -> float:
-        """Way so far by odometry, m."""
+        """Way by odometry, m."""
         return self._path.ways[-1] if len(self._path) else 0.0
 
     @property
     def ambiguous(self) -> bool:
         """True if the last cloud searched for fits several places of the map."""
-        return self._ambiguous
+        return self._places.ambiguous
 
     @property
     def consistency(self) -> SensorConsistency:
-        """Whether the sensors of the vehicle fit the path in the map."""
+        """Whether the sensors of the vehicle fit the path in the map, also in the warnings of `finish`."""
         return self._sensors.consistency
 
     def finish(self) -> None:
-        """After the last scan: look for the place with the points there are, or compare the last ones with the map.
-
-        Sensors that do not fit are named by warnings, and under `consistency`.
-        """
+        """After the last scan: look for the place with the points there are, or compare the last ones with the map."""
         if self._smoother is not None:
+            self.consistency.observe(self._smoother.graph())
             self._compare()
         if self._smoother is None and self._clouds and self.way > self._searched:
             self._search(*self._clouds[-1], self._time)
@@ -215,7 +213,7 @@ class Localiser:
         map_T_frame = None if fix is None else self._places.recognised(thin, fix)
         if map_T_frame is None:
             map_T_frame = self._places.recognised(thin)
-        self._ambiguous, self._searched = self._places.ambiguous, self.way
+        self._searched = self.way
         if map_T_frame is None:
             self._clouds = self._clouds[len(self._clouds) // 2 :]
         else:
@@ -241,7 +239,7 @@ class Localiser:
         self._smoother, self._fitted = IncrementalSmoother(lag=self.settings.lag), self.way
         self._of_sensors = self._sensors.new_providers()
         self._pose, self._covariance = map_T_lidar, _GUESSED
-        self._proved, self._ambiguous = self.way, False
+        self._proved = self.way
 
     def _compare(self) -> None:
         """Give the place up if what stands above the ground around the last keyframes is not what the map has."""
@@ -257,6 +255,8 @@ class Localiser:
 
     def _give_up(self, why: str) -> None:
         _LOG.warning("at %.1f m: %s; the place is looked for", self.way, why)
+        if self._unproved:
+            self.consistency.forget(self._path.times[self._unproved[0]])
         for row in self._unproved:
             self._found.pop(row, None)
             self._fits.discard(row)
@@ -283,7 +283,7 @@ class Localiser:
             self._fitted = self.way
             self._fits.add(row)
         self._smoother.step(time, [*given, *self._of_sensors], self._measured.frame(time, None))
-        self.consistency.observe(self._smoother.graph())
+        self.consistency.observe(self._smoother.graph(), s.lag / 2)
         (pose,) = self._smoother.graph().of(EGO_POSE, self._smoother.graph().epoch).values()
         self._pose, self._covariance = (
             self._smoother.graph().state(pose.key).matrix(),

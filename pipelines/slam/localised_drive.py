@@ -23,8 +23,8 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
+from pipelines.slam.lidar_results import LIDAR_FILES
 from pipelines.slam.localisation import Localiser, LocaliserSettings
-from pipelines.slam.results import SLAM_FILES
 from pipelines.slam.slam_map import SlamMap
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
@@ -106,7 +106,7 @@ def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, sl
     placed = zip(slam_map.map_T_submap, slam_map.points, strict=True)
     points = np.concatenate([transform_points(pose, cloud.astype(np.float64)) for pose, cloud in placed])
     points = points[voxel_downsample(points, 0.3)]
-    with atomic_directory(output, SLAM_FILES) as folder:
+    with atomic_directory(output, known=LIDAR_FILES) as folder:
         write_kitti_poses(folder / "trajectory.txt", path, folder / "times.txt")
         write_tum_poses(folder / "trajectory.tum", path)
         write_tum_poses(folder / "reference.tum", truth)

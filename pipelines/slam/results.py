@@ -34,16 +34,6 @@ from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
 from saga_fg.types.landmark import Landmark
 
 _CONFIRMED = 5  # detections
-# all that a command of SLAM may write: a folder holds the files of its last run alone
-SLAM_FILES = (
-    *("trajectory.tum", "odometry.tum", "online.tum", "reference.tum", "matched.tum"),
-    *("truth.tum", "joint.tum", "settled.tum"),
-    *("trajectory.txt", "times.txt", "trajectory.kitti", "joint.txt", "covariances.csv"),
-    *("graph.g2o", "observations.csv", "poses.g2o", "tracks.csv"),
-    *("landmarks.json", "landmarks.csv", "landmarks.ply", "map.ply", "above.png", "map.png"),
-    *("metrics.json", "figures.json", "errors.json"),
-    *("map/submaps.csv", "map/origin.csv", "map/[0-9]*.ply", "map/[0-9]*.pcd"),
-)
 
 
 def landmark_row(
@@ -122,7 +112,7 @@ def write_landmark_map(
     """
     places = np.array([[row["x"], row["y"], row.get("z", 0.0)] for row in landmarks]).reshape(-1, 3)
     picture = paths_from_above({**(others or {}), "estimate": trajectory.positions}, {"landmarks": places})
-    with atomic_directory(output, SLAM_FILES) as folder:
+    with atomic_directory(output) as folder:
         write_tum_poses(folder / "trajectory.tum", trajectory)
         write_kitti_poses(folder / "trajectory.kitti", trajectory)
         write_figures(folder / "landmarks.json", landmarks)
@@ -135,7 +125,7 @@ def write_joint(output: Path, run: JointRun) -> None:
     """Write the results of a simulated scene: the paths of the run as NAME.tum, and errors.json against the truth."""
     last = np.array([path[-1] for path in confirmed_paths(run.estimate).values()]).reshape(-1, 2)
     drawn = {name: path.positions for name, path in run.paths.items() if name != "settled"}
-    with atomic_directory(output, SLAM_FILES) as folder:
+    with atomic_directory(output, known=("online.tum", "settled.tum")) as folder:
         for name, path in run.paths.items():
             write_tum_poses(folder / f"{name}.tum", path)
         write_kitti_poses(folder / "joint.txt", run.paths["joint"], folder / "times.txt")
@@ -171,7 +161,7 @@ def write_pose_graph(
     if graph.landmarks is not None and optimised.landmarks is not None:
         best = best.with_landmarks(graph.landmarks.at(optimised.landmarks))
         points = {"landmarks": optimised.landmarks}
-    with atomic_directory(output, SLAM_FILES) as folder:
+    with atomic_directory(output, known=("covariances.csv",)) as folder:
         write_g2o(folder / "poses.g2o", best)
         if len(rows):
             write_covariances(folder / "covariances.csv", "id", graph.ids[rows].tolist(), covariances)

@@ -20,7 +20,7 @@ from saga_fg.providers import Wheels
 from saga_fg.providers.mounting import mounting
 from saga_fg.types.ego_measurements import WheelSpeed
 
-_WAY, _LEAST = 25.0, 15  # m and scans that are compared
+_WAY, _LEAST = 15.0, 15  # m and scans that are compared
 _MOVING = 1.0  # m/s from which a speed tells a scale
 _SURE = 3.0  # deviations
 _SCALES, _SPREAD = (0.75, 1.33), 0.1  # of wheels that are scaled, and the largest s of theirs

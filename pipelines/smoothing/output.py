@@ -37,7 +37,7 @@ def write_labels(
 
     write_others  adds the labels of all scenes in another format to the folder
     """
-    with atomic_directory(directory, _TABLES) as folder:
+    with atomic_directory(directory, known=_TABLES) as folder:
         done = tuple(runs)
         labels = [(run.scene, run.labels) for run in done]
         write_label_table(folder / f"labels{suffix}", labels)
@@ -51,7 +51,7 @@ def write_streamed_labels(
     directory: str | Path, smooth: Callable[[Path], Iterable[StreamedScene]], suffix: str = ".csv"
 ) -> tuple[StreamedScene, ...]:
     """Write the labels of recordings smoothed as they are read; `smooth` is called with a folder for their spools."""
-    with atomic_directory(directory, _TABLES) as folder, TemporaryDirectory(dir=folder) as spools:
+    with atomic_directory(directory, known=_TABLES) as folder, TemporaryDirectory(dir=folder) as spools:
         done = tuple(smooth(Path(spools)))
         write_label_table(folder / f"labels{suffix}", chain.from_iterable(run.spool.labels() for run in done))
         _write_summary(folder, {run.name: (run.counts, run.seconds) for run in done})

@@ -16,7 +16,8 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.block_variables import BlockVariables
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.measurements import WhitenedMeasurements
-from saga_fg.numerics.arrays import IntArray
+from saga_fg.estimators.partition import Partition
+from saga_fg.numerics.arrays import BoolArray, IntArray
 
 
 class RunningTree:
@@ -33,6 +34,7 @@ class BayesTree:
     running     the tree, which may have gone on
     updates     that it had had
     variables   of the present states
+    held (n,)   which nodes' variables the tree has, or will have: those that are correlated with others
     factors     to be added
     new         keys of the variables to be added, with their sizes
     leaving     keys of the past variables, to be marginalised
@@ -41,6 +43,7 @@ class BayesTree:
     running: RunningTree
     updates: int
     variables: BlockVariables
+    held: BoolArray
     factors: tuple[gtsam.JacobianFactor, ...]
     new: dict[int, int]
     leaving: tuple[int, ...]
@@ -51,42 +54,40 @@ class BayesTree:
         variances = x.variances()
         if not (variances > 0).all():
             raise np.linalg.LinAlgError("a variance is not positive")
-        variables = BlockVariables.over(x.partition, 0, x.mean, np.sqrt(variances))
-        priors = tuple(variables.priors(x, np.arange(len(x.layout))))
+        variables, held = BlockVariables.over(x.partition, 0, x.mean, np.sqrt(variances)), _tied(x.partition)
+        priors = variables.priors(x.without(np.flatnonzero(~held)), np.flatnonzero(held))
         running = RunningTree(gtsam.ISAM2(_parameters(qr)))
-        return BayesTree(running, 0, variables, priors, variables.dims(), ())
+        return BayesTree(running, 0, variables, held, tuple(priors), variables.dims(held), ())
 
     def with_new_nodes(self, x: BlockGaussian) -> BayesTree:
         """Add the nodes that `x` has at its end and the tree has not, independent of all others."""
-        known, first = self.variables.partition.layout, self._next_key
-        rows = np.arange(len(known), len(x.layout))
+        known = self.variables.partition.layout
         scale = np.sqrt(x.variances()[known.size :])
-        variables = self.variables.extended(x.layout, x.mean[known.size :], scale, first)
-        further = slice(len(self.variables.keys), None)
-        new = dict(zip(variables.keys[further].tolist(), variables.sizes[further].tolist(), strict=True))
-        factors = self.factors + tuple(variables.node_priors(rows, x.covariances(rows)))
-        return replace(self, variables=variables, factors=factors, new=self.new | new)
+        variables = self.variables.extended(x.layout, x.mean[known.size :], scale, self._next_key)
+        new = np.zeros(len(x.layout) - len(known), dtype=bool)
+        return replace(self, variables=variables, held=np.concatenate([self.held, new]))
 
-    def predicted(
-        self, x: BlockGaussian, rows: IntArray, dynamics: Dynamics, by_factors: IntArray, by_covariance: IntArray
-    ) -> BayesTree:
+    def predicted(self, x: BlockGaussian, rows: IntArray, dynamics: Dynamics, anew: BoolArray) -> BayesTree:
         """Move over an interval, whose prediction is `x`; rows: of its nodes in the tree's present variables.
 
-        by_factors, by_covariance: rows of `x`, of the components that interaction factors lead to, and of those that
-        begin with a prior of their own. Raises LinAlgError where a covariance has no root.
+        Interaction factors lead to the components of several nodes, but to those that begin `anew` (n,), or have nodes
+        that the tree has not: they have a prior of their own. Raises LinAlgError where a covariance has no root.
         """
         variances = x.variances()
         if not (variances > 0).all():
             raise np.linalg.LinAlgError("a variance is not positive")
+        label, held = x.partition.label, _tied(x.partition)
+        by_prior = held & np.isin(label, label[anew | ~self.held[rows]])
         variables = BlockVariables.over(x.partition, self._next_key, x.mean, np.sqrt(variances), dynamics)
-        interactions = variables.interactions(self.variables, rows, dynamics.only(by_factors))
-        priors = variables.priors(x.without(by_factors), by_covariance)
+        interactions = variables.interactions(self.variables, rows, dynamics.only(np.flatnonzero(held & ~by_prior)))
+        priors = variables.priors(x.without(np.flatnonzero(~by_prior)), np.flatnonzero(by_prior))
         return replace(
             self,
             variables=variables,
+            held=held,
             factors=(*self.factors, *interactions, *priors),
-            new=self.new | variables.dims(),
-            leaving=(*self.leaving, *self.variables.keys.tolist()),
+            new=self.new | variables.dims(held),
+            leaving=(*self.leaving, *self.variables.dims(self.held)),
         )
 
     @property
@@ -98,13 +99,18 @@ class BayesTree:
     def _next_key(self) -> int:
         return int(self.variables.keys.max(initial=-1)) + 1
 
-    def corrected(self, x: BlockGaussian, measured: WhitenedMeasurements) -> tuple[BayesTree, BlockGaussian]:
+    def corrected(self, x: BlockGaussian, white: WhitenedMeasurements) -> tuple[BayesTree, BlockGaussian]:
         """Take in linear measurements, with all that is still to be taken in; returns also the posterior.
 
-        x: the Gaussian before them. It is read anew where something was measured; nowhere else have they changed it.
+        x: the posterior by covariances, of the components that the tree has not. The others are read from the tree
+        where something was measured; nowhere else has that changed them.
         """
-        tree = replace(self, factors=self.factors + tuple(self.variables.detections(measured))).updated()
-        return tree, tree.variables.posterior(tree.running.isam, x, measured.rows)
+        mine = self.held[white.rows]
+        if not mine.any():
+            return self, x
+        seen = WhitenedMeasurements(white.rows[mine], white.z[mine], white.H[mine])
+        tree = replace(self, factors=self.factors + tuple(self.variables.detections(seen))).updated()
+        return tree, tree.variables.posterior(tree.running.isam, x, seen.rows)
 
     def updated(self, copied: bool = False) -> BayesTree:
         """Take in all changes and marginalise the past.
@@ -128,13 +134,18 @@ class BayesTree:
             for key in self.leaving:  # eliminated first, so that they are leaves: GTSAM crashes on others
                 groups.insert2(key, 0)
                 leaving.push_back(key)
-            for key in self.variables.keys.tolist():
+            for key in self.variables.dims(self.held):
                 groups.insert2(key, 1)
             parameters.constrainedKeys, parameters.extraReelimKeys = groups, leaving
         isam.update(graph, values, parameters)
         if self.leaving:
             isam.marginalizeLeaves(leaving)
         return replace(self, running=running, updates=running.updates, factors=(), new={}, leaving=())
+
+
+def _tied(partition: Partition) -> BoolArray:
+    """(n,) which nodes are in components of several."""
+    return np.asarray(np.bincount(partition.label, minlength=1)[partition.label] > 1)
 
 
 def _parameters(qr: bool) -> gtsam.ISAM2Params:

@@ -31,7 +31,7 @@ from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import WhitenedMeasurements
 from saga_fg.estimators.partition import Partition, unflattened
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 _WHOLE = 64  # size of a component up to which it is one variable
 _PART = 24  # size of the variables of a larger one
@@ -71,9 +71,10 @@ class BlockVariables:
         sizes = np.bincount(self.partition.label, weights=self.partition.layout.dims, minlength=len(self.keys))
         return sizes.astype(np.int64)
 
-    def dims(self) -> dict[int, int]:
-        """Size of each variable, by key."""
-        return dict(zip(self.keys.tolist(), self.sizes.tolist(), strict=True))
+    def dims(self, nodes: BoolArray) -> dict[int, int]:
+        """Size of each variable of some nodes (n,), by key."""
+        chosen = np.unique(self.partition.label[nodes])
+        return dict(zip(self.keys[chosen].tolist(), self.sizes[chosen].tolist(), strict=True))
 
     def priors(self, x: BlockGaussian, rows: IntArray) -> list[gtsam.JacobianFactor]:
         """One factor a component of `x`, whose nodes are at `rows` here; no variable belongs to two components."""
@@ -87,16 +88,6 @@ class BlockVariables:
                 augmented[:, :-1] = whitener[:, order] * self.scale[component[order]]
                 factors.append(native_factor(self.keys[variables].tolist(), self.sizes[variables].tolist(), augmented))
         return factors
-
-    def node_priors(self, rows: IntArray, covariances: FloatArray) -> list[gtsam.JacobianFactor]:
-        """Priors (k, d, d) of the nodes at `rows`, variables of their own that begin at their mean: one factor each."""
-        k, d, _ = covariances.shape
-        span = self.partition.layout.offsets[rows][:, None] + np.arange(d)
-        augmented = np.zeros((k, d + 1, d))  # transposed
-        W = np.linalg.inv(np.linalg.cholesky(covariances)) * self.scale[span][:, None, :]
-        augmented[:, :-1] = np.swapaxes(W, 1, 2)
-        keys = self.keys[self.partition.label[rows]].tolist()
-        return [native_factor([key], [d], matrix.T) for key, matrix in zip(keys, augmented, strict=True)]
 
     def detections(self, white: WhitenedMeasurements) -> list[gtsam.JacobianFactor]:
         """One factor a variable for the measurements of its nodes."""

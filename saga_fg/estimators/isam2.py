@@ -5,9 +5,10 @@ detection factors, with which the tree is updated; then the old variables are ma
 holds one epoch and cost and memory of a frame do not grow. The variables are those of
 `saga_fg.estimators.block_variables`.
 
-A tree is eliminated once a frame, at the first measurements: what is predicted is read before that, by covariances,
-P <- F P F^T + Q, from the posterior that the tree has given. Then it gives the means and covariances of the components
-that were measured; those of others have not changed.
+A node that is correlated with no other has nothing to be solved jointly: such nodes are filtered all at once by
+covariances, and the tree has the components of several nodes. It is eliminated once a frame, at the first measurements:
+what is predicted is read before that, by covariances, P <- F P F^T + Q, from the posterior that the tree has given.
+Then it gives the means and covariances of the components that were measured; those of others have not changed.
 
 Interaction factors are information: noise without variance has none, and noise of variance Q between states of
 variance P costs Cholesky elimination log10(P/Q) digits, QR half as many. So small components are eliminated by QR,
@@ -174,7 +175,7 @@ def _corrected(
     """The tree and its posterior; where GTSAM's arithmetic fails, that by covariances without a tree."""
     try:
         tree = state.tree or BayesTree.begun(state.x, qr=_largest(state.x.partition) <= _SMALL)
-        return tree.corrected(state.x, whitened(linear))
+        return tree.corrected(by_covariance, whitened(linear))
     except (RuntimeError, np.linalg.LinAlgError) as error:
         _log_refusal(state, error)
         return None, by_covariance
@@ -199,15 +200,14 @@ def _tree_moved(state: _State, x: BlockGaussian, dynamics: Dynamics, separated: 
     Components whose digits factors would lose begin with a prior of their own, and so do those that have come apart:
     separated (n,).
     """
-    components, small = x.partition, _largest(x.partition) <= _SMALL
+    small = _largest(x.partition) <= _SMALL
     anew = separated | (noise_ratio(x, dynamics) > (_QR_LIMIT if small else _CHOLESKY_LIMIT))
-    chosen = np.isin(components.label, components.label[anew])
-    if state.tree is None or state.tree.qr != small or chosen.all():
+    if state.tree is None or state.tree.qr != small or anew.all():
         return None
     try:
         tree = state.tree.updated(copied=True) if state.tree.leaving else state.tree
         rows = state.x.layout.rows(x.layout.nodes)
-        return tree.predicted(x, rows, dynamics, np.flatnonzero(~chosen), np.flatnonzero(chosen))
+        return tree.predicted(x, rows, dynamics, anew)
     except (RuntimeError, np.linalg.LinAlgError) as error:
         _log_refusal(state, error)
         return None

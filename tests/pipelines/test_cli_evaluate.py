@@ -29,6 +29,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_nuscenes_figures_are_those_of_the_metrics(drive: Path, tmp_path: Path) -> None:
     file = tmp_path / "figures.json"
+    (tmp_path / "plots").mkdir()
+    (tmp_path / "plots" / "calibration.png").write_text("of an earlier run")
     result = evaluate(
         "nuscenes",
         drive / "result.json",

@@ -49,6 +49,7 @@ def test_times_that_run_backwards_are_named_and_sorted_in_the_result(
     result = CliRunner().invoke(app, ["slam", "laser", str(tmp_path / "drive.log"), "--output", str(output)])
     assert result.exit_code == 0, result.output
     assert "scan 12: its time is 0.2 s before that of the scan ahead of it; so for 1 of" in caplog.text
+    assert "scan 21: its time is that of the scan ahead of it; so for 1 of" in caplog.text
     assert json.loads((output / "figures.json").read_text())["scale_of_the_wheels"] == pytest.approx(1.0, abs=0.05)
     path = read_tum_poses(output / "trajectory.tum")
     assert len(path) == len(log) - 1

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.sensor_logs import SensorLog
 from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans
@@ -74,11 +75,19 @@ def test_a_guess_takes_the_place_of_the_search(known: SlamMap, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("ahead", [6.0, 500.0])
-def test_a_wrong_guess_is_noticed_and_the_place_is_looked_for(known: SlamMap, ahead: float) -> None:
-    """Ground and parallel walls fit 6 m ahead as well, what stands there does not; 500 m ahead there is no map."""
+def test_a_wrong_guess_is_noticed_and_the_place_is_looked_for(
+    known: SlamMap, caplog: pytest.LogCaptureFixture, ahead: float
+) -> None:
+    """Ground and parallel walls fit 6 m ahead as well, what stands there does not; 500 m ahead there is no map.
+
+    Fixes are not blamed for the guess.
+    """
     poses = drive(5.0, 0.5, 25)
-    guess = poses[0] @ yaw_transform(ahead)
-    found = localise(SimulatedScans(3, world_T_lidar=poses), known, guess)
+    scans, guess = SimulatedScans(3, world_T_lidar=poses), poses[0] @ yaw_transform(ahead)
+    fixes = poses[:, :3, 3] + np.random.default_rng(0).normal(0, 0.3, (25, 3))
+    found = localise(scans, known, guess, log=SensorLog({"gps": np.column_stack([scans.timestamps, fixes])}))
+    assert found.misfits == {}
+    assert "fixes lie more than" not in caplog.text
     assert np.linalg.norm(found.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
     assert not found.registered[0]
     assert found.registered.sum() > 5
@@ -104,6 +113,27 @@ def test_a_place_that_turns_out_wrong_is_given_up(known: SlamMap) -> None:
     assert errors[-5:].max() < 0.3
     assert any(lost)
     assert not lost[-1]
+
+
+def test_what_is_no_scan_is_refused_and_the_drive_goes_on(known: SlamMap) -> None:
+    poses = drive(5.0, 0.5, 3)
+    scans, localiser, nothing = SimulatedScans(3, world_T_lidar=poses), Localiser(known, poses[0]), np.empty((0, 3))
+    for scan, time, message in (
+        (None, 0.0, "scan: expected one in every step"),
+        (scans[0].points, 0.0, "scan: expected"),
+        (scans[0], float("nan"), "time: expected a finite number of seconds, got nan"),
+        (scans[0], "0", "time: expected a finite number of seconds, got '0'"),
+        (Scan.of(nothing), 0.0, "expected points to begin with, got none"),
+    ):
+        with pytest.raises(InputError, match=message):
+            localiser.step(scan, time)  # type: ignore[arg-type]
+    localiser.step(scans[0], 0.0)
+    with pytest.raises(InputError, match=r"time: expected one after 0\.000000 s, got -1"):
+        localiser.step(scans[1], -1.0)
+    assert localiser.step(Scan.of(nothing), 0.1).map_T_lidar is not None
+    assert localiser.step(scans[2], 0.2).registered
+    with pytest.raises(InputError, match="slam_map: expected"):
+        Localiser("map")  # type: ignore[arg-type]
 
 
 def test_outside_the_map_odometry_goes_on_and_back_in_it_the_place_is_found(known: SlamMap) -> None:

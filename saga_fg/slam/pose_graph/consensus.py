@@ -16,7 +16,8 @@ whitened. Covariances in files are often far too large and hide false loops; so 
     min( c'^2, m k c^2 ),     c'^2: 99.9 % quantile,  k = median of d^2 over the loops taken / median of chi^2
 
 with k the variance of unit weight, and m = 8, because the errors of recorded loops have longer tails than a Gaussian.
-The worst loops are removed and the best of the removed ones restored until nothing changes. At last those of s^2 <= c^2
+The worst loops are removed and the best of the removed ones restored until nothing changes, each time at the minimum
+with those that are in: one loop may bend a long chain far. At last those of s^2 <= c^2
 at the solution without them come back, until there are none: whatever k, they agree with it.
 
 Sources: Yang, Antonante, Tzoumas, Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020; Baarda, A
@@ -33,12 +34,19 @@ from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.stats import chi2
 
-from factors import ResidualFactors, linearised
+from factors import ResidualFactors, linearised, solve
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.slam.pose_graph.chordal_cost import factorised
 from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
-from saga_fg.slam.pose_graph.optimisation import factor_graph, graph_values, landmark_factors, placed, solved_graph
+from saga_fg.slam.pose_graph.optimisation import (
+    SOLVER,
+    factor_graph,
+    graph_values,
+    landmark_factors,
+    placed,
+    solved_graph,
+)
 
 PROBABILITY = 0.99  # of a true loop within c
 _CERTAIN = 0.999  # of a true loop within the gate: few of many loops may be lost
@@ -46,7 +54,7 @@ _TAILS = 8.0  # m: loops of recordings have tails far longer than Gaussian ones
 _FEWEST = 8  # loops that tell a variance of unit weight
 _STEP = 1.4  # of mu, as in the paper
 _NONE = 1e-3  # weight that counts as 0
-_MOST_STAGES, _MOST_ROUNDS, _SETTLING = 200, 50, 3
+_MOST_STAGES, _MOST_ROUNDS = 200, 50
 _BLOCK = 200  # loops whose covariances are solved for at once
 
 
@@ -146,8 +154,7 @@ class _Problem:
         """A step of Gauss and Newton with weights (M,)."""
         taken = np.flatnonzero(weights > 0)
         part, full = gtsam.NonlinearFactorGraph(), np.flatnonzero(weights[taken] >= 1)
-        others = [*range(self.held), *range(self.held + self.edges, self.factors.size())]
-        for row in [*others, *(self.held + taken[full]).tolist()]:
+        for row in [*self.others, *(self.held + taken[full]).tolist()]:
             part.add(self.factors.at(row))
         linear = linearised(part, self.seen, values)
         unit = gtsam.noiseModel.Unit.Create(self.k)
@@ -161,6 +168,18 @@ class _Problem:
                 )
             )
         return values.retract(linear.optimize())
+
+    def solved(self, values: gtsam.Values, kept: BoolArray) -> gtsam.Values:
+        """The minimum with some of the edges (M,): a loop that returns may bend a long chain far."""
+        part = gtsam.NonlinearFactorGraph()
+        for row in [*self.others, *(self.held + np.flatnonzero(kept)).tolist()]:
+            part.add(self.factors.at(row))
+        return solve(part, self.seen, values, SOLVER).values
+
+    @property
+    def others(self) -> list[int]:
+        """Rows of the factors that are no edges."""
+        return [*range(self.held), *range(self.held + self.edges, self.factors.size())]
 
     def rows(self, values: gtsam.Values) -> tuple[csc_array, FloatArray]:
         """Whitened Jacobian of all factors, edges from row `held` k on, and residuals (M, k) of the edges."""
@@ -198,39 +217,37 @@ def _snooped(
     judged = np.ones(len(rows), dtype=bool)
     kept = kept.copy()
     for _ in range(_MOST_ROUNDS):
-        values = problem.step(problem.step(values, kept.astype(float)), kept.astype(float))
+        values = problem.solved(values, kept)
+        whole = bool(judged.all())
         squares[judged] = _judged(problem, values, rows[judged], kept)
         inside = kept[rows]
         gate = float(chi2.ppf(_CERTAIN, problem.k))
         if inside.sum() >= _FEWEST:
             k = float(np.median(squares[inside])) / float(chi2.median(problem.k))
             gate = min(gate, _TAILS * k * problem.gate)
-        judged = inside | (squares < 10 * problem.gate)  # the others stay far out
+        judged = inside | (squares < 10 * problem.gate)  # the others stay far out, unless the solution has improved
         outlying, fitting = inside & (squares > gate), ~inside & (squares <= gate)
         if outlying.any():
             kept[rows[outlying & (squares >= squares[outlying].max() / 2)]] = False
         elif fitting.any():
             kept[rows[np.argmin(np.where(fitting, squares, np.inf))]] = True
-        else:
+        elif whole:
             break
+        else:
+            judged[:] = True
+            continue
         if (state := kept.tobytes()) in seen:
             break
         seen.add(state)
-    return _settled(problem, values, kept), kept
+    return problem.solved(values, kept), kept
 
 
 def _readmitted(problem: _Problem, values: gtsam.Values, kept: BoolArray) -> tuple[gtsam.Values, BoolArray]:
     """Take in what was left out and agrees with the solution, until nothing does."""
     while (agreeing := ~kept & (problem.distances(values) <= problem.gate)).any():
         kept = kept | agreeing
-        values = _settled(problem, values, kept)
+        values = problem.solved(values, kept)
     return values, kept
-
-
-def _settled(problem: _Problem, values: gtsam.Values, kept: BoolArray) -> gtsam.Values:
-    for _ in range(_SETTLING):
-        values = problem.step(values, kept.astype(float))
-    return values
 
 
 def _judged(problem: _Problem, values: gtsam.Values, edges: IntArray, kept: BoolArray) -> FloatArray:

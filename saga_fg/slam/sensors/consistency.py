@@ -11,6 +11,7 @@ is a misfit; with half of the residuals wrong, outliers are no excuse. Biases ar
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Collection
 
 import numpy as np
@@ -38,6 +39,7 @@ class SensorConsistency:
         self._sensors, self._settings = tuple(sensors), settings
         self._scores: dict[str, dict[tuple[float, str, int], float]] = {sensor: {} for sensor in sensors}
         self._bias: FloatArray | None = None  # (6,), the newest
+        self._observed = -math.inf  # s
         self._stated: dict[str, str] = {}  # what is known of sensors without the graph
 
     def state(self, sensor: str, misfit: str) -> None:
@@ -45,14 +47,23 @@ class SensorConsistency:
         self._stated[sensor] = misfit
         _LOG.warning(misfit)
 
-    def observe(self, graph: SceneFactorGraph) -> None:
-        """Take the residuals of a graph at its solution, and its newest biases."""
+    def observe(self, graph: SceneFactorGraph, every: float = 0.0) -> None:
+        """Take the residuals of a graph at its solution, and its newest biases; at most once in `every` s."""
+        if graph.time < self._observed + every:
+            return
+        self._observed = graph.time
         for sensor, scores in self._scores.items():
             name = getattr(self._settings, sensor).name
             found = _residual_scores(graph, name, None if sensor == "gps" else WINDOW)
             scores |= dict(sorted(found.items()))
         if "imu" in self._sensors and (known := graph.of(EGO_BIAS, graph.epoch)):
             self._bias = np.asarray(graph.state(known[0].key).vector())
+
+    def forget(self, since: float) -> None:
+        """Drop the residuals from a time on, s, as the poses there turned out wrong."""
+        for scores in self._scores.values():
+            for key in [key for key in scores if key[0] >= since]:
+                del scores[key]
 
     @property
     def misfits(self) -> dict[str, str]:

@@ -28,6 +28,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.geometry import carried_covariance, inverse_transform
 from saga_fg.slam.submaps.loop_misfits import Misfits, Solution
 from saga_fg.slam.submaps.loops import LoopClosure
 
@@ -79,11 +80,10 @@ def _step(motions: Sequence[Motion]) -> Motion:
     translations, and by both together."""
     total, parts = np.eye(4), np.zeros((3, 6, 6))
     for moved, P in motions:
-        Ad = gtsam.Pose3(moved).inverse().AdjointMap()
         own = np.zeros((3, 6, 6))
         own[0, :3, :3], own[1, 3:, 3:] = P[:3, :3], P[3:, 3:]
         own[2] = P - own[0] - own[1]
-        total, parts = total @ moved, Ad @ parts @ Ad.T + own
+        total, parts = total @ moved, carried_covariance(inverse_transform(moved), parts) + own
     return total, (parts + parts.swapaxes(1, 2)) / 2
 
 

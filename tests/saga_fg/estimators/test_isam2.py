@@ -137,8 +137,10 @@ def test_intervals_without_measurements_leave_no_more_than_one_behind(updates):
     estimator, expected = IncrementalFilter(), JointKalmanFilter()
     seen = Measurements(np.arange(4), rng.normal(size=(4, 2)), np.eye(2, 4), 0.1 * np.eye(2))
     prior = np.arange(4), rng.normal(size=(4, 4)), random_covariance(rng, 4, 4)
+    tied = discretise(ring(np.arange(4), rng), 0.1)
     for either in (estimator, expected):
         either.add(*prior)
+        either.predict(tied)
         either.update(seen)
     for _ in range(20):
         graph = ring(np.arange(4), rng)
@@ -158,8 +160,10 @@ def test_copies_go_on_independently_of_each_other():
     filters, expected = [IncrementalFilter()], [JointKalmanFilter()]
     nodes = np.arange(4)
     prior = nodes, rng.normal(size=(4, 4)), random_covariance(rng, 4, 4)
+    tied = discretise(ring(nodes, rng), 0.1)
     for either in (filters[0], expected[0]):
         either.add(*prior)
+        either.predict(tied)
         either.update(Measurements(nodes, np.zeros((4, 2)), np.eye(2, 4), 0.1 * np.eye(2)))
     for each in (filters, expected):
         each += [copy.copy(each[0]), copy.copy(each[0])]
@@ -176,6 +180,29 @@ def test_copies_go_on_independently_of_each_other():
         np.testing.assert_allclose(one.joint_mean(nodes), textbook.joint_mean(nodes), rtol=1e-9)
         np.testing.assert_allclose(one.joint_covariance(nodes), textbook.joint_covariance(nodes), rtol=1e-9)
         assert running.updates == (1 if k == 0 else 3)
+
+
+def test_a_node_on_its_own_is_no_variable_of_the_tree(updates):
+    """Until it is tied to another, and again when that has left."""
+    rng = np.random.default_rng(8)
+    textbook, estimator = Textbook(), IncrementalFilter()
+    nodes = [1, 2, 3]
+    edge = np.array([0]), np.array([1]), np.array([0.5]), -np.eye(4)[None], np.eye(4)[None], np.zeros((1, 4))
+    apart, tied = SceneGraph.of(nodes, CAR), SceneGraph.of(nodes, CAR, [Edges("tie", *edge)])
+    seen = Measurements(nodes, rng.normal(size=(3, 2)), np.eye(2, 4), 0.1 * np.eye(2))
+    program = [(apart, 0), (tied, 2), (tied, 2), (apart, 2)]
+    prior = [("add", nodes, rng.normal(size=(3, 4)), random_covariance(rng, 3, 4))]
+    tell(textbook, prior), tell(estimator, prior)
+    for graph, held in program:
+        calls = [("predict", discretise(graph, 0.2)), ("update", seen)]
+        tell(textbook, calls), tell(estimator, calls)
+        assert_textbook(estimator, textbook)
+        assert estimator._state.tree.held.sum() == held
+    assert len(updates) == 3
+    left = [("marginalise", [2]), ("predict", discretise(SceneGraph.of([1, 3], CAR), 0.2))]
+    tell(textbook, left), tell(estimator, left)
+    assert_textbook(estimator, textbook)
+    assert not estimator._state.tree.held.any()
 
 
 def test_nothing_grows_with_time():

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from data_tools.pose_graphs import city, torus, with_false_loops
+from data_tools.pose_graphs import city, read_g2o, torus, with_false_loops
 from saga_fg import InputError
 from saga_fg.slam.pose_graph import (
     LandmarkObservations,
@@ -19,6 +20,15 @@ from saga_fg.slam.pose_graph import (
     trusted,
 )
 from saga_fg.slam.pose_graph.consensus import chosen_edges
+
+
+@pytest.mark.parametrize(("share", "seed"), [(0.3, 2), (1.0, 0)])
+def test_few_loops_and_poor_odometry(recordings: Path, share: float, seed: int) -> None:
+    """Loops that a bad solution puts far out come back when it is better."""
+    graph = read_g2o(recordings / "slam" / "MIT.g2o")
+    agreed = consensus(with_false_loops(graph, share, seed))
+    assert agreed.kept[: len(graph.first)].all()
+    assert not agreed.kept[len(graph.first) :].any()
 
 
 def graph_of(dim: int) -> PoseGraph:
