@@ -223,7 +223,7 @@ class IncrementalSmoother:
         engine, self._engine = self._engine, None  # it is begun anew, should it fail
         start = graph.point().values
         if engine is None or engine.elimination != graph.elimination:
-            engine = Engine(graph.elimination)
+            engine = Engine(graph.elimination, settings.wildfire)
         engine.at_root = self.at_root
         try:
             return engine.solved(graph, settings)
@@ -231,4 +231,4 @@ class IncrementalSmoother:
             if graph.elimination == "qr":
                 raise
         graph.moved_to(start)  # Cholesky has half the digits
-        return Engine("qr").solved(graph, settings)
+        return Engine("qr", settings.wildfire).solved(graph, settings)

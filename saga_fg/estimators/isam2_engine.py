@@ -29,7 +29,7 @@ from saga_fg.graph.messages import solver_error
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import Positive, Range, Settings, setting
+from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
 
 log = logging.getLogger(__name__)
 
@@ -44,15 +44,19 @@ class RelinearisationSettings(Settings):
     max_iterations: Annotated[int, Range(1, 1000)] = setting(
         25, "largest number of linearisations in a frame, before Levenberg-Marquardt takes over"
     )
+    wildfire: NonNegative = setting(
+        0.0,
+        "change of a variable, in its unit, below which those that depend on it stay; higher: faster on long drives",
+    )
 
 
 class Engine:
     """iSAM2, and which of its factors are which rows of the graph's groups."""
 
-    def __init__(self, elimination: Elimination) -> None:
+    def __init__(self, elimination: Elimination, wildfire: float = 0.0) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization(elimination.upper())
-        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(wildfire))
         parameters.enableRelinearization = False
         parameters.findUnusedFactorSlots = True
         self.isam, self.elimination = gtsam.ISAM2(parameters), elimination
@@ -80,7 +84,7 @@ class Engine:
         except GraphError as error:  # where it got to a factor may not be defined
             log.info("at %.3f s: %s", graph.time, error)
         graph.moved_to(start)
-        restarted = Engine(graph.elimination)
+        restarted = Engine(graph.elimination, settings.wildfire)
         restarted.converged = graph.solve(SolverSettings(tolerance=settings.threshold / 10)).converged
         if not restarted.converged:
             log.warning("at %.3f s the graph has not settled: its factors may contradict each other", graph.time)

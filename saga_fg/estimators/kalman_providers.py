@@ -43,6 +43,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.frame import Frame
 
 _TOGETHER = -(1 << 62)  # id of the new variables while they are one node
+_NO_ROWS = np.empty(0, dtype=np.int64)
 _UNDETERMINED = 1e-12  # share of its column that is left of a variable which the factors do not determine
 
 Linear = tuple[list[int], FloatArray]  # keys and [A | b]
@@ -62,8 +63,9 @@ class AuxiliaryVariables:
     def rows(self, layout: StateLayout) -> IntArray:
         """Rows of the auxiliary variables in the joint state."""
         known = self.graph.variables
-        every = enumerate(layout.nodes.tolist()) if known else ()
-        return np.array([row for row, node in every if node in known], dtype=np.int64)
+        if not known:
+            return _NO_ROWS
+        return np.array([row for row, node in enumerate(layout.nodes.tolist()) if node in known], dtype=np.int64)
 
     def dynamics(self, transition: Transition, x: BlockGaussian) -> Dynamics:
         """Dynamics of a transition over the nodes; the auxiliary variables stay as they are."""

@@ -113,8 +113,9 @@ class Choice(Generic[P, R]):
         choices.append(self)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        by_kernel = compiled_kernels() and (self.where is None or self.where(*args, **kwargs))
-        return (self.compiled if by_kernel else self.numpy_version)(*args, **kwargs)
+        if not (_enabled or compiled_kernels()) or (self.where is not None and not self.where(*args, **kwargs)):
+            return self.numpy_version(*args, **kwargs)
+        return self.compiled(*args, **kwargs)
 
 
 choices: list[Choice[Any, Any]] = []  # of the modules that were imported

@@ -185,49 +185,30 @@ def coupling_integrals(
         _set_scaled(A_j, A[j], 1.0)
         _exponential_series(second[j], A_j, h)
         _squares(doubled[j], second[j, 0])
-    result, begin, most = np.empty((m, p, q)), 0, 1
-    while begin < m:
-        end = begin + 1
-        while end < m and at[end] == at[begin] and of[end] == of[begin]:
-            end += 1
-        most, begin = max(most, end - begin), end
-    corner, product, own = np.empty((p, most * q)), np.empty((p, most * q)), np.empty((degree + 1, p, p))
-    place, value = np.empty((most * p * q, 3), dtype=np.int64), np.empty(most * p * q)
+    result, begin, own = np.empty((m, p, q)), 0, np.empty((degree + 1, p, p))
     M_i, C_e, whole = np.empty((p, p)), np.empty((p, q)), np.empty((p, q))  # parts are compiled once for such arrays
-    begin = 0
     while begin < m:  # the edges of a node at once, side by side
         i, j, end, known = at[begin], of[begin], begin, 0
         while end < m and at[end] == i and of[end] == j:
-            for a in range(p):
-                for b in range(q):
-                    if C[end, a, b] != 0.0:
-                        place[known, 0], place[known, 1], place[known, 2] = a, b, (end - begin) * q
-                        value[known] = C[end, a, b]
-                        known += 1
             end += 1
-        width = (end - begin) * q
-        for a in range(p):
-            for b in range(width):
-                corner[a, b] = 0.0
-        for t in range(degree, 0, -1):
+        corner, product = np.zeros((p, (end - begin) * q)), np.empty((p, (end - begin) * q))
+        place, value = np.empty((corner.size, 3), dtype=np.int64), np.empty(corner.size)  # of what is not zero in C
+        for e in range(begin, end):
             for a in range(p):
-                for b in range(width):
-                    product[a, b] = 0.0
-                for c in range(p):
-                    z = M[i, a, c]
-                    if z != 0.0:
-                        for b in range(width):
-                            product[a, b] += z * corner[c, b]
-            for k in range(known):
-                a, c, first_column, z = place[k, 0], place[k, 1], place[k, 2], value[k]
                 for b in range(q):
-                    product[a, first_column + b] += z * second[j, t, c, b]
-            for a in range(p):
-                for b in range(width):
-                    corner[a, b] = product[a, b] * h / t
+                    if C[e, a, b] != 0.0:
+                        place[known, 0], place[known, 1], place[known, 2] = a, b, (e - begin) * q
+                        value[known] = C[e, a, b]
+                        known += 1
+        _set_scaled(M_i, M[i], 1.0)
+        for t in range(degree, 0, -1):
+            _set_product(product, M_i, corner)
+            for k in range(known):
+                for b in range(q):
+                    product[place[k, 0], place[k, 2] + b] += value[k] * second[j, t, place[k, 1], b]
+            _set_scaled(corner, product, h / t)
         if doublings > 0 and not made[i]:
             made[i] = True
-            _set_scaled(M_i, M[i], 1.0)
             _exponential_series(own, M_i, h)
             _squares(first[i], own[0])
         for e in range(begin, end):
@@ -257,3 +238,49 @@ def with_edges(
                 for q in range(d):
                     sums[at[e], p, q] += rate[e] * A_self[e, p, q]
     return sums, constants
+
+
+@kernel("f3 f3 i1 f3 f2 f3 f2 b")
+def with_motions(
+    values: FloatArray,
+    noise: FloatArray,
+    at: IntArray,
+    F: FloatArray,
+    b: FloatArray,
+    Q: FloatArray,
+    back: FloatArray,
+    coupled: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Blocks of F and Q (m, d, d) with the motions F, b, Q (n, d, d), (n, d), at (m,): row of the motion, -1 for none;
+    and b: if `coupled`, G F, G b and G Q G^T with G = `values` `back` (d, d)."""
+    m, d, _ = values.shape
+    own, noises, constants = values.copy(), noise.copy(), b.copy()
+    G, other, product, turned = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
+    for k in range(m):
+        i = at[k]
+        if i < 0:
+            continue
+        if not coupled:
+            _set_scaled(own[k], F[i], 1.0)
+            for p in range(d):
+                for q in range(d):
+                    noises[k, p, q] = (Q[i, p, q] + Q[i, q, p]) / 2
+            continue
+        _set_scaled(turned, values[k], 1.0)
+        _set_scaled(other, back, 1.0)
+        _set_product(G, turned, other)
+        _set_scaled(other, F[i], 1.0)
+        _set_product(product, G, other)
+        _set_scaled(own[k], product, 1.0)
+        _set_scaled(other, Q[i], 1.0)
+        _set_product(product, G, other)
+        for p in range(d):
+            constants[i, p] = 0.0
+            for q in range(d):
+                constants[i, p] += G[p, q] * b[i, q]
+                turned[p, q] = G[q, p]
+        _set_product(other, product, turned)
+        for p in range(d):
+            for q in range(d):
+                noises[k, p, q] = (other[p, q] + other[q, p]) / 2
+    return own, noises, constants

@@ -171,3 +171,44 @@ def course_motions(
                     F[k, 2 * part + p, j] = row[p, j]
                 b[k, 2 * part + p] = row[p, 6]
     return F, b, Q
+
+
+@kernel("f1 f1 f2 f3 f f")
+def mean_courses(
+    yaw: FloatArray, variance: FloatArray, velocity: FloatArray, P: FloatArray, astray: float, least: float
+) -> FloatArray:
+    """Means (k,) of headings (k,), rad, with their variances, and the directions of velocities (k, 2) with covariances
+    P (k, 2, 2), by information, where they differ by less than `astray`."""
+    result = yaw.copy()
+    for k in range(len(yaw)):
+        x, y = velocity[k, 0], velocity[k, 1]
+        square = max(x * x + y * y, least)
+        off = (math.atan2(y, x) - yaw[k] + math.pi) % (2 * math.pi) - math.pi
+        if abs(off) < astray:
+            across = y * y * P[k, 0, 0] - x * y * (P[k, 0, 1] + P[k, 1, 0]) + x * x * P[k, 1, 1]
+            result[k] += variance[k] / (variance[k] + across / square**2) * off
+    return result
+
+
+@kernel("f1 f1 f2 f1 f1 f f")
+def course_inputs(
+    heading: FloatArray,
+    rate_variance: FloatArray,
+    mean: FloatArray,
+    settling: FloatArray,
+    across: FloatArray,
+    dt: float,
+    correlation: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Lateral noise (n,) and accelerations that are taken away (n, 2), of states `mean` (n, 6), see
+    `saga_fg.model.known_course`."""
+    n = len(heading)
+    noise, brake = np.empty(n), np.zeros((n, 2))
+    for k in range(n):
+        c, s = math.cos(heading[k]), math.sin(heading[k])
+        speed, acceleration = mean[k, 2] * c + mean[k, 3] * s, mean[k, 4] * c + mean[k, 5] * s
+        if acceleration < 0 and speed + acceleration * dt < 0:
+            brake[k, 0], brake[k, 1] = acceleration * c, acceleration * s
+        square = mean[k, 2] ** 2 + mean[k, 3] ** 2
+        noise[k] = 2 * (correlation * rate_variance[k] * square + settling[k] * across[k])
+    return noise, brake

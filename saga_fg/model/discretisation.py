@@ -35,7 +35,7 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import compiled_by
-from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise, with_edges
+from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise, with_edges, with_motions
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.transition import Blocks, Transition
@@ -140,23 +140,36 @@ def _move_by_modes(
         own = record.predicted(dt, graph.diffusion_scale[rows])[1]
         place = np.full(len(graph), -1)
         place[rows] = np.arange(len(rows))
-        own_b = own.b
+        own_b, back = own.b, _moved_back(graph.types[rows[0]], dt)
         for of_Q, of_F in enumerate(own_blocks):
-            at = place[F[of_F].target]
-            mine = (at >= 0).nonzero()[0]
-            if len(mine) == 0:
+            target, values = F[of_F].target, F[of_F].values
+            if len(target) == 0 or values.shape[1] != own_b.shape[1]:
                 continue
-            at, target = at[mine], F[of_F].target
-            F_own, Q_own = own.F.take(at, 0), own.Q.take(at, 0)
-            if coupled[target[0]]:  # and so are all of these blocks
-                G = F[of_F].values[mine] @ _moved_back(graph.types[rows[0]], dt)
-                F_own, Q_own = G @ F_own, G @ Q_own @ np.swapaxes(G, 1, 2)
-                own_b = own_b.copy() if own_b is own.b else own_b
-                own_b[at] = (G @ own.b[at][:, :, None])[:, :, 0]
-            values, noise = F[of_F].values.copy(), Q[of_Q].values.copy()
-            values[mine], noise[mine] = F_own, (Q_own + np.swapaxes(Q_own, 1, 2)) / 2
+            tied = bool(coupled[target[0]])  # and so are all of these blocks
+            values, noise, own_b = _with_motions(values, Q[of_Q].values, place[target], own.F, own_b, own.Q, back, tied)
             F[of_F], Q[of_Q] = Blocks(target, target, values), Blocks(target, target, noise)
         b[offsets[rows][:, None] + np.arange(own_b.shape[1])] += own_b
+
+
+@compiled_by(with_motions)
+def _with_motions(
+    values: FloatArray,
+    noise: FloatArray,
+    at: IntArray,
+    F: FloatArray,
+    b: FloatArray,
+    Q: FloatArray,
+    back: FloatArray,
+    coupled: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    values, noise, b, mine = values.copy(), noise.copy(), b.copy(), (at >= 0).nonzero()[0]
+    F, Q = F.take(at[mine], 0), Q.take(at[mine], 0)
+    if coupled:
+        G = values[mine] @ back
+        F, Q = G @ F, G @ Q @ np.swapaxes(G, 1, 2)
+        b[at[mine]] = (G @ b[at[mine]][:, :, None])[:, :, 0]
+    values[mine], noise[mine] = F, (Q + np.swapaxes(Q, 1, 2)) / 2
+    return values, noise, b
 
 
 @lru_cache(maxsize=64)

@@ -40,7 +40,7 @@ from functools import lru_cache
 import numpy as np
 
 from saga_fg.kernels.compilation import compiled_by
-from saga_fg.kernels.turning import Turning, course_motions
+from saga_fg.kernels.turning import Turning, course_inputs, course_motions
 from saga_fg.model.discretisation import linear_motions
 from saga_fg.model.motion import Curvilinear, NodeType
 from saga_fg.model.scene_graph import MatchedMotion
@@ -84,20 +84,14 @@ class KnownCourses(Columns):
         mean: FloatArray,
         dt: float,
         settling: FloatArray | None = None,
-        across: FloatArray | float = 0.0,
+        across: FloatArray | None = None,
         pull: FloatArray | None = None,
     ) -> KnownCourses:
         """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2; settling
-        0 if not given; across (n,) variance of the velocity across, (m/s)^2; pull 0 if not given."""
-        u = _unit(heading)
-        speed, acceleration = (mean[:, _V] * u).sum(axis=1), (mean[:, _A] * u).sum(axis=1)
-        reverses = (acceleration < 0) & (speed + acceleration * dt < 0)
-        brake = np.where(reverses, acceleration, 0.0)[:, None] * u
-        settling = np.zeros(len(ids)) if settling is None else settling
-        square = (mean[:, _V] ** 2).sum(axis=1)
-        lateral_noise = 2 * (RATE_CORRELATION * rate_variance * square + settling * across)
-        pull = np.zeros(len(ids)) if pull is None else pull
-        return cls(ids, heading, rate, lateral_noise, brake, settling, pull, node_type)
+        across (n,) variance of the velocity across, (m/s)^2; these and pull 0 if not given."""
+        settling, across, pull = (np.zeros(len(ids)) if each is None else each for each in (settling, across, pull))
+        noise, brake = _inputs(heading, rate_variance, mean, settling, across, dt, RATE_CORRELATION)
+        return cls(ids, heading, rate, noise, brake, settling, pull, node_type)
 
     def predicted(self, dt: float, scale: FloatArray) -> tuple[KnownCourses, MatchedMotion]:
         """dt seconds later, and the motions until then; scale (n,) of the process noise."""
@@ -120,6 +114,24 @@ class KnownCourses(Columns):
         changed = {"heading": self.heading + theta, "rate": self.rate * np.exp(-dt / tau)}
         later = unchecked(KnownCourses, **self.__dict__ | changed | {"brake": np.zeros_like(self.brake)})
         return later, MatchedMotion(F, b, Q)
+
+
+@compiled_by(course_inputs)
+def _inputs(
+    heading: FloatArray,
+    rate_variance: FloatArray,
+    mean: FloatArray,
+    settling: FloatArray,
+    across: FloatArray,
+    dt: float,
+    correlation: float,
+) -> tuple[FloatArray, FloatArray]:
+    u = _unit(heading)
+    speed, acceleration = (mean[:, _V] * u).sum(axis=1), (mean[:, _A] * u).sum(axis=1)
+    reverses = (acceleration < 0) & (speed + acceleration * dt < 0)
+    square = (mean[:, _V] ** 2).sum(axis=1)
+    noise = 2 * (correlation * rate_variance * square + settling * across)
+    return noise, np.where(reverses, acceleration, 0.0)[:, None] * u
 
 
 @compiled_by(course_motions)

@@ -26,7 +26,7 @@ from saga_fg.errors import InputError, require_type
 from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.covariances import measured_covariances
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, distinct
-from saga_fg.numerics.geometry import inverse_transform, wrap_angle, yaw_transform
+from saga_fg.numerics.geometry import wrap_angle, yaw_transform
 from saga_fg.settings import (
     Finite,
     Fraction,
@@ -306,8 +306,9 @@ class Sensor(Settings):
         """Range (N,), m, and azimuth (N,), rad, of positions (N, 2), world, NaN where the pose is unknown."""
         if world_T_ego is None:
             return np.full(len(position), np.nan), np.full(len(position), np.nan)
-        sensor_T_world = inverse_transform(world_T_ego @ self.extrinsics.ego_T_sensor)
-        local = position @ sensor_T_world[:2, :2].T + sensor_T_world[:2, 3]
+        world_T_sensor = world_T_ego @ self.extrinsics.ego_T_sensor
+        R = world_T_sensor[:3, :3]
+        local = position @ R[:2, :2] - (world_T_sensor[:3, 3] @ R)[:2]
         return np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
 
 

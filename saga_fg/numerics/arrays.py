@@ -173,10 +173,15 @@ def distinct(label: StrArray) -> tuple[tuple[str, ...], IntArray]:
     if known is not None and known[0]() is label:
         return known[1]
     found = _numbered(label)
-    if not label.flags.writeable and label.base is None:
+    if not label.flags.writeable and _unchanging(label.base):
         key = id(label)
         _of_array[key] = weakref.ref(label, lambda _: _of_array.pop(key, None)), found
     return found
+
+
+def _unchanging(base: object) -> bool:
+    """True for what an array is a view of where nobody can write to it."""
+    return base is None or (isinstance(base, np.ndarray) and not base.flags.writeable and base.base is None)
 
 
 _Distinct = tuple[tuple[str, ...], IntArray]

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.turning import mean_courses
 from saga_fg.model.known_course import KnownCourses, turning_time
 from saga_fg.model.motion import Curvilinear
 from saga_fg.model.paths import Paths
 from saga_fg.numerics.arrays import BoolArray, FloatArray, unchecked
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.box_filter import MOVING
-from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.trails import STEP, paths
 from saga_fg.tracking.turn_rate import TURNING
@@ -34,19 +35,21 @@ _LEAST = 1e-9
 
 def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
     """The paths of the `unseen` (n,) vehicles that keep to their courses, of `STEPS` steps, in local positions."""
-    table, rows = state.table, (unseen & np.isfinite(state.table.box.yaw)).nonzero()[0]
+    table, headed = state.table, unseen & np.isfinite(state.table.box.yaw)
     rate = np.zeros(len(table))
     able = np.zeros(len(table), dtype=np.bool_)
-    for node_type, of_type in state.joint.rows_by_type(table.label[rows], moving=True):
+    for node_type, rows in state.joint.rows_by_type(table.label, moving=True):
         if isinstance(node_type.motion, Curvilinear) and node_type.motion.course_time > 0:
-            able[rows[of_type]] = True
+            rows = rows[headed[rows]]
+            able[rows] = True
             if node_type.motion.turn_time > 0:
-                rate[rows[of_type]] = table.turn.known(rows[of_type], node_type.motion.turning_share)[0]
+                rate[rows] = table.turn.known(rows, node_type.motion.turning_share)[0]
     rows = able.nonzero()[0]
     now = state.kinematics().select(rows)
     speed = np.hypot(*now.velocity.T)
     curvature = np.where(speed > MOVING, rate[rows], 0.0) / np.maximum(speed, MOVING)
-    heading = _course(table.box.yaw[rows], table.box.yaw_variance[rows], now)
+    box, v, P = table.box, now.velocity, now.P_velocity
+    heading = _courses(box.yaw[rows], box.yaw_variance[rows], v, P, _ASTRAY, _LEAST)
     found = paths(state.traffic, table.id[rows], now.position + state.origin, heading, curvature, STEPS)
     return unchecked(Paths, **vars(found) | {"row": rows, "position": found.position - state.origin})
 
@@ -121,10 +124,12 @@ def _at(column: FloatArray, way: FloatArray) -> FloatArray:
     return np.asarray(column[each, k] + (share - k) * (column[each, k + 1] - column[each, k]))
 
 
-def _course(yaw: FloatArray, variance: FloatArray, now: Kinematics) -> FloatArray:
-    """Mean (k,) of headings (k,), rad, with their variances, and the directions of motion, by information."""
-    v, P = now.velocity, now.P_velocity
-    across, square = np.stack([-v[:, 1], v[:, 0]], axis=-1), np.maximum((v**2).sum(axis=1), _LEAST)
+@compiled_by(mean_courses)
+def _courses(
+    yaw: FloatArray, variance: FloatArray, velocity: FloatArray, P: FloatArray, astray: float, least: float
+) -> FloatArray:
+    v = velocity
+    across, square = np.stack([-v[:, 1], v[:, 0]], axis=-1), np.maximum((v**2).sum(axis=1), least)
     off = wrap_angle(np.arctan2(v[:, 1], v[:, 0]) - yaw)
     variance_v = np.einsum("ki,kij,kj->k", across, P, across) / square**2
-    return np.asarray(yaw + np.where(np.abs(off) < _ASTRAY, variance / (variance + variance_v), 0.0) * off)
+    return np.asarray(yaw + np.where(np.abs(off) < astray, variance / (variance + variance_v), 0.0) * off)

@@ -213,6 +213,7 @@ class Traffic:
     _known: Mapping[str, tuple[tuple[int, Lane], ...]] = field(default_factory=dict)
     _next_lane: int = FIRST_LANE
     _map: RoadMap | None = None
+    _oldest: float = -np.inf  # no passage is older, s
     _trails: Trails | None = field(default=None, init=False, repr=False)
 
     def copied(self) -> Traffic:
@@ -227,7 +228,10 @@ class Traffic:
             return
         self._trails = None
         since = time - self.settings.memory
-        left, marked, latest = _since(self.left, since), _since(self.marked, since), _since(self.latest, since)
+        left, marked, latest = self.left, self.marked, self.latest
+        if self._oldest < since:
+            left, marked, latest = _since(left, since), _since(marked, since), _since(latest, since)
+            self._oldest = min(each.time.min(initial=time) for each in (left, marked, latest))
         self.latest = latest.select(_others(latest.id, passing.id)).append(passing)
         moved = _moved(passing, marked).nonzero()[0]
         if len(moved):

@@ -46,6 +46,7 @@ from saga_fg.types.landmark import Landmark, LandmarkType, Observation
 
 _MERGE_GATE = 1 - 1e-6  # gate probability of merging duplicates; near 1, since an outlier starts a duplicate
 _THRESHOLD = 1.0  # standard deviations that a variable moves before its factors are linearised anew
+_WILDFIRE = 1e-5  # m and rad; changes that are passed on through the graph, online
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
 
 
@@ -97,7 +98,7 @@ class LandmarkMapper:
         self.settings = settings or MapperSettings()
         self.local = LocalMap(world_T_pose, covariance)
         self._smoother = IncrementalSmoother(
-            lag=None, settings=RelinearisationSettings(_THRESHOLD), elimination="cholesky"
+            lag=None, settings=RelinearisationSettings(_THRESHOLD, wildfire=_WILDFIRE), elimination="cholesky"
         )
         self._poses = 1
         self._near = NearbyLandmarks()

@@ -36,6 +36,7 @@ MOST_DIMENSIONS = 7  # more than d of the frames; the staircase ends far lower, 
 _ROUNDING = 1e-11  # of the largest entry of S: eigenvalues nearer to 0 can't be told from it
 _CONVERGED = 1e-14  # decrease that a step still promises, relative to the cost: rounding
 _NEARLY = 1e-10  # the same for frames of more dimensions: slow where some are superfluous, and the bound holds anyhow
+_MOST_PRODUCTS = 5000  # with Q on the staircase, a minute for 2000 poses in space: then the bound is a loose one
 _SHORTEST = 1e-8  # step along an eigenvector, of a length of sqrt(N d) in all
 _ACCURACY = 1e-4  # of an eigenvalue, relative to the shift
 _LARGER = 10.0  # ratio of successive shifts, until no eigenvalue is below
@@ -86,8 +87,11 @@ def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
         return lowest.direction
 
     found = frames = descend(cost, start[:, :d, :d].swapaxes(1, 2))
-    while (direction := direction_down(frames)) is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS:
-        frames = descend(cost, _escaped(cost, frames, direction))
+    left = _MOST_PRODUCTS
+    while (direction := direction_down(frames)) is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS and left > 0:
+        start = _escaped(cost, frames, direction)
+        frames = best_frames(cost.times, cost.preconditioned, start, _NEARLY, left)
+        left -= frames.products
     if frames is not found:
         found = min(found, descend(cost, rounded_rotations(frames.Y)), key=lambda each: each.cost)
         direction_down(found)
@@ -97,7 +101,7 @@ def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
 
 def descend(cost: ChordalCost, Y: FloatArray) -> Frames:
     """The local minimum from frames Y (N, d, r)."""
-    return best_frames(cost.times, cost.preconditioned, Y, _CONVERGED if Y.shape[2] == cost.dim else _NEARLY)
+    return best_frames(cost.times, cost.preconditioned, Y, _CONVERGED)
 
 
 @dataclass(frozen=True, eq=False)

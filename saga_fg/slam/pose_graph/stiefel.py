@@ -31,10 +31,11 @@ _MOST_STEPS, _MOST_INNER = 200, 300
 
 
 class Frames(NamedTuple):
-    """Y (N, d, r) and its cost."""
+    """Y (N, d, r), its cost, and the number of products with Q of the way there."""
 
     Y: FloatArray
     cost: float
+    products: int
 
 
 def multipliers(Y: FloatArray, V: FloatArray) -> FloatArray:
@@ -49,17 +50,22 @@ def nearest_frames(V: FloatArray) -> FloatArray:
     return np.asarray(U @ Wt)
 
 
-def best_frames(Q: Product, preconditioner: Product, Y: FloatArray, tolerance: float) -> Frames:
+def best_frames(
+    Q: Product, preconditioner: Product, Y: FloatArray, tolerance: float, most_products: float = np.inf
+) -> Frames:
     """A local minimum from a start Y (N, d, r). Q, preconditioner: products with (N d, r).
 
-    tolerance: decrease that a step of the preconditioner still promises, relative to the cost
+    tolerance: decrease that a step of the preconditioner still promises, relative to the cost; most_products: with Q,
+    after which the way ends where it is
     """
     here = _Point(Q, preconditioner, np.ascontiguousarray(Y))
     radius = np.sqrt(Y.shape[0] * Y.shape[1]) / 8
+    products = 0
     for _ in range(_MOST_STEPS):
-        if here.slope <= tolerance * here.cost or radius < _LEAST_RADIUS:
+        if here.slope <= tolerance * here.cost or radius < _LEAST_RADIUS or products >= most_products:
             break
-        step, promised, at_bound = _truncated_cg(here, radius)
+        step, promised, at_bound, count = _truncated_cg(here, radius)
+        products += count + 1
         there = _Point(Q, preconditioner, nearest_frames(Y + step))
         noise = _ROUNDING * here.cost
         ratio = (here.cost - there.cost + noise) / (promised + noise)
@@ -69,7 +75,7 @@ def best_frames(Q: Product, preconditioner: Product, Y: FloatArray, tolerance: f
             radius *= 2
         if ratio > _ACCEPTED:
             here, Y = there, there.Y
-    return Frames(here.Y, here.cost)
+    return Frames(here.Y, here.cost, products)
 
 
 @dataclass(eq=False)
@@ -118,8 +124,8 @@ class _Point:
         return product(V.reshape(-1, V.shape[2])).reshape(V.shape)
 
 
-def _truncated_cg(at: _Point, radius: float) -> tuple[FloatArray, float, bool]:
-    """The step, the decrease it promises, and whether it ends at the bound of the trust region.
+def _truncated_cg(at: _Point, radius: float) -> tuple[FloatArray, float, bool, int]:
+    """The step, the decrease it promises, whether it ends at the bound of the trust region, and its iterations.
 
     Lengths are measured in the metric of the preconditioner, by recursion (Conn, Gould, Toint 2000, section 7.5.1).
     """
@@ -128,7 +134,8 @@ def _truncated_cg(at: _Point, radius: float) -> tuple[FloatArray, float, bool]:
     enough = rz * min(0.1, np.sqrt(rz)) ** 2
     ss, sd, dd = 0.0, 0.0, rz  # squares and product of step and direction
     at_bound = False
-    for _ in range(_MOST_INNER):
+    count = 0
+    for count in range(1, _MOST_INNER + 1):  # noqa: B007
         H = at.hessian(direction)
         curvature = float((direction * H).sum())
         alpha = rz / curvature if curvature > 0 else np.inf
@@ -143,4 +150,4 @@ def _truncated_cg(at: _Point, radius: float) -> tuple[FloatArray, float, bool]:
         beta = rz / before
         ss, sd, dd = ss + 2 * alpha * sd + alpha**2 * dd, beta * (sd + alpha * dd), rz + beta**2 * dd
         direction = -conditioned + beta * direction
-    return step, -float((at.gradient * step).sum() + (step * H_step).sum() / 2), at_bound
+    return step, -float((at.gradient * step).sum() + (step * H_step).sum() / 2), at_bound, count

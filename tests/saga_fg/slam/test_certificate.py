@@ -45,6 +45,16 @@ def twice_round(dim: int, poses: int = 20) -> FloatArray:
     return T
 
 
+def test_a_staircase_that_ends_early_has_a_bound_and_no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, start = ring(2, poses=60), twice_round(2, poses=60)
+    whole = chordal_minimum(graph, start)
+    monkeypatch.setattr("saga_fg.slam.pose_graph.certificate._MOST_PRODUCTS", 1)
+    early = chordal_minimum(graph, start)
+    assert whole.certified
+    assert not early.certified
+    assert early.bound <= whole.cost < early.cost
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_the_cost_is_the_sum_over_measurements(dim: int) -> None:
     graph, true = loop(dim, seed=2)
