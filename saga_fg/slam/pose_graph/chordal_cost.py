@@ -122,6 +122,11 @@ class ChordalCost:
         return np.asarray(self._solver.solve(whole)[self.rotations])
 
     @cached_property
+    def entries(self) -> int:
+        """Entries of the factors that a product with Q and with its preconditioner pass: what these cost."""
+        return int(self._solver.L.nnz + (self._positions_solver.L.nnz if len(self.positions) > 1 else 0))
+
+    @cached_property
     def _M_RR(self) -> csc_array:
         return self.M[self.rotations][:, self.rotations]
 
