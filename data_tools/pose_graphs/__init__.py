@@ -2,6 +2,6 @@
 
 from data_tools.pose_graphs.false_loops import with_false_loops
 from data_tools.pose_graphs.g2o import read_g2o, write_g2o
-from data_tools.pose_graphs.generated import city, torus
+from data_tools.pose_graphs.generated import city, cube, grid, sphere, torus
 
-__all__ = ["city", "read_g2o", "torus", "with_false_loops", "write_g2o"]
+__all__ = ["city", "cube", "grid", "read_g2o", "sphere", "torus", "with_false_loops", "write_g2o"]

@@ -1,11 +1,11 @@
 """The g2o format of pose graphs, in the plane and in space (https://github.com/RainerKuemmerle/g2o/wiki/File-Format).
 
 The records are those of `data_tools.pose_graphs.g2o_records`. A measurement is first_T_second; landmarks are measured
-in the frame of the pose, and ids of poses and landmarks are of one numbering. g2o means the vector part of a quaternion
-by a rotation in space; like GTSAM, which everybody compares with, we read the matrix as that of a rotation vector.
-Offsets of sensors (PARAMS_SE3OFFSET) are taken into the measurements, but for EDGE_SE3_XYZ_PRIOR: g2o means it of the
-pose itself. FIX names poses to hold; the first pose is always held unless there are priors, and others are not: reading
-warns of them. Empty lines and those that begin with # are left out.
+in the frame of the pose, and ids of poses and landmarks are of one numbering, up to 2^63 - 1, as GTSAM's symbols are.
+g2o means the vector part of a quaternion by a rotation in space; like GTSAM, which everybody compares with, we read the
+matrix as that of a rotation vector. Offsets of sensors (PARAMS_SE3OFFSET) are taken into the measurements, but for
+EDGE_SE3_XYZ_PRIOR: g2o means it of the pose itself. FIX names poses to hold; the first pose is always held unless there
+are priors, and others are not: reading warns of them. Empty lines and those that begin with # are left out.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _OBSERVED: dict[str, ObservationKind] = {
     "EDGE_SE3_TRACKXYZ": "point",
 }
 _TANGENT = {2: [0, 1, 2], 3: [3, 4, 5, 0, 1, 2]}  # where each entry of our tangent is found in the file's
-_OFFSET, _LARGEST_ID = "PARAMS_SE3OFFSET", 2**62
+_OFFSET, _LARGEST_ID = "PARAMS_SE3OFFSET", 2**63 - 1
 log = logging.getLogger(__name__)
 
 

@@ -1,13 +1,17 @@
-"""Generated pose graphs of known truth: a drive through a city of square blocks, and a path wound round a torus.
+"""Generated pose graphs of known truth: drives through a city and over grids, paths wound round a torus and a sphere.
 
     city    in the plane: steps of 1 m, at every crossing (each `block` steps) straight on, left or right at random;
             measurements to one earlier pose within 1.5 m of each pose, where there is one
     torus   in space: K windings round the tube while going once round the hole, headings along the path; measurements
             to the neighbour on the winding before
+    sphere  in space: a spiral from pole to pole, headings along the path; measurements to the neighbour on the turn
+            before
+    grid    in the plane: steps of 1 m, row by row to and fro over a square; measurements between all neighbours
+    cube    the same in space, layer by layer
 
 The noise is Gaussian in the tangent of the measured pose, its information written with each measurement. The guess is
-dead reckoning along the path. After the synthetic sets "city10000" and "torus3D" that pose-graph papers use (Kaess et
-al., iSAM2, IJRR 2012; Rosen et al., SE-Sync, IJRR 2019).
+dead reckoning along the path. After the synthetic sets "city10000", "torus3D", "sphere" and "grid3D" that pose-graph
+papers use (Kaess et al., iSAM2, IJRR 2012; Rosen et al., SE-Sync, IJRR 2019).
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ _APART = 10  # poses, at least, between the two of a loop closure
 
 
 def city(poses: int, seed: int, block: int = 5, noise: float = 0.05) -> tuple[PoseGraph, FloatArray]:
-    """A graph of a city, and its true poses (N, 3, 3); noise: m and, times 0.2, rad. Raises `InputError`."""
+    """A graph of a city, and its true poses (N, 3, 3); noise as of a city. Raises `InputError`."""
     _check(poses, noise)
     rng = np.random.default_rng(seed)
     turns = np.zeros(poses - 1)
@@ -55,17 +59,95 @@ def torus(poses: int, seed: int, windings: int = 20, noise: float = 0.05) -> tup
     radius = per_winding / (2 * np.pi)  # steps of about 1 m
     reach = 3 * radius + radius * np.cos(round_tube)
     place = np.stack([reach * np.cos(round_hole), reach * np.sin(round_hole), radius * np.sin(round_tube)], axis=1)
+    middle = 3 * radius * np.stack([np.cos(round_hole), np.sin(round_hole), 0 * round_hole], axis=1)
+    true = _along(place, place - middle)
+    closures = _neighbours_before(poses, per_winding)
+    return _measured(true, closures, np.full(6, noise), rng, gtsam.Pose3.Expmap), true
+
+
+def sphere(poses: int, seed: int, turns: int | None = None, noise: float = 0.05) -> tuple[PoseGraph, FloatArray]:
+    """A graph of a sphere, and its true poses (N, 4, 4); turns: of the spiral, by default as many as poses in each.
+
+    noise: m and rad. Raises `InputError`.
+    """
+    _check(poses, noise)
+    turns = max(2, round(np.sqrt(poses))) if turns is None else turns
+    if turns < 2:
+        raise InputError(f"turns: expected at least 2, got {turns}")
+    per_turn = poses // turns
+    if per_turn < 4:
+        raise InputError(f"poses: expected at least {4 * turns}, 4 for each of {turns} turns, got {poses}")
+    rng = np.random.default_rng(seed)
+    row = np.arange(poses + 1)
+    azimuth, from_pole = 2 * np.pi * row / per_turn, np.pi * (row + 0.5) / (poses + 1)
+    outward = np.stack(
+        [np.sin(from_pole) * np.cos(azimuth), np.sin(from_pole) * np.sin(azimuth), -np.cos(from_pole)], axis=1
+    )
+    true = _along(per_turn / (2 * np.pi) * outward, outward)  # steps of about 1 m at the equator
+    return _measured(true, _neighbours_before(poses, per_turn), np.full(6, noise), rng, gtsam.Pose3.Expmap), true
+
+
+def grid(poses: int, seed: int, noise: float = 0.05) -> tuple[PoseGraph, FloatArray]:
+    """A graph of a grid in the plane, and its true poses (N, 3, 3); noise as of a city. Raises `InputError`."""
+    _check(poses, noise)
+    place = _to_and_fro(poses, 2)
+    true = transforms(np.column_stack([place[:-1], _headings(place)]))
+    sigma = noise * np.array([1.0, 1.0, 0.2])
+    return _measured(true, _all_neighbours(place[:-1]), sigma, np.random.default_rng(seed), gtsam.Pose2.Expmap), true
+
+
+def cube(poses: int, seed: int, noise: float = 0.05) -> tuple[PoseGraph, FloatArray]:
+    """A graph of a grid in space, and its true poses (N, 4, 4); noise: m and rad. Raises `InputError`."""
+    _check(poses, noise)
+    place, rng = _to_and_fro(poses, 3), np.random.default_rng(seed)
+    true = np.tile(np.eye(4), (poses, 1, 1))
+    level = transforms(np.column_stack([place[:-1, :2], _headings(place)]))
+    true[:, :2, :2], true[:, :3, 3] = level[:, :2, :2], place[:-1]
+    return _measured(true, _all_neighbours(place[:-1]), np.full(6, noise), rng, gtsam.Pose3.Expmap), true
+
+
+def _along(place: FloatArray, outward: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) at the first N of N + 1 places, x along the path and z nearly in a direction (N + 1, 3)."""
     ahead = np.diff(place, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    middle = 3 * radius * np.stack([np.cos(round_hole), np.sin(round_hole), 0 * round_hole], axis=1)[:-1]
-    side = np.cross(place[:-1] - middle, ahead)
+    side = np.cross(outward[:-1], ahead)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
-    true = np.tile(np.eye(4), (poses, 1, 1))
+    true = np.tile(np.eye(4), (len(ahead), 1, 1))
     true[:, :3, :3] = np.stack([ahead, side, np.cross(ahead, side)], axis=2)
     true[:, :3, 3] = place[:-1]
-    later = np.arange(per_winding, poses)
-    closures = np.stack([later - per_winding, later], axis=1)
-    return _measured(true, closures, np.full(6, noise), rng, gtsam.Pose3.Expmap), true
+    return true
+
+
+def _neighbours_before(poses: int, per_turn: int) -> IntArray:
+    later = np.arange(per_turn, poses)
+    return np.stack([later - per_turn, later], axis=1)
+
+
+def _to_and_fro(poses: int, d: int) -> FloatArray:
+    """Places (N + 1, d) of a path through the cells of a square or cube, each next to the one before."""
+    side = int(np.ceil((poses + 1) ** (1 / d) - 1e-9))
+    cells = np.indices((side,) * d).reshape(d, -1)  # the last axis runs fastest
+    for axis in range(1, d):
+        back = cells[:axis].sum(axis=0) % 2 == 1
+        cells[axis] = np.where(back, side - 1 - cells[axis], cells[axis])
+    return np.asarray(cells[::-1, : poses + 1].T, dtype=np.float64)
+
+
+def _headings(place: FloatArray) -> FloatArray:
+    """Headings (N,) of the steps between places; upward steps keep the one before."""
+    step = np.diff(place, axis=0)
+    level = np.abs(step[:, :2]).max(axis=1) > 0
+    last = np.maximum.accumulate(np.where(level, np.arange(len(step)), 0))
+    return np.arctan2(step[:, 1], step[:, 0])[last]
+
+
+def _all_neighbours(place: FloatArray) -> IntArray:
+    """Pairs (earlier, later) of cells of a grid that are next to each other, but not successive."""
+    from scipy.spatial import cKDTree
+
+    pairs = np.sort(cKDTree(place).query_pairs(1.1, output_type="ndarray"), axis=1)
+    pairs = pairs[pairs[:, 1] - pairs[:, 0] > 1]
+    return np.asarray(pairs[np.lexsort(pairs.T)], dtype=np.int64)
 
 
 def _revisits(place: FloatArray, rng: np.random.Generator) -> IntArray:

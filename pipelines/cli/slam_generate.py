@@ -17,10 +17,13 @@ class Shape(StrEnum):
 
     CITY = "city"
     TORUS = "torus"
+    SPHERE = "sphere"
+    GRID = "grid"
+    CUBE = "cube"
 
 
 def generate(
-    shape: Annotated[Shape, typer.Argument(help="city: in the plane; torus: in space.")],
+    shape: Annotated[Shape, typer.Argument(help="city, grid: in the plane; torus, sphere, cube: in space.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="g2o file to write.")],
     poses: Annotated[int, typer.Option("--poses", min=2, help="Number of poses.")] = 10000,
     noise: Annotated[float, typer.Option("--noise", help="Standard deviation of a measurement, m.")] = 0.05,
@@ -34,14 +37,14 @@ def generate(
       saga-fg slam generate city --poses 10000 --output city.g2o
       saga-fg slam g2o city.g2o --output city --compare
     """
-    from data_tools.pose_graphs import city, torus, write_g2o
+    from data_tools import pose_graphs
     from saga_fg.errors import InputError
 
     try:
-        graph, _ = (city if shape is Shape.CITY else torus)(poses, seed, noise=noise)
+        graph, _ = getattr(pose_graphs, shape.value)(poses, seed, noise=noise)
     except InputError as error:
         raise InputError(f"--{error}") from None
-    write_g2o(output, graph)
+    pose_graphs.write_g2o(output, graph)
     residuals, free = graph.information.shape[1] * len(graph.first), graph.information.shape[1] * (len(graph) - 1)
     typer.echo(
         f"{output}: {counted(len(graph), 'pose')}, {counted(len(graph.first), 'measurement')}; "

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from data_tools.pose_graphs import city, torus
+from data_tools.pose_graphs import city, cube, grid, sphere, torus
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import PoseGraph, factor_graph, optimise_poses, pose_values
@@ -15,7 +15,7 @@ from saga_fg.slam.pose_graph import PoseGraph, factor_graph, optimise_poses, pos
 Generator = Callable[..., tuple[PoseGraph, FloatArray]]
 
 
-@pytest.mark.parametrize("make", [city, torus])
+@pytest.mark.parametrize("make", [city, torus, sphere, grid, cube])
 def test_residuals_at_the_truth_are_the_noise(make: Generator) -> None:
     graph, true = make(1200, seed=0)
     residuals = len(graph.first) * graph.information.shape[1]
@@ -25,7 +25,7 @@ def test_residuals_at_the_truth_are_the_noise(make: Generator) -> None:
     assert len(graph.first) > 1.1 * len(graph)  # there are loops to close
 
 
-@pytest.mark.parametrize("make", [city, torus])
+@pytest.mark.parametrize("make", [city, torus, sphere, grid, cube])
 def test_the_optimum_has_the_expected_error_where_the_guess_is_far_off(make: Generator) -> None:
     graph, true = make(600, seed=1, noise=0.15)
     optimised = optimise_poses(graph)
@@ -42,6 +42,16 @@ def test_the_guess_is_dead_reckoning() -> None:
     np.testing.assert_array_equal(graph.world_T_pose[0], true[0])
 
 
+@pytest.mark.parametrize(
+    ("make", "poses", "measurements"), [(sphere, 2500, 4949), (grid, 2500, 4900), (cube, 1000, 2700)]
+)
+def test_measurements_join_the_neighbours(make: Generator, poses: int, measurements: int) -> None:
+    graph, true = make(poses, seed=0)
+    assert len(graph.first) == pytest.approx(measurements, rel=0.01)
+    steps = np.linalg.norm(true[graph.first, :-1, -1] - true[graph.second, :-1, -1], axis=1)
+    assert 0.9 < steps.max() < 1.1
+
+
 def test_the_same_seed_makes_the_same_graph() -> None:
     for name in ("first", "second", "first_T_second"):
         np.testing.assert_array_equal(getattr(city(300, 5)[0], name), getattr(city(300, 5)[0], name))
@@ -55,6 +65,8 @@ def test_the_same_seed_makes_the_same_graph() -> None:
         (lambda: city(10, 0, noise=0.0), "noise"),
         (lambda: torus(50, 0, windings=20), "poses: expected at least 80, 4 for each of 20 windings, got 50"),
         (lambda: torus(50, 0, windings=1), "windings: expected at least 2"),
+        (lambda: sphere(50, 0, turns=1), "turns: expected at least 2"),
+        (lambda: sphere(50, 0, turns=20), "poses: expected at least 80, 4 for each of 20 turns, got 50"),
     ],
 )
 def test_what_cannot_be_made_is_refused(make: Callable[[], object], message: str) -> None:

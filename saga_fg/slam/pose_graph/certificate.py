@@ -1,13 +1,13 @@
 r"""Proof that poses are the global minimum of the chordal cost, and the way to it where they are not.
 
-At a critical point of F = tr(Y^T Q Y) over frames Y_i, with the multipliers Lambda of the constraints Y_i Y_i^T = 1,
+At frames Y_i with F = tr(Y^T Q Y), and with the multipliers Lambda of the constraints Y_i Y_i^T = 1,
 
-    S = Q - blockdiag(Lambda_1, ..., Lambda_N),     S Y = 0,     F* >= F + N d min(lambda_min(S), 0)
+    S = Q - blockdiag(Lambda_1, ..., Lambda_N),     F* >= F + N d min(lambda_min(S), 0)
 
-for frames of any dimension r, as tr(Y'^T Lambda Y') is the same for all frames Y'. So the minimum is global if no
-eigenvalue of S is negative. The signs of the pivots of S + eta 1 tell whether one is below -eta; with the positions, of
-which the first is fixed, S is sparse, and has as many negative pivots. The lowest eigenvalue is then the one nearest to
--eta, which shifted inverse iteration finds at once.
+for frames of any dimension r, as tr(Y'^T Lambda Y') is F for all frames Y'. At a critical point S Y = 0, and it is the
+global minimum if no eigenvalue of S is negative. The signs of the pivots of S + eta 1 tell whether one is below -eta;
+with the positions, of which the first is fixed, S is sparse, and has as many negative pivots. The lowest eigenvalue is
+then the one nearest to -eta, which shifted inverse iteration finds at once.
 
 Where an eigenvalue is negative its vector is a direction of descent for frames of one dimension more (the Riemannian
 staircase). At a global minimum of more than d dimensions the frames are rounded to rotations, which are improved in
@@ -19,6 +19,7 @@ Preconditioned Eigensolvers, RA-L 2022, for the test by factorisation.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,9 +37,10 @@ MOST_DIMENSIONS = 7  # more than d of the frames; the staircase ends far lower, 
 _ROUNDING = 1e-11  # of the largest entry of S: eigenvalues nearer to 0 can't be told from it
 _CONVERGED = 1e-14  # decrease that a step still promises, relative to the cost: rounding
 _NEARLY = 1e-10  # the same for frames of more dimensions: slow where some are superfluous, and the bound holds anyhow
-_MOST_PRODUCTS = 5000  # with Q on the staircase, a minute for 2000 poses in space: then the bound is a loose one
+_MOST_WORK = 5e9  # products with Q, times entries of its factors: half a minute in all, then the bound is a loose one
 _SHORTEST = 1e-8  # step along an eigenvector, of a length of sqrt(N d) in all
 _ACCURACY = 1e-4  # of an eigenvalue, relative to the shift
+_NOTHING = 1e-13  # cost that counts as none, relative to the trace of M: rounding, where all measurements agree
 _LARGER = 10.0  # ratio of successive shifts, until no eigenvalue is below
 
 
@@ -48,7 +50,7 @@ class ChordalMinimum:
 
     world_T_pose  (N, d + 1, d + 1), in the frame of the priors, or with the first as in the graph
     cost          F of these poses
-    bound         proven lower bound of F over all poses
+    bound         proven lower bound of F over all poses, 0 at least
     eigenvalue    a lower bound, 0 or less, of the eigenvalues of S at the frames that prove this
     dimensions    r of these frames; d: the poses themselves
     """
@@ -79,37 +81,46 @@ def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
     if graph.anchored:
         start = np.concatenate([start, np.eye(d + 1)[None]])
     proofs: list[tuple[float, float, int]] = []  # bound, eigenvalue, dimensions
+    most = _MOST_WORK / cost.entries
 
-    def direction_down(frames: Frames) -> FloatArray | None:
+    def tested(frames: Frames) -> LowestEigenvalue:
         n, _, r = frames.Y.shape
         lowest = lowest_eigenvalue(cost, frames.Y)
         proofs.append((frames.cost + n * d * lowest.value, lowest.value, r))
-        return lowest.direction
+        return lowest
 
-    found = frames = descend(cost, start[:, :d, :d].swapaxes(1, 2))
-    left = _MOST_PRODUCTS
-    while (direction := direction_down(frames)) is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS and left > 0:
-        start = _escaped(cost, frames, direction)
+    found = frames = descend(cost, start[:, :d, :d].swapaxes(1, 2), most / 2)
+    left = 0.75 * most - found.products  # the last quarter is for the way down from the staircase
+    while (lowest := tested(frames)).direction is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS:
+        left -= lowest.factorisations * cost.products_per_factorisation
+        if left <= 0:
+            break
+        start = _escaped(cost, frames, lowest.direction)
         frames = best_frames(cost.times, cost.preconditioned, start, _NEARLY, left)
         left -= frames.products
     if frames is not found:
-        found = min(found, descend(cost, rounded_rotations(frames.Y)), key=lambda each: each.cost)
-        direction_down(found)
+        found = min(found, descend(cost, rounded_rotations(frames.Y), most / 4), key=lambda each: each.cost)
+        tested(found)
     bound, eigenvalue, dimensions = max(proofs)
-    return ChordalMinimum(_poses(graph, cost, found.Y), found.cost, bound, eigenvalue, dimensions)
+    least = found.cost if found.cost > _NOTHING * cost.M.trace() else 0.0
+    return ChordalMinimum(_poses(graph, cost, found.Y), least, min(max(bound, 0.0), least), eigenvalue, dimensions)
 
 
-def descend(cost: ChordalCost, Y: FloatArray) -> Frames:
-    """The local minimum from frames Y (N, d, r)."""
-    return best_frames(cost.times, cost.preconditioned, Y, _CONVERGED)
+def descend(cost: ChordalCost, Y: FloatArray, most_products: float = math.inf) -> Frames:
+    """The local minimum from frames Y (N, d, r), or where the way there ends for its length."""
+    return best_frames(cost.times, cost.preconditioned, Y, _CONVERGED, most_products)
 
 
 @dataclass(frozen=True, eq=False)
 class LowestEigenvalue:
-    """value: lower bound of the eigenvalues of S, at most 0; direction (N, d): of the lowest, None if it may be 0."""
+    """value: lower bound of the eigenvalues of S, at most 0; direction (N, d): of the lowest, None if it may be 0.
+
+    factorisations: how many it took
+    """
 
     value: float
     direction: FloatArray | None
+    factorisations: int
 
 
 def lowest_eigenvalue(cost: ChordalCost, Y: FloatArray) -> LowestEigenvalue:
@@ -120,11 +131,11 @@ def lowest_eigenvalue(cost: ChordalCost, Y: FloatArray) -> LowestEigenvalue:
     L = multipliers(Y, QY.reshape(Y.shape))
     S = _with_positions(cost, L)
     eta = max(GAP * float((flat * QY).sum()) / (n * d), _ROUNDING * float(abs(cost.M).max()))
-    below = False
+    count = 1
     while _negative(solver := factorised(S + _on_rotations(cost, eta))):
-        below, eta = True, eta * _LARGER
+        count, eta = count + 1, eta * _LARGER
     value, vector = _eigenpair(cost, L, solver, eta)
-    return LowestEigenvalue(min(value, 0.0) - 2 * _ACCURACY * eta, vector.reshape(n, d) if below else None)
+    return LowestEigenvalue(min(value, 0.0) - 2 * _ACCURACY * eta, vector.reshape(n, d) if count > 1 else None, count)
 
 
 def _negative(solver: SuperLU) -> bool:

@@ -151,7 +151,9 @@ class PoseGraph:
             return self
         graph = replace(
             self,
-            ids=np.append(self.ids, self.ids.max() + 1),
+            ids=np.append(
+                self.ids, np.setdiff1d(np.arange(n + 1), self.ids)[0]
+            ),  # one more than the largest may be none
             world_T_pose=np.concatenate([self.world_T_pose, np.eye(self.dim + 1)[None]]),
         )
         if priors is None:

@@ -14,6 +14,7 @@ frames by the polar decomposition. Source: Absil, Mahony, Sepulchre, Optimizatio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +27,7 @@ from saga_fg.numerics.arrays import FloatArray
 Product = Callable[[FloatArray], FloatArray]
 _ACCEPTED, _POOR, _GOOD = 0.05, 0.25, 0.9  # shares of the promised decrease: to take a step, to shrink, to grow
 _ROUNDING = 1e-13  # of the cost: differences below are noise
+_LEAST = 1e-11  # of the cost: a step that promises less, and does not hold it, meets rounding
 _LEAST_RADIUS = 1e-12
 _MOST_STEPS, _MOST_INNER = 200, 300
 
@@ -64,7 +66,7 @@ def best_frames(
     for _ in range(_MOST_STEPS):
         if here.slope <= tolerance * here.cost or radius < _LEAST_RADIUS or products >= most_products:
             break
-        step, promised, at_bound, count = _truncated_cg(here, radius)
+        step, promised, at_bound, count = _truncated_cg(here, radius, min(_MOST_INNER, most_products - products))
         products += count + 1
         there = _Point(Q, preconditioner, nearest_frames(Y + step))
         noise = _ROUNDING * here.cost
@@ -75,6 +77,8 @@ def best_frames(
             radius *= 2
         if ratio > _ACCEPTED:
             here, Y = there, there.Y
+        elif promised <= _LEAST * here.cost:
+            break
     return Frames(here.Y, here.cost, products)
 
 
@@ -124,7 +128,7 @@ class _Point:
         return product(V.reshape(-1, V.shape[2])).reshape(V.shape)
 
 
-def _truncated_cg(at: _Point, radius: float) -> tuple[FloatArray, float, bool, int]:
+def _truncated_cg(at: _Point, radius: float, most: float) -> tuple[FloatArray, float, bool, int]:
     """The step, the decrease it promises, whether it ends at the bound of the trust region, and its iterations.
 
     Lengths are measured in the metric of the preconditioner, by recursion (Conn, Gould, Toint 2000, section 7.5.1).
@@ -135,7 +139,7 @@ def _truncated_cg(at: _Point, radius: float) -> tuple[FloatArray, float, bool, i
     ss, sd, dd = 0.0, 0.0, rz  # squares and product of step and direction
     at_bound = False
     count = 0
-    for count in range(1, _MOST_INNER + 1):  # noqa: B007
+    for count in range(1, 1 + math.ceil(most)):  # noqa: B007
         H = at.hessian(direction)
         curvature = float((direction * H).sum())
         alpha = rz / curvature if curvature > 0 else np.inf

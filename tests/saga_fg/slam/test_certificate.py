@@ -48,7 +48,7 @@ def twice_round(dim: int, poses: int = 20) -> FloatArray:
 def test_a_staircase_that_ends_early_has_a_bound_and_no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     graph, start = ring(2, poses=60), twice_round(2, poses=60)
     whole = chordal_minimum(graph, start)
-    monkeypatch.setattr("saga_fg.slam.pose_graph.certificate._MOST_PRODUCTS", 1)
+    monkeypatch.setattr("saga_fg.slam.pose_graph.certificate._MOST_WORK", 1)
     early = chordal_minimum(graph, start)
     assert whole.certified
     assert not early.certified
@@ -218,3 +218,33 @@ def test_a_graph_in_pieces_cannot_be_certified() -> None:
     )
     with pytest.raises(InputError, match="expected measurements that connect it"):
         optimise_poses(apart, certify=True)
+
+
+def test_other_starts_are_tried_beside_proven_poses_only_where_they_are_better() -> None:
+    graph, _ = loop(2, seed=1)
+    far = optimise_poses(graph.at(twice_round(2, poses=len(graph))), certify=True)
+    assert far.chordal is not None
+    assert far.chordal.certified
+    assert set(far.errors) == {"chordal minimum"}
+    there = optimise_poses(graph.at(far.world_T_pose), certify=True)
+    assert there.error <= far.error * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_measurements_that_all_agree_cost_nothing(dim: int) -> None:
+    graph, true = loop(dim, seed=0)
+    exact = replace(graph, first_T_second=np.linalg.inv(true[graph.first]) @ true[graph.second])
+    minimum = chordal_minimum(exact, chordal_poses(exact))
+    assert (minimum.cost, minimum.bound, minimum.gap) == (0.0, 0.0, 0.0)
+    assert minimum.certified
+
+
+def test_the_whole_way_is_bounded() -> None:
+    graph, start = ring(2, poses=60), twice_round(2, poses=60)
+    cost = ChordalCost.of(graph)
+    Y = start[:, :2, :2].swapaxes(1, 2)
+    for most in (1, 5, 20):
+        short = descend(cost, Y, most)
+        assert short.products <= most + 1
+        bound = short.cost + 2 * len(graph) * lowest_eigenvalue(cost, short.Y).value  # holds where the way ended, too
+        assert bound <= chordal_minimum(graph, chordal_poses(graph)).cost * (1 + 1e-9)
