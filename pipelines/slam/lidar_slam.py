@@ -112,6 +112,7 @@ class LidarSlam:
         self,
         start: FloatArray | None = None,
         settings: LidarSlamSettings | None = None,
+        *,
         providers: Sequence[FactorProvider] = (),
         detectors: Sequence[LandmarkDetector] = (),
         loops: SubmapLoops | None = None,
@@ -252,6 +253,7 @@ class LidarSlam:
 def lidar_slam(
     scans: ScanSequence,
     source: OdometrySource = "lidar",
+    *,
     settings: LidarSlamSettings | None = None,
     progress: Progress | None = None,
     providers: Sequence[FactorProvider] = (),
@@ -276,13 +278,22 @@ def lidar_slam(
     seen: Sequence[Frame | None] = [None] * len(scans.timestamps)
     if tracker is not None:
         seen = frames_at(frames, scans.timestamps, inverse_transform(scans.ego_T_lidar), tracker)
-    named = tuple(log.tables)
-    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar, named, moving, sensors)
+    slam = LidarSlam(
+        start,
+        s,
+        providers=providers,
+        detectors=detectors,
+        odometry=recorded,
+        ego_T_lidar=scans.ego_T_lidar,
+        sensors=tuple(log.tables),
+        moving=moving,
+        sensor_settings=sensors,
+    )
     for k, time in enumerate(scans.timestamps.tolist()):
         log.feed(buffer, time)
         ego = buffer.take(time)
         detections = None if (frame := seen[k]) is None else frame.detections
-        slam.step(scans[k], time, ego.imu, ego.gps, detections, ego.wheels)
+        slam.step(scans[k], time, imu=ego.imu, gps=ego.gps, detections=detections, wheels=ego.wheels)
         if progress is not None:
             progress("slam", k + 1, len(scans))
     return slam.finish()
