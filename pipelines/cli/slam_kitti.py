@@ -157,9 +157,17 @@ def kitti(
             loop_closures=slam.lidar.loop_closures and not blind,
         )
         tracker = path_tracker(settings) if objects and not blind else None
-        providers, detectors = slam.new_providers(), slam.new_detectors()
         result = lidar_slam(
-            recorded, odometry, lidar, progress, providers, detectors, log, frames, tracker, slam.sensors
+            recorded,
+            odometry,
+            settings=lidar,
+            progress=progress,
+            providers=slam.new_providers(),
+            detectors=slam.new_detectors(),
+            log=log,
+            frames=frames,
+            tracker=tracker,
+            sensors=slam.sensors,
         )
     found: LidarSlamResult | SlamWithObjects = result
     if objects:
@@ -174,7 +182,10 @@ def kitti(
     if objects:
         counts.append(counted(figures["objects"], "object"))
     typer.echo(f"{output}: {', '.join(counts)}")
-    for name in ("odometry", "online", *(["without_objects"] if objects else []), "trajectory"):
+    compared = ["odometry", "online", *(["without_objects"] if objects else []), "trajectory"]
+    if odometry == "oxts":  # these are the recording itself
+        compared = [*(["online"] if online else []), "trajectory"]
+    for name in compared:
         e, what = figures[name], name.replace("_", " ")
         relative = f"no RPE on a path shorter than {e['relative_distance']:g} m"
         if e["pieces"]:

@@ -133,6 +133,8 @@ class LidarOdometry:
         changed its velocity so much since then, or the first two scans fit each other clearly better without it.
         """
         s, last = self.settings, self._last
+        if not np.isfinite(timestamp):
+            raise InputError(f"timestamp: expected a finite number of seconds, got {timestamp!r}")
         if last is not None and not timestamp > last.timestamp:
             raise InputError(f"timestamp: expected one after {last.timestamp:.6f} s, got {timestamp:.6f} s")
         if velocity is not None:

@@ -6,6 +6,7 @@ be corrected goes on with it; the others find that out, and begin anew.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -99,24 +100,29 @@ class BayesTree:
     def _next_key(self) -> int:
         return int(self.variables.keys.max(initial=-1)) + 1
 
-    def corrected(self, x: BlockGaussian, white: WhitenedMeasurements) -> tuple[BayesTree, BlockGaussian]:
+    def corrected(self, x: BlockGaussian, measured: Sequence[WhitenedMeasurements]) -> tuple[BayesTree, BlockGaussian]:
         """Take in linear measurements, with all that is still to be taken in; returns also the posterior.
 
         x: the posterior by covariances, of the components that the tree has not. The others are read from the tree
         where something was measured; nowhere else has that changed them.
         """
-        mine = self.held[white.rows]
-        if not mine.any():
+        factors, rows = list(self.factors), list[IntArray]()
+        for white in measured:
+            mine = self.held[white.rows]
+            if mine.any():
+                seen = WhitenedMeasurements(white.rows[mine], white.z[mine], white.H[mine])
+                factors += self.variables.detections(seen)
+                rows.append(seen.rows)
+        if not rows:
             return self, x
-        seen = WhitenedMeasurements(white.rows[mine], white.z[mine], white.H[mine])
-        tree = replace(self, factors=self.factors + tuple(self.variables.detections(seen))).updated()
-        return tree, tree.variables.posterior(tree.running.isam, x, seen.rows)
+        tree = replace(self, factors=tuple(factors)).updated()
+        return tree, tree.variables.posterior(tree.running.isam, x, np.concatenate(rows))
 
     def updated(self, copied: bool = False) -> BayesTree:
         """Take in all changes and marginalise the past.
 
-        copied: for this state to stay that of the running tree. Raises RuntimeError where the tree has gone on, and
-        where GTSAM's arithmetic fails.
+        copied: change a copy of GTSAM's tree, so that the other states that share it can go on. Raises RuntimeError
+        where the tree has gone on, and where GTSAM's arithmetic fails.
         """
         if self.running.updates != self.updates:
             raise RuntimeError("another copy of the filter has gone on with the tree")

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.filter_steps import corrected
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_prior
@@ -150,16 +150,20 @@ class GraphFilter(LatestMarginals):
         if not self._relinearised:  # nobody is to be asked for factors on the epoch before
             smoother.forget(keys.values())
 
-    def update(self, measurements: Measurements | Observations) -> float:
-        require_type("measurements", measurements, Measurements, Observations)
-        recorded = RecordedMeasurements(measurements)
-        recorded.check(self._layout)
-        if len(measurements) == 0:
+    def update(self, *measurements: Measurements | Observations) -> float:
+        """Take in measurements, several kinds of them by one solution."""
+        kinds = [RecordedMeasurements(each) for each in measurements]
+        for recorded in kinds:
+            recorded.check(self._layout)
+        kinds = [recorded for recorded in kinds if len(recorded.measured)]
+        if not kinds:
             return 0.0
-        x = self.posterior()
-        likelihood = innovation_likelihood(x, *recorded.linearised(x.layout, x.mean))
-        self._smoother_to_change().extend([DetectionFactors(measurements, self._keys)])
-        return likelihood
+        x, log_likelihood = self.posterior(), 0.0
+        for recorded in kinds:
+            x, likelihood = corrected(x, recorded.linearised(x.layout, x.mean))
+            log_likelihood += likelihood
+        self._smoother_to_change().extend([DetectionFactors(recorded.measured, self._keys) for recorded in kinds])
+        return log_likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
         """Nodes that disappear have no state at the next epoch; their information on their neighbours stays."""

@@ -6,9 +6,10 @@ holds one epoch and cost and memory of a frame do not grow. The variables are th
 `saga_fg.estimators.block_variables`.
 
 A node that is correlated with no other has nothing to be solved jointly: such nodes are filtered all at once by
-covariances, and the tree has the components of several nodes. It is eliminated once a frame, at the first measurements:
-what is predicted is read before that, by covariances, P <- F P F^T + Q, from the posterior that the tree has given.
-Then it gives the means and covariances of the components that were measured; those of others have not changed.
+covariances, and the tree has the components of several nodes. It is eliminated once for the measurements that come
+together, with the intervals before them: what is predicted is read before that, by covariances, P <- F P F^T + Q, from
+the posterior that the tree has given. Then it gives the means and covariances of the components that were measured;
+those of others have not changed.
 
 Interaction factors are information: noise without variance has none, and noise of variance Q between states of
 variance P costs Cholesky elimination log10(P/Q) digits, QR half as many. So small components are eliminated by QR,
@@ -19,6 +20,7 @@ many million times smaller than P), and those that have come apart, begin anew: 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +37,7 @@ from saga_fg.estimators.filter_pass import filter_epochs
 from saga_fg.estimators.filter_steps import corrected, predicted
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
 from saga_fg.estimators.layout import StateLayout, checked_prior
-from saga_fg.estimators.measurements import LinearisedMeasurements, Observations, RecordedMeasurements, whitened
+from saga_fg.estimators.measurements import Observations, RecordedMeasurements, WhitenedMeasurements, whitened
 from saga_fg.estimators.object_factors import recording_graph
 from saga_fg.estimators.partition import Partition
 from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows
@@ -46,7 +48,7 @@ from saga_fg.numerics.arrays import BoolArray, IntArray
 log = logging.getLogger(__name__)
 
 _SMALL = 64  # size of the largest component up to which QR costs no more than Cholesky
-_CHOLESKY_LIMIT = 1e6  # variance predicted over process noise, up to which Cholesky elimination is exact enough
+_CHOLESKY_LIMIT = 1e6  # trace of Q^-1 P up to which Cholesky elimination is exact enough, P predicted
 _QR_LIMIT = 1e11
 
 
@@ -118,16 +120,23 @@ class IncrementalFilter(LatestMarginals):
         interval.check(self._state.live)
         self._state = _moved(self._state, interval)
 
-    def update(self, measurements: Measurements | Observations) -> float:
-        recorded = RecordedMeasurements(measurements)
-        recorded.check(self._state.live)
-        if len(measurements) == 0:
+    def update(self, *measurements: Measurements | Observations) -> float:
+        """Take in measurements, several kinds of them by one update of the tree."""
+        kinds = [RecordedMeasurements(each) for each in measurements]
+        for recorded in kinds:
+            recorded.check(self._state.live)
+        kinds = [recorded for recorded in kinds if len(recorded.measured)]
+        if not kinds:
             return 0.0
-        state = self._state
-        linear = recorded.linearised(state.x.layout, state.x.mean)
-        by_covariance, log_likelihood = corrected(state.x, linear)
-        tree, x = _corrected(state, linear, by_covariance)
-        epochs = state.with_newest(replace(state.newest, measurements=(*state.newest.measurements, recorded)))
+        state, white, log_likelihood = self._state, list[WhitenedMeasurements](), 0.0
+        by_covariance = state.x
+        for recorded in kinds:
+            linear = recorded.linearised(state.x.layout, by_covariance.mean)
+            by_covariance, likelihood = corrected(by_covariance, linear)
+            log_likelihood += likelihood
+            white.append(whitened(linear))
+        tree, x = _corrected(state, white, by_covariance)
+        epochs = state.with_newest(replace(state.newest, measurements=(*state.newest.measurements, *kinds)))
         self._state = replace(state, tree=tree, x=x, epochs=epochs)
         return log_likelihood
 
@@ -170,12 +179,12 @@ class IncrementalFilter(LatestMarginals):
 
 
 def _corrected(
-    state: _State, linear: LinearisedMeasurements, by_covariance: BlockGaussian
+    state: _State, white: Sequence[WhitenedMeasurements], by_covariance: BlockGaussian
 ) -> tuple[BayesTree | None, BlockGaussian]:
     """The tree and its posterior; where GTSAM's arithmetic fails, that by covariances without a tree."""
     try:
         tree = state.tree or BayesTree.begun(state.x, qr=_largest(state.x.partition) <= _SMALL)
-        return tree.corrected(by_covariance, whitened(linear))
+        return tree.corrected(by_covariance, white)
     except (RuntimeError, np.linalg.LinAlgError) as error:
         _log_refusal(state, error)
         return None, by_covariance

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, SceneGraph
+from saga_fg.errors import UnknownNodeError
 from saga_fg.estimators import IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import OBJECT, key_of
 from saga_fg.model.discretisation import discretise
@@ -130,6 +131,36 @@ def test_one_interval_and_its_measurements_take_one_update(updates):
         estimator.covariance(np.arange(4))
     # first the prior of one variable, then its interaction; and its detection factor
     assert updates == [2, 2, 2]
+
+
+def test_measurements_of_several_kinds_take_one_update(updates):
+    """States of two sizes, some with their velocities: the same as one after the other."""
+    rng = np.random.default_rng(11)
+    together, apart, textbook = IncrementalFilter(), IncrementalFilter(), JointKalmanFilter()
+    types = (CAR, BUS, CAR, BUS)
+    by_size = [([k for k, t in enumerate(types) if t is kind], kind.dim) for kind in (CAR, BUS)]
+    priors = [(nodes, rng.normal(size=(2, dim)), random_covariance(rng, 2, dim)) for nodes, dim in by_size]
+    for estimator in (together, apart, textbook):
+        for prior in priors:
+            estimator.add(*prior)
+    for _ in range(3):
+        interval = discretise(random_graph(rng, types, range(4), density=1.0), 0.2)
+        kinds = [Measurements(nodes, rng.normal(size=(2, 2)), np.eye(2, dim), np.eye(2)) for nodes, dim in by_size]
+        for estimator in (together, apart, textbook):
+            estimator.predict(interval)
+        before = len(updates)
+        likelihood = together.update(*kinds)
+        assert len(updates) == before + 1
+        assert sum(apart.update(each) for each in kinds) == pytest.approx(likelihood, rel=1e-9)
+        assert sum(textbook.update(each) for each in kinds) == pytest.approx(likelihood, rel=1e-9)
+        for estimator in (together, apart):
+            np.testing.assert_allclose(estimator.joint_mean(range(4)), textbook.joint_mean(range(4)), rtol=1e-9)
+            P = textbook.joint_covariance(range(4))
+            np.testing.assert_allclose(estimator.joint_covariance(range(4)), P, atol=1e-9 * P.max())
+    assert len(together.graph().variables) == 8
+    with pytest.raises(UnknownNodeError):
+        together.update(kinds[0], Measurements([99], [[0.0, 0.0]], np.eye(2, 4), np.eye(2)))
+    assert together.update() == 0.0
 
 
 def test_intervals_without_measurements_leave_no_more_than_one_behind(updates):
