@@ -85,7 +85,7 @@ def kitti(
     picture from above (above.png) and the errors against GPS/IMU (metrics.json).
 
     With --map it writes the path in the frame of that map (trajectory.txt with times.txt, trajectory.tum),
-    reference.tum, above.png and metrics.json.
+    covariances.csv, reference.tum, above.png and metrics.json.
 
     With --objects and --odometry oxts a sequence needs no scans.
 
