@@ -79,9 +79,15 @@ def kitti(
 ) -> None:
     """LiDAR SLAM on a KITTI sequence: poses, walls, poles and, with --objects, what moves, in one graph.
 
-    Writes the trajectory (KITTI and TUM formats), covariances.csv, the map and the landmarks (map.ply, landmarks.ply,
-    landmarks.json), the objects in the world (tracks.csv), a picture from above (above.png) and the errors against
-    GPS/IMU (metrics.json). With --objects and --odometry oxts a sequence needs no scans.
+    Writes the path (trajectory.txt with times.txt, trajectory.tum), those to compare it with (odometry.tum, online.tum,
+    reference.tum), covariances.csv, the points (map.ply; map/ for --map), the landmarks (landmarks.csv, landmarks.json,
+    landmarks.ply), the graph (graph.g2o, observations.csv), with --objects the objects in the world (tracks.csv), a
+    picture from above (above.png) and the errors against GPS/IMU (metrics.json).
+
+    With --map it writes the path in the frame of that map (trajectory.txt with times.txt, trajectory.tum),
+    covariances.csv, reference.tum, above.png and metrics.json.
+
+    With --objects and --odometry oxts a sequence needs no scans.
 
     \b
     Examples:

@@ -115,8 +115,10 @@ def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) 
 
 
 def test_sensors_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected some of gps, imu, wheels, got 'radar'"):
+    with pytest.raises(InputError, match="--sensors: expected some of gps, imu, wheels, got 'radar'"):
         sensor_log(tmp_path, "radar", [], 0, TIMES)
+    with pytest.raises(InputError, match="--sensor-log: expected some of gps, imu, wheels, got 'radar'"):
+        sensor_log(tmp_path, "", ["radar=radar.csv"], 0, TIMES)
     with pytest.raises(InputError, match="imu: expected either --sensors or --sensor-log, once"):
         sensor_log(tmp_path, "imu", ["imu=imu.csv"], 0, TIMES)
     with pytest.raises(InputError, match=r"--sensor-log: expected SENSOR=FILE, such as imu=imu.csv, got 'imu'"):
