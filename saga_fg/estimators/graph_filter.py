@@ -184,7 +184,7 @@ class GraphFilter(LatestMarginals):
         return self._smoother.graph()
 
     def snapshot(self) -> GraphState:
-        """The whole state as a value. iSAM2 begins anew from it, so that both go on to the same bits."""
+        """The whole state as a value, which can be pickled. iSAM2 begins anew from it: both go on to the same bits."""
         state = GraphState(self._smoother.snapshot(), self._layout, self._keys, self._auxiliary, self._left)
         self.restore(state)
         return state

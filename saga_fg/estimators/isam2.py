@@ -22,6 +22,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,10 +55,11 @@ _QR_LIMIT = 1e11
 
 @dataclass(frozen=True, eq=False)
 class IncrementalState:
-    """The filter as a value: the Gaussian of the present nodes, and the time, s."""
+    """The filter as a value: its Gaussian, and the last interval with the Gaussian before it, for `graph()`."""
 
     x: BlockGaussian
-    time: float
+    before: BlockGaussian
+    epochs: tuple[Epoch, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +92,15 @@ class IncrementalFilter(LatestMarginals):
 
     def __init__(self) -> None:
         self._state: _State
-        self.restore(IncrementalState(BlockGaussian.empty(), 0.0))
+        self.restore(IncrementalState(BlockGaussian.empty(), BlockGaussian.empty(), (Epoch(0.0),)))
+
+    def __copy__(self) -> IncrementalFilter:
+        twin = object.__new__(IncrementalFilter)
+        twin._state = self._state  # never changed, and GTSAM's tree is that of the first to be corrected
+        return twin
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (), self.snapshot()
 
     @property
     def nodes(self) -> IntArray:
@@ -118,7 +128,10 @@ class IncrementalFilter(LatestMarginals):
     def predict(self, transition: Transition) -> None:
         interval = IntervalDynamics(transition)
         interval.check(self._state.live)
-        self._state = _moved(self._state, interval)
+        state = self._state
+        if transition.dt == 0 and interval.linearised(state.live, np.zeros(state.live.size)).unchanged.all():
+            return
+        self._state = _moved(state, interval)
 
     def update(self, *measurements: Measurements | Observations) -> float:
         """Take in measurements, several kinds of them by one update of the tree."""
@@ -163,16 +176,17 @@ class IncrementalFilter(LatestMarginals):
 
     def snapshot(self) -> IncrementalState:
         """The whole state as a value. The filter itself restarts from it, so that both go on to the same bits."""
-        x = self._state.x
-        leaving = x.layout.rows(self._state.newest.leaving)
-        state = IncrementalState(x.without(leaving), self.time)
+        state = IncrementalState(self._state.x, self._state.before, self._state.epochs)
         self.restore(state)
         return state
 
     def restore(self, state: IncrementalState) -> None:
         """Continue from a snapshot."""
         require_type("state", state, IncrementalState)
-        self._state = _State(state.x.layout, None, state.x, state.x, (Epoch(state.time),))
+        layout, leaving = state.x.layout, state.epochs[-1].leaving
+        self._state = _State(layout.without(layout.rows(leaving)), None, state.x, state.before, state.epochs)
+
+    __setstate__ = restore
 
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
         return live_rows(self._state.x, self._state.live, nodes)
@@ -199,6 +213,9 @@ def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
     parts = np.bincount(stay.partition.label[first_nodes(apart.partition.label)])
     tree = _tree_moved(state, x, dynamics, separated=parts[stay.partition.label] > 1)
     then, now = state.newest.time, state.newest.time + interval.dt
+    if isinstance(interval, ZeroInterval):  # nodes are exchanged, the last interval is still the last
+        epochs = (*state.with_newest(replace(state.newest, interval=interval)), Epoch(now))
+        return _State(stay.layout, tree, x, state.before, epochs)
     epochs = (Epoch(then, leaving=state.newest.leaving, interval=interval), Epoch(now))
     return _State(stay.layout, tree, x, state.x, epochs)
 
