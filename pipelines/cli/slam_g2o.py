@@ -90,8 +90,9 @@ def g2o(
     compared: list[FromStart] = []
     loss = None if robust is None or robust == "consensus" else Robust(robust, scale)
     graph = read_g2o(file)
+    rows = _rows(covariances, graph.ids)
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
-        rows, guess = _rows(covariances, graph.ids), graph_error(graph, loss)
+        guess = graph_error(graph, loss)
         if robust == "consensus":
             agreed = consensus(graph)
             rejected = [
