@@ -14,7 +14,9 @@ those of others have not changed.
 Interaction factors are information: noise without variance has none, and noise of variance Q between states of
 variance P costs Cholesky elimination log10(P/Q) digits, QR half as many. So small components are eliminated by QR,
 large ones by Cholesky while that leaves enough digits. Components that an interval would leave fewer (Q singular, or
-many million times smaller than P), and those that have come apart, begin anew: the prediction is their prior.
+many million times smaller than P), and those that have come apart, begin anew: the prediction is their prior. So does
+the whole tree after several intervals without measurements, which are chained by covariances, and where GTSAM refuses
+an update, which is then done by covariances, counted and warned of.
 """
 
 from __future__ import annotations
@@ -55,11 +57,12 @@ _QR_LIMIT = 1e11
 
 @dataclass(frozen=True, eq=False)
 class IncrementalState:
-    """The filter as a value: its Gaussian, and the last interval with the Gaussian before it, for `graph()`."""
+    """The filter as a value: its Gaussian; the last interval, with the Gaussian before it, for `graph()`; refusals."""
 
     x: BlockGaussian
     before: BlockGaussian
     epochs: tuple[Epoch, ...]
+    refusals: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,7 @@ class _State:
     tree    iSAM2, with what its next update takes in; None where it has to begin anew
     x       the Gaussian of the nodes, with those that leave after this epoch
     before  the Gaussian before the `epochs`: the last interval, and the present
+    refusals  number of times that GTSAM's arithmetic has failed
     """
 
     live: StateLayout
@@ -77,6 +81,7 @@ class _State:
     x: BlockGaussian
     before: BlockGaussian
     epochs: tuple[Epoch, ...]
+    refusals: int
 
     @property
     def newest(self) -> Epoch:
@@ -92,7 +97,7 @@ class IncrementalFilter(LatestMarginals):
 
     def __init__(self) -> None:
         self._state: _State
-        self.restore(IncrementalState(BlockGaussian.empty(), BlockGaussian.empty(), (Epoch(0.0),)))
+        self.restore(IncrementalState(BlockGaussian.empty(), BlockGaussian.empty(), (Epoch(0.0),), 0))
 
     def __copy__(self) -> IncrementalFilter:
         twin = object.__new__(IncrementalFilter)
@@ -109,6 +114,11 @@ class IncrementalFilter(LatestMarginals):
     @property
     def time(self) -> float:
         return self._state.newest.time
+
+    @property
+    def refusals(self) -> int:
+        """Number of times that GTSAM's arithmetic has failed: covariances gave the estimate, the tree began anew."""
+        return self._state.refusals
 
     def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
         mean, covariance = checked_prior(nodes, means, covariances)
@@ -148,9 +158,9 @@ class IncrementalFilter(LatestMarginals):
             by_covariance, likelihood = corrected(by_covariance, linear)
             log_likelihood += likelihood
             white.append(whitened(linear))
-        tree, x = _corrected(state, white, by_covariance)
+        tree, x, refusals = _corrected(state, white, by_covariance)
         epochs = state.with_newest(replace(state.newest, measurements=(*state.newest.measurements, *kinds)))
-        self._state = replace(state, tree=tree, x=x, epochs=epochs)
+        self._state = replace(state, tree=tree, x=x, epochs=epochs, refusals=refusals)
         return log_likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -176,15 +186,16 @@ class IncrementalFilter(LatestMarginals):
 
     def snapshot(self) -> IncrementalState:
         """The whole state as a value. The filter itself restarts from it, so that both go on to the same bits."""
-        state = IncrementalState(self._state.x, self._state.before, self._state.epochs)
+        now = self._state
+        state = IncrementalState(now.x, now.before, now.epochs, now.refusals)
         self.restore(state)
         return state
 
     def restore(self, state: IncrementalState) -> None:
         """Continue from a snapshot."""
         require_type("state", state, IncrementalState)
-        layout, leaving = state.x.layout, state.epochs[-1].leaving
-        self._state = _State(layout.without(layout.rows(leaving)), None, state.x, state.before, state.epochs)
+        live = state.x.layout.without(state.x.layout.rows(state.epochs[-1].leaving))
+        self._state = _State(live, None, state.x, state.before, state.epochs, state.refusals)
 
     __setstate__ = restore
 
@@ -194,14 +205,15 @@ class IncrementalFilter(LatestMarginals):
 
 def _corrected(
     state: _State, white: Sequence[WhitenedMeasurements], by_covariance: BlockGaussian
-) -> tuple[BayesTree | None, BlockGaussian]:
-    """The tree and its posterior; where GTSAM's arithmetic fails, that by covariances without a tree."""
+) -> tuple[BayesTree | None, BlockGaussian, int]:
+    """The tree, its posterior and refusals; where GTSAM's arithmetic fails, that by covariances without a tree."""
     try:
-        tree = state.tree or BayesTree.begun(state.x, qr=_largest(state.x.partition) <= _SMALL)
-        return tree.corrected(by_covariance, white)
+        tree = state.tree
+        if tree is None or not tree.is_current:
+            tree = BayesTree.begun(state.x, qr=_largest(state.x.partition) <= _SMALL)
+        return *tree.corrected(by_covariance, white), state.refusals
     except (RuntimeError, np.linalg.LinAlgError) as error:
-        _log_refusal(state, error)
-        return None, by_covariance
+        return None, by_covariance, _refused(state, error)
 
 
 def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
@@ -211,36 +223,40 @@ def _moved(state: _State, interval: IntervalDynamics | ZeroInterval) -> _State:
     apart = dynamics.separated(stay)
     x = predicted(apart, dynamics, None, False).over(dynamics.joined(apart.partition))
     parts = np.bincount(stay.partition.label[first_nodes(apart.partition.label)])
-    tree = _tree_moved(state, x, dynamics, separated=parts[stay.partition.label] > 1)
+    tree, refusals = _tree_moved(state, x, dynamics, separated=parts[stay.partition.label] > 1)
     then, now = state.newest.time, state.newest.time + interval.dt
     if isinstance(interval, ZeroInterval):  # nodes are exchanged, the last interval is still the last
         epochs = (*state.with_newest(replace(state.newest, interval=interval)), Epoch(now))
-        return _State(stay.layout, tree, x, state.before, epochs)
+        return _State(stay.layout, tree, x, state.before, epochs, refusals)
     epochs = (Epoch(then, leaving=state.newest.leaving, interval=interval), Epoch(now))
-    return _State(stay.layout, tree, x, state.x, epochs)
+    return _State(stay.layout, tree, x, state.x, epochs, refusals)
 
 
-def _tree_moved(state: _State, x: BlockGaussian, dynamics: Dynamics, separated: BoolArray) -> BayesTree | None:
-    """The tree after an interval, whose prediction is `x`; None where it has to begin anew.
+def _tree_moved(
+    state: _State, x: BlockGaussian, dynamics: Dynamics, separated: BoolArray
+) -> tuple[BayesTree | None, int]:
+    """The tree after an interval, whose prediction is `x`, None where it has to begin anew; and refusals.
 
     Components whose digits factors would lose begin with a prior of their own, and so do those that have come apart:
     separated (n,).
     """
     small = _largest(x.partition) <= _SMALL
     anew = separated | (noise_ratio(x, dynamics) > (_QR_LIMIT if small else _CHOLESKY_LIMIT))
-    if state.tree is None or state.tree.qr != small or anew.all():
-        return None
+    tree = state.tree
+    if tree is None or tree.leaving or tree.qr != small or anew.all():
+        return None, state.refusals
     try:
-        tree = state.tree.updated(copied=True) if state.tree.leaving else state.tree
-        rows = state.x.layout.rows(x.layout.nodes)
-        return tree.predicted(x, rows, dynamics, anew)
+        return tree.predicted(x, state.x.layout.rows(x.layout.nodes), dynamics, anew), state.refusals
     except (RuntimeError, np.linalg.LinAlgError) as error:
-        _log_refusal(state, error)
-        return None
+        return None, _refused(state, error)
 
 
-def _log_refusal(state: _State, error: Exception) -> None:
-    log.info("iSAM2 begins anew at %.3f s: %s", state.newest.time, " ".join(str(error).split())[:200])
+def _refused(state: _State, error: Exception) -> int:
+    """Count a refusal; warn of the first, the tenth, the hundredth, ..."""
+    count, text = state.refusals + 1, " ".join(str(error).split())[:200]
+    level = logging.WARNING if set(str(count)[1:]) <= {"0"} and str(count)[0] == "1" else logging.INFO
+    log.log(level, "iSAM2 begins anew at %.3f s (refusal %d): %s", state.newest.time, count, text)
+    return count
 
 
 def _largest(partition: Partition) -> int:
