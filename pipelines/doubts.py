@@ -25,6 +25,7 @@ from saga_fg.model.edge_rules import acting_classes
 from saga_fg.model.motion import Curvilinear
 from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.tracking import TrackerSettings
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
@@ -64,6 +65,7 @@ class Doubts:
         self._live: list[Frame] = []
         self._yaw: list[FloatArray] = []
         self._tracked_frames = 0
+        self._tell(_without_effect(settings.tracker, usual.tracker))
 
     def over(self, scenes: Iterable[Scene]) -> Iterator[Scene]:
         """Pass scenes on, and warn of what is doubtful in the first of them."""
@@ -144,6 +146,20 @@ class Doubts:
             if doubt.kind not in self._told:
                 self._told.add(doubt.kind)
                 log.warning("%s", doubt.text("" if doubt.mend is None else self._option_for(doubt.mend)))
+
+
+def _without_effect(tracker: TrackerSettings, usual: TrackerSettings) -> Iterator[Doubt]:
+    """Settings, other than the shipped ones, that the estimator does not have."""
+    name, given = tracker.estimator, []
+    if name != "fixed-lag" and tracker.lag != usual.lag:
+        given.append(f"lag: {tracker.lag:g}")
+    if name != "kalman" and tracker.tolerance not in (0.0, usual.tolerance):
+        given.append(f"tolerance: {tracker.tolerance:g}")
+    if name != "kalman" and tracker.max_component < usual.max_component:
+        given.append(f"max_component: {tracker.max_component}")
+    if given:
+        what = f"tracker: {', '.join(given)}: without effect with estimator: {name}"
+        yield Doubt("estimator", what, "lag is of fixed-lag, tolerance and max_component are of kalman")
 
 
 class Doubted:

@@ -13,6 +13,13 @@ from typing import TextIO
 
 from saga_fg.errors import InputError
 
+_COMPRESSED = {
+    b"BZh": "bzip2",
+    b"\x1f\x8b": "gzip",
+    b"PK\x03\x04": "zip",
+    b"\xfd7zXZ": "xz",
+    b"\x28\xb5\x2f\xfd": "zstd",
+}
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -45,8 +52,15 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def read_text(path: str | Path) -> str:
-    """Read a whole text file in UTF-8. Raises `InputError` as `open_bytes` does, and for another encoding."""
+    """Read a whole text file in UTF-8. Raises `InputError` as `open_bytes` does, and for what is no such text."""
+    content = read_bytes(path)
     try:
-        return read_bytes(path).decode("utf-8")
+        return content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected text in UTF-8: {error}") from error
+        packed = next((name for start, name in _COMPRESSED.items() if content.startswith(start)), None)
+        got = (
+            f"a file compressed by {packed}, to be decompressed first"
+            if packed
+            else "bytes that are none: another encoding, or no text"
+        )
+        raise InputError(f"{path}: expected text in UTF-8, got {got}") from error

@@ -1,4 +1,4 @@
-"""Scan registration: point-to-plane ICP against a local map of surfels.
+"""Scan registration: point-to-plane ICP against the surfels of the scans before.
 
     minimise over T   sum_i rho( n_i . (T p_i - m_i) ),        rho(r) = s^2/2 log(1 + r^2 / s^2)      (Cauchy)
 

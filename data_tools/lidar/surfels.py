@@ -1,4 +1,4 @@
-"""A local map of surfels: for each voxel, the Gaussian of the points that fell into it.
+"""Surfels of the scans before: for each voxel, the Gaussian of the points that fell into it.
 
     n, m = mean, S = sum (p - m)(p - m)^T;   two sets of points of one voxel together, d = m_b - m_a:
 

@@ -52,13 +52,19 @@ def scan_map_from_above(
     """
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=(9.0, 8.0), layout="constrained")
+    driven = np.concatenate([path[:, :2] for path in paths.values()])
+    (left, bottom), (right, top) = driven.min(axis=0) - MARGIN, driven.max(axis=0) + MARGIN
+    wide = float(np.clip(7.5 * (right - left) / (top - bottom), 4.0, 14.0))
+    tall = min(7.5, wide * (top - bottom) / (right - left))
+    layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
+    figure = Figure(figsize=(wide + 1.7, max(tall, 3.0) + 0.7), layout=layout)  # inches
     ax = figure.subplots()
     chosen = points[:: max(1, len(points) // MOST_POINTS)]
     low, high = np.percentile(chosen[:, 2], [5, 95]) if len(chosen) else (0.0, 1.0)
     x, y, z = chosen.T
-    dots = ax.scatter(x, y, c=z, s=0.3, cmap="viridis", vmin=low, vmax=high, linewidths=0)
+    dots = ax.scatter(x, y, c=z, s=1.2, cmap="viridis", vmin=low, vmax=high, linewidths=0)
     figure.colorbar(dots, ax=ax, label="height, m", shrink=0.7)
     for (name, ends), colour in zip(lines.items(), ("#d62728", "#9467bd"), strict=False):
         if len(ends):
@@ -72,8 +78,6 @@ def scan_map_from_above(
         ax.plot(*np.array([track[-1] for track in tracks]).T, "s", color="#2ca02c", markersize=3)
     for row, ((name, path), colour) in enumerate(zip(paths.items(), ("black", "#1f77b4", "#e377c2"), strict=False)):
         ax.plot(*path[:, :2].T, color=colour, linewidth=1.5 if row else 4.0, label=name)
-    driven = np.concatenate([path[:, :2] for path in paths.values()])
-    (left, bottom), (right, top) = driven.min(axis=0) - MARGIN, driven.max(axis=0) + MARGIN
     ax.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(left, right), ylim=(bottom, top))
     ax.legend(frameon=True, fontsize=9, loc="upper right")
     return figure

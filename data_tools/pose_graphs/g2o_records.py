@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.files.error_messages import unknown_name
 from data_tools.files.text_tables import LARGEST, TextTable, read_lines
 from saga_fg.errors import InputError
 from saga_fg.numerics import planar_poses
@@ -94,7 +95,8 @@ def read_records(file: Path) -> tuple[dict[str, TextTable], list[int]]:
         tag = _SPELLED.get(tag, tag)
         record = RECORDS.get(tag)
         if record is None:
-            raise InputError(f"{file}: line {number}: expected one of {', '.join(RECORDS)}, FIX, got {tag[:40]!r}")
+            unknown = unknown_name("record", tag[:40], (*RECORDS, "FIX"))
+            raise InputError(f"{file}: line {number}: {unknown}; lines that the graph can do without may be removed")
         if len(row) != record.columns:
             raise InputError(f"{file}: line {number}: expected {record.columns} values after {tag}, got {len(row)}")
         rows, lines = found.setdefault(tag, ([], []))

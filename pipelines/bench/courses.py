@@ -93,7 +93,7 @@ def drive_course(
     """Drive the course of a seed."""
     course = SimulatedCourse(seed, period=_PERIOD, skewed=False)
     scans = _Drifting(course, odometry_of(course, seed, drift))
-    return course, lidar_slam(scans, "oxts", SETTINGS, progress)
+    return course, lidar_slam(scans, "oxts", settings=SETTINGS, progress=progress)
 
 
 def bench_course(seed: int, drift: float = 0.0, progress: Progress | None = None) -> CourseRow:

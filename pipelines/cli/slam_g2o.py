@@ -90,8 +90,9 @@ def g2o(
     compared: list[FromStart] = []
     loss = None if robust is None or robust == "consensus" else Robust(robust, scale)
     graph = read_g2o(file)
+    rows = _rows(covariances, graph.ids)
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
-        rows, guess = _rows(covariances, graph.ids), graph_error(graph, loss)
+        guess = graph_error(graph, loss)
         if robust == "consensus":
             agreed = consensus(graph)
             rejected = [
@@ -145,8 +146,10 @@ def _rows(chosen: str, ids: IntArray) -> IntArray:
     if chosen in ("all", "last", "none"):
         return {"all": np.arange(len(ids)), "last": np.array([len(ids) - 1]), "none": np.arange(0)}[chosen]
     known = {str(name): row for row, name in enumerate(ids.tolist())}
-    names = [name.strip() for name in chosen.split(",")]
+    names = list(dict.fromkeys(name.strip() for name in chosen.split(",")))
     for name in names:
+        if name in ("all", "last", "none"):
+            raise InputError(f"--covariances: expected {name} alone or ids of poses with commas, got {chosen!r:.40}")
         if name not in known:
             raise InputError(f"--covariances: expected all, last, none or ids of poses with commas, got {name!r:.40}")
     return np.array([known[name] for name in names])

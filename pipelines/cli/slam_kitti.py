@@ -79,9 +79,15 @@ def kitti(
 ) -> None:
     """LiDAR SLAM on a KITTI sequence: poses, walls, poles and, with --objects, what moves, in one graph.
 
-    Writes the trajectory (KITTI and TUM formats), covariances.csv, the map and the landmarks (map.ply, landmarks.ply,
-    landmarks.json), the objects in the world (tracks.csv), a picture from above (above.png) and the errors against
-    GPS/IMU (metrics.json). With --objects and --odometry oxts a sequence needs no scans.
+    Writes the path (trajectory.txt with times.txt, trajectory.tum), those to compare it with (odometry.tum, online.tum,
+    reference.tum), covariances.csv, the points (map.ply; map/ for --map), the landmarks (landmarks.csv, landmarks.json,
+    landmarks.ply), the graph (graph.g2o, observations.csv), with --objects the objects in the world (tracks.csv), a
+    picture from above (above.png) and the errors against GPS/IMU (metrics.json).
+
+    With --map it writes the path in the frame of that map (trajectory.txt with times.txt, trajectory.tum),
+    covariances.csv, reference.tum, above.png and metrics.json.
+
+    With --objects and --odometry oxts a sequence needs no scans.
 
     \b
     Examples:
@@ -151,9 +157,17 @@ def kitti(
             loop_closures=slam.lidar.loop_closures and not blind,
         )
         tracker = path_tracker(settings) if objects and not blind else None
-        providers, detectors = slam.new_providers(), slam.new_detectors()
         result = lidar_slam(
-            recorded, odometry, lidar, progress, providers, detectors, log, frames, tracker, slam.sensors
+            recorded,
+            odometry,
+            settings=lidar,
+            progress=progress,
+            providers=slam.new_providers(),
+            detectors=slam.new_detectors(),
+            log=log,
+            frames=frames,
+            tracker=tracker,
+            sensors=slam.sensors,
         )
     found: LidarSlamResult | SlamWithObjects = result
     if objects:
@@ -168,7 +182,10 @@ def kitti(
     if objects:
         counts.append(counted(figures["objects"], "object"))
     typer.echo(f"{output}: {', '.join(counts)}")
-    for name in ("odometry", "online", *(["without_objects"] if objects else []), "trajectory"):
+    compared = ["odometry", "online", *(["without_objects"] if objects else []), "trajectory"]
+    if odometry == "oxts":  # these are the recording itself
+        compared = [*(["online"] if online else []), "trajectory"]
+    for name in compared:
         e, what = figures[name], name.replace("_", " ")
         relative = f"no RPE on a path shorter than {e['relative_distance']:g} m"
         if e["pieces"]:

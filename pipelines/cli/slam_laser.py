@@ -50,4 +50,5 @@ def laser(
     typer.echo(f"{output}: {counted(len(log), 'scan')}, {counted(len(path.keyframes), 'keyframe')}, {loops}")
     entropy, alone = figures["entropy"], figures["entropy_scan_matching"]
     typer.echo(f"entropy of the map: {entropy:.0f} bits, by scan matching alone {alone:.0f}")
-    typer.echo(f"{seconds:.1f} s of CPU, {figures['times_real_time']:.0f} times real time")
+    used = f"{seconds:.1f} s" if seconds >= 1 else f"{1e3 * seconds:.0f} ms"
+    typer.echo(f"{used} of CPU, {figures['times_real_time']:.0f} times real time")

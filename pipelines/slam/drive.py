@@ -172,12 +172,14 @@ class RecordedOdometry:
         moved = inverse_transform(self._poses[self._keyframe]) @ self._poses[k]
         keyframe = k == 0 or moved_on(moved, s)
         self._row, self._keyframe = k, k if keyframe else self._keyframe
-        scan = still(scan, k, self._poses, self._times, s)
+        scan = deskewed_in_range(scan, k, self._poses, self._times, s)
         placed = inverse_transform(self._poses[0]) @ self._poses[k]
         return OdometryStep(timestamp, placed, self._noise if k else np.zeros((6, 6)), scan, keyframe, None)
 
 
-def still(scan: Scan, row: int, poses: FloatArray, timestamps: FloatArray, settings: OdometrySettings) -> Scan:
+def deskewed_in_range(
+    scan: Scan, row: int, poses: FloatArray, timestamps: FloatArray, settings: OdometrySettings
+) -> Scan:
     """Return a scan within range and without skew, by poses (K, 4, 4) of the sensor at all scans."""
     scan, before = scan.within(settings.min_range, settings.max_range), max(row - 1, 0)
     if scan.time is None or len(poses) < 2:
@@ -201,4 +203,4 @@ class KeyframeClouds(Sequence[FloatArray]):
     def __getitem__(self, k: Any) -> Any:
         row = self._drive.keyframes[k]
         scan = without_objects(self._scans[row], self._moving[row])
-        return still(scan, row, self._drive.poses, self._scans.timestamps, self._settings).points
+        return deskewed_in_range(scan, row, self._drive.poses, self._scans.timestamps, self._settings).points

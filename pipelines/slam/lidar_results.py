@@ -2,7 +2,7 @@
 
 trajectory.txt, times.txt   poses of the vehicle, KITTI's format: world_T_ego of every scan, and its time
 trajectory.tum              the same in the TUM format
-odometry.tum                by odometry alone; online.tum: as estimated when each keyframe came
+odometry.tum                by odometry alone; online.tum: as estimated when each scan came
 covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
 reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
@@ -15,6 +15,7 @@ above.png                   map, paths, landmarks and the objects' tracks from a
 metrics.json                errors of the trajectories against the recording's own poses, the map's sharpness, scans
                             that left motions open, and sensors that do not fit or measured too little to tell
 
+Files of points and landmarks are left out where there are none.
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
 
@@ -115,17 +116,16 @@ def write_lidar_slam(
     output: Path,
     found: LidarSlamResult | SlamWithObjects,
     scans: ScanSequence,
-    spacing: float = 0.2,
     settings: LidarSlamSettings | None = None,
     origin: Origin | None = None,
 ) -> dict[str, Any]:
     """Write all files of a run to a folder, or none; returns the metrics.
 
-    spacing: of the map's points, m; settings: of the run; origin: of the world, on Earth
+    settings: of the run, with the spacing of the map's points; origin: of the world, on Earth
     """
     s = settings or LidarSlamSettings()
     result, objects = (found, None) if isinstance(found, LidarSlamResult) else (found.slam, found.estimate)
-    points = accumulated_map(result, spacing)
+    points = accumulated_map(result, s.map_spacing)
     figures = metrics(result, scans, s.odometry)
     if isinstance(found, SlamWithObjects):
         figures["objects"] = len(object_paths(found.estimate))
@@ -142,11 +142,12 @@ def write_lidar_slam(
             (folder / "map").mkdir()
             clouds = [submap.points for submap in result.submaps]
             write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin), s.map_format)
+            write_cloud(folder / "map.ply", points)
         write_graph(folder, result)
         times = result.trajectory.timestamps[result.keyframes].tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
-        write_cloud(folder / "map.ply", points)
-        _write_landmarks(folder, result)
+        if result.landmarks:
+            _write_landmarks(folder, result)
         paths = {"reference": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
         if objects is not None:
             write_objects(folder / "tracks.csv", objects)

@@ -46,7 +46,6 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
-from saga_fg.slam.mapping import MapperSettings
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings
 from saga_fg.slam.submaps import SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
@@ -78,11 +77,10 @@ class LidarSlamSettings(Settings):
     loops: LoopSettings = settings_group(LoopSettings, "loop closures by place")
     landmarks: bool = setting(True, "use landmarks as nodes of the graph")
     loop_closures: bool = setting(True, "search for loop closures")
-    map_spacing: Positive = setting(0.25, "spacing of the points of the map, m; higher: less memory, smaller files")
-    map_format: CloudFormat = setting("ply", "format of the files of the map's submaps: ply or pcd")
-    mapper: MapperSettings = settings_group(
-        lambda: MapperSettings(confirm_after=4), "association of landmarks where objects are estimated online"
+    map_spacing: Positive = setting(
+        0.25, "spacing of the points of the map, its submaps and map.ply, m; higher: less memory, smaller files"
     )
+    map_format: CloudFormat = setting("ply", "format of the files of the map's submaps: ply or pcd")
     objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "objects in the same graph")
     oxts_rotation: Positive = setting(
         2e-4, "standard deviation of the rotation of a GPS/IMU increment between scans, rad; usual 1e-4 to 1e-3"
@@ -114,6 +112,7 @@ class LidarSlam:
         self,
         start: FloatArray | None = None,
         settings: LidarSlamSettings | None = None,
+        *,
         providers: Sequence[FactorProvider] = (),
         detectors: Sequence[LandmarkDetector] = (),
         loops: SubmapLoops | None = None,
@@ -131,7 +130,7 @@ class LidarSlam:
         both = [*self._sensors.new_providers(), *providers]
         self._new_graph = partial(SubmapGraph, settings=s.submaps, providers=both)
         self._graph = self._new_graph(self._start, START)
-        self._detectors = tuple(detectors)
+        self._detectors, self._others = tuple(detectors), bool(providers)
         self._closed = ClosedSubmaps(PlaceLoops(s.loops) if loops is None and s.loop_closures else loops)
         self._builder = SubmapBuilder(s.map_spacing, straighten=not isinstance(self._odometry, LidarOdometry))
         self._path = OdometryPath()
@@ -158,8 +157,8 @@ class LidarSlam:
         imu: samples since the scan before; gps: a fix at this scan; detections: of objects, in the sensor's frame;
         wheels: speed since the scan before, which also predicts the motion. The providers read them from `view.frame`.
         A keyframe has the newest fix since the one before, with its age; detections of other scans are left out.
-        Raises `InputError` for a scan that is not later than the one before, for a first scan without points, for one
-        of the vehicle's sensors that nothing reads, and after `finish`. A later scan without points lies where it was
+        Raises `InputError` for a scan that is not later than the one before, for a first scan without points, for a
+        measurement or detections that nothing reads, and after `finish`. A later scan without points lies where it was
         predicted, with the deviation that the settings say, until one is registered again.
         """
         if self._finished:
@@ -167,6 +166,8 @@ class LidarSlam:
         self._path.check(scan, time, isinstance(self._odometry, LidarOdometry))
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
+        if detections is not None and self._moving is None and not self._others:
+            raise InputError("detections: expected with `moving`, or with providers that read them")
         moving = Boxes.empty()
         if self._moving is not None and detections is not None:
             self._moving.check(scan, detections)
@@ -252,6 +253,7 @@ class LidarSlam:
 def lidar_slam(
     scans: ScanSequence,
     source: OdometrySource = "lidar",
+    *,
     settings: LidarSlamSettings | None = None,
     progress: Progress | None = None,
     providers: Sequence[FactorProvider] = (),
@@ -276,13 +278,22 @@ def lidar_slam(
     seen: Sequence[Frame | None] = [None] * len(scans.timestamps)
     if tracker is not None:
         seen = frames_at(frames, scans.timestamps, inverse_transform(scans.ego_T_lidar), tracker)
-    named = tuple(log.tables)
-    slam = LidarSlam(start, s, providers, detectors, None, recorded, scans.ego_T_lidar, named, moving, sensors)
+    slam = LidarSlam(
+        start,
+        s,
+        providers=providers,
+        detectors=detectors,
+        odometry=recorded,
+        ego_T_lidar=scans.ego_T_lidar,
+        sensors=tuple(log.tables),
+        moving=moving,
+        sensor_settings=sensors,
+    )
     for k, time in enumerate(scans.timestamps.tolist()):
         log.feed(buffer, time)
         ego = buffer.take(time)
         detections = None if (frame := seen[k]) is None else frame.detections
-        slam.step(scans[k], time, ego.imu, ego.gps, detections, ego.wheels)
+        slam.step(scans[k], time, imu=ego.imu, gps=ego.gps, detections=detections, wheels=ego.wheels)
         if progress is not None:
             progress("slam", k + 1, len(scans))
     return slam.finish()

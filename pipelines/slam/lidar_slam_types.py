@@ -52,7 +52,7 @@ class LidarSlamResult:
     observations   of landmarks, with the landmark and the keyframe of each
     loops          that were closed and agree with each other, between keyframes
     false_loops    those that do not, and are left out of the solution
-    inflation       deviations of odometry in it to those stated, as loops demand; at least 1
+    selection      how loops were chosen, and deviations of odometry to those stated, as they demand
     degenerate     (K) motions that each scan left open, in words
     moving         (K) boxes of moving objects that were left out of each scan, in its frame
     misfits        what does not fit of the vehicle's sensors, in words, by their names

@@ -32,11 +32,11 @@ from pipelines.slam.map_registration import MapRegistration, MeasuredPose
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.slam.slam_map import SlamMap
 from pipelines.slam.vehicle_sensors import VehicleSensors
-from saga_fg.errors import require_type
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, FactorProvider
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.numerics.geometry import checked_transform, inverse_transform, transform_points
+from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
 from saga_fg.settings import Fraction, NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import MeasuredMotion
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings
@@ -109,7 +109,8 @@ class Localiser:
         self._places = MapPlaces(slam_map, s.radius, s.min_overlap, s.scan_spacing, s.odometry.registration)
         self._map = MapRegistration(self._places, s.scan_spacing)
         self._path = OdometryPath()
-        self._found: dict[int, FloatArray] = {}  # map_T_lidar of keyframes, as estimated when they came
+        # of keyframes as estimated when they came: map_T_lidar, and the covariance of its tangent
+        self._found: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._fits = set[int]()  # keyframes registered with the map
         self._unproved = list[int]()  # keyframes since the structure was compared
         self._clouds: list[tuple[int, FloatArray]] = []  # of the last keyframes, thinned, with their rows
@@ -117,6 +118,7 @@ class Localiser:
         self._smoother: IncrementalSmoother | None = None
         self._last, self._time, self._fitted = 0, 0.0, 0.0  # keyframe in the graph, time of it; way of the last fit, m
         self._pose, self._covariance = np.eye(4), _GUESSED  # of that keyframe
+        self._finished = False
 
     def step(
         self,
@@ -130,6 +132,8 @@ class Localiser:
 
         Raises `InputError` as that, too.
         """
+        if self._finished:
+            raise InputError("step: expected no scan after finish; a new Localiser takes the next drive")
         self._path.check(scan, time, True)
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
@@ -161,7 +165,22 @@ class Localiser:
         if not self._found:
             return None
         rows = sorted(self._found)
-        return self._path.drive(rows).carried(np.array([self._found[row] for row in rows]))
+        return self._path.drive(rows).carried(np.array([self._found[row][0] for row in rows]))
+
+    def covariances(self) -> FloatArray | None:
+        """Covariances (K, 6, 6) of the tangents of the poses of `path`, rad^2, m^2; None if no place has been found."""
+        if not self._found:
+            return None
+        known, found = np.array(sorted(self._found)), list[FloatArray]()
+        of = known[np.maximum(np.searchsorted(known, np.arange(len(self._path)), side="right") - 1, 0)].tolist()
+        for row, keyframe in enumerate(of):
+            pose, covariance = self._found[keyframe]
+            if row >= keyframe:
+                found.append(moved_pose(pose, covariance, self._path.moved(keyframe, row))[1])
+            else:
+                ahead, noise = self._path.moved(row, keyframe)
+                found.append(carried_covariance(ahead, covariance + noise))
+        return np.array(found)
 
     @property
     def registered(self) -> BoolArray:
@@ -185,6 +204,9 @@ class Localiser:
 
     def finish(self) -> None:
         """After the last scan: look for the place with the points there are, or compare the last ones with the map."""
+        if self._finished:
+            raise InputError("finish: expected to be called once")
+        self._finished = True
         if self._smoother is not None:
             self.consistency.observe(self._smoother.graph())
             self._compare()
@@ -290,7 +312,7 @@ class Localiser:
             self._smoother.covariance(pose.key),
         )
         self._last = row
-        self._found[row] = self._pose
+        self._found[row] = self._pose, self._covariance
         self._unproved.append(row)
         if self.way - self._fitted > s.lost_after:
             self._give_up(f"no scan has fitted the map for {s.lost_after:.0f} m")

@@ -2,6 +2,7 @@
 
 trajectory.tum, trajectory.txt, times.txt   poses of the vehicle in the map's frame
 reference.tum                               the recording's own poses
+covariances.csv of the sensor's pose at each scan, and whether that was registered with the map
 metrics.json    errors against these, as they are and with the path aligned; scans, those registered with the map, and
                 the first that was; sensors that do not fit or measured too little to tell
 above.png       map and paths from above
@@ -25,6 +26,7 @@ from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.lidar_results import LIDAR_FILES
 from pipelines.slam.localisation import Localiser, LocaliserSettings
+from pipelines.slam.results import write_covariances
 from pipelines.slam.slam_map import SlamMap
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
@@ -37,11 +39,13 @@ from saga_fg.slam.sensors import SensorBuffer, SensorSettings
 class LocalisedDrive:
     """Poses (K) of the vehicle in the map, and whether each scan (K,) was registered with it.
 
+    covariances (K, 6, 6) of the sensor's poses, (rotation, translation) in its frame, rad^2, m^2
     misfits   what does not fit of the vehicle's sensors, in words, by their names
     unjudged  sensors that have measured too little to tell, likewise
     """
 
     trajectory: Trajectory
+    covariances: FloatArray
     registered: BoolArray
     misfits: Mapping[str, str]
     unjudged: Mapping[str, str]
@@ -73,8 +77,8 @@ def localise(
         if progress is not None:
             progress("localising", k + 1, len(scans))
     localiser.finish()
-    path, registered = localiser.path(), localiser.registered
-    if path is None or not registered.any():
+    path, covariances, registered = localiser.path(), localiser.covariances(), localiser.registered
+    if path is None or covariances is None or not registered.any():
         if localiser.ambiguous:
             raise InputError(
                 "map: expected one that shows the place of this drive once, it is ambiguous: several places of the map "
@@ -88,7 +92,8 @@ def localise(
             "drive, or a guess good to a metre or two and 0.1 rad, may help"
         )
     trajectory = Trajectory(scans.timestamps, path @ inverse_transform(scans.ego_T_lidar))
-    return LocalisedDrive(trajectory, registered, localiser.consistency.misfits, localiser.consistency.unjudged)
+    fit = localiser.consistency
+    return LocalisedDrive(trajectory, covariances, registered, fit.misfits, fit.unjudged)
 
 
 def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, slam_map: SlamMap) -> dict[str, Any]:
@@ -110,6 +115,8 @@ def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, sl
         write_kitti_poses(folder / "trajectory.txt", path, folder / "times.txt")
         write_tum_poses(folder / "trajectory.tum", path)
         write_tum_poses(folder / "reference.tum", truth)
+        registered, times = found.registered.astype(int).tolist(), path.timestamps.tolist()
+        write_covariances(folder / "covariances.csv", "timestamp", times, found.covariances, registered=registered)
         drawn = {"reference": truth.positions, "trajectory": path.positions}
         write_bytes(folder / "above.png", png(scan_map_from_above(points, drawn, np.empty((0, 2)), {})))
         write_figures(folder / "metrics.json", figures)

@@ -2,7 +2,7 @@
 
     predict    T- = T_(k-1) exp(dt xi)                        the velocity of the step before, or of other sensors
     de-skew    by xi, where the points have times
-    register   T = point-to-plane ICP of a thinned scan against the local map of surfels, started at T-
+    register   T = point-to-plane ICP of a thinned scan against the surfels of the scans before, from T-
     adapt      e_k = || trans D || + 2 r sin(angle(D) / 2),  D = (T-)^-1 T,  r a typical range
                sigma_k = root mean square of the e so far, not below a floor
     extend     the map, by scans that moved on since the last that did (keyframes)
@@ -57,7 +57,7 @@ class OdometrySettings(Settings):
 
     min_range: Positive = setting(3.0, "ignore nearer points, which are on the vehicle, m")
     max_range: Positive = setting(100.0, "ignore points and surfels further away, m")
-    surfel_size: Positive = setting(1.0, "voxel size of the local map, m; usual 0.5 to 1")
+    surfel_size: Positive = setting(1.0, "voxel size of the surfels, m; usual 0.5 to 1")
     map_spacing: Positive = setting(0.25, "spacing of the points that enter the map, m")
     scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
     keyframe_distance: Positive = setting(
@@ -133,6 +133,8 @@ class LidarOdometry:
         changed its velocity so much since then, or the first two scans fit each other clearly better without it.
         """
         s, last = self.settings, self._last
+        if not np.isfinite(timestamp):
+            raise InputError(f"timestamp: expected a finite number of seconds, got {timestamp!r}")
         if last is not None and not timestamp > last.timestamp:
             raise InputError(f"timestamp: expected one after {last.timestamp:.6f} s, got {timestamp:.6f} s")
         if velocity is not None:

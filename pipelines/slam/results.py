@@ -52,12 +52,14 @@ def landmark_rows(landmarks: Iterable[Landmark]) -> list[dict[str, Any]]:
     ]
 
 
-def write_covariances(path: Path, key: str, names: Sequence[object], covariances: FloatArray) -> None:
-    """Write covariances.csv: the covariance (N, k, k) of each pose, its name in column `key`."""
+def write_covariances(
+    path: Path, key: str, names: Sequence[object], covariances: FloatArray, **columns: Sequence[object]
+) -> None:
+    """Write covariances.csv: the covariance (N, k, k) of each pose, its name in column `key`; other columns follow."""
     upper = np.triu_indices(covariances.shape[1])
-    rows = [",".join([key, *(f"P{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))])]
-    for name, covariance in zip(names, covariances, strict=True):
-        rows.append(",".join([str(name), *(f"{x:.9g}" for x in covariance[upper])]))
+    rows = [",".join([key, *columns, *(f"P{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))])]
+    for *entries, covariance in zip(names, *columns.values(), covariances, strict=True):
+        rows.append(",".join([*map(str, entries), *(f"{x:.9g}" for x in covariance[upper])]))
     write_text(path, "\n".join(rows) + "\n")
 
 

@@ -37,12 +37,13 @@ def sensor_log(
     if unfinished := [name for name, _, path in given if not path]:
         raise InputError(f"--sensor-log: expected SENSOR=FILE, such as imu=imu.csv, got {unfinished[0][:40]!r}")
     known = get_args(SensorName)
-    for name in (*named, *(name for name, _, _ in given)):
-        if name not in known:
-            raise InputError(f"sensors: expected some of {', '.join(known)}, got {name[:40]!r}")
+    for option, names in (("--sensors", named), ("--sensor-log", [name for name, _, _ in given])):
+        for name in names:
+            if name not in known:
+                raise InputError(f"{option}: expected some of {', '.join(known)}, got {name[:40]!r}")
     twice = [name for name in known if (*named, *(name for name, _, _ in given)).count(name) > 1]
     if twice:
-        raise InputError(f"sensors: {twice[0]}: expected either --sensors or --sensor-log, once")
+        raise InputError(f"{twice[0]}: expected either --sensors or --sensor-log, once")
     if not named and not given:
         return None
     tables: dict[SensorName, FloatArray] = {}

@@ -1,9 +1,9 @@
 """Comparison of the wheels' speed with the motion by scans, once, over the first way on which scans show the motion.
 
 The ratio k of both is the median over scans, with deviation 1.25 s / sqrt(n), s by the median absolute deviation. Until
-then speeds enter the graph only where scans leave motions open. Within `_SURE` deviations of what the settings allow,
-wheels are taken as they are. Beyond, the speed is divided by k from then on; it is left out if k changes too much, or
-is none that radius or calibration of wheels explain.
+then speeds enter the graph only where scans leave motions open. Within `_SURE` deviations of 1, that of k and the
+`share` of the settings together, wheels are taken as they are. Beyond, the speed is divided by k from then on; it is
+left out if k changes too much, or is none that radius or calibration of wheels explain.
 """
 
 from __future__ import annotations
@@ -72,12 +72,13 @@ class WheelComparison:
         spread = 1.4826 * float(np.median(np.abs(np.array(self._ratios) - ratio)))
         deviation = np.hypot(self._settings.share, 1.25 * spread / np.sqrt(len(self._ratios)))
         self._judged = True
-        if abs(ratio - 1) <= _SURE * deviation:
+        allowed = _SURE * deviation
+        if abs(ratio - 1) <= allowed:
             return ""
         scaled = 1 / ratio if _SCALES[0] <= ratio <= _SCALES[1] and spread <= _SPREAD else None
         self._scale = scaled
         then = "they are left out from here on" if scaled is None else f"it is multiplied by {scaled:.3f} from here on"
         return (
             f"{self._settings.name}: over the first {self._way:.0f} m their speed is {ratio:.3f} times that by the "
-            f"scans, where its settings allow {_SURE * self._settings.share:.0%}; {then}"
+            f"scans, where its settings and the spread of the ratio allow {allowed:.1%} off; {then}"
         )

@@ -26,6 +26,7 @@ from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import JointEstimate, OdometryIncrements, estimate_jointly, estimate_online
+from saga_fg.slam.mapping import LandmarkSettings
 from saga_fg.slam.sensors import SensorBuffer, SensorSettings, sensor_providers
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
@@ -98,9 +99,8 @@ def with_objects(
         observed: list[list[Observation]] = [[] for _ in rows]
         for one in result.observations:
             observed[at[one.pose]].append(one.observation)
-        online = estimate_online(
-            seen, odometry, new_tracker(), lag, s.objects, start, observed, s.mapper, [*of_sensors, *new_providers()]
-        )
+        marks, others = LandmarkSettings(s.submaps.gate, s.submaps.confirm_after), [*of_sensors, *new_providers()]
+        online = estimate_online(seen, odometry, new_tracker(), lag, s.objects, start, observed, marks, others)
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
         slam = replace(slam, online=Trajectory(scans.timestamps, placed))
     return SlamWithObjects(slam, result, estimate)

@@ -1,11 +1,12 @@
 """`gtsam.ISAM2` over the states of one epoch.
 
-Updates change GTSAM's object itself: to copy it costs a tenth of an update. Of several copies of a filter the first to
-be corrected goes on with it; the others find that out, and begin anew.
+Updates change GTSAM's object itself, which is not copied. Of several copies of a filter the first to be corrected goes
+on with it; the trees of the others are no longer current, and begin anew.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -91,6 +92,11 @@ class BayesTree:
         )
 
     @property
+    def is_current(self) -> bool:
+        """False where another copy of the filter has gone on with GTSAM's tree."""
+        return self.running.updates == self.updates
+
+    @property
     def qr(self) -> bool:
         """True where it is eliminated by QR, false by Cholesky."""
         return self.running.isam.params().getFactorization() == "QR"
@@ -99,30 +105,29 @@ class BayesTree:
     def _next_key(self) -> int:
         return int(self.variables.keys.max(initial=-1)) + 1
 
-    def corrected(self, x: BlockGaussian, white: WhitenedMeasurements) -> tuple[BayesTree, BlockGaussian]:
-        """Take in linear measurements, with all that is still to be taken in; returns also the posterior.
+    def corrected(self, x: BlockGaussian, measured: Sequence[WhitenedMeasurements]) -> tuple[BayesTree, BlockGaussian]:
+        """Take in linear measurements, with all that is still to be taken in; returns also the posterior. If current.
 
         x: the posterior by covariances, of the components that the tree has not. The others are read from the tree
-        where something was measured; nowhere else has that changed them.
+        where something was measured; nowhere else has that changed them. Raises RuntimeError or LinAlgError where
+        GTSAM's arithmetic fails.
         """
-        mine = self.held[white.rows]
-        if not mine.any():
+        factors, rows = list(self.factors), list[IntArray]()
+        for white in measured:
+            mine = self.held[white.rows]
+            if mine.any():
+                seen = WhitenedMeasurements(white.rows[mine], white.z[mine], white.H[mine])
+                factors += self.variables.detections(seen)
+                rows.append(seen.rows)
+        if not rows:
             return self, x
-        seen = WhitenedMeasurements(white.rows[mine], white.z[mine], white.H[mine])
-        tree = replace(self, factors=self.factors + tuple(self.variables.detections(seen))).updated()
-        return tree, tree.variables.posterior(tree.running.isam, x, seen.rows)
+        tree = replace(self, factors=tuple(factors))._updated()
+        return tree, tree.variables.posterior(tree.running.isam, x, np.concatenate(rows))
 
-    def updated(self, copied: bool = False) -> BayesTree:
-        """Take in all changes and marginalise the past.
-
-        copied: for this state to stay that of the running tree. Raises RuntimeError where the tree has gone on, and
-        where GTSAM's arithmetic fails.
-        """
-        if self.running.updates != self.updates:
-            raise RuntimeError("another copy of the filter has gone on with the tree")
-        running = RunningTree(gtsam.ISAM2(self.running.isam)) if copied else self.running
-        isam, values = running.isam, gtsam.Values()
-        running.updates += 1
+    def _updated(self) -> BayesTree:
+        """Take in all changes and marginalise the past."""
+        isam, values = self.running.isam, gtsam.Values()
+        self.running.updates += 1
         zeros = {size: np.zeros(size) for size in {*self.new.values()}}
         for key, size in self.new.items():
             values.insert(key, zeros[size])
@@ -140,7 +145,7 @@ class BayesTree:
         isam.update(graph, values, parameters)
         if self.leaving:
             isam.marginalizeLeaves(leaving)
-        return replace(self, running=running, updates=running.updates, factors=(), new={}, leaving=())
+        return replace(self, updates=self.running.updates, factors=(), new={}, leaving=())
 
 
 def _tied(partition: Partition) -> BoolArray:

@@ -81,15 +81,6 @@ def correct_whitened(x: BlockGaussian, factors: Sequence[WhitenedFactor]) -> Blo
     return _posterior(x, _factor_stacks(x, factors))[0]
 
 
-def innovation_likelihood(x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray) -> float:
-    """Log-likelihood of the innovation, as `correct` gives it, without correcting anything."""
-    likelihood = -0.5 * z.size * math.log(2 * math.pi)
-    for stacked in _stacks(x, rows, z, H, R):
-        L = _innovation_root(stacked)
-        likelihood -= _half_mahalanobis(L, solve_lower(L, stacked.innovation))
-    return likelihood
-
-
 class _Stacked(NamedTuple):
     """Measurements of c components of equal size s, a values each (rows of zeros fill up).
 

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.correction import innovation_likelihood
 from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.filter_steps import corrected
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_prior
@@ -34,12 +34,13 @@ from saga_fg.types.frame import Frame
 @dataclass(frozen=True, eq=False)
 class GraphState:
     """The filter as a value: the graph; its nodes, in order; their variables, by id; variables beside them that stay
-    until providers are asked again."""
+    until providers are asked again; those of nodes that have left since the epoch began."""
 
     graph: SceneFactorGraph
     layout: StateLayout
     keys: Mapping[int, int]
     auxiliary: tuple[int, ...]
+    left: tuple[int, ...]
 
 
 class GraphFilter(LatestMarginals):
@@ -62,6 +63,7 @@ class GraphFilter(LatestMarginals):
         self._layout = StateLayout()
         self._keys: Mapping[int, int] = {}
         self._auxiliary: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
+        self._left: tuple[int, ...] = ()  # variables of nodes that have left since the epoch began
         self._posterior: BlockGaussian | None = None  # until the graph changes
 
     def __copy__(self) -> GraphFilter:
@@ -86,8 +88,9 @@ class GraphFilter(LatestMarginals):
             self.extend(predictors(self.providers))
 
     def ask_providers(self) -> None:
-        """Let the users' providers add their factors."""
+        """Let the users' providers add their factors, on the nodes that have not left."""
         smoother = self._smoother_to_change()
+        smoother.marginalise(key for key in self._left if key in smoother.graph().variables)
         smoother.extend(self.providers)
         smoother.forget(self._keys.values())
         self._auxiliary = self._auxiliary_now()
@@ -119,6 +122,7 @@ class GraphFilter(LatestMarginals):
         if back:  # removed and added at the same epoch: iSAM2 has to forget them first
             smoother.marginalise(back)
             smoother.extend([])
+            self._left = tuple(key for key in self._left if key not in back)
         smoother.extend([NewObjects(added, mean, covariance, labels or {})])
         self._layout, self._keys = layout, {**self._keys, **keys}
 
@@ -141,25 +145,31 @@ class GraphFilter(LatestMarginals):
         moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, carried_over)
         begun = [moved, *predictors(self.providers)]
         smoother.begin(self.time + transition.dt, begun, [self._keys[node] for node in carried_over], change)
-        self._keys = keys
+        self._keys, self._left = keys, ()
         self._auxiliary += self._auxiliary_now()
         if not self._relinearised:  # nobody is to be asked for factors on the epoch before
             smoother.forget(keys.values())
 
-    def update(self, measurements: Measurements | Observations) -> float:
-        require_type("measurements", measurements, Measurements, Observations)
-        recorded = RecordedMeasurements(measurements)
-        recorded.check(self._layout)
-        if len(measurements) == 0:
+    def update(self, *measurements: Measurements | Observations) -> float:
+        """Take in measurements, several kinds of them by one solution."""
+        kinds = [RecordedMeasurements(each) for each in measurements]
+        for recorded in kinds:
+            recorded.check(self._layout)
+        kinds = [recorded for recorded in kinds if len(recorded.measured)]
+        if not kinds:
             return 0.0
-        x = self.posterior()
-        likelihood = innovation_likelihood(x, *recorded.linearised(x.layout, x.mean))
-        self._smoother_to_change().extend([DetectionFactors(measurements, self._keys)])
-        return likelihood
+        x, log_likelihood = self.posterior(), 0.0
+        for recorded in kinds:
+            x, likelihood = corrected(x, recorded.linearised(x.layout, x.mean))
+            log_likelihood += likelihood
+        self._smoother_to_change().extend([DetectionFactors(recorded.measured, self._keys) for recorded in kinds])
+        return log_likelihood
 
     def marginalise(self, nodes: ArrayLike) -> None:
         """Nodes that disappear have no state at the next epoch; their information on their neighbours stays."""
-        self._layout = self._layout.without(self._layout.rows(nodes))
+        rows = self._layout.rows(nodes)
+        self._left += tuple(self._keys[node] for node in self._layout.nodes[rows].tolist())
+        self._layout = self._layout.without(rows)
         self._keys = {node: self._keys[node] for node in self._layout.nodes.tolist()}
         self._posterior = None
 
@@ -174,8 +184,8 @@ class GraphFilter(LatestMarginals):
         return self._smoother.graph()
 
     def snapshot(self) -> GraphState:
-        """The whole state as a value. iSAM2 begins anew from it, so that both go on to the same bits."""
-        state = GraphState(self._smoother.snapshot(), self._layout, self._keys, self._auxiliary)
+        """The whole state as a value, which can be pickled. iSAM2 begins anew from it: both go on to the same bits."""
+        state = GraphState(self._smoother.snapshot(), self._layout, self._keys, self._auxiliary, self._left)
         self.restore(state)
         return state
 
@@ -183,7 +193,8 @@ class GraphFilter(LatestMarginals):
         """Continue from a snapshot."""
         require_type("state", state, GraphState)
         self._smoother_to_change().restore(state.graph)
-        self._layout, self._keys, self._auxiliary = state.layout, state.keys, state.auxiliary
+        self._layout, self._keys = state.layout, state.keys
+        self._auxiliary, self._left = state.auxiliary, state.left
 
     def _auxiliary_now(self) -> tuple[int, ...]:
         """Variables of the present epoch beside the nodes."""

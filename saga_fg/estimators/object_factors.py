@@ -64,7 +64,8 @@ def recording_graph(
 ) -> SceneFactorGraph:
     """The graph of `epochs` after `prior`; layouts and smoothed means of each epoch's joint state.
 
-    Raises `InputError` where a covariance has become singular, so that no factor can be made of it.
+    Raises `InputError` where a covariance has become singular, or a node that moves has no noise in some direction, so
+    that no factor can be made of it.
     """
     try:
         recorded = recording_factors(prior, epochs, layouts, means)
@@ -72,7 +73,8 @@ def recording_graph(
         raise InputError(f"graph: {error}") from error
     graph = SceneFactorGraph()
     for epoch, layout, mean, one in zip(epochs, layouts, means, recorded, strict=True):
-        graph.advance(max(epoch.time, float(np.nextafter(graph.time, np.inf))))  # two may be at the same time
+        time = max(epoch.time, float(np.nextafter(graph.time, np.inf)))  # two may be at the same time
+        graph.advance(time, [key for key in one.keys.values() if key in graph.variables])
         new = [
             NewVariable(*node_kind(node), mean[layout.offsets[row] : layout.offsets[row + 1]])
             for row, node in enumerate(layout.nodes.tolist())
@@ -198,7 +200,10 @@ def interval_factors(
         sources = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
         b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
         if not _is_regular(Q):
-            raise FactorError(f"node {node}: expected noise in all directions of its state")
+            raise FactorError(
+                f"node {node}: expected process noise in all directions of its state, since edges act on it or it "
+                "moves; without, its interaction is no factor (estimates need none)"
+            )
         native.append(interaction_factor(int(then[row]), [key for key, _ in sources], [F for _, F in sources], b, Q))
     return native, nonlinear
 

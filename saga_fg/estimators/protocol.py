@@ -112,7 +112,11 @@ class Estimator(Protocol):
         ...
 
     def graph(self) -> SceneFactorGraph:
-        """The equivalent factor graph, its values the solution; `solve()` and GTSAM's own solvers come to the same."""
+        """The equivalent factor graph, its values the solution; `solve()` and GTSAM's own solvers come to the same.
+
+        `graph.of(OBJECT, graph.epoch)` are the present nodes. Raises `InputError` that names a node on which edges act
+        without process noise in all directions of its state: its interaction is no factor.
+        """
         ...
 
     def snapshot(self) -> Any:

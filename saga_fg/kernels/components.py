@@ -100,16 +100,16 @@ def regrouped_blocks(
     count = 0
     for k in range(n):
         count = max(count, new_label[k] + 1)
-    of, whole = np.full(count, -1, dtype=np.int64), np.ones(count, dtype=np.bool_)
+    of, changed = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.bool_)
     for k in range(n):  # components that stay as they are
         i, c = source[k], new_label[k]
         if i < 0 or size[i] != new_size[k] or offset[i] != new_offset[k] or (of[c] >= 0 and start[of[c]] != start[i]):
-            whole[c] = False
+            changed[c] = True
         else:
             of[c] = i
     for k in range(n):
         c = new_label[k]
-        if whole[c] and of[c] >= 0:
+        if not changed[c] and of[c] >= 0:
             old, new, area = start[of[c]], new_start[k], new_size[k] * new_size[k]
             for e in range(area):
                 result[new + e] = flat[old + e]
@@ -117,7 +117,7 @@ def regrouped_blocks(
     latest, before = np.full(count, -1, dtype=np.int64), np.full(n, -1, dtype=np.int64)
     for k in range(n):  # before[k]: the node of its component that comes before it
         i = source[k]
-        if i < 0 or whole[new_label[k]]:
+        if i < 0 or not changed[new_label[k]]:
             continue
         d = dims[i]
         other = k
@@ -199,10 +199,10 @@ def uncorrelated_labels(
 ) -> IntArray:
     """(n,) components that no correlation above `tolerance` ties, numbered from 0 in the order of their nodes."""
     n = len(label)
-    root = np.arange(n)
+    root = np.empty(n, dtype=np.int64)
     count = 0
     for i in range(n):
-        count = max(count, label[i] + 1)
+        root[i], count = i, max(count, label[i] + 1)
     latest, before = np.full(count, -1, dtype=np.int64), np.full(n, -1, dtype=np.int64)
     for i in range(n):
         s, d = size[i], dims[i]

@@ -56,7 +56,7 @@ def predicted_state(
     (q,): nodes of the blocks of Q, which begin at at_Q (q,)
     """
     n, m = len(label), len(target)
-    moved, result = b.copy(), np.empty(len(flat))
+    moved, result = b.copy(), np.zeros(len(flat))
     into, at = np.zeros(n + 1, dtype=np.int64), np.empty(m, dtype=np.int64)
     for e in range(m):
         into[target[e] + 1] += 1
@@ -76,8 +76,8 @@ def predicted_state(
         s, begin = size[first[k]], start[first[k]]
         P, product = flat[begin : begin + s * s].reshape(s, s), work[: s * s].reshape(s, s)
         F_P, after = turned[: s * s].reshape(s, s), result[begin : begin + s * s].reshape(s, s)
-        F_P[:] = 0.0
-        after[:] = 0.0
+        for p in range(s * s):
+            turned[p] = 0.0
         i = first[k]
         while i >= 0:
             for x in range(into[i], into[i + 1]):

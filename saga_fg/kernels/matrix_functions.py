@@ -94,7 +94,7 @@ def phi_and_noise(
         for j in range(degree - 1, -order - 1, -1):  # phi_order by Horner's rule, then the lower ones
             k = order + min(j, 0)
             inverse *= order + j + 1
-            _set_product(product, Z, phi[min(k + 1, order)] if j < 0 else phi[order])
+            _set_product(product, Z, phi[min(k + 1, order)])
             for a in range(d):
                 product[a, a] += inverse
             _set_scaled(phi[k], product, 1.0)

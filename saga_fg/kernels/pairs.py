@@ -86,8 +86,7 @@ def gated_pairs(
     """
     n, m, classes = len(position), len(z), belief.shape[1]
     k, room = 0, max(64, 2 * (n + m))
-    track, detection = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
-    numbers = np.empty((room, 7))
+    found, numbers = np.empty((2, room), dtype=np.int64), np.empty((room, 7))
     for i in range(n):
         for j in range(m):
             if group[i] != group_z[j]:
@@ -108,24 +107,29 @@ def gated_pairs(
             if not d2 + of_class < gate[i]:
                 continue
             if k == room:
-                track, detection = np.append(track, track), np.append(detection, detection)
-                numbers, room = np.concatenate((numbers, numbers)), 2 * room
-            track[k], detection[k] = i, j
+                room = 2 * room
+                more, longer = np.empty((2, room), dtype=np.int64), np.empty((room, 7))
+                for e in range(k):
+                    more[0, e], more[1, e] = found[0, e], found[1, e]
+                    for q in range(7):
+                        longer[e, q] = numbers[e, q]
+                found, numbers = more, longer
+            found[0, k], found[1, k] = i, j
             numbers[k, 0], numbers[k, 1], numbers[k, 2], numbers[k, 3], numbers[k, 4] = x, y, a, b, c
             numbers[k, 5], numbers[k, 6] = d2, d2 + np.log(det) + of_class
             k += 1
-    S = np.empty((k, 2, 2))
-    for p in range(k):
-        S[p, 0, 0], S[p, 0, 1], S[p, 1, 0], S[p, 1, 1] = numbers[p, 2], numbers[p, 3], numbers[p, 3], numbers[p, 4]
-    found = numbers[:k]
-    return (
-        track[:k].copy(),
-        detection[:k].copy(),
-        found[:, :2].copy(),
-        S,
-        found[:, 5].copy(),
-        found[:, 6].copy(),
+    rows, innovation, S, d2_and_cost = (
+        np.empty((2, k), dtype=np.int64),
+        np.empty((k, 2)),
+        np.empty((k, 2, 2)),
+        np.empty((2, k)),
     )
+    for p in range(k):
+        rows[0, p], rows[1, p] = found[0, p], found[1, p]
+        innovation[p, 0], innovation[p, 1] = numbers[p, 0], numbers[p, 1]
+        S[p, 0, 0], S[p, 0, 1], S[p, 1, 0], S[p, 1, 1] = numbers[p, 2], numbers[p, 3], numbers[p, 3], numbers[p, 4]
+        d2_and_cost[0, p], d2_and_cost[1, p] = numbers[p, 5], numbers[p, 6]
+    return rows[0], rows[1], innovation, S, d2_and_cost[0], d2_and_cost[1]
 
 
 @kernel("i1 i1 f2 f3 f2 f3 f1 f1 f2 f3 i1 f1 f f")

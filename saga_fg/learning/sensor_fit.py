@@ -13,7 +13,8 @@ import numpy as np
 from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
 from saga_fg.learning.measurement_noise import FEWEST, fit_position_noise, robust_deviation
 from saga_fg.learning.score_calibration import fit_score_calibration
-from saga_fg.model.sensor import FieldOfView, NoiseModel, ScoreCalibration, Sensor
+from saga_fg.model.sensor import NoiseModel, ScoreCalibration, Sensor
+from saga_fg.model.sensor_geometry import FieldOfView
 from saga_fg.types.by_class import DEFAULT
 
 FEWEST_CHANCES = 20  # to detect an object of a class, for a detection probability of its own

@@ -32,19 +32,14 @@ from saga_fg.types.frame import Frame
 
 _UNKNOWN_POSITION = 1e5  # standard deviation, m
 
-
 TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother | GraphFilter
 
 
 def new_estimator(
     settings: TrackerSettings, providers: Sequence[FactorProvider], rules: Sequence[EdgeRule]
 ) -> TrackEstimator:
-    """A fresh estimator.
-
-    With `providers`, or where objects move nonlinearly, iSAM2 and the smoother are a running graph.
-    """
-    name = settings.estimator
-    if name == "kalman":
+    """A fresh estimator; with `providers`, or nonlinear motion, iSAM2 and the smoother are a running graph."""
+    if (name := settings.estimator) == "kalman":
         return JointKalmanFilter(providers, settings.tolerance, settings.max_component)
     if providers or settings.nonlinear(tuple(rules)):
         return GraphFilter(providers, settings.lag if name == "fixed-lag" else 0.0, relinearised=True)
@@ -90,8 +85,8 @@ class JointTrackState:
     ) -> None:
         """Add tracks as they were `delay` s ago; components that `now` does not have start at 0.
 
-        Where `relative` positions, seen from the vehicle, are given, they stand in for those of `now`. If `appended`,
-        the rows come after those of the last call of `kinematics`, whose estimates stay as they are.
+        `relative` positions, seen from the vehicle, stand in for those of `now`. If `appended`, the rows come after
+        those of the last call of `kinematics`, whose estimates stay as they are.
         """
         before = self._kinematics if appended and relative is None else None
         if relative is not None:
@@ -163,11 +158,12 @@ class JointTrackState:
     ) -> None:
         """Take in one measurement each of some tracks, made `delay` s ago; positions by `relative`, where it is given.
 
-        z (k, 4) position and velocity, R (k, 4, 4); the velocity is used where `with_velocity` (k,). A smoother puts a
-        late measurement at its time; a filter, or a track initiated since, moves it to the present along own motion.
+        z (k, 4) position and velocity, R (k, 4, 4); velocities are used `with_velocity` (k,). A smoother puts a late
+        measurement at its time; a filter, or a track initiated since, moves it to the present along own motion.
         """
         if relative is not None:
             self._add_relative(ids, label, relative)
+        kinds: list[Measurements] = []
         for node_type, of_type in self.rows_by_type(label, delay > 0):
             measured = with_velocity[of_type] & node_type.has(VELOCITY)
             for velocity in (True, False):
@@ -177,10 +173,10 @@ class JointTrackState:
                     continue
                 k = slice(0 if relative is None else 2, 4 if velocity else 2)
                 H = np.broadcast_to(node_type.selector(names), (len(rows), len(names), node_type.dim))
-                self.measure(node_type, ids[rows], z[rows, k], H, R[rows, k, k], delay)
+                kinds.append(self._at_present(node_type, ids[rows], z[rows, k], H, R[rows, k, k], delay))
+        self._take_in(kinds)
 
     def _add_relative(self, ids: IntArray, label: StrArray, relative: RelativePositions) -> None:
-        """Take in positions seen from the vehicle."""
         estimator = self._estimator_to_change()
         assert isinstance(estimator, GraphFilter)
         for node_type, rows in self.rows_by_type(label):
@@ -202,9 +198,8 @@ class JointTrackState:
     @property
     def empty(self) -> bool:
         """True without any track or other variable."""
-        estimator = self.estimator
-        others = estimator.others if isinstance(estimator, GraphFilter | JointKalmanFilter) else ()
-        return len(estimator.nodes) + len(others) == 0
+        others = self.estimator.others if isinstance(self.estimator, GraphFilter | JointKalmanFilter) else ()
+        return len(self.estimator.nodes) + len(others) == 0
 
     def pose(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
@@ -252,8 +247,8 @@ class JointTrackState:
     def copied(self) -> JointTrackState:
         """Return a state that changes independently of this one."""
         twin = shallow_copy(self)
-        twin.estimator, twin._initiated = copy.copy(self.estimator), dict(self._initiated)
-        twin._modes = dict(self._modes)
+        twin.estimator = copy.copy(self.estimator)
+        twin._initiated, twin._modes = dict(self._initiated), dict(self._modes)
         return twin
 
     def measure(
@@ -261,8 +256,14 @@ class JointTrackState:
     ) -> None:
         """Take in linear measurements of tracks of one type: z (k, m), H (k, m, d), R (k, m, m), `delay` s old.
 
-        They are not checked: detections and the settings of sensors are, when they are made.
+        Not checked: detections and the settings of sensors are, when they are made.
         """
+        self._take_in([self._at_present(node_type, ids, z, H, R, delay)])
+
+    def _at_present(
+        self, node_type: NodeType, ids: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, delay: float
+    ) -> Measurements:
+        """Measurements as of now; those that a smoother puts at their own time are taken in and left out."""
         estimator = self._estimator_to_change()
         if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
             self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
@@ -276,7 +277,16 @@ class JointTrackState:
             ids, z, H, R = ids[~there], z[~there], H[~there], R[~there]
         if delay > 0:
             H, R = moved_to_present(node_type, H, R, delay)
-        estimator.update(Measurements.unchecked(ids, z, H, R))
+        return Measurements.unchecked(ids, z, H, R)
+
+    def _take_in(self, kinds: Sequence[Measurements]) -> None:
+        """Correct the estimator, once if it takes several kinds together."""
+        estimator = self._estimator_to_change()
+        if isinstance(estimator, IncrementalFilter | GraphFilter):
+            estimator.update(*kinds)
+        else:
+            for measurements in kinds:
+                estimator.update(measurements)
 
     def _anchor_modes(self) -> None:
         estimator = self.estimator

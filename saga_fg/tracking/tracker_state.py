@@ -197,7 +197,8 @@ class TrackerState:
 
     def snapshot(self) -> TrackerSnapshot:
         """The state as a value."""
-        twin = self.copied()
+        twin = shallow_copy(self)
+        twin._part_from_others()
         return TrackerSnapshot(**{name: getattr(twin, name) for name in _VALUES}, joint=self.joint.snapshot())
 
     def restore(self, snapshot: TrackerSnapshot) -> None:

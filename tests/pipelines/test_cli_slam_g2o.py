@@ -49,7 +49,7 @@ def test_the_chordal_minimum_is_certified_and_some_covariances_are_written(tmp_p
     edges = [line for line in (tmp_path / "loop.g2o").read_text().splitlines() if line.startswith("EDGE")]
     (tmp_path / "loop.g2o").write_text("\n".join(edges) + "\n")
     arguments = ["slam", "g2o", str(tmp_path / "loop.g2o"), "--output", str(tmp_path / "out"), "--certify"]
-    result = CliRunner().invoke(app, [*arguments, "--covariances", "120,30"], catch_exceptions=False)
+    result = CliRunner().invoke(app, [*arguments, "--covariances", "120,30,120"], catch_exceptions=False)
     assert result.exit_code == 0
     assert "the global minimum: no poses below" in result.stdout
     assert "(at the start " in result.stdout  # the file has no vertices, so there is no guess in it
@@ -140,6 +140,7 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
             ["--covariances", "10,elephant"],
             "--covariances: expected all, last, none or ids of poses with commas, got 'e",
         ),
+        (["--covariances", "last,10"], "--covariances: expected last alone or ids of poses with commas, got 'last,10'"),
         (["--robust-scale", "2"], "--robust-scale: expected with --robust and the name of a loss only"),
         (["--robust", "consensus", "--robust-scale", "2"], "--robust-scale: expected with --robust"),
         (["--isam2-batch", "2"], "--isam2-batch: expected with --compare only"),

@@ -250,8 +250,15 @@ def test_sensors_are_a_list_of_names() -> None:
 
 def test_detections_without_a_scan_are_refused_and_the_drive_goes_on(scans: SimulatedScans) -> None:
     """As of a camera that is between two scans."""
-    slam = LidarSlam(scans.world_T_ego[0], PLAIN)
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN, providers=[Listener()])
     slam.step(scans[0], 0.0)
     with pytest.raises(InputError, match=r"scan: expected one in every step: .* give those nearest to a scan"):
         slam.step(None, 0.05, detections=Detections.empty())  # type: ignore[arg-type]
     assert slam.step(scans[1], 0.1, detections=Detections.empty()).keyframe == 1
+
+
+def test_detections_that_nothing_reads_are_refused(scans: SimulatedScans) -> None:
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN)
+    with pytest.raises(InputError, match="detections: expected with `moving`, or with providers that read them"):
+        slam.step(scans[0], 0.0, detections=Detections.empty())
+    assert slam.step(scans[0], 0.0).keyframe == 0

@@ -15,7 +15,7 @@ from data_tools.simulator.street import CURB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
 from pipelines.slam.drive import RecordedOdometry
-from pipelines.slam.lidar_results import covered_spans, metrics, write_lidar_slam
+from pipelines.slam.lidar_results import accumulated_map, covered_spans, metrics, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.lidar_slam_types import LidarSlamResult
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
@@ -73,7 +73,7 @@ def test_a_poor_odometry_is_made_better_by_landmarks() -> None:
         poor.append(poor[-1] @ inverse_transform(a) @ b @ noise)
     scans.world_T_ego = np.array(poor)
     settings = LidarSlamSettings(oxts_rotation=0.003, oxts_translation=0.05)
-    found = lidar_slam(scans, "oxts", settings)
+    found = lidar_slam(scans, "oxts", settings=settings)
     before = trajectory_errors(found.odometry, truth, "start").ate
     assert trajectory_errors(found.trajectory, truth, "start").ate < 0.7 * before
 
@@ -81,7 +81,7 @@ def test_a_poor_odometry_is_made_better_by_landmarks() -> None:
 def test_road_lines_are_found_where_the_road_ends() -> None:
     scans = SimulatedScans(0, 16, curbs=True)
     settings = LidarSlamSettings(loop_closures=False)
-    edges = [mark for mark in lidar_slam(scans, "lidar", settings).landmarks if mark.kind == LINE]
+    edges = [mark for mark in lidar_slam(scans, "lidar", settings=settings).landmarks if mark.kind == LINE]
     assert len(edges) == 2
     for mark in edges:  # the lines y = CURB and y = -CURB
         truth = np.array([np.pi / 2 * np.sign(mark.state[0]), CURB])
@@ -98,7 +98,7 @@ def test_a_place_that_is_come_back_to_closes_a_loop() -> None:
     truth = Trajectory(scans.timestamps, poses)
     scans.world_T_ego = np.array([yaw_transform(y=0.02 * k) for k in range(len(poses))]) @ poses
     settings = LidarSlamSettings(submaps=SubmapSettings(length=8.0), loops=LoopSettings(min_path=10.0), landmarks=False)
-    found = lidar_slam(scans, "oxts", settings)
+    found = lidar_slam(scans, "oxts", settings=settings)
     assert found.loops
     for loop in found.loops:
         first, second = (poses[found.keyframes[k]] for k in (loop.first, loop.second))
@@ -182,7 +182,7 @@ def test_what_cannot_be_placed_is_said() -> None:
 
 
 def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: LidarSlamResult, tmp_path: Path) -> None:
-    figures = write_lidar_slam(tmp_path / "run", result, scans)
+    figures = write_lidar_slam(tmp_path / "run", result, scans, LidarSlamSettings(map_spacing=0.6))
     folder = tmp_path / "run"
     for trajectory in (
         read_kitti_poses(folder / "trajectory.txt", folder / "times.txt"),
@@ -191,7 +191,7 @@ def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: Lida
         np.testing.assert_allclose(trajectory.world_T_ego, result.trajectory.world_T_ego, atol=1e-6)
         np.testing.assert_allclose(trajectory.timestamps, scans.timestamps)
     points = read_scan(folder / "map.ply").points
-    assert len(points) > 1000
+    assert 1000 < len(points) == len(accumulated_map(result, 0.6)) < len(accumulated_map(result, 0.25))
     assert len(read_scan(folder / "landmarks.ply")) > 0
     landmarks = json.loads((folder / "landmarks.json").read_text())
     assert {mark["kind"] for mark in landmarks} == {"pole", "wall"}
@@ -216,6 +216,7 @@ def test_the_command_on_real_scans(recordings: Path, tmp_path: Path, odometry: s
     assert outcome.exit_code == 0, outcome.output
     assert "8 scans" in outcome.stdout
     assert "trajectory against GPS/IMU: ATE" in outcome.stdout
+    assert ("odometry against GPS/IMU: ATE" in outcome.stdout) == (odometry == "lidar")
     assert "no RPE on a path shorter than 10 m" in outcome.stdout
     assert "nan" not in outcome.stdout
     assert (tmp_path / "run" / "map.ply").is_file()

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.sensor_logs import SensorLog
 from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans
-from pipelines.cli import app
 from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.localisation import Localiser, LocaliserSettings
@@ -132,6 +130,11 @@ def test_what_is_no_scan_is_refused_and_the_drive_goes_on(known: SlamMap) -> Non
         localiser.step(scans[1], -1.0)
     assert localiser.step(Scan.of(nothing), 0.1).map_T_lidar is not None
     assert localiser.step(scans[2], 0.2).registered
+    localiser.finish()
+    with pytest.raises(InputError, match="step: expected no scan after finish"):
+        localiser.step(scans[2], 0.3)
+    with pytest.raises(InputError, match="finish: expected to be called once"):
+        localiser.finish()
     with pytest.raises(InputError, match="slam_map: expected"):
         Localiser("map")  # type: ignore[arg-type]
 
@@ -227,37 +230,6 @@ def test_a_fix_counts_as_long_as_the_vehicle_is_near(known: SlamMap, way: int, w
     assert asked[-2:] == last
 
 
-@pytest.mark.parametrize("name", ["providers", "landmarks"])
-def test_what_a_configuration_adds_is_refused_in_a_map(
-    recordings: Path, known: SlamMap, tmp_path: Path, name: str
-) -> None:
-    write_map(tmp_path, known)
-    (tmp_path / "own.yaml").write_text(f"slam: {{{name}: [own:Own]}}\n")
-    command = ["slam", "kitti", "--dataroot", str(recordings / "kitti"), "--map", str(tmp_path)]
-    outcome = CliRunner().invoke(
-        app, [*command, "--config", str(tmp_path / "own.yaml"), "--output", str(tmp_path / "out")]
-    )
-    assert outcome.exit_code != 0
-    assert "--config: slam.providers, slam.landmarks: expected without --map" in " ".join(outcome.output.split())
-
-
-@pytest.mark.parametrize("guess", ["1,2", "1,2,3,x", "1,2,3,nan"])
-def test_a_guess_that_is_none_is_named(recordings: Path, known: SlamMap, tmp_path: Path, guess: str) -> None:
-    write_map(tmp_path, known)
-    command = ["slam", "kitti", "--dataroot", str(recordings / "kitti"), "--map", str(tmp_path), "--guess", guess]
-    outcome = CliRunner().invoke(app, [*command, "--output", str(tmp_path / "out")])
-    assert outcome.exit_code != 0
-    assert f"--guess: expected x,y,z,yaw, m and rad, got '{guess}'" in " ".join(outcome.output.split())
-
-
-@pytest.mark.parametrize("option", [["--odometry", "oxts"], ["--no-landmarks"]])
-def test_options_that_a_map_has_no_use_for_are_refused(tmp_path: Path, option: list[str]) -> None:
-    command = ["slam", "kitti", "--dataroot", str(tmp_path), "--map", str(tmp_path), "--output", str(tmp_path / "o")]
-    outcome = CliRunner().invoke(app, [*command, *option])
-    assert outcome.exit_code != 0
-    assert "--map: expected without" in outcome.output
-
-
 def test_where_the_map_has_no_such_place_none_is_found(known: SlamMap) -> None:
     scans = SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 24))
     localiser = Localiser(known, settings=LocaliserSettings(search_way=10.0))
@@ -295,11 +267,18 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     shutil.copytree(tmp_path / "first", tmp_path / "second")
     (tmp_path / "second" / "notes.txt").write_text("mine")
     figures = write_localised(tmp_path / "second", found, second, slam_map)
-    of_second = ["above.png", "metrics.json", "notes.txt", "reference.tum", "times.txt"]
+    of_second = ["above.png", "covariances.csv", "metrics.json", "notes.txt", "reference.tum", "times.txt"]
     of_second += ["trajectory.tum", "trajectory.txt"]  # nothing of the first run is left
     assert sorted(file.name for file in (tmp_path / "second").iterdir()) == of_second
     assert figures["trajectory"]["ate"] < 0.2
     assert figures["registered"] > 5
+    header, *rows = (tmp_path / "second" / "covariances.csv").read_text().splitlines()
+    assert header.startswith("timestamp,registered,P11,P12")
+    assert [row.split(",")[1] for row in rows] == [str(int(one)) for one in found.registered]
+    errors = np.linalg.norm(found.trajectory.positions - second.world_T_ego[:, :3, 3], axis=1)
+    sigma = np.sqrt(np.trace(found.covariances[:, 3:, 3:], axis1=1, axis2=2))
+    assert (errors < 5 * sigma).all()
+    assert np.linalg.eigvalsh(found.covariances).min() > 0
     assert (tmp_path / "second" / "trajectory.tum").is_file()
     with pytest.raises(InputError, match="expected one that shows a place of this drive"):
         localise(SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 4)), slam_map)
@@ -313,28 +292,6 @@ def test_evo_finds_the_same_error(tmp_path: Path) -> None:
     said = subprocess.run(command, cwd=tmp_path / "run", capture_output=True, text=True, check=True).stdout
     rmse = next(float(line.split()[1]) for line in said.splitlines() if line.split()[:1] == ["rmse"])
     assert rmse == pytest.approx(figures["trajectory"]["ate"], abs=1e-6)
-
-
-def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_path: Path) -> None:
-    options = ["slam", "kitti", "--dataroot", str(recordings / "kitti")]
-    first = CliRunner().invoke(app, [*options, "--scans", "20", "--no-landmarks", "--output", str(tmp_path / "first")])
-    assert first.exit_code == 0, first.output
-    assert read_map(tmp_path / "first").origin is not None
-    again = ["--scans", "10", "--map", str(tmp_path / "first"), "--guess", "0.5,0.3,0,-1.2", "--sensors", "gps,wheels"]
-    again += ["--output"]
-    outcome = CliRunner().invoke(app, [*options, *again, str(tmp_path / "again")])
-    assert outcome.exit_code == 0, outcome.output
-    assert "registered with the map, the first of them scan 0" in outcome.stdout
-    assert "in the map's frame: ATE 0." in outcome.stdout
-    (tmp_path / "first" / "map" / "origin.csv").unlink()
-    outcome = CliRunner().invoke(app, [*options, *again, str(tmp_path / "nowhere")])
-    assert outcome.exit_code != 0
-    assert "expected a map with origin.csv" in " ".join(outcome.output.split())
-    fixes = tmp_path / "fixes.csv"
-    fixes.write_text("time [s],x [m],y [m],z [m]\n0.1,0.1,0,0\n0.5,0.2,0,0\n")
-    own = [*again[: again.index("--sensors")], "--sensor-log", f"gps={fixes}", "--output", str(tmp_path / "metres")]
-    outcome = CliRunner().invoke(app, [*options, *own])
-    assert outcome.exit_code == 0, outcome.output
 
 
 def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
@@ -352,46 +309,3 @@ def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
         read_map(tmp_path)
     with pytest.raises(InputError, match="expected points in at least one submap"):
         SlamMap([np.empty((0, 3), dtype=np.float32)], np.eye(4)[None])
-
-
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ("0,0,tower,1 2 3,1 0 1", "line 2: kind: expected one of wall, pole, road line, ground, got 'tower'"),
-        ("7,0,pole,1 2 3,1 0 1", "line 2: expected numbers of a keyframe of graph.g2o"),
-        ("0,0,pole,1 2 3,1 0", "line 2: expected the numbers of an observation of a pole"),
-        ("0,0,pole", "line 2: expected 5 columns, got 3"),
-    ],
-)
-def test_a_graph_that_is_none_is_named(tmp_path: Path, row: str, message: str) -> None:
-    poses = "".join(f"VERTEX_SE3:QUAT {x} {x} 0 0 0 0 0 1\n" for x in range(2))
-    information = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
-    (tmp_path / "graph.g2o").write_text(f"{poses}EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {information}\n")
-    (tmp_path / "observations.csv").write_text(f"keyframe,landmark,kind,value,covariance\n{row}\n")
-    with pytest.raises(InputError, match=message):
-        read_graph(tmp_path)
-
-
-@pytest.mark.parametrize("backwards", [False, True])
-def test_all_measurements_of_a_read_graph_count(tmp_path: Path, backwards: bool) -> None:
-    eye = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
-    pair = "EDGE_SE3:QUAT 1 0 -1 0 0 0 0 0 1" if backwards else "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1"
-    lines = [f"{pair} {eye}", f"EDGE_SE3:QUAT 0 1 2 0 0 0 0 0 1 {eye}", f"EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1 {eye}"]
-    (tmp_path / "graph.g2o").write_text("".join(f"{line}\n" for line in lines))
-    (tmp_path / "observations.csv").write_text("keyframe,landmark,kind,value,covariance\n")
-    poses = read_graph(tmp_path).solved().world_T_pose
-    np.testing.assert_allclose(poses[:, 0, 3], [0.0, 1.5, 2.5], atol=1e-6)
-
-
-def test_a_read_graph_is_in_space(tmp_path: Path) -> None:
-    (tmp_path / "graph.g2o").write_text("EDGE_SE2 0 1 1 0 0 100 0 0 100 0 1000\n")
-    (tmp_path / "observations.csv").write_text("keyframe,landmark,kind,value,covariance\n")
-    with pytest.raises(InputError, match="expected poses in space, got poses in the plane"):
-        read_graph(tmp_path)
-
-
-def test_a_map_is_not_written_over(tmp_path: Path) -> None:
-    command = ["slam", "kitti", "--dataroot", str(tmp_path), "--sequence", "0000"]
-    result = CliRunner().invoke(app, [*command, "--map", str(tmp_path), "--output", str(tmp_path)])
-    assert result.exit_code != 0
-    assert "--output: expected another folder than that of --map" in f"{result.output}{result.exception}"

@@ -104,6 +104,8 @@ def test_time_runs_forwards_and_settings_are_checked() -> None:
     odometry = LidarOdometry()
     scan = scans(street(0), drive(2))[0]
     odometry.step(scan, 1.0)
+    with pytest.raises(InputError, match="timestamp: expected a finite number of seconds, got nan"):
+        LidarOdometry().step(scan, float("nan"))
     with pytest.raises(InputError, match=r"timestamp: expected one after 1\.0"):
         odometry.step(scan, 1.0)
     with pytest.raises(InputError, match="surfel_size: expected"):

@@ -55,7 +55,7 @@ def test_in_a_tunnel_the_wheels_say_how_far() -> None:
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
-        (1.1, r"1\.\d+ times that by the scans, .*; it is multiplied by 0\.9\d+ from here on"),
+        (1.1, r"1\.\d+ times that by the scans, where .* allow \d\.\d% off; it is multiplied by 0\.9\d+ from here on"),
         (-1.0, "they are left out"),
     ],
 )
@@ -108,14 +108,17 @@ def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) 
     assert figures["trajectory"]["ate"] < 0.5
     assert figures["misfits"] == {}
     assert set(figures["unjudged"]) == {"gps", "imu", "wheels"}
-    assert re.search(
-        r"gps: too few measurements to judge whether it fits: \d, 15 are needed", figures["unjudged"]["gps"]
+    assert re.fullmatch(
+        r"gps: factors in the graph: \d, too few to judge whether it fits; 15 are needed", figures["unjudged"]["gps"]
     )
+    assert figures["unjudged"]["wheels"].startswith("wheels: not used so far")
 
 
 def test_sensors_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected some of gps, imu, wheels, got 'radar'"):
+    with pytest.raises(InputError, match="--sensors: expected some of gps, imu, wheels, got 'radar'"):
         sensor_log(tmp_path, "radar", [], 0, TIMES)
+    with pytest.raises(InputError, match="--sensor-log: expected some of gps, imu, wheels, got 'radar'"):
+        sensor_log(tmp_path, "", ["radar=radar.csv"], 0, TIMES)
     with pytest.raises(InputError, match="imu: expected either --sensors or --sensor-log, once"):
         sensor_log(tmp_path, "imu", ["imu=imu.csv"], 0, TIMES)
     with pytest.raises(InputError, match=r"--sensor-log: expected SENSOR=FILE, such as imu=imu.csv, got 'imu'"):

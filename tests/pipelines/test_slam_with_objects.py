@@ -51,7 +51,7 @@ def poor_drive(count: int = 24) -> tuple[SimulatedScans, np.ndarray, list[Frame]
 def test_parked_cars_are_landmarks_and_moving_ones_are_tracked(tmp_path: Path) -> None:
     scans, truth, frames = poor_drive()
     settings = LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05)
-    found = with_objects(lidar_slam(scans, "oxts", settings), scans, frames, load_config("kitti"), settings)
+    found = with_objects(lidar_slam(scans, "oxts", settings=settings), scans, frames, load_config("kitti"), settings)
     reference = Trajectory(scans.timestamps, truth)
     before = trajectory_errors(found.alone.trajectory, reference, "start").ate
     assert trajectory_errors(found.slam.trajectory, reference, "start").ate < 0.6 * before
@@ -70,7 +70,7 @@ def test_parked_cars_are_landmarks_and_moving_ones_are_tracked(tmp_path: Path) -
 def test_landmarks_and_objects_are_in_one_graph() -> None:
     scans, _, frames = poor_drive(12)
     settings = LidarSlamSettings(oxts_rotation=0.003, oxts_translation=0.05)
-    alone = lidar_slam(scans, "oxts", settings)
+    alone = lidar_slam(scans, "oxts", settings=settings)
     found = with_objects(alone, scans, frames, load_config("kitti"), settings)
     assert [mark.number for mark in found.slam.landmarks] == [mark.number for mark in alone.landmarks]
     for with_, without in zip(found.slam.landmarks, alone.landmarks, strict=True):
@@ -95,7 +95,7 @@ def test_the_sensors_of_the_vehicle_are_in_the_same_graph(sensors: tuple[SensorN
     gps = replace(SensorSettings().gps, deviation=0.02, height_deviation=0.02)
     settings = LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05)
     own, config = replace(SensorSettings(), gps=gps), load_config("kitti")
-    alone = lidar_slam(scans, "oxts", settings, log=log, sensors=own)
+    alone = lidar_slam(scans, "oxts", settings=settings, log=log, sensors=own)
     without, found = (
         with_objects(alone, scans, frames, config, settings, 1.0, log=one, sensors=own).slam for one in (None, log)
     )
@@ -119,10 +119,13 @@ def test_the_command_with_and_without_scans(recordings: Path, tmp_path: Path, op
     arguments = ["--dataroot", str(recordings / "kitti"), "--objects", *options, "--output", str(tmp_path / "run")]
     outcome = CliRunner().invoke(app, ["slam", "kitti", *arguments])
     assert outcome.exit_code == 0, outcome.output
-    assert "without objects against GPS/IMU: ATE" in outcome.stdout
+    assert "trajectory against GPS/IMU: ATE" in outcome.stdout
+    assert ("without objects against GPS/IMU: ATE" in outcome.stdout) == ("0004" not in options)
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert figures["objects"] > 0
     assert (figures["scan_to_map_residual"] is None) == ("0004" in options)
+    written = {file.name for file in (tmp_path / "run").iterdir()}
+    assert {"map", "map.ply", "landmarks.ply"}.isdisjoint(written) == ("0004" in options)
     assert (tmp_path / "run" / "tracks.csv").read_text().count("\n") > 10
 
 

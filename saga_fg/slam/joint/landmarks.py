@@ -18,8 +18,8 @@ from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import (
     LandmarkObservations,
+    LandmarkSettings,
     LocalMap,
-    MapperSettings,
     NearbyLandmarks,
     associate,
     landmark_key,
@@ -55,7 +55,7 @@ def nearest_landmarks(observations: Observations, path: FloatArray, reach: float
 class WindowLandmarks:
     """Landmarks of an online estimator: those observed in the window, and those that left it, in their last state."""
 
-    def __init__(self, settings: MapperSettings) -> None:
+    def __init__(self, settings: LandmarkSettings) -> None:
         self._settings = settings
         self._last_seen: dict[int, int] = {}
         self._kinds: dict[int, LandmarkType] = {}

@@ -31,7 +31,7 @@ from saga_fg.slam.joint.record import EpochRecorder, RecordedEpoch
 from saga_fg.slam.joint.settings import JointSettings
 from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
 from saga_fg.slam.joint.window import Window
-from saga_fg.slam.mapping import MapperSettings
+from saga_fg.slam.mapping import LandmarkSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Landmark, Observation
@@ -56,7 +56,7 @@ class OnlineEstimator:
 
     tracker    a new one, which associates detections
     lag        s; the window begins at the last epoch that is at least so old
-    settings   of the graph; mapper: `gate` of the association of landmarks, `confirm` for observations of a certain one
+    settings   of the graph; landmarks: of the association and confirmation of landmarks
     start      first pose (4, 4), by default the identity
     providers  of factors of your own, asked with each frame after its vehicle and objects are added
 
@@ -68,7 +68,7 @@ class OnlineEstimator:
         tracker: Tracker,
         lag: float,
         settings: JointSettings | None = None,
-        mapper: MapperSettings | None = None,
+        landmarks: LandmarkSettings | None = None,
         start: FloatArray | None = None,
         providers: Sequence[FactorProvider] = (),
     ) -> None:
@@ -79,7 +79,7 @@ class OnlineEstimator:
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._window = Window(self._settings, providers)
         self._clutter_area = tracker.settings.association.clutter_area
-        self._landmarks = WindowLandmarks(mapper or MapperSettings())
+        self._landmarks = WindowLandmarks(landmarks or LandmarkSettings())
         self._lanes = LaneAssociation(self._settings.lanes, [tracker.settings.road_map])
         self._stationary: list[FloatArray] = []
         self._slow = SlowErrors.at_start(self._settings)
@@ -184,15 +184,16 @@ def estimate_online(
     settings: JointSettings | None = None,
     start: FloatArray | None = None,
     landmarks: Observations | None = None,
-    mapper: MapperSettings | None = None,
+    landmark_settings: LandmarkSettings | None = None,
     providers: Sequence[FactorProvider] = (),
 ) -> OnlineEstimate:
-    """Feed n frames to an `OnlineEstimator`; landmarks: observations at each epoch; other parameters as there.
+    """Feed n frames to an `OnlineEstimator`; landmarks: observations at each epoch; landmark_settings
+    and the other parameters: as there.
 
     Raises `InputError` where frames, odometry and landmarks do not fit together.
     """
     landmarks = checked_landmarks(frames, odometry, landmarks)
-    estimator = OnlineEstimator(tracker, lag, settings, mapper, start, providers)
+    estimator = OnlineEstimator(tracker, lag, settings, landmark_settings, start, providers)
     newest, covariances, settled = [], [], []
     for k, frame in enumerate(frames):
         increment = odometry.a_T_b[k - 1] if k else None

@@ -1,4 +1,4 @@
-from .association import associate, log_odds
+from .association import LandmarkSettings, associate, log_odds
 from .local_map import Innovation, LocalMap
 from .mapper import AssociatedObservation, LandmarkMap, LandmarkMapper, MapperSettings
 from .merging import duplicates
@@ -11,6 +11,7 @@ __all__ = [
     "LandmarkMap",
     "LandmarkMapper",
     "LandmarkObservations",
+    "LandmarkSettings",
     "LocalMap",
     "MapperSettings",
     "MeasuredMotion",

@@ -18,13 +18,26 @@ search all combinations).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import assign, gate
+from saga_fg.settings import Range, Settings, setting
 from saga_fg.slam.mapping.local_map import Innovation, LocalMap
 from saga_fg.types.landmark import Observation
+
+
+@dataclass(frozen=True)
+class LandmarkSettings(Settings):
+    """Association and confirmation of landmarks."""
+
+    gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
+        0.999, "gate probability of association; higher: fewer duplicates, more wrong matches"
+    )
+    confirm_after: Annotated[int, Range(1, 10**9)] = setting(2, "observations that confirm a landmark")
 
 
 def associate(local: LocalMap, observations: Sequence[Observation], probability: float) -> dict[int, Innovation]:

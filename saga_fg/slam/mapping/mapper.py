@@ -23,15 +23,15 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from factors import ResidualFactor, SolverSettings, Variable
-from saga_fg.errors import InputError
+from factors import FactorError, ResidualFactor, SolverSettings, Variable, pose
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.batch_solver import BatchSolver
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
-from saga_fg.settings import Range, Settings, setting
-from saga_fg.slam.mapping.association import associate
+from saga_fg.settings import Range, Settings, setting, settings_group
+from saga_fg.slam.mapping.association import LandmarkSettings, associate
 from saga_fg.slam.mapping.local_map import POSE, LocalMap
 from saga_fg.slam.mapping.merging import duplicates
 from saga_fg.slam.mapping.nearby import NearbyLandmarks, place_of
@@ -52,15 +52,12 @@ _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
 
 @dataclass(frozen=True)
 class MapperSettings(Settings):
-    """Association, merging and confirmation of landmarks."""
+    """Association, confirmation and smoothing of landmarks."""
 
-    gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
-        0.999, "gate probability of association; higher: fewer duplicates, more wrong matches"
-    )
+    landmarks: LandmarkSettings = settings_group(LandmarkSettings, "association and confirmation of landmarks")
     smooth_every: Annotated[int, Range(1, 10**9)] = setting(
         100, "largest number of observations between two smoothings; higher: faster, later corrections"
     )
-    confirm_after: Annotated[int, Range(1, 10**9)] = setting(2, "observations that confirm a landmark")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +91,13 @@ class LandmarkMapper:
     def __init__(
         self, world_T_pose: FloatArray, covariance: FloatArray, settings: MapperSettings | None = None
     ) -> None:
-        """world_T_pose: the first pose, (3, 3) in the plane or (4, 4); covariance: of its tangent."""
+        """world_T_pose: the first pose, (3, 3) in the plane or (4, 4); covariance: of its tangent.
+
+        Raises `InputError` for what is no pose, or no positive definite covariance of one.
+        """
         self.settings = settings or MapperSettings()
+        world_T_pose = _rigid("world_T_pose", world_T_pose)
+        covariance = checked_covariances("covariance", [covariance], 1, 3 if len(world_T_pose) == 3 else 6)[0]
         self.local = LocalMap(world_T_pose, covariance)
         self._smoother = IncrementalSmoother(
             lag=None, settings=RelinearisationSettings(_THRESHOLD, wildfire=_WILDFIRE), elimination="cholesky"
@@ -128,6 +130,7 @@ class LandmarkMapper:
         time = self._time + 1.0 if time is None else float(time)
         if not self._time < time < np.inf:
             raise InputError(f"time: expected a finite number after {self._time:.6f} s, got {time!r}")
+        a_T_b = _rigid("a_T_b", a_T_b, 3 if self.local.planar else 4)
         covariance = checked_covariances("covariance", [covariance], 1, 3 if self.local.planar else 6)[0]
         self.local.predict(a_T_b, covariance)
         self._near.move(a_T_b, covariance)
@@ -142,10 +145,13 @@ class LandmarkMapper:
         Returns the number of the landmark of each; an observation without a clear match initiates a new landmark.
         Raises `InputError`, and adds none, for one that its type refuses, or that does not determine a new landmark.
         """
+        require_type("observations", observations, Sequence)
         try:
+            for observation in observations:
+                self._check(observation)
             places = [place_of(observation) for observation in observations]
             self._come_near()
-            pairs = associate(self.local, observations, self.settings.gate)
+            pairs = associate(self.local, observations, self.settings.landmarks.gate)
             for row, observation in enumerate(observations):
                 if row not in pairs:
                     self.local.check(observation)
@@ -215,9 +221,20 @@ class LandmarkMapper:
             AssociatedObservation(row, observation, number) for row, now in seen.items() for number, observation in now
         ]
         poses = np.stack([_pose(solver, row) for row in range(self._poses)])
+        confirm = self.settings.landmarks.confirm_after
         return LandmarkMap(
-            poses, LandmarkObservations(seen, {}).landmarks(solver.solve(), self.settings.confirm_after), observations
+            poses,
+            LandmarkObservations(seen, {}).landmarks(solver.solve(), confirm),
+            observations,
         )
+
+    def _check(self, observation: Observation) -> None:
+        """Raise `InputError` for what is no observation, and for one of a type for poses of another dimension."""
+        require_type("observations", observation, Observation)
+        kind, spatial = observation.kind, not self.local.planar
+        if (kind.pose.dim == 6) != spatial:
+            expected, got = ("the plane", "space") if spatial else ("space", "the plane")
+            raise InputError(f"{kind.name}: expected poses in {expected} for this type, the mapper's are in {got}")
 
     def _place(self) -> FloatArray:
         """Place (2,) of the present pose."""
@@ -301,6 +318,18 @@ class _Merged:
             off = partial(variable.local, view.state(key))
             held.append(ResidualFactor((key,), (variable,), off, np.eye(variable.dim), name="held"))
         return Additions(factors=held, named={last: observation_factors(chunk) for last, chunk in self.changed.items()})
+
+
+def _rigid(name: str, matrix: FloatArray, size: int | None = None) -> FloatArray:
+    """The transform as an array; raises `InputError` for what is none, or is not of that size."""
+    try:
+        pose(name, matrix)
+    except FactorError as error:
+        raise InputError(str(error)) from error
+    T = np.asarray(matrix, dtype=np.float64)
+    if size not in (None, len(T)):
+        raise InputError(f"{name}: expected a {size} x {size} transform like the mapper's poses, got shape {T.shape}")
+    return T
 
 
 def _pose(solver: IncrementalSmoother | BatchSolver, row: int) -> FloatArray:

@@ -37,7 +37,7 @@ MOST_DIMENSIONS = 7  # more than d of the frames; the staircase ends far lower, 
 _ROUNDING = 1e-11  # of the largest entry of S: eigenvalues nearer to 0 can't be told from it
 _CONVERGED = 1e-14  # decrease that a step still promises, relative to the cost: rounding
 _NEARLY = 1e-10  # the same for frames of more dimensions: slow where some are superfluous, and the bound holds anyhow
-_MOST_WORK = 8e9  # products with Q, times entries of its factors: about a minute in all, then the bound is a loose one
+_MOST_WORK = 5e9  # products with Q, times entries of its factors: half a minute in all, then the bound is a loose one
 _SHORTEST = 1e-8  # step along an eigenvector, of a length of sqrt(N d) in all
 _ACCURACY = 1e-4  # of an eigenvalue, relative to the shift
 _NOTHING = 1e-13  # cost that counts as none, relative to the trace of M: rounding, where all measurements agree
@@ -81,23 +81,26 @@ def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
     if graph.anchored:
         start = np.concatenate([start, np.eye(d + 1)[None]])
     proofs: list[tuple[float, float, int]] = []  # bound, eigenvalue, dimensions
+    most = _MOST_WORK / cost.entries
 
-    def direction_down(frames: Frames) -> FloatArray | None:
+    def tested(frames: Frames) -> LowestEigenvalue:
         n, _, r = frames.Y.shape
         lowest = lowest_eigenvalue(cost, frames.Y)
         proofs.append((frames.cost + n * d * lowest.value, lowest.value, r))
-        return lowest.direction
+        return lowest
 
-    most = _MOST_WORK / cost.entries
     found = frames = descend(cost, start[:, :d, :d].swapaxes(1, 2), most / 2)
     left = 0.75 * most - found.products  # the last quarter is for the way down from the staircase
-    while (direction := direction_down(frames)) is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS and left > 0:
-        start = _escaped(cost, frames, direction)
+    while (lowest := tested(frames)).direction is not None and frames.Y.shape[2] < d + MOST_DIMENSIONS:
+        left -= lowest.factorisations * cost.products_per_factorisation
+        if left <= 0:
+            break
+        start = _escaped(cost, frames, lowest.direction)
         frames = best_frames(cost.times, cost.preconditioned, start, _NEARLY, left)
         left -= frames.products
     if frames is not found:
         found = min(found, descend(cost, rounded_rotations(frames.Y), most / 4), key=lambda each: each.cost)
-        direction_down(found)
+        tested(found)
     bound, eigenvalue, dimensions = max(proofs)
     least = found.cost if found.cost > _NOTHING * cost.M.trace() else 0.0
     return ChordalMinimum(_poses(graph, cost, found.Y), least, min(max(bound, 0.0), least), eigenvalue, dimensions)
@@ -110,10 +113,14 @@ def descend(cost: ChordalCost, Y: FloatArray, most_products: float = math.inf) -
 
 @dataclass(frozen=True, eq=False)
 class LowestEigenvalue:
-    """value: lower bound of the eigenvalues of S, at most 0; direction (N, d): of the lowest, None if it may be 0."""
+    """value: lower bound of the eigenvalues of S, at most 0; direction (N, d): of the lowest, None if it may be 0.
+
+    factorisations: how many it took
+    """
 
     value: float
     direction: FloatArray | None
+    factorisations: int
 
 
 def lowest_eigenvalue(cost: ChordalCost, Y: FloatArray) -> LowestEigenvalue:
@@ -124,11 +131,11 @@ def lowest_eigenvalue(cost: ChordalCost, Y: FloatArray) -> LowestEigenvalue:
     L = multipliers(Y, QY.reshape(Y.shape))
     S = _with_positions(cost, L)
     eta = max(GAP * float((flat * QY).sum()) / (n * d), _ROUNDING * float(abs(cost.M).max()))
-    below = False
+    count = 1
     while _negative(solver := factorised(S + _on_rotations(cost, eta))):
-        below, eta = True, eta * _LARGER
+        count, eta = count + 1, eta * _LARGER
     value, vector = _eigenpair(cost, L, solver, eta)
-    return LowestEigenvalue(min(value, 0.0) - 2 * _ACCURACY * eta, vector.reshape(n, d) if below else None)
+    return LowestEigenvalue(min(value, 0.0) - 2 * _ACCURACY * eta, vector.reshape(n, d) if count > 1 else None, count)
 
 
 def _negative(solver: SuperLU) -> bool:

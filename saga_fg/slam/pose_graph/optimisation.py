@@ -2,10 +2,10 @@
 
 Pose graphs have many local minima, and the start decides which one a solver finds. Dead reckoning may lie in the basin
 of a bad one; the chordal start (`chordal_poses`) uses every measurement and no guess, in closed form. Both are tried,
-and the lower error is kept; so is the minimum of the chordal cost, where it is to be certified
-(`saga_fg.slam.pose_graph.certificate`). If that is proven to be the global one, a guess is tried only where its own
-error is lower than what the others led to: from far off, solvers take long to find bad minima. The first pose is fixed,
-unless priors say where poses are.
+and the lower error is kept. Where the minimum of the chordal cost is to be certified
+(`saga_fg.slam.pose_graph.certificate`) it is a start too. If it is proven to be the global one, the others are tried
+only where their own error is lower than what it led to: from far off, solvers take long to find bad minima. The first
+pose is fixed, unless priors say where poses are.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def optimise_poses(graph: PoseGraph, robust: Robust | None = None, certify: bool
 
     robust: a loss over the measurements that do not join successive poses, which may be false loop closures; the errors
     then are robust costs. certify: find the global minimum of the chordal cost too, and start from there as well; if it
-    is proven, a guess that is worse is left out.
+    is proven, starts that are worse than where it leads are left out.
     Raises `InputError` for a graph that is not connected, or too badly conditioned, and, to be certified, for
     landmarks seen by bearings and poses that landmarks alone connect.
     """
@@ -91,16 +91,14 @@ def optimise_poses(graph: PoseGraph, robust: Robust | None = None, certify: bool
         starts = {"chordal": placed(graph, chordal_poses(graph)), **starts}
     if certify:
         chordal = chordal_minimum(graph, starts["chordal"].world_T_pose)
-        starts["chordal minimum"] = placed(graph, chordal.world_T_pose)
-    seen = landmark_factors(graph)
-    proven = chordal is not None and chordal.certified
-    guess = starts.pop("guess")
+        starts = {"chordal minimum": placed(graph, chordal.world_T_pose), **starts}
+    seen, proven = landmark_factors(graph), chordal is not None and chordal.certified
     solutions: dict[str, Solution] = {}
     try:
         for name, start in starts.items():
-            solutions[name] = solve(factors, seen, graph_values(start), SOLVER)
-        if not proven or graph_error(guess, robust) < min(solution.error for solution in solutions.values()):
-            solutions["guess"] = solve(factors, seen, graph_values(guess), SOLVER)
+            reached = min((solution.error for solution in solutions.values()), default=np.inf)
+            if not proven or not solutions or graph_error(start, robust) < reached:
+                solutions[name] = solve(factors, seen, graph_values(start), SOLVER)
     except FactorError as error:
         raise InputError(f"{_UNLIKE}: {error}") from error
     best = min(solutions, key=lambda name: solutions[name].error)

@@ -19,7 +19,7 @@ from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 
 _LOG = logging.getLogger(__name__)
-_LONGEST = 0.5  # s that the first measurement stands for
+_LONGEST = 0.5  # s that the first measurement stands for at most; the second one says how long its interval is
 _GAP = 3.0  # intervals like the one before, beyond which measurements are missing
 _NOTHING = 1e-9  # s
 
@@ -31,9 +31,12 @@ class _Span:
     start: float
     end: float
     value: FloatArray
+    first: bool = False
 
     def next(self, time: float, value: FloatArray) -> _Span:
         """The measurement after this one, from where this one ends unless some are missing between them."""
+        if self.first:
+            return _Span(max(self.end, time - _LONGEST), time, value)
         length = self.end - self.start
         return _Span(self.end if time - self.end <= _GAP * length else time - length, time, value)
 
@@ -53,14 +56,14 @@ class SensorBuffer:
         """Specific force (3,), m/s^2, and turn rate (3,), rad/s, at `time`, s, for the time since the sample before."""
         both = [checked("imu: acceleration", acceleration, (3,)), checked("imu: angular_rate", angular_rate, (3,))]
         self._in_order("imu", time)
-        self._imu.append(_next(self._imu, time, np.concatenate(both)))
+        _add(self._imu, time, np.concatenate(both))
 
     def add_wheels(self, time: float, speed: float) -> None:
         """Speed ahead, m/s, at `time`, s, for the time since the speed before."""
         if not math.isfinite(speed):
             raise InputError(f"wheels: speed: expected a finite number, got {speed!r}")
         self._in_order("wheels", time)
-        self._wheels.append(_next(self._wheels, time, np.array([speed])))
+        _add(self._wheels, time, np.array([speed]))
 
     def add_gps(self, time: float, position: FloatArray, covariance: FloatArray | None = None) -> None:
         """A place (2,) or (3,), world, m, at `time`, s; covariance, m^2: by the settings if None."""
@@ -104,8 +107,15 @@ class SensorBuffer:
         self._newest[sensor] = time
 
 
-def _next(kept: list[_Span], time: float, value: FloatArray) -> _Span:
-    return kept[-1].next(time, value) if kept else _Span(time - _LONGEST, time, value)
+def _add(kept: list[_Span], time: float, value: FloatArray) -> None:
+    """Add a measurement; the interval between the first two is that of the first, too."""
+    if not kept:
+        kept.append(_Span(time - _LONGEST, time, value, first=True))
+        return
+    last = kept[-1]
+    kept.append(last.next(time, value))
+    if last.first:
+        kept[-2] = _Span(last.end - (time - kept[-1].start), last.end, last.value)
 
 
 def _kept(spans: list[_Span], time: float) -> list[_Span]:

@@ -98,12 +98,17 @@ class SensorConsistency:
 
     @property
     def unjudged(self) -> dict[str, str]:
-        """Sensors that have measured too little to judge them, likewise."""
+        """Sensors with too few factors in the graph to judge them, likewise."""
+        counts = {sensor: len(self._newest(sensor)) for sensor in self._sensors}
         return {
-            sensor: f"{getattr(self._settings, sensor).name}: too few measurements to judge whether it fits: {count}, "
-            f"{LEAST} are needed"
-            for sensor in self._sensors
-            if (count := len(self._newest(sensor))) < LEAST
+            sensor: f"{getattr(self._settings, sensor).name}: "
+            + (
+                f"factors in the graph: {count}, too few to judge whether it fits; {LEAST} are needed"
+                if count
+                else "not used so far, the graph has no factors of it"
+            )
+            for sensor, count in counts.items()
+            if count < LEAST
         }
 
     @property

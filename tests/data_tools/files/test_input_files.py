@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import os
 import resource
 import signal
@@ -108,6 +110,20 @@ def test_links_to_files_are_followed(tmp_path: Path) -> None:
     assert read_text(tmp_path / "b") == "text"
     with open_json(tmp_path / "b") as file:
         assert file.read() == "text"
+
+
+@pytest.mark.parametrize(
+    ("content", "got"),
+    [
+        (bz2.compress(b"text"), "got a file compressed by bzip2, to be decompressed first"),
+        (gzip.compress(b"text"), "got a file compressed by gzip, to be decompressed first"),
+        ("Tür".encode("latin-1"), "got bytes that are none: another encoding, or no text"),
+    ],
+)
+def test_what_is_no_text(tmp_path: Path, content: bytes, got: str) -> None:
+    (tmp_path / "graph.g2o").write_bytes(content)
+    with pytest.raises(InputError, match=rf"graph\.g2o: expected text in UTF-8, {got}"):
+        read_g2o(tmp_path / "graph.g2o")
 
 
 @pytest.mark.parametrize("text", ["[" * 5000, '{"a": ' * 5000, "[1", b"\xff"])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, SceneGraph
+from saga_fg.errors import UnknownNodeError
 from saga_fg.estimators import IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import OBJECT, key_of
 from saga_fg.model.discretisation import discretise
@@ -132,7 +133,38 @@ def test_one_interval_and_its_measurements_take_one_update(updates):
     assert updates == [2, 2, 2]
 
 
-def test_intervals_without_measurements_leave_no_more_than_one_behind(updates):
+def test_measurements_of_several_kinds_take_one_update(updates):
+    """States of two sizes, some with their velocities: the same as one after the other."""
+    rng = np.random.default_rng(11)
+    together, apart, textbook = IncrementalFilter(), IncrementalFilter(), JointKalmanFilter()
+    types = (CAR, BUS, CAR, BUS)
+    by_size = [([k for k, t in enumerate(types) if t is kind], kind.dim) for kind in (CAR, BUS)]
+    priors = [(nodes, rng.normal(size=(2, dim)), random_covariance(rng, 2, dim)) for nodes, dim in by_size]
+    for estimator in (together, apart, textbook):
+        for prior in priors:
+            estimator.add(*prior)
+    for _ in range(3):
+        interval = discretise(random_graph(rng, types, range(4), density=1.0), 0.2)
+        kinds = [Measurements(nodes, rng.normal(size=(2, 2)), np.eye(2, dim), np.eye(2)) for nodes, dim in by_size]
+        for estimator in (together, apart, textbook):
+            estimator.predict(interval)
+        before = len(updates)
+        likelihood = together.update(*kinds)
+        assert len(updates) == before + 1
+        assert sum(apart.update(each) for each in kinds) == pytest.approx(likelihood, rel=1e-9)
+        assert sum(textbook.update(each) for each in kinds) == pytest.approx(likelihood, rel=1e-9)
+        for estimator in (together, apart):
+            np.testing.assert_allclose(estimator.joint_mean(range(4)), textbook.joint_mean(range(4)), rtol=1e-9)
+            P = textbook.joint_covariance(range(4))
+            np.testing.assert_allclose(estimator.joint_covariance(range(4)), P, atol=1e-9 * P.max())
+    assert len(together.graph().variables) == 8
+    with pytest.raises(UnknownNodeError):
+        together.update(kinds[0], Measurements([99], [[0.0, 0.0]], np.eye(2, 4), np.eye(2)))
+    assert together.update() == 0.0
+
+
+def test_several_intervals_without_measurements_take_no_update(updates):
+    """They are chained by covariances; the tree begins anew with the next measurements."""
     rng = np.random.default_rng(2)
     estimator, expected = IncrementalFilter(), JointKalmanFilter()
     seen = Measurements(np.arange(4), rng.normal(size=(4, 2)), np.eye(2, 4), 0.1 * np.eye(2))
@@ -146,16 +178,18 @@ def test_intervals_without_measurements_leave_no_more_than_one_behind(updates):
         graph = ring(np.arange(4), rng)
         for either in (estimator, expected):
             either.predict(discretise(graph, 0.1))
-        assert len(estimator._state.tree.factors) == 1
     for either in (estimator, expected):
         either.update(seen)
-    assert len(updates) == 21
+    assert len(updates) == 2
     np.testing.assert_allclose(estimator.joint_mean(prior[0]), expected.joint_mean(prior[0]), rtol=1e-9)
     np.testing.assert_allclose(estimator.joint_covariance(prior[0]), expected.joint_covariance(prior[0]), rtol=1e-9)
 
 
 def test_copies_go_on_independently_of_each_other():
-    """The first to be corrected goes on with GTSAM's tree, others begin anew; predictions alone leave it alone."""
+    """The first to be corrected goes on with GTSAM's tree, others begin anew; predictions alone leave it alone.
+
+    That is no refusal.
+    """
     rng = np.random.default_rng(7)
     filters, expected = [IncrementalFilter()], [JointKalmanFilter()]
     nodes = np.arange(4)
@@ -180,6 +214,7 @@ def test_copies_go_on_independently_of_each_other():
         np.testing.assert_allclose(one.joint_mean(nodes), textbook.joint_mean(nodes), rtol=1e-9)
         np.testing.assert_allclose(one.joint_covariance(nodes), textbook.joint_covariance(nodes), rtol=1e-9)
         assert running.updates == (1 if k == 0 else 3)
+        assert one.refusals == 0
 
 
 def test_a_node_on_its_own_is_no_variable_of_the_tree(updates):
@@ -227,7 +262,7 @@ def test_nothing_grows_with_time():
     assert (late <= early + 2).all()
 
 
-def test_what_gtsam_refuses_is_done_without_it(monkeypatch):
+def test_what_gtsam_refuses_is_done_without_it_and_counted(monkeypatch, caplog):
     rng = np.random.default_rng(4)
     estimator, expected = IncrementalFilter(), JointKalmanFilter()
     original, refusals = gtsam.ISAM2.update, []
@@ -249,7 +284,9 @@ def test_what_gtsam_refuses_is_done_without_it(monkeypatch):
         assert estimator.update(seen) == pytest.approx(expected.update(seen), rel=1e-9)
         np.testing.assert_allclose(estimator.joint_mean([1, 2]), expected.joint_mean([1, 2]), atol=1e-10)
         np.testing.assert_allclose(estimator.joint_covariance([1, 2]), expected.joint_covariance([1, 2]), atol=1e-10)
-    assert len(refusals) == 2
+    assert len(refusals) == estimator.refusals == copy.deepcopy(estimator).refusals == 2
+    (warned,) = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+    assert warned.startswith("iSAM2 begins anew at 0.300 s (refusal 1): Indeterminate linear system")
 
 
 def test_little_noise_beside_large_variances_costs_no_digits():

@@ -13,7 +13,15 @@ from saga_fg.model.landmarks.point import PointLandmark
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import gate
-from saga_fg.slam.mapping import LandmarkMap, LandmarkMapper, LocalMap, MapperSettings, associate, duplicates
+from saga_fg.slam.mapping import (
+    LandmarkMap,
+    LandmarkMapper,
+    LandmarkSettings,
+    LocalMap,
+    MapperSettings,
+    associate,
+    duplicates,
+)
 from saga_fg.types.landmark import LandmarkType, Observation
 
 KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark(), LineLandmark()]
@@ -154,7 +162,9 @@ def street(seed: int) -> tuple[LandmarkMap, FloatArray, FloatArray, list[gtsam.O
     planes = [gtsam.OrientedPlane3(wall / np.linalg.norm(wall[:3])) for wall in walls]
     true = [gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.array([9.0, 0.0, 1.5]))]
     turn = 2 * np.pi / 30
-    mapper = LandmarkMapper(true[0].matrix(), 1e-6 * np.eye(6), MapperSettings(smooth_every=200, confirm_after=5))
+    mapper = LandmarkMapper(
+        true[0].matrix(), 1e-6 * np.eye(6), MapperSettings(LandmarkSettings(confirm_after=5), smooth_every=200)
+    )
     for _ in range(60):
         observations = []
         for x, y in poles:
@@ -211,7 +221,7 @@ def test_every_observation_belongs_to_one_landmark_of_the_map() -> None:
         (lambda: LineLandmark().initialise(np.eye(4), np.tile([3.0, 2.0, 0.0], 2)), "two ends that are apart"),
         (lambda: PointLandmark(dim=4), "dim: expected 2 or 3"),
         (lambda: PoleLandmark(density=0.0), "density"),
-        (lambda: MapperSettings(gate=0.2), "gate"),
+        (lambda: LandmarkSettings(gate=0.2), "gate"),
         (lambda: MapperSettings(smooth_every=0), "smooth_every"),
     ],
 )

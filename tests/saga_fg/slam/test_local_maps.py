@@ -11,6 +11,7 @@ import pytest
 from saga_fg import InputError
 from saga_fg.model.landmarks.plane import PlaneLandmark
 from saga_fg.model.landmarks.point import PointLandmark
+from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LandmarkMapper, LocalMap, MapperSettings, NearbyLandmarks, place_of
 from saga_fg.types.landmark import Observation
@@ -139,7 +140,38 @@ def test_what_an_observation_cannot_be_names_type_and_time_and_changes_nothing()
         mapper.move(ahead(1.0), Q, time=12.5)
     with pytest.raises(InputError, match="covariance"):
         mapper.move(ahead(1.0), np.eye(6))
+    with pytest.raises(InputError, match=r"pose 1 at 12\.50 s: pole: expected poses in space for this type"):
+        mapper.observe([Observation(PoleLandmark(), np.array([1.0, 2.0, 3.0]), R)])
+    with pytest.raises(InputError, match="observations: expected Sequence, got Observation"):
+        mapper.observe(good)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="observations: expected Observation, got int"):
+        mapper.observe([3])  # type: ignore[list-item]
     assert [landmark.observations for landmark in mapper.map().landmarks] == [1]
+
+
+@pytest.mark.parametrize(
+    ("motion", "message"),
+    [
+        (np.eye(4), r"a_T_b: expected a 3 x 3 transform like the mapper's poses, got shape \(4, 4\)"),
+        (np.full((3, 3), np.nan), "a_T_b"),
+        (2 * np.eye(3), "a_T_b: expected a rigid transform"),
+        ("ahead", "a_T_b"),
+    ],
+)
+def test_what_is_no_motion_is_refused_and_the_drive_goes_on(motion: FloatArray, message: str) -> None:
+    mapper = LandmarkMapper(np.eye(3), SURE)
+    with pytest.raises(InputError, match=message):
+        mapper.move(motion, Q)
+    mapper.move(ahead(1.0).tolist(), Q)  # type: ignore[arg-type]
+    assert len(mapper.map().world_T_pose) == 2
+
+
+@pytest.mark.parametrize("covariance", [np.eye(6), np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)])
+def test_a_first_pose_has_a_covariance(covariance: FloatArray) -> None:
+    with pytest.raises(InputError, match="covariance"):
+        LandmarkMapper(np.eye(3), covariance)
+    with pytest.raises(InputError, match="world_T_pose: expected a rigid transform"):
+        LandmarkMapper(2 * np.eye(3), SURE)
 
 
 class Sideways(PointLandmark):

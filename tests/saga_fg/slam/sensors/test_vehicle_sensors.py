@@ -227,6 +227,20 @@ def test_measurements_come_in_order_of_time() -> None:
         sensor_providers(SETTINGS, ["radar"], np.eye(4))
 
 
+def test_a_gap_after_the_first_sample_is_not_filled() -> None:
+    buffer = SensorBuffer()
+    buffer.take(0.0)
+    for time in (1.0, 1.1, 1.9, 2.0):  # 0.8 s without samples
+        buffer.add_imu(time, np.array([time, 0.0, 0.0]), np.zeros(3))
+    found = buffer.take(2.0)
+    np.testing.assert_allclose(found.imu.dt, 0.1)
+    buffer = SensorBuffer()
+    buffer.take(0.0)
+    for time in (0.1, 1.3, 1.4):
+        buffer.add_wheels(time, 5.0)
+    assert buffer.take(1.4).wheels.dt == pytest.approx(0.1 + 0.5 + 0.1)
+
+
 def test_a_buffer_gives_each_pose_what_came_since_the_one_before() -> None:
     buffer = SensorBuffer()
     buffer.take(0.0)
