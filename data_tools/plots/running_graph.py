@@ -59,9 +59,10 @@ def running_graph_picture(
     behind = np.array([_behind(node) for node in nodes]).reshape(-1, 2)
     places = _set_back(nodes, places, behind, is_newest, APART * point)
     covered = _draw_factors(ax, factors, places, behind, colours, STUB * point)
-    for node, place, new in zip(nodes, places, is_newest.tolist(), strict=True):
-        _draw_node(ax, node, place, new)
-    shown = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1) & is_newest)
+    inside = ((places >= low) & (places <= high)).all(axis=1)
+    for n in np.flatnonzero(inside).tolist():
+        _draw_node(ax, nodes[n], places[n], bool(is_newest[n]))
+    shown = np.flatnonzero(inside & is_newest)
     names = [nodes[n]["name"].split(" at ")[0] for n in shown.tolist()]
     _draw_names(ax, names, places[shown], np.concatenate([places, covered]), point)
     return figure
@@ -145,14 +146,14 @@ def _style(kind: str, newest: bool) -> dict[str, Any]:
 
 def _draw_names(ax: Any, names: Sequence[str], places: FloatArray, obstacles: FloatArray, point: float) -> None:
     """Draw each name where it covers the least of nodes, factors and other names. Sizes in points."""
-    places, boxes = places / point, [np.array([*(place - 3.5), *(place + 3.5)]) for place in obstacles / point]
+    places, boxes = places / point, np.concatenate([obstacles / point - 3.5, obstacles / point + 3.5], axis=1)
     for name, place in zip(names, places, strict=True):
         size = np.array([0.58 * LABEL * len(name), 1.15 * LABEL])
         offsets = [np.array(way) * (size / 2 + 5.0 + more) for more in (0.0, 8.0, 18.0) for way in WAYS]
         around = [np.concatenate([place + offset - size / 2, place + offset + size / 2]) for offset in offsets]
-        cost = [sum(_overlap(one, box) for box in boxes) + 0.5 * n for n, one in enumerate(around)]
+        cost = [_overlap(one, boxes) + 0.5 * n for n, one in enumerate(around)]
         best = int(np.argmin(cost))
-        boxes.append(around[best])
+        boxes = np.concatenate([boxes, around[best][None]])
         line = {"arrowstyle": "-", "color": "#999999", "linewidth": 0.5} if best >= len(WAYS) else None
         ax.annotate(
             name, place * point, xytext=offsets[best], textcoords="offset points", ha="center", va="center",
@@ -160,9 +161,10 @@ def _draw_names(ax: Any, names: Sequence[str], places: FloatArray, obstacles: Fl
         )  # fmt: skip
 
 
-def _overlap(a: FloatArray, b: FloatArray) -> float:
-    """Return the common area of two boxes (left, low, right, high), square points."""
-    return float(np.prod(np.maximum(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0.0)))
+def _overlap(box: FloatArray, others: FloatArray) -> float:
+    """Return the area, square points, that a box (left, low, right, high) has in common with others (n, 4), summed."""
+    common = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    return float(np.prod(np.maximum(common, 0.0), axis=1).sum())
 
 
 def _legend(nodes: Sequence[Mapping[str, Any]], colours: Mapping[str, str], newest: float | None) -> list[Any]:

@@ -292,7 +292,9 @@ def _score_factor(low_score_growth: FloatArray, probability: FloatArray) -> Floa
 
 
 def checked_sensors(sensors: Mapping[str, Sensor] | None) -> dict[str, Sensor]:
-    """Models of sensors by name, as a dictionary of its own; raises `InputError` for values of another type."""
+    """Models of sensors by name, as a dictionary of its own; raises `InputError` for what is none."""
+    if sensors is not None:
+        require_type("sensors", sensors, Mapping)
     found = dict(sensors or {})
     for name, sensor in found.items():
         require_type(f"sensors.{name}", sensor, Sensor)

@@ -299,6 +299,7 @@ def test_what_is_no_frame_is_refused(make, nothing):
     [
         ({"settings": {"min_hits": 2}}, "settings: expected {}, got dict"),
         ({"sensors": {"lidar": 0.3}}, "sensors.lidar: expected Sensor, got float"),
+        ({"sensors": ()}, "sensors: expected Mapping, got tuple"),
     ],
 )
 def test_settings_and_sensors_of_another_type_are_named(make, arguments, message):
