@@ -26,6 +26,7 @@ import math
 
 import numpy as np
 
+from saga_fg.estimators.protocol import LatestMarginals
 from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.returns import return_evidence, returned_pairs
 from saga_fg.model.interactions import POSITION, VELOCITY
@@ -125,7 +126,9 @@ def _evidence_by_kernel(
     return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0, p, *if_still)
 
 
-@compiled_by(_evidence_by_kernel)
+@compiled_by(
+    _evidence_by_kernel, where=lambda state, new, old, V_0, p: isinstance(state.joint.estimator, LatestMarginals)
+)
 def _evidence(
     state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.estimators.protocol import LatestMarginals
 from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
 from saga_fg.kernels.compilation import compiled_by
 from saga_fg.model.discretisation import discretise, own_motion
@@ -336,7 +337,7 @@ def _kinematics_by_kernel(joint: JointTrackState, ids: IntArray, label: StrArray
     return Kinematics(x[:, :2], x[:, 2:], P[:, :2, :2], P[:, 2:, 2:])
 
 
-@compiled_by(_kinematics_by_kernel)
+@compiled_by(_kinematics_by_kernel, where=lambda joint, ids, label: isinstance(joint.estimator, LatestMarginals))
 def _kinematics(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
     n = len(ids)
     result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
