@@ -119,6 +119,7 @@ def test_links_to_files_are_followed(tmp_path: Path) -> None:
         (gzip.compress(b"text"), "got a file compressed by gzip, to be decompressed first"),
         ("Tür".encode("latin-1"), "got bytes that are none: another encoding, or no text"),
     ],
+    ids=["bzip2", "gzip", "latin-1"],  # bytes of gzip hold the time
 )
 def test_what_is_no_text(tmp_path: Path, content: bytes, got: str) -> None:
     (tmp_path / "graph.g2o").write_bytes(content)
