@@ -18,6 +18,7 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.kernels import edges
 from saga_fg.kernels.compilation import compiled_by
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
@@ -28,6 +29,7 @@ from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
 from saga_fg.model.paths import NO_PATHS, SHARP
+from saga_fg.model.scene_graph import NonlinearEdges
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.settings import (
     NonNegative,
@@ -63,6 +65,18 @@ class EdgeRule(Protocol):
     def interaction(self) -> Interaction | AccelerationLaw: ...
 
     def pairs(self, nodes: NodeTable) -> Pairs: ...
+
+
+def require_rules(name: str, rules: object) -> None:
+    """Raise `InputError` unless `rules` are a tuple or list of edge rules, which edges of a graph are not."""
+    if not isinstance(rules, tuple | list):
+        raise InputError(f"{name}: expected a tuple of edge rules, got {type(rules).__name__}")
+    for k, rule in enumerate(rules):
+        if isinstance(rule, type) or not (hasattr(rule, "interaction") and hasattr(rule, "pairs")):
+            instead = "; their law can be the interaction of a rule" if isinstance(rule, NonlinearEdges) else ""
+            raise InputError(
+                f"{name}[{k}]: expected an edge rule, with interaction and pairs, got {type(rule).__name__}{instead}"
+            )
 
 
 def acting_classes(rules: Iterable[EdgeRule]) -> set[str]:

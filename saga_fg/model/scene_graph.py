@@ -118,6 +118,20 @@ def _checked_ends(edges: Edges | NonlinearEdges) -> tuple[str, int]:
     return what, count
 
 
+def _require_groups(name: str, groups: object, kind: type[Edges] | type[NonlinearEdges]) -> None:
+    """Raise `InputError` unless `groups` are a tuple or list of edges of this kind."""
+    wanted = f"{name}: expected a tuple of {kind.__name__}"
+    if not isinstance(groups, tuple | list):
+        raise InputError(f"{wanted}, got {type(groups).__name__}")
+    for group in groups:
+        if isinstance(group, NonlinearEdges) and kind is Edges:
+            raise InputError(f"{wanted}, got NonlinearEdges of {group.interaction}, which belong in `nonlinear`")
+        if isinstance(group, Edges) and kind is NonlinearEdges:
+            raise InputError(f"{wanted}, got Edges of {group.interaction}, which belong in `edges`")
+        if not isinstance(group, kind):
+            raise InputError(f"{wanted}, got one of {type(group).__name__}")
+
+
 @dataclass(frozen=True, eq=False)
 class SceneGraph:
     """Nodes and edges at the start of an interval.
@@ -130,7 +144,8 @@ class SceneGraph:
                      explains of a node's motion is noise no more
     modes  of nodes whose own motion is a mixture, in place of that of their types
 
-    Raises `InputError` for edges that name a row the graph has not, or triples whose sizes don't fit the nodes.
+    Raises `InputError` for edges that name a row the graph has not, triples whose sizes don't fit the nodes,
+    or edges of the other kind.
     """
 
     nodes: IntArray
@@ -142,6 +157,8 @@ class SceneGraph:
 
     def __post_init__(self) -> None:
         nodes = checked_ids("nodes", self.nodes)
+        _require_groups("edges", self.edges, Edges)
+        _require_groups("nonlinear", self.nonlinear, NonlinearEdges)
         vars(self).update(nodes=nodes, types=tuple(self.types))
         if len(self.types) != len(nodes):
             raise InputError(f"types: expected {len(nodes)} node types, got {len(self.types)}")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
+from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, require_rules, traffic_rules
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
@@ -303,6 +303,7 @@ class TrackerSettings(Settings):
             if self.estimator == "kalman":
                 raise InputError("ego.estimated: expected the estimator isam2 or fixed-lag, got kalman")
         self._require_groups_that_move_alike()
+        require_rules("edges", self.edges)
         require_stable(self.edges, self.max_step)
 
     def _require_groups_that_move_alike(self) -> None:

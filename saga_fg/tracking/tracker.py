@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, require_type
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
-from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.edge_rules import EdgeRule, require_rules
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray
@@ -81,6 +81,7 @@ class Tracker:
         require_type("settings", self.settings, TrackerSettings)
         self.sensors = checked_sensors(sensors)
         self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
+        require_rules("rules", self.rules)
         self.observer = observer
         for provider in providers:
             if not callable(getattr(provider, "factors", None)):

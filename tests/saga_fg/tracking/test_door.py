@@ -11,9 +11,11 @@ from saga_fg.estimators import Measurements
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.model.transition import Transition
+from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
 from tests.saga_fg.random_graphs import CAR
@@ -85,6 +87,44 @@ def test_edges_that_cannot_be(edges):
     given = {"target": [0], "source": [1], "rate": [0.5], "A_self": -np.eye(4)[None], "A_other": np.eye(4)[None]}
     with pytest.raises(InputError):
         SceneGraph([1, 2], (CAR, CAR), (Edges("shared", **given | edges, b=np.zeros((1, 4))),))
+
+
+NONLINEAR = NonlinearEdges(SmoothDriver(), [0], [1], [1.0], [4.0])
+LINEAR = Edges("shared", [0], [1], [0.5], -np.eye(4)[None], np.eye(4)[None], np.zeros((1, 4)))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"edges": (NONLINEAR,)},
+            "edges: expected a tuple of Edges, got NonlinearEdges of SmoothDriver, .*`nonlinear`",
+        ),
+        ({"nonlinear": (LINEAR,)}, "nonlinear: expected a tuple of NonlinearEdges, got Edges of shared, .* `edges`"),
+        ({"edges": NONLINEAR}, "edges: expected a tuple of Edges, got NonlinearEdges"),
+        ({"edges": (3,)}, "edges: expected a tuple of Edges, got one of int"),
+    ],
+    ids=["nonlinear as edges", "edges as nonlinear", "no tuple", "no edges"],
+)
+def test_groups_of_edges_in_the_wrong_place(given, message):
+    with pytest.raises(InputError, match=message):
+        SceneGraph([1, 2], (CAR, CAR), **given)
+
+
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ((NONLINEAR,), r"\[0\]: expected an edge rule, .*, got NonlinearEdges; their law can be the interaction of"),
+        (NONLINEAR, ": expected a tuple of edge rules, got NonlinearEdges$"),
+        ((Neighbours(), Neighbours), r"\[1\]: expected an edge rule, .*, got type$"),
+    ],
+    ids=["edges", "no tuple", "a class"],
+)
+def test_what_is_no_edge_rule(rules, message):
+    with pytest.raises(InputError, match=f"^edges{message}"):
+        TrackerSettings(edges=rules)
+    with pytest.raises(InputError, match=f"^rules{message}"):
+        Tracker(rules=rules)
 
 
 def test_inside_nothing_is_checked_again(monkeypatch):
