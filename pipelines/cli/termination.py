@@ -1,13 +1,18 @@
 """SIGTERM as an exception: `finally` blocks run, temporary files go, workers end, as they do after Ctrl-C.
 
 Unlike `KeyboardInterrupt`, which comes wherever it may, it waits while work is under way that is short and must not be
-cut in two: an import, which might swallow the exception or leave a module half made, the start of a process, and the
-moments when a temporary file or folder is made, moved into its place, or removed.
+cut in two:
+
+* an import, which might swallow the exception or leave a module half made, and the start of a process;
+* the moments when a temporary file or folder is made, moved into its place, or removed;
+* Python that a compiled kernel calls: the kernel checks no exceptions and would go on without the result;
+* the compiler's work on memory that is not Python's, which would be released twice.
 """
 
 from __future__ import annotations
 
 import signal
+import sys
 import weakref
 from types import FrameType
 
@@ -20,12 +25,15 @@ _UNINTERRUPTED = frozenset(
         "importlib._bootstrap",
         "multiprocessing.process",
         "multiprocessing.util",
+        "numba.core.caching",
+        "numba.core.serialize",  # called by kernels for the types of their results
         "pipelines.scale_out.folder",
         "shutil",
         __name__,
         "tempfile",
     }
 )
+_UNINTERRUPTED_PACKAGE = "llvmlite."  # also called back by the compiler, where exceptions are printed and forgotten
 
 
 class Terminated(BaseException):
@@ -35,7 +43,7 @@ class Terminated(BaseException):
 def raise_on_sigterm() -> None:
     """Make SIGTERM raise `Terminated` in the main thread, which has to be the caller's.
 
-    Where that is swallowed, as in a finaliser, it is raised again.
+    Where that is swallowed, as in a finaliser, it is raised again, and nothing is printed.
     """
     raised: weakref.ref[Terminated] | None = None
 
@@ -51,6 +59,13 @@ def raise_on_sigterm() -> None:
             finally:
                 del error  # which would keep itself alive, by its traceback
 
+    report = sys.unraisablehook
+
+    def on_swallowed(swallowed: sys.UnraisableHookArgs) -> None:
+        if not isinstance(swallowed.exc_value, Terminated):
+            report(swallowed)
+
+    sys.unraisablehook = on_swallowed
     signal.signal(signal.SIGALRM, on_signal)
     signal.signal(signal.SIGTERM, on_signal)
 
@@ -63,7 +78,8 @@ def ignore_sigterm() -> None:
 
 def _uninterrupted(frame: FrameType | None) -> bool:
     while frame is not None:
-        if frame.f_globals.get("__name__") in _UNINTERRUPTED:
+        name = str(frame.f_globals.get("__name__"))
+        if name in _UNINTERRUPTED or name.startswith(_UNINTERRUPTED_PACKAGE):
             return True
         frame = frame.f_back
     return False

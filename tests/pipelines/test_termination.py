@@ -133,13 +133,21 @@ MOMENTS = {
     "the system's temporary folder made": ("os.mkdir", "scratch()"),
     "the system's temporary folder removed": ("shutil.rmtree", "scratch()"),
     "results written": ("os.replace", "OutputFolder(folder).write('c/d', b'x')"),
+    "a type of a kernel's results looked up": ("numba.cloudpickle.loads", "distinct(LABELS)"),
+    "the compiler of kernels made": ("llvmlite.binding.executionengine.ExecutionEngine.__init__", "distinct(LABELS)"),
+    "a compiled kernel kept on disk": ("os.replace", "distinct(LABELS)"),
+    "a finaliser": ("time.time", "weakref.finalize(set(), lambda: time.time())"),
     "nothing of note": ("time.time", "time.time()"),
 }
 SCRIPT = """
-import os, pathlib, shutil, signal, sys, tempfile, time
+import logging, os, pathlib, pkgutil, shutil, signal, sys, tempfile, time, weakref
+import numpy as np
 from data_tools.files.atomic_files import atomic_directory, write_text
-from pipelines.cli.termination import Terminated, raise_on_sigterm
+from pipelines.cli.termination import Terminated, ignore_sigterm, raise_on_sigterm
 from pipelines.scale_out.folder import OutputFolder
+from saga_fg.numerics.arrays import distinct
+
+LABELS = np.array(["a", "b", "a"])  # whose kernel has not been compiled
 
 def fill(path):
     with atomic_directory(path) as inner:
@@ -160,10 +168,9 @@ def signalled(*arguments, **options):
 
 folder = pathlib.Path(sys.argv[1])
 (folder / "keep").touch()
-*path, name = sys.argv[2].split(".")
-owner = globals()[path[0]]
-for part in path[1:]:
-    owner = getattr(owner, part)
+logging.disable()  # that kernels are compiled
+path, _, name = sys.argv[2].rpartition(".")
+owner = pkgutil.resolve_name(path)
 original = getattr(owner, name)
 raise_on_sigterm()
 try:
@@ -172,6 +179,7 @@ try:
     while True:
         time.sleep(0.001)
 except Terminated:
+    ignore_sigterm()
     print("terminated")
 """
 
@@ -179,9 +187,10 @@ except Terminated:
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_at_moments_when_an_exception_would_leave_something(tmp_path: Path, moment: str) -> None:
     command = [sys.executable, "-B", "-c", SCRIPT, str(tmp_path), *MOMENTS[moment]]
-    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert (run.stdout, run.stderr) == ("terminated\n", "")
-    assert [path for path in tmp_path.rglob("*") if path.name.endswith(".tmp") or path.name.startswith("tmp")] == []
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120, env=environment)
+    assert (run.stdout, run.stderr, run.returncode) == ("terminated\n", "", 0)
+    assert [path for path in tmp_path.rglob("*") if ".tmp" in path.name or path.name.startswith("tmp")] == []
 
 
 def test_where_it_is_swallowed_it_comes_again() -> None:
