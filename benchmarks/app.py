@@ -5,6 +5,7 @@ from __future__ import annotations
 from benchmarks.fusion import fusion
 from benchmarks.metrics import metrics
 from benchmarks.scaling import scaling
+from benchmarks.settling import settling
 from benchmarks.signals import signals
 from benchmarks.smoothing import smoothing
 from benchmarks.streaming import streaming
@@ -13,7 +14,7 @@ from pipelines.cli.console import new_command
 
 app = new_command()
 
-for command in (fusion, metrics, scaling, signals, smoothing, streaming, synthetic):
+for command in (fusion, metrics, scaling, settling, signals, smoothing, streaming, synthetic):
     app.command()(command)
 
 

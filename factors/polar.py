@@ -10,8 +10,10 @@ The sensor stands at s = (s_x, s_y) with heading phi and moves with velocity u; 
     d rho / dp  = d / rho                               d bearing / dp = (-d_y, d_x) / rho^2
     d rate / dp = ((v - u) - rate d / rho) / rho        d rate / dv    = d / rho
 
-All are undefined where the object is at the sensor itself. Source: Bar-Shalom, Li and Kirubarajan, Estimation with
-Applications to Tracking and Navigation (2001), section 10.4.
+Nearer than 1 cm, finer than any sensor measures, range and rate have the soft distance in place of rho
+(`factors.soft_distance`), so that they and their derivatives are continuous for an object that passes through the
+sensor. A bearing cannot be: round the sensor it takes all values, however near. There it is undefined. Source:
+Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), section 10.4.
 """
 
 from __future__ import annotations
@@ -22,11 +24,13 @@ import numpy as np
 
 from factors.errors import FactorError
 from factors.measurement import checked_components
+from factors.soft_distance import SoftDistance, soft_distance
 from factors.validation import FloatArray, checked
 
 Pair = tuple[int, int]
 Pose = tuple[float, float, float]
 RANGE, BEARING, RANGE_RATE = "range", "bearing", "range rate"
+_SOFT = 0.01  # m; finer than any sensor measures
 
 
 @dataclass(frozen=True)
@@ -71,32 +75,35 @@ class Polar:
         return False
 
     def predict(self, x: FloatArray) -> FloatArray:
-        u, rho = self._sight(x)
-        z = {RANGE: rho, BEARING: np.arctan2(u[..., 1], u[..., 0]) - self.sensor_pose[2]}
+        d, sight = self._sight(x)
+        z = {RANGE: sight.value, BEARING: np.arctan2(d[..., 1], d[..., 0]) - self.sensor_pose[2]}
         if self.velocity:
-            z[RANGE_RATE] = (u * self._relative(x)).sum(axis=-1)
+            z[RANGE_RATE] = (sight.direction * self._relative(x)).sum(axis=-1)
         return np.stack([z[name] for name in self.measured], axis=-1)
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        u, rho = self._sight(x)
-        by_position = {RANGE: u, BEARING: np.stack([-u[..., 1], u[..., 0]], axis=-1) / rho[..., None]}
+        d, sight = self._sight(x)
+        u = sight.direction
+        by_position = {RANGE: u}
+        if BEARING in self.measured:
+            rho = np.hypot(d[..., 0], d[..., 1])[..., None]
+            by_position[BEARING] = np.stack([-d[..., 1], d[..., 0]], axis=-1) / rho / rho
         J = np.zeros((*x.shape[:-1], self.dim, self.state_dim))
         if self.velocity:
             relative = self._relative(x)
-            rate = (u * relative).sum(axis=-1, keepdims=True)
-            by_position[RANGE_RATE] = (relative - rate * u) / rho[..., None]
+            rate = sight.share[..., None] * (u * relative).sum(axis=-1, keepdims=True)
+            by_position[RANGE_RATE] = (relative - rate * u) / sight.radius[..., None]
             J[..., self.measured.index(RANGE_RATE), list(self.velocity)] = u
         for row, name in enumerate(self.measured):
             J[..., row, list(self.position)] = by_position[name]
         return J
 
-    def _sight(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Unit vectors (..., 2) from sensor to object, and ranges (...)."""
+    def _sight(self, x: FloatArray) -> tuple[FloatArray, SoftDistance]:
+        """Vectors (..., 2) from sensor to object, and their lengths."""
         d = x[..., list(self.position)] - np.array(self.sensor_pose[:2])
-        rho = np.hypot(d[..., 0], d[..., 1])
-        if not np.all(rho > 0):
-            raise FactorError("the object is at the sensor itself, where range and bearing have no derivative")
-        return d / rho[..., None], rho
+        if BEARING in self.measured and not (d != 0).any(axis=-1).all():
+            raise FactorError("the object is at the sensor itself, where a bearing has no derivative")
+        return d, soft_distance(d, _SOFT)
 
     def _relative(self, x: FloatArray) -> FloatArray:
         return np.asarray(x[..., list(self.velocity)] - np.array(self.sensor_velocity))

@@ -250,7 +250,7 @@ class Repulsion(Settings):
         target, source = np.repeat(pushed, len(pushing)), np.tile(pushing, len(pushed))
         target, source = target[target != source], source[target != source]
         given = self.interaction.given(nodes, target, source)
-        apart, _ = nearest_offset(nodes.position[target] - nodes.position[source], given)
+        apart = nearest_offset(nodes.position[target] - nodes.position[source], given)
         distance = np.hypot(*apart.T)
         near = (distance <= self.max_distance).nonzero()[0]
         near = near[strongest(target[near], -distance[near], len(nodes), self.max_degree)]

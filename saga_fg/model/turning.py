@@ -122,11 +122,14 @@ class Bicycle(Settings):
         return _turned_jacobian(x, dt * speed * curvature, by_state, dt)
 
     def _curvature(self, steering: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """kappa (...), 1/m, and its derivative; sin(beta) = s / sqrt(4 c^2 + s^2), s and c of the steering angle."""
+        """kappa (...), 1/m, and its derivative; sin(beta) = s / sqrt(4 c^2 + s^2), s and c of the steering angle.
+
+        Past a right angle, where a vehicle would roll backwards, it goes on without a jump.
+        """
         s, c = np.sin(steering), np.cos(steering)
         root = np.sqrt(4 * c * c + s * s)
         half = self.wheelbase / 2
-        return s * np.sign(c) / (root * half), 4 * np.abs(c) / (root**3 * half)
+        return s / (root * half), 4 * c / (root**3 * half)
 
 
 def _arcs(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
