@@ -20,6 +20,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from benchmarks.tracking import sampled_differences
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics import (
     Interval,
@@ -32,7 +33,6 @@ from data_tools.metrics.matching import match_scene
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from data_tools.simulator.scenarios import scenario_settings
 from data_tools.simulator.sensors import points_on, sensor_position
-from pipelines.bench.tracking import sampled_differences
 from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.tables import JsonFile, report

@@ -23,15 +23,15 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from pipelines.bench.contenders import dense
-from pipelines.bench.flocks import Flock, FlockFrame
+from benchmarks.contenders import dense
+from benchmarks.flocks import Flock, FlockFrame
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 D = 4  # size of a node's state, and of an edge's
 
 
 class JointGraphTracking:
-    """One Kalman filter over nodes and edges; a `Filter` of `pipelines.bench.contenders`."""
+    """One Kalman filter over nodes and edges; a `Filter` of `benchmarks.contenders`."""
 
     def __init__(self, flock: Flock) -> None:
         n = len(flock)
@@ -76,7 +76,7 @@ class JointGraphTracking:
 
 
 class SeparateGraphTracking:
-    """A Kalman filter for every node and every edge; a `Filter` of `pipelines.bench.contenders`."""
+    """A Kalman filter for every node and every edge; a `Filter` of `benchmarks.contenders`."""
 
     def __init__(self, flock: Flock) -> None:
         self._x, self._P = flock.means, flock.covariances

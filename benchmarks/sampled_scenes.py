@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.bench.flocks import sample_step
+from benchmarks.flocks import sample_step
 from pipelines.config import TrackConfig
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following, Neighbours

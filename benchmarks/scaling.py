@@ -1,6 +1,6 @@
 """`python -m benchmarks scaling`: node-only filtering against filters with node and edge states.
 
-Cost and accuracy over the number of objects, on flocks of cars that share velocities (`pipelines.bench.flocks`,
+Cost and accuracy over the number of objects, on flocks of cars that share velocities (`benchmarks.flocks`,
 `connected`), sampled from the model that all filters know; association is known. Besides the misses of single frames
 every object is hidden for two seconds once, some at a time, so that interactions matter. Times are medians of CPU time
 a frame on one thread, the contenders in turn; errors are root mean squares of positions, of objects while they are
@@ -17,13 +17,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from benchmarks.contenders import Filter, Ours
+from benchmarks.flocks import DT, Flock, FlockFrame, flock
 from benchmarks.graph_tracking import JointGraphTracking, SeparateGraphTracking
+from benchmarks.measuring import timed
 from data_tools.figures import FigureTable, cell
 from data_tools.files.atomic_files import check_writable, write_bytes
 from data_tools.plots import png
-from pipelines.bench.contenders import Filter, Ours
-from pipelines.bench.flocks import DT, Flock, FlockFrame, flock
-from pipelines.bench.measuring import timed
 from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Verbose, counts
 from pipelines.cli.tables import JsonFile, report

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -48,9 +49,9 @@ def main() -> None:
     write_running_graph_pictures(HERE)
     write_loops_picture(HERE)
     if data := os.environ.get("SAGA_FG_DATA"):
-        gap = "bench gaps --sets ngsim --test USA_US101-12_1_T-1 --passes 2 --lengths 3,5 --life kept"
+        gap = "-m benchmarks gaps --sets ngsim --test USA_US101-12_1_T-1 --passes 2 --lengths 3,5 --life kept"
         subprocess.run(
-            ["saga-fg", *gap.split(), "--contenders", "saga,kf", "--data", data, "--picture", HERE / "gap.png"],
+            [sys.executable, *gap.split(), "--contenders", "saga,kf", "--data", data, "--picture", HERE / "gap.png"],
             check=True,
         )
     with tempfile.TemporaryDirectory() as folder:

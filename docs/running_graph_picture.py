@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.sampled_traffic import SampledTraffic, providers, sample_traffic
 from data_tools.plots import running_graph_picture
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from factors import bearing_range_factor
-from pipelines.bench.sampled_traffic import SampledTraffic, providers, sample_traffic
 from pipelines.config import load_config
 from pipelines.explaining import graph_picture
 from saga_fg import Tracker

@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.app import app
+from benchmarks.flocks import flock
 from benchmarks.graph_tracking import JointGraphTracking, SeparateGraphTracking
 from benchmarks.scaling import APART, JOINT, NODES, SEPARATE, ScalingSettings, bench_scaling
-from pipelines.bench.flocks import flock
 
 
 @pytest.fixture(scope="module")

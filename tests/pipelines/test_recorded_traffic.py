@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.recordings import recording_set
 from data_tools.datasets.parts import scene_digests
 from data_tools.simulator.recorded_source import NgsimSource
-from pipelines.bench.recordings import recording_set
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.learning import scenes_to_learn_from

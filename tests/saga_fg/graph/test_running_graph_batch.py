@@ -5,14 +5,14 @@ import copy
 import numpy as np
 import pytest
 
-from factors import ResidualFactors, prior_factor
-from pipelines.bench.sampled_traffic import (
+from benchmarks.sampled_traffic import (
     DetectionProvider,
     ObjectProvider,
     VehicleProvider,
     providers,
     sample_traffic,
 )
+from factors import ResidualFactors, prior_factor
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver, GraduatedNonConvexity, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphError, NewVariable, UndeterminedError, key_of

@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 
+from benchmarks.sampled_traffic import providers, sample_traffic
 from factors import SolverSettings, gaussian_factor, marginal_moments, pose_prior_factor, prior_factor
-from pipelines.bench.sampled_traffic import providers, sample_traffic
 from saga_fg.estimators import BatchSmoother, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import (
     EGO_POSE,

@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 
+from benchmarks.sampled_traffic import providers, sample_traffic
 from factors import ResidualFactors
-from pipelines.bench.sampled_traffic import providers, sample_traffic
 from saga_fg import Detection, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import OBJECT, Additions

@@ -1,0 +1,1 @@
+"""The live service at work: endurance, hostile clients, round trips."""
