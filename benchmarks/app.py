@@ -1,33 +1,14 @@
-"""All benchmarks, as one command."""
+"""All benchmarks, as one command: the function `NAME` of each module `benchmarks.NAME`."""
 
 from __future__ import annotations
 
-from benchmarks.estimators_command import estimators
-from benchmarks.fusion import fusion
-from benchmarks.gaps_command import gaps
-from benchmarks.joint_command import joint
-from benchmarks.loops_command import loops
-from benchmarks.metrics import metrics
-from benchmarks.scaling import scaling
-from benchmarks.service_command import service
-from benchmarks.signals import signals
-from benchmarks.slam_command import slam
-from benchmarks.smoothing import smoothing
-from benchmarks.speed_command import speed
-from benchmarks.streaming import streaming
-from benchmarks.synthetic import synthetic
-from benchmarks.tracking_command import tracking
-from pipelines.cli.console import new_command
+from importlib import import_module
 
-app = new_command()
+from benchmarks.runner import application
 
-for command in (
-    *(estimators, fusion, gaps, joint, loops, metrics, scaling, service),
-    *(signals, slam, smoothing, speed, streaming, synthetic, tracking),
-):
-    app.command()(command)
+NAMES = (
+    *("estimators", "gaps", "joint", "loops", "metrics", "scaling", "service"),
+    *("slam", "smoothing", "speed", "streaming", "tracking"),
+)
 
-
-@app.callback()
-def benchmarks() -> None:
-    """Measure: every figure is compared with a baseline in the same run."""
+app = application(getattr(import_module(f"benchmarks.{name}"), name) for name in NAMES)

@@ -1,318 +1,219 @@
 """Every estimator against its baseline: the textbook on dense matrices, or GTSAM's own fixed-lag smoother.
 
 Filters read all means and all per-node covariances after every frame; the fixed-lag smoothers all means of their window
-and (ours only) the newest covariances; the batch smoothers all means and all per-node covariances of a recording.
+and (ours only) the newest covariances; the batch smoothers all means and all per-node covariances of a recording. The
+running graph takes vehicles with linear interactions and with those of intelligent drivers. In the endurance run a
+young filter takes turns with one that went all the way, over its last tenth.
+
+    ratio            of the times to the baseline's
+    largest, mean    difference of a mean from the reference's, standard deviations
+    covariance       largest relative difference of a node's covariance, Frobenius
+    ANEES            mean normalised squared error of the estimates: 1 if covariances are right
+    MB               of the estimator's state
 """
 
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from benchmarks.contenders import Contender, Filter, GtsamWindow, Ours, OurWindow, Textbook, dense
-from benchmarks.estimator_figures import Criterion, Row, Soak, criteria, exponents
-from benchmarks.flocks import Flock, Kind, flock
-from benchmarks.measuring import environment, size_of, timed
-from benchmarks.running_graph import drivers, endless_drivers, windows
+from benchmarks.filters import Filter, GtsamWindow, Ours, OurWindow, Read, Textbook, blocks, dense
+from benchmarks.flocks import DT, Flock, FlockFrame, Kind, flock
+from benchmarks.runner import Row, Rows, Seed, each, growth, in_turn, timed
+from factors import gaussian_factors, prior_factors
+from pipelines.cli.options import counts
 from pipelines.process import one_thread, resident_memory
-from pipelines.tracking import Progress
-from saga_fg.errors import InputError
 from saga_fg.estimators import (
     BatchSmoother,
     BoundedKalmanFilter,
     Gaussian,
     IncrementalFilter,
+    IncrementalSmoother,
     JointKalmanFilter,
     kalman_predict,
     kalman_update,
     rts_smooth,
 )
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import setting
+from saga_fg.graph import OBJECT, Additions, GraphView, NewVariable
+from saga_fg.model.nonlinear_interactions import SmoothDriver, interaction
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.tracking import TrackerSettings
 
 KINDS: tuple[Kind, ...] = ("connected", "components")
-LAG = 5  # frames
-TRACKER = "kalman, as in the tracker"  # with the bounds that the tracker has by default
-WARM_UP = 3  # frames that are not counted
-WHOLE = 100  # more nodes take the running graph seconds a frame
-DENSE = INCREMENTAL = 300  # more nodes in one graph are hopeless for the textbook and for iSAM2
-_COVARIANCES = 50  # more nodes take GTSAM's smoother seconds to tell its covariances
+LAG, WARM_UP = 5, 3  # frames; those that are not counted
+DENSE, WHOLE = 300, 100  # more nodes in one graph are hopeless for the textbook and iSAM2; for windows and the graph
+GROWTH_FROM = 50  # nodes: below, calls cost more than numbers
+ROW = 5  # vehicles
+F, Q = np.eye(4) + DT * np.eye(4, k=2), 0.3 * np.kron([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]], np.eye(2))
+OWN, LEADER = np.diag([1.0, 1.0, 0.95, 0.95]) @ F, np.diag([0.0, 0.0, 0.05, 0.05])
+COST, GROWTH, ENDURANCE = "cost, and error in standard deviations", "growth of the cost", "endurance"
 
 
-@dataclass(frozen=True)
-class EstimatorBenchSettings:
-    """Size of the benchmark."""
+def estimators(
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Numbers of nodes, with commas between.")
+    ] = "10,50,100,300,1000",
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of each case that are counted.")] = 20,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="No more frames of a case after that.")] = 30.0,
+    batch: Annotated[
+        int, typer.Option("--batch-frames", min=0, help="Length of the batch smoothers' recording; 0: none.")
+    ] = 200,
+    soak: Annotated[int, typer.Option("--soak-frames", min=0, help="Frames of the endurance run; 0: none.")] = 10_000,
+    nodes: Annotated[int, typer.Option("--nodes", min=2, help="Nodes of these two.")] = 100,
+    seed: Seed = 0,
+) -> Rows:
+    """Measure time, memory and exactness of the estimators.
 
-    sizes: tuple[int, ...] = setting((10, 50, 100, 300, 1000), "numbers of nodes")
-    frames: int = setting(20, "largest number of frames that are timed in each case")
-    seconds: float = setting(30.0, "time after which a case ends early, s")
-    batch_frames: int = setting(200, "frames of the recording that the batch smoothers solve; 0 for none")
-    batch_nodes: int = setting(100, "nodes of that recording")
-    soak_frames: int = setting(10_000, "frames of the endurance run; 0 for none")
-    soak_nodes: int = setting(100, "nodes of the endurance run")
-    scenes: int = setting(20, "nonlinear scenes drawn from the model; 0 for none")
-    seed: int = setting(0, "seed of the flocks")
-    scene_frames: int = setting(40, "frames of each of these scenes")
-    everything: bool = setting(False, "measure the hopeless cases too")
+    Filters are compared with the textbook's on dense matrices, fixed-lag smoothers with GTSAM's, batch smoothers with
+    Rauch, Tung and Striebel's, a running graph of intelligent drivers with a linear one.
 
-    def __post_init__(self) -> None:
-        if not self.sizes or min(self.sizes) < 2:
-            raise InputError(f"sizes: expected at least 2 nodes each, got {self.sizes}")
-        if self.frames < 1 or self.batch_frames < 0 or self.soak_frames < 0 or self.seconds <= 0:
-            raise InputError("frames, seconds: expected positive numbers")
-
-
-@dataclass(frozen=True)
-class EstimatorBench:
-    """All that was measured; exponents: of the cost over the number of nodes, by contender and graph."""
-
-    rows: tuple[Row, ...]
-    soaks: tuple[Soak, ...]
-    exponents: dict[str, float]
-    criteria: tuple[Criterion, ...]
-    settings: EstimatorBenchSettings
-    environment: Mapping[str, str] = field(default_factory=environment)
-
-
-def bench_estimators(settings: EstimatorBenchSettings, progress: Progress | None = None) -> EstimatorBench:
-    """Measure everything, one case after the other."""
-    rows: list[Row] = []
-    soaks: list[Soak] = []
-    cases = [*_filter_cases(settings), *_lag_cases(settings), *_batch_cases(settings)]
-    cases += [*_running_cases(settings), *_soak_cases(settings)]
-    with one_thread():
-        for done, (name, case) in enumerate(cases):
-            if progress is not None:
-                progress(name, done, len(cases))
-            for measured in case():
-                if isinstance(measured, Soak):
-                    soaks.append(measured)
-                else:
-                    rows.append(measured)
-    return EstimatorBench(tuple(rows), tuple(soaks), exponents(rows), criteria(rows, soaks), settings)
-
-
-Case = tuple[str, Callable[[], Sequence[Row | Soak]]]
-
-
-def _filter_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
-    for n in settings.sizes:
+    \b
+    Examples:
+      python -m benchmarks estimators
+      python -m benchmarks estimators --sizes 10,100 --frames 5 --soak-frames 0 --json figures.json
+    """
+    numbers = counts("--sizes", sizes, least=2)
+    cases: list[Callable[[], Iterator[Row]]] = []
+    for n in numbers:
         for kind in KINDS:
-            yield f"filters, {kind}, {n} nodes", partial(_filters, kind, n, settings)
+            cases.append(partial(_filters, kind, n, frames, seconds, seed))
+            if kind == "components" or n <= WHOLE:
+                cases.append(partial(_windows, kind, n, frames, seconds, seed))
+            if n <= WHOLE:
+                cases.append(partial(_running_graph, kind, n, frames, seconds))
+    if batch:
+        cases += [partial(_batch, kind, nodes, batch, seed) for kind in KINDS]
+    costs: dict[tuple[str, str], list[tuple[int, float]]] = {}
+    for case in each(cases, "cases"):
+        for title, row in case():
+            if row["nodes"] >= GROWTH_FROM and row["case"] != "batch":
+                costs.setdefault((row["estimator"], row["graph"]), []).append((row["nodes"], row["ms"]))
+            yield title, row
+    for (name, graph), points in costs.items():
+        if len(points) > 2:
+            yield GROWTH, {"estimator": name, "graph": graph, "nodes^": growth(*zip(*points, strict=True))}
+    if soak:
+        scene = flock("components", nodes, 50, seed)
+        with one_thread():
+            yield from _endurance("isam2", soak, partial(_endless, scene))
 
 
-def _filters(kind: Kind, n: int, settings: EstimatorBenchSettings) -> list[Row]:
-    frames = settings.frames + WARM_UP
-    scene = flock(kind, n, frames, settings.seed)
-    contenders: dict[str, Filter] = {}
-    if n <= DENSE or settings.everything:
-        contenders["textbook"] = Textbook(scene)
-    contenders["kalman"] = Ours(JointKalmanFilter(), scene)
+def _filters(kind: Kind, n: int, frames: int, seconds: float, seed: int) -> Iterator[Row]:
+    scene, tracker = flock(kind, n, frames + WARM_UP, seed), TrackerSettings()
+    filters: dict[str, Filter] = {"textbook": Textbook(scene)} if n <= DENSE else {}
+    filters["kalman"] = Ours(JointKalmanFilter(), scene)
     if kind == "connected":
-        contenders["kalman, bounded"] = Ours(BoundedKalmanFilter(), scene)
-        tracker = TrackerSettings()
-        contenders[TRACKER] = Ours(JointKalmanFilter((), tracker.tolerance, tracker.max_component), scene)
-    if kind == "components" or n <= INCREMENTAL or settings.everything:
-        contenders["isam2"] = Ours(IncrementalFilter(), scene)
-    race = _race(contenders, scene, settings)
-    reference = contenders.get("textbook", contenders["kalman"])
-    baseline = race.milliseconds.get("textbook", math.nan)
-    return [
-        Row(
-            "filter",
-            kind,
-            n,
-            name,
-            race.milliseconds[name],
-            race.milliseconds[name] / baseline,
-            *_errors(contender.read(), reference.read()),
-            race.anees[name],
-            size_of(contender.estimator.snapshot()) if isinstance(contender, Ours) else math.nan,
-        )
-        for name, contender in contenders.items()
-    ]
+        filters["kalman, bounded"] = Ours(BoundedKalmanFilter(), scene)
+        bounds = tracker.tolerance, tracker.max_component
+        filters["kalman, as in the tracker"] = Ours(JointKalmanFilter((), *bounds), scene)
+    if kind == "components" or n <= DENSE:
+        filters["isam2"] = Ours(IncrementalFilter(), scene)
+    anees: dict[str, list[float]] = {name: [] for name in filters}
+
+    def judged() -> Iterator[FlockFrame]:
+        for frame in scene.frames:
+            yield frame
+            for name, one in filters.items():
+                anees[name].append(_anees(frame.truth, *one.read()))
+
+    times = in_turn({name: one.prepare for name, one in filters.items()}, judged(), WARM_UP, seconds)
+    reference, base = next(iter(filters)), float(np.median(times[next(iter(filters))]))
+    for name, one in filters.items():
+        ms = float(np.median(times[name]))
+        errors = _errors(one.read(), filters[reference].read())
+        memory = len(pickle.dumps(one.estimator.snapshot())) / 1e6 if isinstance(one, Ours) else None
+        about = {"case": "filter", "graph": kind, "nodes": n, "estimator": name, "ms": ms, "ratio": ms / base}
+        yield COST, {**about, **errors, "ANEES": float(np.mean(anees[name][WARM_UP:] or math.nan)), "MB": memory}
 
 
-def _lag_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
-    for n in settings.sizes:
-        for kind in KINDS:
-            if kind == "components" or n <= 100 or settings.everything:
-                yield f"fixed lag, {kind}, {n} nodes", partial(_windows, kind, n, settings)
+def _windows(kind: Kind, n: int, frames: int, seconds: float, seed: int) -> Iterator[Row]:
+    scene = flock(kind, n, frames + WARM_UP + LAG, seed)
+    ours, theirs = OurWindow(LAG, scene), GtsamWindow(LAG, scene)
+    times = in_turn({"GTSAM's": theirs.prepare, "fixed-lag": ours.prepare}, scene.frames, WARM_UP + LAG, seconds)
+    sigma = np.sqrt(np.diagonal(ours.read()[1], axis1=1, axis2=2)).ravel()
+    off = np.array([np.abs((a - b) / sigma) for a, b in zip(ours.window, theirs.window, strict=True)])
+    for name, spent in times.items():
+        ms = float(np.median(spent))
+        about = {"case": "fixed lag", "graph": kind, "nodes": n, "estimator": name, "ms": ms}
+        errors = {"largest": off.max(), "mean": off.mean()} if name == "fixed-lag" else {}
+        yield COST, {**about, "ratio": ms / float(np.median(times["GTSAM's"])), **errors}
 
 
-def _windows(kind: Kind, n: int, settings: EstimatorBenchSettings) -> list[Row]:
-    scene = flock(kind, n, settings.frames + WARM_UP + LAG, settings.seed)
-    ours, gtsams = OurWindow(LAG, scene), GtsamWindow(LAG, scene)
-    race = _race({"fixed-lag": ours, "gtsam": gtsams}, scene, settings, warm_up=WARM_UP + LAG)
-    _, covariances = ours.read()
-    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).ravel()
-    window = [np.abs((a - b) / sigma) for a, b in zip(ours.window, gtsams.window, strict=True)]
-    theirs = gtsams.covariances() if n <= _COVARIANCES else None
-    baseline = race.milliseconds["gtsam"]
-    mine = Row(
-        "fixed lag",
-        kind,
-        n,
-        "fixed-lag",
-        race.milliseconds["fixed-lag"],
-        race.milliseconds["fixed-lag"] / baseline,
-        float(np.max(window)),
-        float(np.mean(window)),
-        math.nan if theirs is None else _relative(covariances, theirs),
-        race.anees["fixed-lag"],
-        size_of(ours.estimator.snapshot()),
-    )
-    return [Row("fixed lag", kind, n, "GTSAM's", baseline, 1.0), mine]
+def _batch(kind: Kind, n: int, frames: int, seed: int) -> Iterator[Row]:
+    scene, found = flock(kind, n, frames, seed), dict[str, list[Read]]()
+    runs = {"textbook": _textbook_smoother, "batch": _batch_smoother}
+    contenders = {
+        name: partial(lambda run, _, name: lambda: found.update({name: run(scene)}), run, name=name)
+        for name, run in runs.items()
+    }
+    times = in_turn(contenders, (scene,))
+    pairs = zip(found["batch"], found["textbook"], strict=True)
+    errors = [_errors(mine, reference) for mine, reference in pairs]
+    worst = {key: max(error[key] for error in errors) for key in errors[0]}
+    for name in runs:
+        ms = float(times[name][0])
+        about = {"case": "batch", "graph": kind, "nodes": n, "estimator": name, "ms": ms}
+        yield COST, {**about, "ratio": ms / float(times["textbook"][0]), **(worst if name == "batch" else {})}
 
 
-def _batch_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
-    for kind in KINDS if settings.batch_frames else ():
-        yield f"batch, {kind}, {settings.batch_nodes} nodes", partial(_batches, kind, settings)
-
-
-def _batches(kind: Kind, settings: EstimatorBenchSettings) -> list[Row]:
-    n = settings.batch_nodes
-    scene = flock(kind, n, settings.batch_frames, settings.seed)
-    textbook, baseline = _textbook_smoother(scene)
-    ours: list[tuple[FloatArray, FloatArray]] = []
-    milliseconds = timed(lambda: ours.extend(_batch_smoother(scene)))
-    at = np.arange(4 * n).reshape(-1, 4)
-    errors = []
-    for (mean, covariances), reference in zip(ours, textbook, strict=True):
-        blocks = reference.covariance[at[:, :, None], at[:, None, :]]
-        errors.append(_errors((mean.reshape(-1, 4), covariances), (reference.mean.reshape(-1, 4), blocks)))
-    largest, average, covariance = np.array(errors).T
-    return [
-        Row("batch", kind, n, "textbook", baseline, 1.0),
-        Row(
-            "batch",
-            kind,
-            n,
-            "batch",
-            milliseconds,
-            milliseconds / baseline,
-            float(largest.max()),
-            float(average.mean()),
-            float(covariance.max()),
-        ),
-    ]
-
-
-def _batch_smoother(scene: Flock) -> list[tuple[FloatArray, FloatArray]]:
+def _batch_smoother(scene: Flock) -> list[Read]:
     smoother = BatchSmoother(likelihoods=False)
     smoother.add(scene.nodes, scene.means, scene.covariances)
     for frame in scene.frames:
         smoother.predict(frame.transition)
         smoother.update(frame.measurements)
-    return [(moment.state, moment.covariance(scene.nodes)) for moment in smoother.smoothed()]
+    return [(now.state.reshape(len(scene), -1), now.covariance(scene.nodes)) for now in smoother.smoothed()]
 
 
-def _textbook_smoother(scene: Flock) -> tuple[list[Gaussian], float]:
-    """Smoothed states of every moment, and the milliseconds that filter and smoother took."""
-    filtered, predicted, transitions = [Gaussian(scene.means.ravel(), _block_diagonal(scene.covariances))], [], []
-    milliseconds = 0.0
-
-    def take(F: FloatArray, b: FloatArray, Q: FloatArray, z: FloatArray, H: FloatArray, R: FloatArray) -> None:
+def _textbook_smoother(scene: Flock) -> list[Read]:
+    n, d = scene.means.shape
+    P = np.zeros((n, d, n, d))
+    P[np.arange(n), :, np.arange(n)] = scene.covariances
+    filtered, predicted, transitions = [Gaussian(scene.means.ravel(), P.reshape(n * d, -1))], [], []
+    for frame in scene.frames:
+        F, b, Q, z, H, R = dense(frame)
         predicted.append(kalman_predict(filtered[-1], F, b, Q))
         filtered.append(kalman_update(predicted[-1], z, H, R)[0])
         transitions.append(F)
-
-    for frame in scene.frames:
-        milliseconds += timed(partial(take, *dense(frame)))
-    smoothed: list[Gaussian] = []
-    milliseconds += timed(lambda: smoothed.extend(rts_smooth(filtered, predicted, transitions)))
-    return smoothed, milliseconds
+    return [blocks(now.mean, now.covariance, n) for now in rts_smooth(filtered, predicted, transitions)]
 
 
-def _running_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
-    for n in settings.sizes:
-        for kind in KINDS if n <= WHOLE else ():
-            yield f"running graph, {kind}, {n} nodes", partial(drivers, kind, n, settings.frames)
-    if settings.scenes:
-        yield "nonlinear scenes", partial(windows, settings.scenes, settings.scene_frames, settings.seed)
-
-
-def _soak_cases(settings: EstimatorBenchSettings) -> Iterator[Case]:
-    few = max(2, settings.soak_nodes // 5)
-    for kind in KINDS if settings.soak_frames else ():
-        n = settings.soak_nodes if kind == "components" else few
-        scene = flock(kind, n, 50, settings.seed)
-        yield f"endurance, {kind}, {n} nodes", partial(_soak, "isam2", kind, n, settings, partial(_endless, scene))
-    if settings.soak_frames:
-        make = partial(endless_drivers, few)
-        yield f"endurance, drivers, {few} nodes", partial(_soak, "drivers", "components", few, settings, make)
+def _running_graph(kind: Kind, n: int, frames: int, seconds: float) -> Iterator[Row]:
+    row = ROW if kind == "components" else n
+    graphs = {"linear": True, "intelligent driver": False}
+    smoothers = {name: IncrementalSmoother([Vehicles(n, row, linear)]) for name, linear in graphs.items()}
+    contenders = {name: partial(partial, smoother.step) for name, smoother in smoothers.items()}
+    times = in_turn(contenders, [DT * k for k in range(WARM_UP + frames)], WARM_UP, seconds)
+    for name, spent in times.items():
+        about = {"case": "running graph", "graph": kind, "nodes": n, "estimator": name, "ms": float(np.median(spent))}
+        yield COST, {**about, "ratio": float(np.median(spent) / np.median(times["linear"]))}
 
 
 def _endless(scene: Flock) -> Callable[[int], None]:
     """The linear filter on the same frames over and over."""
     ours = Ours(IncrementalFilter(), scene)
-
-    def step(k: int) -> None:
-        ours.prepare(scene.frames[k % len(scene.frames)])
-        ours.step()
-
-    return step
+    return lambda k: ours.step(scene.frames[k % len(scene.frames)])
 
 
-def _soak(
-    name: str, kind: Kind, n: int, settings: EstimatorBenchSettings, make: Callable[[], Callable[[int], None]]
-) -> list[Soak]:
-    """`make` gives a fresh filter, which takes frame k. Over the last tenth of the frames a young one, which is then
-    between one and two tenths old, takes turns with the one that went all the way.
-    """
-    part = max(1, settings.soak_frames // 10)
-    second, late = settings.soak_frames - 2 * part, settings.soak_frames - part
-    old, young = make(), make()
-    times: dict[str, list[float]] = {"young": [], "old": []}
-    memory: tuple[list[float], list[float]] = ([], [])
-    for k in range(settings.soak_frames):
-        taken = [timed(partial(old, k)), timed(partial(young, k - second)) if k >= second else 0.0]
-        if k >= late:
-            times["old"].append(taken[0])
-            times["young"].append(taken[1])
-        if k >= late or part <= k < 2 * part:
-            memory[k >= late].append(resident_memory())
-    medians = float(np.median(times["young"])), float(np.median(times["old"]))
-    held = float(np.median(memory[0] or memory[1])), float(np.median(memory[1]))
-    return [Soak(name, kind, n, settings.soak_frames, medians, held)]
-
-
-@dataclass(frozen=True)
-class _Race:
-    """Median milliseconds a frame, and ANEES, of each contender."""
-
-    milliseconds: dict[str, float]
-    anees: dict[str, float]
-
-
-def _race(
-    contenders: Mapping[str, Contender], scene: Flock, settings: EstimatorBenchSettings, warm_up: int = WARM_UP
-) -> _Race:
-    """All contenders, frame by frame in turn; the first frames are not counted."""
-    times: dict[str, list[float]] = {name: [] for name in contenders}
-    errors: dict[str, list[float]] = {name: [] for name in contenders}
-    spent = 0.0
-    for k, frame in enumerate(scene.frames):
-        for name, contender in contenders.items():
-            contender.prepare(frame)
-            taken = timed(contender.step)
-            spent += taken / 1e3
-            if k < warm_up:
-                continue
-            times[name].append(taken)
-            if isinstance(contender, Ours | Textbook):
-                errors[name].append(_anees(frame.truth, *contender.read()))
-        if k >= warm_up and spent > settings.seconds:
-            break
-    return _Race(
-        {name: float(np.median(taken)) for name, taken in times.items()},
-        {name: float(np.mean(each)) if each else math.nan for name, each in errors.items()},
-    )
+def _endurance(name: str, frames: int, make: Callable[[], Callable[[int], None]]) -> Iterator[Row]:
+    """`make` gives a fresh filter, which takes frame k. The young one is one to two tenths old when it counts."""
+    part = max(1, frames // 10)
+    old, young, memory = make(), make(), np.zeros(frames)
+    times: list[tuple[float, float]] = []
+    for k in each(range(frames), f"endurance, {name}"):
+        taken = timed(old, k), timed(young, k - frames + 2 * part) if k >= frames - 2 * part else 0.0
+        times.append(taken)
+        memory[k] = resident_memory()
+    at_end, at_start = np.median(times[-part:], axis=0).tolist()
+    held = np.median(memory[part : 2 * part]), np.median(memory[-part:])
+    about: Mapping[str, Any] = {"estimator": name, "frames": frames, "ms at the end": at_end, "ms, young": at_start}
+    yield ENDURANCE, {**about, "old / young": at_end / at_start, "memory, end / start": held[1] / held[0]}
 
 
 def _anees(truth: FloatArray, means: FloatArray, covariances: FloatArray) -> float:
@@ -322,23 +223,54 @@ def _anees(truth: FloatArray, means: FloatArray, covariances: FloatArray) -> flo
     return float(square.mean() / truth.shape[1])
 
 
-def _errors(
-    read: tuple[FloatArray, FloatArray], reference: tuple[FloatArray, FloatArray]
-) -> tuple[float, float, float]:
-    """Largest and average difference of the means, in standard deviations; largest of the covariances, relative."""
-    sigma = np.sqrt(np.diagonal(reference[1], axis1=1, axis2=2))
-    difference = np.abs((read[0] - reference[0]) / sigma)
-    return float(difference.max()), float(difference.mean()), _relative(read[1], reference[1])
+def _errors(read: Read, reference: Read) -> dict[str, float]:
+    """Differences of means, in standard deviations, and of covariances."""
+    off = np.abs((read[0] - reference[0]) / np.sqrt(np.diagonal(reference[1], axis1=1, axis2=2)))
+    relative = np.linalg.norm(read[1] - reference[1], axis=(1, 2)) / np.linalg.norm(reference[1], axis=(1, 2))
+    return {"largest": float(off.max()), "mean": float(off.mean()), "covariance": float(relative.max())}
 
 
-def _relative(blocks: FloatArray, reference: FloatArray) -> float:
-    """Largest relative difference of one of the matrices."""
-    difference = np.linalg.norm(blocks - reference, axis=(1, 2))
-    return float((difference / np.linalg.norm(reference, axis=(1, 2))).max())
+class Vehicles:
+    """Provider of rows of vehicles at 8 m/s, 14 m apart, each behind the next, all seen in every frame.
+
+    With linear interactions velocities approach the leader's; others are those of the intelligent driver.
+    """
+
+    name = "vehicles"
+
+    def __init__(self, count: int, row: int, linear: bool) -> None:
+        self.linear, self.slots = linear, np.arange(count)
+        self.start = np.zeros((count, 4))
+        self.start[:, 0], self.start[:, 1] = -14.0 * (self.slots % row), 5.0 * (self.slots // row)
+        self.start[:, 2] = 8.0
+        self.first, self.behind = np.flatnonzero(self.slots % row == 0), np.flatnonzero(self.slots % row)
+
+    def factors(self, view: GraphView) -> Additions:
+        """Positions, priors in the first frame, then interactions."""
+        there = self.start + view.time * np.array([8.0, 0.0, 0.0, 0.0])
+        z = there[:, :2] + 0.3 * np.random.default_rng(view.epoch).normal(size=(len(there), 2))
+        now = np.array([view.key(OBJECT, i) for i in self.slots.tolist()], dtype=np.uint64)
+        H = np.tile(np.eye(2, 4), (len(there), 1, 1))
+        factors: list[Any] = [*gaussian_factors(now[:, None], [H], z, 0.09 * np.eye(2))]
+        if view.epoch == 0:
+            factors += prior_factors(now, there, 0.5 * np.eye(4))
+        else:
+            before, behind = view.before(OBJECT), self.behind
+            last = np.array([before[i].key for i in self.slots.tolist()], dtype=np.uint64)
+            x = np.stack([view.state(key) for key in last.tolist()])
+            there = x @ F.T
+            factors += _linear(now, last, self.first, [F])
+            if self.linear:
+                factors += _linear(now, last, behind, [OWN, LEADER])
+            elif len(behind):
+                motion = interaction(SmoothDriver())
+                there[behind] = motion.predict(x[behind], [x[behind - 1]], DT)
+                factors.append(motion.factors(now[behind], last[behind], last[behind - 1, None], 4, DT, Q))
+        return Additions([NewVariable(OBJECT, i, x) for i, x in zip(self.slots.tolist(), there, strict=True)], factors)
 
 
-def _block_diagonal(blocks: FloatArray) -> FloatArray:
-    n, d, _ = blocks.shape
-    whole = np.zeros((n, d, n, d))
-    whole[np.arange(n), :, np.arange(n)] = blocks
-    return whole.reshape(n * d, n * d)
+def _linear(now: Any, last: Any, rows: IntArray, parts: Sequence[FloatArray]) -> list[Any]:
+    """x' = F x, plus a leader's share if there are two parts, of the vehicles in some places."""
+    keys = np.stack([now[rows], last[rows], last[rows - 1]][: 1 + len(parts)], axis=1)
+    J = [np.tile(M, (len(rows), 1, 1)) for M in (np.eye(4), *(-part for part in parts))]
+    return [*gaussian_factors(keys, J, np.zeros((len(rows), 4)), Q)] if len(rows) else []

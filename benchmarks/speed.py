@@ -1,99 +1,46 @@
 """Speed of the tracking methods: milliseconds a frame, where they go, memory, and growth with the number of objects.
 
-All methods and the reference take the frames of a recording in turn, so that whatever else the machine does hits all
-alike. Times are CPU times of one thread. They are compared with `centerpoint`, and with clocks that never change: its
-frozen copy (`benchmarks.frozen_greedy`), a hundred textbook Kalman filters, one after the other in NumPy, and one
-singular value decomposition of a 300 x 300 matrix.
+All methods and the reference take the frames of a recording in turn. They are compared with `centerpoint`, and with
+clocks that never change: a hundred textbook Kalman filters, one after the other in NumPy, and one singular value
+decomposition of a 300 x 300 matrix.
+
+Simulated cars come in columns. Loosely connected: lanes far apart, in each a queue of five with the shipped edge rules:
+who is in plain view is hardly tied to others. Densely: cars side by side, each tied to the four around it by a rate of
+0.5 /s: one connected graph.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import typer
 
-from benchmarks.frozen_greedy import FrozenGreedy
-from benchmarks.measuring import environment, size_of, timed
 from benchmarks.recordings import recording_set
-from benchmarks.sampling_profiler import SamplingProfiler
-from benchmarks.service.round_trip import RoundTrip, round_trips
-from benchmarks.speed_scenes import Ties, speed_config, speed_frames
+from benchmarks.runner import Data, Row, Rows, Seed, growth, in_turn
+from benchmarks.service.round_trip import round_trips
+from pipelines.cli.options import counts
 from pipelines.config import Method, TrackConfig, load_config
 from pipelines.observers import StageClock
-from pipelines.process import one_thread
-from pipelines.tracking import Progress
-from saga_fg.errors import InputError
-from saga_fg.model.sensor import sensor_model
-from saga_fg.settings import setting
-from saga_fg.types.frame import Frame
+from saga_fg.model.edge_rules import Neighbours
+from saga_fg.model.interactions import SharedVelocity
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Detections, Frame
 
+Ties = Literal["loose", "dense"]
+INTERVAL, SPEED, NOISE, DETECTED = 0.1, 12.0, 0.15, 0.9  # s, m/s, m, share
+QUEUE = 5
+LABEL, SIZE = "car", (4.5, 1.9, 1.6)
 METHODS: tuple[Method, ...] = ("saga", "kf", "centerpoint")
-FROZEN = "centerpoint, frozen"
 RECORDINGS = {"nuscenes": ("megvii", "scene-0655"), "kitti": ("kitti", "0011")}  # set and scene, neither the smallest
-ISAM2_ON = ("nuscenes",)
 TIES: tuple[Ties, ...] = ("loose", "dense")
 WARM_UP = 5  # frames that are not counted: tracks are new
-EVERY = 5  # frames from one reading of the fixed clocks to the next
-GROWTH_FROM = 100  # objects
-SERVED = 200  # objects of the live service
-
-
-@dataclass(frozen=True)
-class SpeedBenchSettings:
-    """Size of the benchmark."""
-
-    sizes: tuple[int, ...] = setting((10, 100, 200, 500, 1000, 5000), "numbers of simulated objects; (): none")
-    frames: int = setting(60, "largest number of frames of a case that are counted")
-    seconds: float = setting(
-        60.0,
-        "end a case after this time, s; a method that took a quarter of it is left out of larger cases of the kind",
-    )
-    seed: int = setting(0, "seed of the simulated objects")
-    round_trips: int = setting(200, "round trips of the live service, at 10 Hz; 0: none")
-
-    def __post_init__(self) -> None:
-        if any(size < 1 for size in self.sizes) or self.frames < 1 or self.seconds <= 0 or self.round_trips < 0:
-            raise InputError("sizes, frames, seconds: expected positive numbers")
-
-
-@dataclass(frozen=True)
-class SpeedRow:
-    """One method on one case.
-
-    case           name of the recording, or how simulated objects are connected
-    objects        mean number of reported tracks
-    median, p99    ms of CPU time a frame
-    stages         ms a frame by stage, of the methods that tell
-    memory         of the tracker's state at the end, MB
-    to_centerpoint, to_frozen, to_filters, to_svd   median over that of the reference; NaN where it was left out
-    """
-
-    case: str
-    method: str
-    objects: float
-    median: float
-    p99: float
-    stages: Mapping[str, float]
-    memory: float
-    to_centerpoint: float
-    to_frozen: float
-    to_filters: float
-    to_svd: float
-
-
-@dataclass(frozen=True)
-class SpeedBench:
-    """All rows; growth: the exponent of time over the number of objects, by case and method; the live service."""
-
-    rows: tuple[SpeedRow, ...]
-    growth: Mapping[str, float]
-    service: RoundTrip | None
-    settings: SpeedBenchSettings
-    environment: Mapping[str, str] = field(default_factory=environment)
+GROWTH_FROM, SERVED = 100, 200  # objects; those of the live service
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,109 +52,109 @@ class SpeedCase:
     frames: Sequence[Frame]
     config: TrackConfig
 
-    @property
-    def name(self) -> str:
-        return self.kind if self.size is None else f"{self.size} {self.kind}"
 
-    def contenders(self, methods: Sequence[Method]) -> dict[str, tuple[TrackConfig, Method]]:
-        """Trackers by name: the methods, and `saga` with iSAM2 on recordings of `ISAM2_ON`."""
-        found: dict[str, tuple[TrackConfig, Method]] = {method: (self.config, method) for method in methods}
-        if self.kind in ISAM2_ON and "saga" in methods:
-            tracker = replace(self.config.tracker, estimator="isam2")
-            found["saga, isam2"] = replace(self.config, tracker=tracker), "saga"
-        return found
+def speed(
+    data: Data = None,
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Numbers of simulated objects, with commas between.")
+    ] = "10,100,200,500,1000,5000",
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of each case that are counted.")] = 60,
+    seconds: Annotated[
+        float,
+        typer.Option("--seconds", min=0.1, help="No more frames of a case after that; no larger case after a quarter."),
+    ] = 60.0,
+    trips: Annotated[
+        int, typer.Option("--round-trips", min=0, help="Frames to the live service, at 10 Hz; 0: none.")
+    ] = 200,
+    seed: Seed = 0,
+) -> Rows:
+    """Measure what a frame costs: milliseconds by method and stage, memory, growth with the number of objects.
 
+    With --data, first two recordings of nuScenes and KITTI. All methods take the frames in turn on one thread; times
+    are CPU times, beside those of clocks that never change.
 
-def speed_cases(settings: SpeedBenchSettings, data: Path | None) -> Iterator[SpeedCase]:
-    """The recordings in `data`, then simulated objects, from few to many."""
-    for name, (recordings, scene) in RECORDINGS.items() if data is not None else ():
-        chosen = recording_set(recordings, data, 1)
-        frames = list(chosen.dataset.scene(scene).frames)[: settings.frames + WARM_UP]
-        yield SpeedCase(name, None, frames, load_config(chosen.family))
+    \b
+    Examples:
+      python -m benchmarks speed --sizes 10,100 --frames 20
+      python -m benchmarks speed --data data --json figures.json --markdown tables.md
+    """
+    numbers, length = sorted(counts("--sizes", sizes)), frames + WARM_UP
+    cases: list[Callable[[], SpeedCase]] = []
+    for kind, (name, scene) in RECORDINGS.items() if data is not None else ():
+        recordings = recording_set(name, data, 1)
+        cases.append(partial(_recording, kind, recordings.dataset.scene, scene, length, load_config(recordings.family)))
     for ties in TIES:
-        for size in sorted(settings.sizes):
-            frames = speed_frames(size, ties, settings.frames + WARM_UP, settings.seed)
-            yield SpeedCase(ties, size, frames, speed_config(ties))
-
-
-def bench_speed(settings: SpeedBenchSettings, data: Path | None = None, progress: Progress | None = None) -> SpeedBench:
-    """Measure everything, one case after the other."""
-    rows: list[SpeedRow] = []
+        for size in numbers:
+            cases.append(partial(_simulated, size, ties, length, seed))
     slow: set[tuple[str, str]] = set()
-    growing: dict[str, list[tuple[int, float]]] = {}
-    with one_thread():
-        for case in speed_cases(settings, data):
-            methods = [method for method in METHODS if (case.kind, method) not in slow]
-            measured, spent = _measured(case, methods, settings, progress)
-            rows += measured
-            slow |= {(case.kind, method) for method, seconds in spent.items() if seconds > settings.seconds / 4}
-            for row in measured:
-                if case.size is not None and case.size >= GROWTH_FROM:
-                    growing.setdefault(f"{case.kind}, {row.method}", []).append((case.size, row.median))
-    growth = {name: _exponent(points) for name, points in growing.items() if len(points) > 1}
-    trips = settings.round_trips
-    service = round_trips(SERVED, trips, settings.seed, progress) if trips else None
-    return SpeedBench(tuple(rows), growth, service, settings)
+    growing: dict[tuple[str, str], list[tuple[int, float]]] = {}
+    for make in cases:
+        case = make()
+        for title, row in measured(case, [m for m in METHODS if (case.kind, m) not in slow], seconds):
+            yield title, row
+            if "ms" in row:
+                if row["ms"] * len(case.frames) > 250 * seconds:
+                    slow.add((case.kind, row["method"]))
+                if (case.size or 0) >= GROWTH_FROM:
+                    growing.setdefault((case.kind, row["method"]), []).append((case.size or 0, row["ms"]))
+    for (kind, method), points in growing.items():
+        if len(points) > 1:
+            yield "growth", {"case": kind, "method": method, "objects^": growth(*zip(*points, strict=True))}
+    if trips:
+        yield "live service at 10 Hz: round trip on the wall's clock, ms", round_trips(SERVED, trips, seed)
 
 
-def write_profile(path: Path, case: SpeedCase, method: Method) -> None:
-    """Track a case and write where the time goes, for speedscope."""
-    profiler, tracker = SamplingProfiler(), case.config.new_tracker(method)
-    with one_thread(), profiler.running():
-        for frame in case.frames:
-            tracker.step(frame)
-    profiler.write(path, f"{case.name}, {method}")
+def _recording(kind: str, read: Callable[[str], Any], scene: str, length: int, config: TrackConfig) -> SpeedCase:
+    return SpeedCase(kind, None, list(read(scene).frames)[:length], config)
 
 
-def _measured(
-    case: SpeedCase, methods: Sequence[Method], settings: SpeedBenchSettings, progress: Progress | None
-) -> tuple[list[SpeedRow], dict[str, float]]:
-    """The rows of a case, and the seconds that each method took; a case ends early when these run out."""
-    contenders = case.contenders(methods)
-    clocks = {name: StageClock() for name in contenders}
-    trackers = {name: config.new_tracker(method, clocks[name]) for name, (config, method) in contenders.items()}
-    frozen, references = FrozenGreedy(), {"filters": _Filters().step, "svd": _svd}
-    times: dict[str, list[float]] = {name: [] for name in (*contenders, FROZEN, *references)}
-    stages: dict[str, dict[str, float]] = {}
-    reported: dict[str, list[int]] = {name: [] for name in contenders}
-    for number, frame in enumerate(case.frames):
-        if number == WARM_UP:
-            stages = {name: dict(clock.seconds) for name, clock in clocks.items()}
-        for name, tracker in trackers.items():
+def _simulated(size: int, ties: Ties, length: int, seed: int) -> SpeedCase:
+    return SpeedCase(ties, size, speed_frames(size, ties, length, seed), speed_config(ties))
+
+
+def measured(case: SpeedCase, methods: Sequence[Method], seconds: float) -> Iterator[Row]:
+    """The rows of a case: cost, and shares of the stages."""
+    settings: dict[str, tuple[TrackConfig, Method]] = {method: (case.config, method) for method in methods}
+    if case.kind == "nuscenes":
+        settings["saga, isam2"] = replace(case.config, tracker=replace(case.config.tracker, estimator="isam2")), "saga"
+    clocks = {name: StageClock() for name in settings}
+    trackers = {name: config.new_tracker(method, clocks[name]) for name, (config, method) in settings.items()}
+    filters = _Filters()
+    reported: dict[str, list[int]] = {name: [] for name in trackers}
+    before: dict[str, Mapping[str, float]] = {name: {} for name in trackers}
+
+    def contender(name: str) -> Callable[[Frame], Callable[[], Any]]:
+        def prepare(frame: Frame) -> Callable[[], Any]:
             clocks[name].start()
-            times[name].append(timed(partial(tracker.step, frame)))
-            reported[name].append(len(tracker.tracks(frame.timestamp).id))
-        detections = sensor_model(case.config.sensors, frame.sensor).in_world(frame)
-        boxes = detections.boxes
-        taken = partial(frozen.step, frame.timestamp, boxes.label, boxes.position, detections.score)
-        times[FROZEN].append(timed(taken))
-        for name, run in references.items() if number % EVERY == 0 else ():
-            times[name].append(timed(run))
-        if progress is not None:
-            progress(case.name, number + 1, len(case.frames))
-        if number > WARM_UP and max((sum(times[name]) for name in contenders), default=0.0) > 1e3 * settings.seconds:
-            break
-    first = min(WARM_UP, len(times[FROZEN]) - 1)
-    counted = {name: spent if name in references else spent[first:] for name, spent in times.items()}
-    medians = {name: float(np.median(spent)) for name, spent in counted.items()}
-    rows = []
-    for name in (*trackers, FROZEN):
-        spent = counted[name]
-        of_stage = clocks[name].seconds if name in clocks else {}
-        before = stages.get(name, {})
-        per_stage = {k: 1e3 * (v - before.get(k, 0.0)) / len(spent) for k, v in of_stage.items()}
-        memory = size_of(trackers[name].snapshot() if name in trackers else vars(frozen))
-        ratios = (medians[name] / medians.get(k, math.nan) for k in ("centerpoint", FROZEN, "filters", "svd"))
-        objects = float(np.mean(reported[name][first:])) if name in reported else math.nan
-        p99 = float(np.percentile(spent, 99))
-        rows.append(SpeedRow(case.name, name, objects, medians[name], p99, per_stage, memory, *ratios))
-    return rows, {method: sum(times[method]) / 1e3 for method in methods}
+            return partial(trackers[name].step, frame)
 
+        return prepare
 
-def _exponent(points: Sequence[tuple[int, float]]) -> float:
-    """Slope of the times over the sizes, both as logarithms."""
-    sizes, milliseconds = np.log(np.array(points)).T
-    return float(np.polyfit(sizes, milliseconds, 1)[0])
+    def counted() -> Iterator[Frame]:
+        for number, frame in enumerate(case.frames):
+            if number == WARM_UP:
+                before.update({name: dict(clock.seconds) for name, clock in clocks.items()})
+            yield frame
+            for name, tracker in trackers.items():
+                reported[name].append(len(tracker.tracks(frame.timestamp).id))
+
+    contenders = {name: contender(name) for name in trackers}
+    contenders |= {"filters": lambda _: filters.step, "svd": lambda _: _svd}
+    times = in_turn(contenders, counted(), WARM_UP, seconds)
+    medians = {name: float(np.median(spent)) for name, spent in times.items()}
+    title = case.kind if case.size is None else f"{case.size} {case.kind}"
+    references = {"/ centerpoint": "centerpoint", "/ 100 filters": "filters", "/ SVD": "svd"}
+    for name, tracker in trackers.items():
+        state = tracker.snapshot()
+        about = {"case": title, "method": name, "tracks": np.mean(reported[name][-len(times[name]) :])}
+        cost = {"ms": medians[name], "p99": float(np.percentile(times[name], 99)), "MB": len(pickle.dumps(state)) / 1e6}
+        ratios = {column: medians[name] / medians.get(one, math.nan) for column, one in references.items()}
+        yield "CPU time a frame", {**about, **cost, **ratios}
+    for name, clock in clocks.items():
+        spent = {stage: seconds - before[name].get(stage, 0.0) for stage, seconds in clock.seconds.items()}
+        if total := math.fsum(spent.values()):
+            shares = {stage: seconds / total for stage, seconds in spent.items()}
+            yield "shares of the stages", {"case": title, "method": name, **shares}
 
 
 class _Filters:
@@ -234,3 +181,37 @@ _MATRIX = np.random.default_rng(0).normal(size=(300, 300))
 
 def _svd() -> None:
     np.linalg.svd(_MATRIX)
+
+
+def speed_frames(count: int, ties: Ties, frames: int, seed: int) -> list[Frame]:
+    """Frames of `count` cars that drive along; each is missed now and then, nothing false is detected."""
+    rng = np.random.default_rng(seed)
+    k = np.arange(count)
+    if ties == "loose":
+        column, row, across, along = k // QUEUE % 50, k // QUEUE // 50 * (QUEUE + 5) + k % QUEUE, 12.0, 20.0
+    else:
+        side = int(np.ceil(np.sqrt(count)))
+        column, row, across, along = k % side, k // side, 4.0, 12.0
+    place = np.stack([row * along, column * across], axis=-1) + rng.normal(scale=(1.0, 0.3), size=(count, 2))
+    speed, found = SPEED + rng.normal(scale=0.5, size=count), []
+    for number in range(frames):
+        place[:, 0] += speed * INTERVAL
+        speed += rng.normal(scale=0.1, size=count)
+        seen = np.flatnonzero(rng.random(count) < DETECTED)
+        z = np.zeros((len(seen), 3))
+        z[:, :2] = place[seen] + rng.normal(scale=NOISE, size=(len(seen), 2))
+        label, size, unknown = np.full(len(seen), LABEL), np.tile(SIZE, (len(seen), 1)), np.full((len(seen), 2), np.nan)
+        boxes = Boxes.of(label, z, size, np.zeros(len(seen)), unknown)
+        found.append(Frame(number * INTERVAL, "lidar", Detections(boxes, np.full(len(seen), 0.9)), None))
+    return found
+
+
+def speed_config(ties: Ties) -> TrackConfig:
+    """The shipped configuration of recorded traffic; where cars are densely connected, with edges of their own."""
+    config = load_config("traffic")
+    if ties == "loose":
+        return config
+    around = Neighbours(
+        SharedVelocity(), rate=0.5, distance_scale=15.0, max_distance=20.0, max_degree=4, classes=(LABEL,)
+    )
+    return replace(config, tracker=replace(config.tracker, edges=(around,)))

@@ -1,252 +1,182 @@
 """The methods, and the graph-aware tracker with each component off, on the same recordings.
 
-Every variant tracks every scene, in turn, so that whatever else the machine does hits all alike; times are CPU times of
-the tracker alone. Differences come with intervals of a paired bootstrap over scenes (`data_tools.metrics.bootstrap`):
-errors at labels from their sums, the figures averaged over recall by scoring each drawn set of scenes anew.
+Every variant tracks every scene, in turn; times are CPU times of the tracker alone. Changes from `kf` come with
+intervals over scenes: errors at labels from their sums, figures averaged over recall by scoring each drawn set of
+scenes anew.
 """
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from benchmarks.predictions import PredictionErrors, PredictionRecorder
-from benchmarks.recordings import RecordingSet, Score
-from benchmarks.variants import GRAPH_MATCHING, Variant, variants
-from data_tools.evaluation.hota import HotaRow
-from data_tools.metrics import Interval, LabelErrors, paired_bootstrap
-from pipelines.config import TrackConfig
-from pipelines.learning.interactions import learn_interactions
-from pipelines.observers import StageClock
-from pipelines.tracking import OnlineTracker, Progress, TrackedScene, track_scene
+from benchmarks.gaps import chosen_lengths
+from benchmarks.recordings import RecordingSet, Score, chosen_sets, exact_set
+from benchmarks.runner import Data, Row, Rows, clocked, each, resampled
+from benchmarks.variants import COMPONENTS, SHIPPED, contenders
+from data_tools.datasets.source import names
+from data_tools.metrics import Interval, LabelErrors, calibration, error_summary, errors_by_class, paired_bootstrap
+from pipelines.cli.options import Config
+from pipelines.config import load_config
+from pipelines.learning.gap_runs import Contender, hidden
+from pipelines.tracking import TrackedScene, track_scene
 from saga_fg.errors import InputError
-from saga_fg.model.learned_interactions import LearnedInteractions
-from saga_fg.tracking import Tracker
-from saga_fg.types.frame import Frame
-from saga_fg.types.track import Tracks
+from saga_fg.learning.gaps import made_gaps
+from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.model.sensor import Sensor
+from saga_fg.types.dataset import Dataset, Scene
 
-SAGA, KF, BASELINE = "saga", "kf", "centerpoint"
-LEARNED = Variant("learned interactions")
-FOLDS = 2  # of scenes that interactions are learned from
-RELATIVE_SWITCHES = "IDS, relative"
-LOWER_IS_BETTER = ("AMOTP", "IDS", "FRAG", "RMSE", RELATIVE_SWITCHES)
+KF, BASELINE = "kf", "centerpoint"
+ERRORS = ("position", "velocity", "heading")
 
 
-@dataclass(frozen=True)
-class TrackingBenchSettings:
-    """Size of the benchmark.
+def tracking(
+    data: Data = None,
+    sets: Annotated[
+        str | None,
+        typer.Option(
+            "--sets",
+            help="Of megvii, centerpoint, camera, kitti, simulated, ngsim, openacc.  [default: all but the last two]",
+        ),
+    ] = None,
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
+    viewpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--viewpoint",
+            help="Of the sensors in the sets ngsim and openacc: mast, above, vehicle, the id of one, or X,Y,Z in m.  "
+            "[default: mast, vehicle]",
+        ),
+    ] = None,
+    test: Annotated[
+        str | None, typer.Option("--test", help="Track these recordings alone, with commas.  [default: all]")
+    ] = None,
+    passes: Annotated[
+        int,
+        typer.Option(
+            "--passes",
+            min=0,
+            help="Track each recording so often with made gaps, in the sets simulated, ngsim and openacc; 0: as "
+            "detected.",
+        ),
+    ] = 0,
+    lengths: Annotated[str, typer.Option("--lengths", help="Of these gaps, s, with commas.")] = "1,2,3,5",
+    compared: Annotated[
+        str | None,
+        typer.Option("--contenders", help="Methods and components, by name, with commas.  [default: all]"),
+    ] = None,
+    components: Annotated[bool, typer.Option(help="Switch the components off one by one as well.")] = True,
+    draws: Annotated[int, typer.Option("--draws", min=0, help="Drawn sets of scenes for intervals; 0: none.")] = 200,
+    config: Config = None,
+) -> Rows:
+    """Track the same recordings by every method, and with every component off; compare accuracy and time.
 
-    components  whether to switch components off one by one
-    contenders  whether to track by graph matching and by interactions learned on other scenes of the set, and to judge
-                by HOTA
-    draws       sets of scenes drawn for the intervals of figures averaged over recall; 0: no intervals of these
+    The file of --config changes the shipped settings of every kind of data.
+
+    \b
+    Examples:
+      python -m benchmarks tracking --sets simulated --scenes 4 --draws 0
+      python -m benchmarks tracking --data data --json figures.json --markdown tables.md
+      python -m benchmarks tracking --data data --sets kitti --no-components
+      python -m benchmarks tracking --data data --sets ngsim --passes 4 --lengths 2,3 --no-components
+      python -m benchmarks tracking --data data --sets megvii --contenders 'saga,kf,graph matching'
     """
-
-    components: bool = True
-    contenders: bool = False
-    draws: int = 200
-    seed: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class VariantResult:
-    """One variant on one set: headline figures, errors at labels scene by scene, ms of CPU time a frame.
-
-    stages       ms a frame by stage, of the trackers that tell (not `centerpoint`)
-    predictions  errors of predictions, scene by scene, of the methods that predict covariances (not `centerpoint`)
-    """
-
-    variant: Variant
-    score: Score
-    figures: Mapping[str, float]
-    milliseconds: float
-    stages: Mapping[str, float]
-    predictions: tuple[PredictionErrors, ...]
+    chosen = [variant.name for variant in (*SHIPPED, *(COMPONENTS if components else ()))]
+    wanted = names("--contenders", compared) if compared else chosen
+    for recordings in chosen_sets(sets, data, scenes, test, viewpoint):
+        base = load_config(recordings.family, config)
+        if passes:
+            recordings = with_made_gaps(recordings, base.sensors, passes, chosen_lengths(lengths))
+        yield from set_rows(recordings, contenders(recordings.family, base, wanted, ()), draws)
 
 
-@dataclass(frozen=True, eq=False)
-class SetResult:
-    """All variants on one set, and what the graph changes: less kf (relative for errors), by variant and figure."""
-
-    name: str
-    scenes: tuple[str, ...]
-    variants: Mapping[str, VariantResult]
-    differences: Mapping[str, Mapping[str, Interval]]
-
-    def ratio(self, variant: str) -> float:
-        """Time a frame over that of `centerpoint`."""
-        return self.variants[variant].milliseconds / self.variants[BASELINE].milliseconds
-
-    def errors(self, variant: str) -> LabelErrors:
-        """At the labels of all scenes."""
-        return LabelErrors.pool(self.variants[variant].score.errors)
-
-
-class _Timed:
-    """A tracker with a clock; with `predictions`, recorded while the clock stands still."""
-
-    def __init__(self, tracker: OnlineTracker, stages: StageClock, predictions: PredictionRecorder | None) -> None:
-        self.seconds, self._tracker, self._stages, self._predictions = 0.0, tracker, stages, predictions
-
-    def step(self, frame: Frame) -> Tracks:
-        self._stages.start()
-        begin = time.thread_time()
-        tracks = self._tracker.step(frame)
-        self.seconds += time.thread_time() - begin
-        if self._predictions is not None and isinstance(self._tracker, Tracker):
-            self._predictions.after(self._tracker, tracks)
-        return tracks
-
-    def tracks(self, timestamp: float) -> Tracks:
-        begin = time.thread_time()
-        tracks = self._tracker.tracks(timestamp)
-        self.seconds += time.thread_time() - begin
-        return tracks
+def set_rows(recordings: RecordingSet, compared: Sequence[Contender], draws: int) -> Iterator[Row]:
+    """Accuracy and time of all, changes from kf, and how many errors are within the ellipses."""
+    scenes, names_of = recordings.dataset.scenes, [one.name for one in compared]
+    runs: dict[str, dict[str, TrackedScene]] = {name: {} for name in names_of}
+    seconds = dict.fromkeys(names_of, 0.0)
+    for name in each(scenes, recordings.name):
+        scene = recordings.scene(name)
+        for one in compared:
+            runs[one.name][name], ms = clocked(track_scene, scene, one.config.new_tracker(one.method))
+            seconds[one.name] += ms / 1e3
+    frames = sum(run.frames for run in next(iter(runs.values())).values())
+    scores = {name: recordings.score(found) for name, found in runs.items()}
+    for name, score in scores.items():
+        errors = error_summary(LabelErrors.pool(score.errors))
+        about = {"variant": name, **score.figures_of(range(len(scenes)))}
+        rmse = {"position": errors.position, "velocity": errors.velocity, "velocity moving": errors.velocity_moving}
+        ms = 1e3 * seconds[name] / frames
+        ratio = seconds[name] / seconds[BASELINE] if BASELINE in seconds else None
+        title = f"{recordings.name}: {len(scenes)} scenes; RMSE of position in m, of velocity in m/s"
+        yield title, {**about, **rmse, "ms / frame": ms, "/ centerpoint": ratio}
+    for name in names_of if KF in scores and draws else ():
+        if name not in (KF, BASELINE):
+            title = f"{recordings.name}: changes from kf (RMSE: relative), 95 % intervals over scenes"
+            yield title, {"variant": name, **changes(scores[name], scores[KF], recordings.units, draws)}
+    for label, errors_of in errors_by_class(LabelErrors.pool(scores[names_of[0]].errors)).items():
+        c = calibration(errors_of)
+        if c.enough_data:
+            shares = {f"in {100 * p:g} %": share for p, share in c.coverage.items()}
+            about = {"class": label, "objects": c.objects, "boxes": c.boxes, "ANEES / 2": c.anees}
+            yield f"{recordings.name}: errors within the ellipses of {names_of[0]}", {**about, **shares}
 
 
-def bench_set(
-    recordings: RecordingSet,
-    base: TrackConfig,
-    settings: TrackingBenchSettings | None = None,
-    progress: Progress | None = None,
-) -> SetResult:
-    """Compare on one set."""
-    settings = settings or TrackingBenchSettings()
-    compared = variants(base, settings.components, settings.contenders)
-    learned: dict[str, LearnedInteractions] = {}
-    if settings.contenders:
-        learned = learn_by_folds(recordings, base, progress)
-        compared += (LEARNED,)
-    runs: dict[str, dict[str, TrackedScene]] = {variant.name: {} for variant in compared}
-    seconds, clocks = dict.fromkeys(runs, 0.0), {name: StageClock() for name in runs}
-    scenes = recordings.dataset.scenes
-    predictions: dict[str, list[PredictionErrors]] = {name: [] for name in runs}
-    for name in scenes:
-        scene = recordings.dataset.scene(name)
-        for done, variant in enumerate(compared):
-            clock = clocks[variant.name]
-            config = base.with_interactions(learned[name]) if variant is LEARNED else variant.config(base)
-            recorder = PredictionRecorder() if variant.name in (SAGA, KF) else None
-            timed = _Timed(config.new_tracker(variant.method, clock), clock, recorder)
-            runs[variant.name][name] = track_scene(scene, timed)
-            seconds[variant.name] += timed.seconds
-            if recorder is not None:
-                predictions[variant.name].append(recorder.errors(scene))
-            if progress is not None:
-                progress(f"{recordings.name} {name}", done + 1, len(compared))
-    results = {}
-    for variant in compared:
-        tracked = runs.pop(variant.name)
-        score = recordings.score(tracked)
-        if settings.contenders:
-            score = score.with_hota()
-        per_frame = 1000 / max(sum(run.frames for run in tracked.values()), 1)
-        stages = {stage: per_frame * spent for stage, spent in clocks[variant.name].seconds.items()}
-        spent = per_frame * seconds[variant.name]
-        judged = {f"HOTA {row.label}": row.figures.hota for row in _in_space(score)} if settings.contenders else {}
-        ahead = tuple(predictions[variant.name])
-        results[variant.name] = VariantResult(variant, score, score.figures | judged, spent, stages, ahead)
-    compared_with_kf = (SAGA, GRAPH_MATCHING.name, LEARNED.name) if settings.contenders else (SAGA,)
-    differences = {
-        name: graph_differences(results[name].score, results[KF].score, settings)
-        for name in compared_with_kf
-        if name in results
-    }
-    return SetResult(recordings.name, scenes, results, differences)
-
-
-def _in_space(score: Score) -> list[HotaRow]:
-    """HOTA of cars by their overlap in space."""
-    return [row for row in score.hota() if row.label == "car" and row.overlap == "3D"]
-
-
-def learn_by_folds(
-    recordings: RecordingSet, base: TrackConfig, progress: Progress | None = None
-) -> dict[str, LearnedInteractions]:
-    """Interactions for every scene, learned from the truth of the scenes of the other fold.
-
-    Scenes that overlap are in one fold. Raises `InputError` for a single one.
-    """
-    scenes = recordings.dataset.scenes
-    unit = {name: recordings.clusters.get(name, name) for name in scenes}
-    units = list(dict.fromkeys(unit.values()))
-    if len(units) < FOLDS:
-        raise InputError(f"{', '.join(scenes)}: expected scenes to learn from beside it")
-    learned: dict[str, LearnedInteractions] = {}
-    for fold in range(FOLDS):
-        tested = [name for name in scenes if unit[name] in units[fold::FOLDS]]
-        read = (recordings.dataset.scene(name) for name in scenes if name not in tested)
-        others = {scene.name: scene for scene in read}  # several may have the same truth
-        found = learn_interactions(others, f"scenes {', '.join(others)}", base, progress=progress)
-        learned |= dict.fromkeys(tested, found.interactions)
-    return learned
-
-
-def graph_differences(saga: Score, kf: Score, settings: TrackingBenchSettings) -> dict[str, Interval]:
-    """Saga against kf: headline figures as differences, RMSEs as relative changes.
-
-    Needs two scenes that don't overlap; else empty.
-    """
-    units = saga.units
+def changes(score: Score, base: Score, units: Sequence[Sequence[int]], draws: int) -> dict[str, Any]:
+    """Figures as differences, RMSEs as relative changes; none of less than two scenes that don't overlap."""
     if len(units) < 2:
         return {}
-    result = {}
-    if settings.draws:
-        result = sampled_differences(saga.figures_of, kf.figures_of, units, settings.draws, settings.seed)
-    for name in ("position", "velocity", "heading"):
+
+    def figures(rows: Sequence[int]) -> dict[str, float]:
+        theirs = base.figures_of(rows)
+        found = {name: value - theirs[name] for name, value in score.figures_of(rows).items() if name in theirs}
+        return {**found, **({"IDS, relative": found["IDS"] / (theirs["IDS"] or np.nan)} if "IDS" in found else {})}
+
+    result: dict[str, Interval] = resampled(figures, units, draws)
+    for name in ERRORS:
         a, b = (
-            [np.sum([score.errors[row].sample(name).square_sums for row in unit], axis=0) for unit in units]
-            for score in (saga, kf)
+            [np.sum([one.errors[row].sample(name).square_sums for row in unit], axis=0) for unit in units]
+            for one in (score, base)
         )
-        result[f"{name} RMSE"] = paired_bootstrap(a, b, seed=settings.seed)
+        result[f"{name} RMSE"] = paired_bootstrap(a, b)
     return result
 
 
-def sampled_differences(
-    first: Callable[[Sequence[int]], Mapping[str, float]],
-    second: Callable[[Sequence[int]], Mapping[str, float]],
-    units: Sequence[Sequence[int]],
-    draws: int,
-    seed: int = 0,
-    confidence: float = 0.95,
-) -> dict[str, Interval]:
-    """First less second in each figure that both have, and relative switches, with intervals.
+class HiddenRecordings:
+    """Each scene of a dataset in several passes, with other gaps in each. Windows of recorded traffic are short, and an
+    object seldom returns in one."""
 
-    units  numbers of the scenes; those of one unit are drawn together
+    def __init__(self, dataset: Dataset, sensors: Mapping[str, Sensor], passes: int, lengths: Sequence[float]) -> None:
+        self._dataset, self._sensors, self._passes, self._lengths = dataset, sensors, passes, lengths
+        every = ((name, k) for name in dataset.scenes for k in range(1, passes + 1))
+        self.pass_of = {f"{name}, pass {k}": (name, k) for name, k in every}
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the recordings with the numbers of the passes."""
+        return tuple(self.pass_of)
+
+    def scene(self, name: str) -> Scene:
+        """One pass; its name is that of the recording."""
+        recording, number = self.pass_of[name]
+        labelled = LabelledScene.of(self._dataset.scene(recording), self._sensors)
+        gaps = [gap for gap in made_gaps(labelled, self._passes, 0, self._lengths) if gap.run == number]
+        return replace(labelled.scene, frames=hidden(labelled, gaps))
+
+
+def with_made_gaps(
+    recordings: RecordingSet, sensors: Mapping[str, Sensor], passes: int, lengths: Sequence[float]
+) -> RecordingSet:
+    """The set in several passes, each with made gaps of some lengths, s; those of one recording are one for intervals.
+
+    Raises `InputError` for a set whose truth is not known at every frame.
     """
-    rng = np.random.default_rng(seed)
-    sampled: dict[str, list[float]] = {}
-    for _ in range(draws):
-        rows = [row for unit in rng.integers(len(units), size=len(units)).tolist() for row in units[unit]]
-        for name, value in _differences(first(rows), second(rows)).items():
-            sampled.setdefault(name, []).append(value)
-    tail = (1 - confidence) / 2
-    every = [row for unit in units for row in unit]
-    estimate = _differences(first(every), second(every))
-    result = {}
-    for name, values in sampled.items():
-        known = [value for value in values if math.isfinite(value)]
-        if name in estimate and known:
-            low, high = np.quantile(known, [tail, 1 - tail]).tolist()
-            result[name] = Interval(estimate[name], low, high, confidence)
-    return result
-
-
-def _differences(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, float]:
-    """In each figure that both have, and of switches the relative change as well."""
-    found = {name: value - theirs[name] for name, value in ours.items() if name in theirs}
-    if "IDS" in found:
-        found[RELATIVE_SWITCHES] = found["IDS"] / theirs["IDS"] if theirs["IDS"] else math.nan
-    return found
-
-
-def verdict(name: str, difference: Interval) -> str:
-    """`better`, `worse`, or `no difference` where the interval holds 0."""
-    if not difference.excludes(0.0):
-        return "no difference"
-    lower = name.endswith(LOWER_IS_BETTER)
-    return "better" if (difference.estimate < 0) == lower else "worse"
+    if not recordings.exact:
+        raise InputError(f"--passes: set {recordings.name}: expected simulated or recorded traffic, of exact truth")
+    dataset = HiddenRecordings(recordings.dataset, sensors, passes, lengths)
+    clusters = {name: recordings.clusters.get(of, of) for name, (of, _) in dataset.pass_of.items()}
+    return exact_set(recordings.name, recordings.family, dataset, clusters)

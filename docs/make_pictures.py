@@ -12,9 +12,9 @@ from pathlib import Path
 from concept_pictures import write_concept_pictures
 from heterogeneous_picture import write_heterogeneous_picture
 from running_graph_picture import write_running_graph_pictures
+from scaling_picture import write_scaling_picture
 from slam_loops_picture import write_loops_picture
 
-from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
 from data_tools.simulator import simulate_scene
 from data_tools.simulator.laser_drive import laser_drive
 from data_tools.simulator.street import SimulatedScans
@@ -44,7 +44,7 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 def main() -> None:
     """All pictures; those of recordings where the variable SAGA_FG_DATA names their folder."""
     write_concept_pictures(HERE)
-    write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
+    write_scaling_picture(HERE / "scaling.png")
     write_heterogeneous_picture(HERE)
     write_running_graph_pictures(HERE)
     write_loops_picture(HERE)

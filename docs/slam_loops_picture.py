@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.courses import drive_course
+from benchmarks.loops import drive_course
 from data_tools.files.atomic_files import write_bytes
 from data_tools.plots import paths_from_above, png
 

@@ -7,38 +7,25 @@ other work of the machine counts; the CPU time of the service a frame does not d
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.runner import each
 from benchmarks.service.endurance import INTERVAL, CirclingObjects
 from benchmarks.service.served import Served
 from pipelines.serving import StreamClient
 from pipelines.serving.messages import encode
-from pipelines.tracking import Progress
 
 SAVED_EVERY = 1.0  # s between two snapshots of the state
 WARM_UP = 10  # frames that are not counted: tracks are new
 
 
-@dataclass(frozen=True)
-class RoundTrip:
-    """Numbers of objects and of counted frames, percentiles of the round trip, and CPU time of the service a frame, ms;
-    size of the service's memory at the end, MB."""
+def round_trips(objects: int, frames: int, seed: int) -> dict[str, float]:
+    """Percentiles of `frames` round trips, and CPU time of the service a frame, ms; size of its memory at the end, MB.
 
-    objects: int
-    frames: int
-    p50: float
-    p90: float
-    p99: float
-    cpu: float
-    memory: float
-
-
-def round_trips(objects: int, frames: int, seed: int, progress: Progress | None = None) -> RoundTrip:
-    """Measure `frames` round trips. Raises `SagaError` when the service does not come up."""
+    Raises `SagaError` when the service does not come up."""
     scene, rng, times = CirclingObjects(objects, seed), np.random.default_rng([seed, 4]), []
     lines = []
     for k in range(frames + WARM_UP):
@@ -51,7 +38,7 @@ def round_trips(objects: int, frames: int, seed: int, progress: Progress | None 
         try:
             with StreamClient(server.address) as client:
                 before, begin = 0.0, time.monotonic()
-                for k, line in enumerate(lines):
+                for k, line in enumerate(each(lines, "service")):
                     if k == WARM_UP:
                         before = client.ask({"type": "status"})["cpu_seconds"]
                     time.sleep(max(0.0, begin + k * INTERVAL - time.monotonic()))
@@ -59,11 +46,10 @@ def round_trips(objects: int, frames: int, seed: int, progress: Progress | None 
                     client.send(line)
                     client.receive()
                     times.append(1e3 * (time.monotonic() - sent))
-                    if progress is not None:
-                        progress(f"service, {objects} objects", k + 1, len(lines))
                 status = client.ask({"type": "status"})
         finally:
             server.end()
     p50, p90, p99 = np.percentile(times[WARM_UP:], (50, 90, 99)).tolist()
     cpu = 1e3 * (status["cpu_seconds"] - before) / frames
-    return RoundTrip(objects, frames, p50, p90, p99, cpu, status["memory_mb"])
+    about: dict[str, float] = {"objects": objects, "frames": frames, "p50": p50, "p90": p90, "p99": p99}
+    return {**about, "CPU a frame": cpu, "MB": status["memory_mb"]}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import product
 from math import inf
-from multiprocessing import get_context
 from typing import Literal, Protocol
 
 import numpy as np
@@ -15,7 +14,6 @@ import numpy as np
 from pipelines.config import Method, TrackConfig
 from pipelines.learning.gap_judging import GapOutcome, JudgedRun, Links
 from pipelines.tracking import Progress, track_scene
-from saga_fg.kernels.compilation import load_kernels
 from saga_fg.learning.gaps import LENGTHS, LONGEST, Gap, made_gaps, real_gaps
 from saga_fg.learning.labelled_scene import LabelledScene
 from saga_fg.learning.situations import situations_of
@@ -84,10 +82,6 @@ class Contender:
     method: Method
     config: TrackConfig
 
-    def same_as(self, other: Contender) -> bool:
-        """Return True if the other is the same method and configuration."""
-        return (self.method, self.config) == (other.method, other.config)
-
 
 @dataclass(frozen=True)
 class Run:
@@ -109,41 +103,23 @@ class Run:
     links: Links | None
 
 
-@dataclass(frozen=True)
-class _Job:
-    source: SceneSource
-    recording: str
-    contender: Contender
-    settings: GapBenchSettings
-
-
 def bench_gaps(
     source: SceneSource,
     recordings: Sequence[str],
     contenders: Sequence[Contender],
-    settings: GapBenchSettings | None = None,
-    workers: int = 1,
+    settings: GapBenchSettings,
     progress: Progress | None = None,
 ) -> list[Run]:
-    """All runs on some recordings of a set. workers: processes; 1: this one."""
-    settings = settings or GapBenchSettings()
-    cluster = source.clusters
-    jobs = [_Job(source, name, contender, settings) for name in recordings for contender in contenders]
-    runs: list[Run] = []
-    for done, (job, found) in enumerate(zip(jobs, _performed(jobs, workers), strict=True)):
-        runs += [replace(run, cluster=cluster.get(run.recording, run.recording)) for run in found]
+    """All runs on some recordings of a set."""
+    cluster, runs, jobs = source.clusters, list[Run](), list(product(recordings, contenders))
+    for done, (name, contender) in enumerate(jobs):
+        labelled, gaps = prepared(source, name, settings, contender.config.sensors)
+        for life in settings.lives:
+            run = run_of(labelled, gaps, contender, life, settings.real)
+            runs.append(replace(run, cluster=cluster.get(name, name)))
         if progress is not None:
-            progress(f"{source.name} {job.recording} {job.contender.name}", done + 1, len(jobs))
+            progress(f"{source.name} {name} {contender.name}", done + 1, len(jobs))
     return runs
-
-
-def _performed(jobs: Sequence[_Job], workers: int) -> Iterator[list[Run]]:
-    if workers == 1:
-        yield from map(_perform, jobs)
-        return
-    load_kernels()  # compiled once, not by each process
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:  # a fork would copy locks of threads
-        yield from pool.map(_perform, jobs)
 
 
 @dataclass(frozen=True)
@@ -154,11 +130,6 @@ class _Preparation:
     recording: str
     settings: GapBenchSettings
     sensors: Mapping[str, Sensor] = field(compare=False)
-
-
-def _perform(job: _Job) -> list[Run]:
-    labelled, gaps = prepared(job.source, job.recording, job.settings, job.contender.config.sensors)
-    return [run_of(labelled, gaps, job.contender, life, job.settings.real) for life in job.settings.lives]
 
 
 def prepared(

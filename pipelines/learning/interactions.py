@@ -100,13 +100,11 @@ def learn_interactions(
     start: LearnedInteractions | None = None,
     settings: LearningSettings | None = None,
     progress: Progress | None = None,
-    workers: int = 1,
 ) -> LearnedForms:
     """Learn from annotated scenes with detections; `origin` says in the file where from.
 
     config   of the tracker: its motion, turns and stationarity are the base on which edges are learned
     start    rules from which the search begins, in place of the forms of the template
-    workers  processes that track the recordings held out
 
     Raises `InputError` where no object is followed for long enough.
     """
@@ -141,7 +139,7 @@ def learn_interactions(
         _Part(tested, {group: fitted(tuple(taught), templates, group) for group in groups})
         for taught, tested in ((first, second), (second, first))
     ]
-    trials = _trials(parts, config, origin, settings, progress, workers)
+    trials = _trials(parts, config, origin, settings, progress)
     ratios, chosen = {}, {}
     for group in groups:
         ratios[group] = {form: _ratio(runs, trials[BASE], group) for form, runs in trials.items() if form != BASE}
@@ -166,7 +164,7 @@ def learn_interactions(
         for part in parts:
             if part.tested:
                 learned = Contender(LEARNED, "saga", config.with_interactions(combined(part.rules, origin)))
-                runs += _judged(part.tested, [learned], settings, progress, workers)
+                runs += _judged(part.tested, [learned], settings, progress)
     everything = {
         group: fitted(tuple(scenes), {form: templates[form]}, group)
         for group, form in chosen.items()
@@ -217,7 +215,6 @@ def _trials(
     origin: str,
     settings: LearningSettings,
     progress: Progress | None,
-    workers: int,
 ) -> dict[str, list[Run]]:
     """The runs of every form on the recordings held out, by form."""
     found: dict[str, list[Run]] = {BASE: [], SHIPPED: []}
@@ -231,7 +228,7 @@ def _trials(
                 learned_from=origin, edges=rules, explained_noise=config.tracker.explained_noise
             )
             contenders.append(Contender(form, "saga", config.with_interactions(learned)))
-        for run in _judged(part.tested, contenders, settings, progress, workers):
+        for run in _judged(part.tested, contenders, settings, progress):
             found.setdefault(run.contender, []).append(run)
     return found
 
@@ -241,11 +238,10 @@ def _judged(
     contenders: Sequence[Contender],
     settings: LearningSettings,
     progress: Progress | None,
-    workers: int,
 ) -> list[Run]:
     source = _HeldScenes("held out", scenes, {})
     bench = GapBenchSettings(settings.passes, lives=("kept",), seed=settings.seed, real=False)
-    return bench_gaps(source, tuple(scenes), contenders, bench, workers, progress)
+    return bench_gaps(source, tuple(scenes), contenders, bench, progress)
 
 
 def _ratio(runs: Sequence[Run], base: Sequence[Run], group: Sequence[str]) -> float:

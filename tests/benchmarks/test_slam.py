@@ -1,4 +1,4 @@
-"""LiDAR odometry beside KISS-ICP."""
+"""`python -m benchmarks slam`: odometry beside KISS-ICP, cost of scans all in, and of landmarks."""
 
 from __future__ import annotations
 
@@ -6,38 +6,46 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from benchmarks.app import app
-from benchmarks.slam import bench_slam
+from benchmarks.slam import all_in_rows, odometry_rows
 from data_tools.datasets.kitti import KittiScans
 from data_tools.simulator.street import SimulatedScans
 
 
-def test_the_benchmark_measures_both_on_the_same_scans() -> None:
+def test_both_are_measured_on_the_same_scans() -> None:
     pytest.importorskip("kiss_icp", reason="kiss-icp comes with the extra bench")
-    rows = bench_slam(SimulatedScans(2, 20))
-    assert [(row.case, row.contender) for row in rows] == [
+    rows = [row for _, row in odometry_rows(SimulatedScans(2, 20))]
+    assert [(row["scans"], row["method"]) for row in rows] == [
         (case, name) for case in ("as recorded", "de-skewed") for name in ("saga-fg", "kiss-icp")
     ]
     for row in rows:
-        assert row.errors.poses == 20
-        assert np.isfinite(row.errors.relative_translation)
-        assert 0 < row.residual < 0.1
-        assert row.milliseconds > 0
-    assert all(
-        row.errors.relative_translation < 0.05 for row in rows if row.contender == "saga-fg" and row.case == "de-skewed"
-    )
+        assert np.isfinite(row["RPE, m per 10 m"])
+        assert 0 < row["residual, mm"] < 100
+        assert row["ms a scan"] > 0
+    assert rows[2]["RPE, m per 10 m"] < 0.05
 
 
-def test_bench_slam_prints_and_writes_the_figures(recordings: Path, tmp_path: Path) -> None:
+def test_the_command_on_recorded_scans(bench, recordings: Path) -> None:
     kitti = recordings / "kitti"
     assert len(KittiScans(kitti, "0000")) == 90
-    result = CliRunner().invoke(
-        app,
-        ["slam", "--dataroot", str(kitti), "--scans", "30", "--no-kiss", "--json", str(tmp_path / "f.json")],
-    )
-    assert result.exit_code == 0, result.output
-    assert "as recorded" in result.stdout
-    assert "de-skewed" in result.stdout
-    assert (tmp_path / "f.json").read_text().count('"contender": "saga-fg"') == 2
+    rows = bench("slam --scans 20 --no-kiss", "--dataroot", str(kitti))
+    assert [row["scans"] for row in rows if row.get("method") == "saga-fg"] == ["as recorded", "de-skewed"]
+    assert any(row["table"] == "SLAM all in, CPU time" for row in rows)
+
+
+def test_scans_are_counted_and_timed() -> None:
+    (_, cost), *_ = all_in_rows(SimulatedScans(0, 6))
+    assert (cost["scans"], cost["submaps"]) == (6, 1)
+    assert cost["points a scan"] > 1000
+    assert np.isfinite([cost["ms a scan"], cost["keyframe"], cost["longest"], cost["at the end, s"]]).all()
+
+
+def test_a_map_of_landmarks_is_measured_while_it_grows(bench) -> None:
+    *parts, whole = bench("slam --landmarks 60")
+    assert whole["landmarks"] == parts[-1]["landmarks of the map"] == 60
+    assert whole["F1 over pairs"] == 1.0
+    assert max(part["in the local Gaussian"] for part in parts) < 45
+
+
+def test_one_thing_is_asked_for_at_a_time(refused) -> None:
+    assert "expected one of --dataroot, --landmarks and --dense" in refused("slam --landmarks 120 --dense 3")
