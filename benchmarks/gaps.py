@@ -17,10 +17,8 @@ import typer
 
 from benchmarks.gap_picture import write_telling_picture
 from benchmarks.recordings import TRAFFIC_SETS, RecordingSet, chosen_sets
-from benchmarks.runner import Data, Row, Rows
+from benchmarks.runner import Data, Row, Rows, chosen
 from benchmarks.variants import contenders
-from data_tools.datasets.source import names
-from data_tools.files.error_messages import unknown_name
 from data_tools.metrics.bootstrap import difference, relative_change
 from data_tools.simulator.recorded_world import ABOVE
 from pipelines.cli.console import progress_bar
@@ -57,7 +55,7 @@ def gaps(
         ),
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
-    chosen: Annotated[
+    compared_by_name: Annotated[
         str, typer.Option("--contenders", help="Names, with commas; those without effect are left out.")
     ] = CONTENDERS,
     against: Annotated[str, typer.Option("--against", help="The contender that all others are compared with.")] = "kf",
@@ -145,23 +143,16 @@ def gaps(
       python -m benchmarks gaps --data data --sets openacc --life kept --longest 20 --folds 2
     """
     found = chosen_sets(sets, data, scenes, test, viewpoint, longest, usual=ABOVE)
-    wanted = names("--of", of) if of is not None else ()
-    for name in wanted:
-        if name not in SITUATIONS:
-            raise InputError(f"--of: {unknown_name('situation', name, SITUATIONS)}")
-    fits = names("--fit", fit)
-    for name in fits:
-        if name not in FITS:
-            raise InputError(f"--fit: {unknown_name('fit', name, FITS)}")
+    wanted = chosen("--of", of, SITUATIONS) if of is not None else ()
+    fits = chosen("--fit", fit, FITS)
     settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths), of=wanted)
     for recordings in found:
         base, complete = (
             load_config(recordings.family, config),
             recordings.name in TRAFFIC_SETS and viewpoint in (None, ABOVE),
         )
-        tried = contenders(recordings.family, base, names("--contenders", chosen), own or ())
-        if against not in (known := tuple(one.name for one in tried)):
-            raise InputError(f"--against: {unknown_name('contender', against, known)}")
+        tried = contenders(recordings.family, base, compared_by_name, own or ())
+        chosen("--against", against, [one.name for one in tried])
         judged = replace(settings, real=not complete)  # from above nothing is hidden, there are no gaps but made ones
         with progress_bar(unit="runs") as progress:
             runs = split_runs(recordings, folds, fits, tried, base, judged, progress)
@@ -176,11 +167,7 @@ def gaps(
 
 def chosen_lengths(text: str) -> tuple[float, ...]:
     """Lengths of made gaps, s. Raises `InputError` for others than those there are."""
-    known = {f"{length:g}": length for length in LENGTHS}
-    for entry in (wanted := names("--lengths", text)):
-        if entry not in known:
-            raise InputError(f"--lengths: expected some of {', '.join(known)}, got {entry!r:.40}")
-    return tuple(known[entry] for entry in known if entry in wanted)
+    return tuple(sorted(map(float, chosen("--lengths", text, [f"{length:g}" for length in LENGTHS]))))
 
 
 def split_runs(

@@ -9,6 +9,7 @@ from functools import partial
 from math import inf
 from pathlib import Path
 
+from benchmarks.runner import chosen
 from data_tools.datasets.kitti import KittiTracking, write_kitti_results
 from data_tools.datasets.kitti.evaluation import CLASSES, kitti_label_errors
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
@@ -18,9 +19,8 @@ from data_tools.datasets.nuscenes.evaluation import nuscenes_label_errors
 from data_tools.datasets.openacc import OpenAccPlatoons
 from data_tools.datasets.overlapping import overlapping
 from data_tools.datasets.recorded_traffic import Stretches, TrafficRecordings
-from data_tools.datasets.source import ChosenScenes, names
+from data_tools.datasets.source import ChosenScenes
 from data_tools.evaluation.placed_detections import placed_detections
-from data_tools.files.error_messages import unknown_name
 from data_tools.metrics import (
     KittiTrackingSequence,
     LabelErrors,
@@ -166,12 +166,10 @@ def recording_set(
     viewpoint  of the sensors that see recorded traffic, see `data_tools.simulator.recorded_world`; None: the set's own
     longest    of recorded traffic, s, from the middle of longer recordings
 
-    Raises `InputError` for an unknown name or missing recordings.
+    Raises `InputError` for missing recordings.
     """
     if name == "simulated":
         return simulated_set(scenes)
-    if name not in (*SETS, *TRAFFIC_SETS):
-        raise InputError(f"--sets: {unknown_name('set', name, (*SETS, *TRAFFIC_SETS, 'simulated'))}")
     if data is None:
         raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
     if name in SETS:
@@ -197,18 +195,19 @@ def chosen_sets(
 
     Raises `InputError` for a recording that no set has, and for options of recorded traffic without it.
     """
-    wanted = names("--sets", sets) if sets else (*(SETS if data is not None else ()), "simulated")
+    wanted = (
+        chosen("--sets", sets, (*SETS, *TRAFFIC_SETS, "simulated"))
+        if sets
+        else (*(SETS if data is not None else ()), "simulated")
+    )
     for option, value in (("--viewpoint", viewpoint), ("--longest", longest)):
         if value is not None and not set(wanted) & set(TRAFFIC_SETS):
             raise InputError(f"{option}: expected {' or '.join(TRAFFIC_SETS)} among --sets, others do not use it")
     found = [recording_set(name, data, scenes, viewpoint or usual, longest or inf) for name in wanted]
     if test is None:
         return found
-    known = tuple(name for one in found for name in one.dataset.scenes)
-    for name in (chosen := names("--test", test)):
-        if name not in known:
-            raise InputError(f"--test: {unknown_name('recording', name, known)}")
-    mine = ((one, [name for name in one.dataset.scenes if name in chosen]) for one in found)
+    named = chosen("--test", test, [name for one in found for name in one.dataset.scenes])
+    mine = ((one, [name for name in one.dataset.scenes if name in named]) for one in found)
     return [replace(one, dataset=ChosenScenes(one.dataset, ",".join(some))) for one, some in mine if some]
 
 

@@ -25,12 +25,15 @@ import typer
 from rich.progress import track
 from threadpoolctl import threadpool_info
 
+from data_tools.datasets.source import names
 from data_tools.figures import FigureTable
+from data_tools.files.error_messages import unknown_name
 from data_tools.metrics import Interval
 from pipelines.cli.console import error_console, new_command
 from pipelines.cli.options import Verbose
 from pipelines.cli.tables import JsonFile, MarkdownFile, report
 from pipelines.process import one_thread
+from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import compiled_kernels
 from saga_fg.numerics.arrays import FloatArray
 
@@ -102,6 +105,15 @@ def text(value: Any) -> str:
     if isinstance(value, float | np.floating):
         return f"{value:.4g}" if math.isfinite(value) else "-"
     return "" if value is None else str(value)
+
+
+def chosen(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
+    """The entries of an option with commas between them. Raises `InputError` for one that is not known."""
+    found = names(option, text)
+    for name in found:
+        if name not in known:
+            raise InputError(f"{option}: {unknown_name('name', name, tuple(known))}")
+    return found
 
 
 def each(items: Sequence[T], name: str) -> Iterator[T]:

@@ -22,7 +22,6 @@ from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.scene_graph import SceneGraph
 
-TITLE = "nodes alone, and nodes and edges"
 NODES, JOINT, SEPARATE, APART = "nodes", "nodes and edges", "nodes and edges, each apart", "independent"
 HIDDEN_FOR, SHARES, MIXING = 20, 5, 0.35  # frames; parts of the objects, hidden one after the other; see `flock`
 WARM_UP = 3  # frames that are not timed
@@ -46,7 +45,7 @@ def scaling(
       python -m benchmarks scaling --objects 5,10,15 --frames 60 --json figures.json
     """
     for n in each(counts("--objects", objects, least=2), "objects"):  # one has no neighbours
-        yield from ((TITLE, row) for row in rows_of(n, n <= joint_limit, frames, seed))
+        yield from (("nodes alone, and nodes and edges", row) for row in rows_of(n, n <= joint_limit, frames, seed))
 
 
 def rows_of(n: int, joint: bool, frames: int, seed: int) -> list[dict[str, Any]]:

@@ -16,6 +16,8 @@ import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -78,18 +80,10 @@ def speed(
       python -m benchmarks speed --sizes 10,100 --frames 20
       python -m benchmarks speed --data data --json figures.json --markdown tables.md
     """
-    numbers, length = sorted(counts("--sizes", sizes)), frames + WARM_UP
-    cases: list[Callable[[], SpeedCase]] = []
-    for kind, (name, scene) in RECORDINGS.items() if data is not None else ():
-        recordings = recording_set(name, data, 1)
-        cases.append(partial(_recording, kind, recordings.dataset.scene, scene, length, load_config(recordings.family)))
-    for ties in TIES:
-        for size in numbers:
-            cases.append(partial(_simulated, size, ties, length, seed))
+    cases = speed_cases(data, sorted(counts("--sizes", sizes)), frames + WARM_UP, seed)
     slow: set[tuple[str, str]] = set()
     growing: dict[tuple[str, str], list[tuple[int, float]]] = {}
-    for make in cases:
-        case = make()
+    for case in cases:
         for title, row in measured(case, [m for m in METHODS if (case.kind, m) not in slow], seconds):
             yield title, row
             if "ms" in row:
@@ -104,12 +98,13 @@ def speed(
         yield "live service at 10 Hz: round trip on the wall's clock, ms", round_trips(SERVED, trips, seed)
 
 
-def _recording(kind: str, read: Callable[[str], Any], scene: str, length: int, config: TrackConfig) -> SpeedCase:
-    return SpeedCase(kind, None, list(read(scene).frames)[:length], config)
-
-
-def _simulated(size: int, ties: Ties, length: int, seed: int) -> SpeedCase:
-    return SpeedCase(ties, size, speed_frames(size, ties, length, seed), speed_config(ties))
+def speed_cases(data: Path | None, sizes: Sequence[int], length: int, seed: int) -> Iterator[SpeedCase]:
+    """The recordings in `data`, then simulated objects, from few to many."""
+    for kind, (name, scene) in RECORDINGS.items() if data is not None else ():
+        recordings = recording_set(name, data, 1)
+        yield SpeedCase(kind, None, list(recordings.scene(scene).frames)[:length], load_config(recordings.family))
+    for ties, size in product(TIES, sizes):
+        yield SpeedCase(ties, size, speed_frames(size, ties, length, seed), speed_config(ties))
 
 
 def measured(case: SpeedCase, methods: Sequence[Method], seconds: float) -> Iterator[Row]:
@@ -145,9 +140,12 @@ def measured(case: SpeedCase, methods: Sequence[Method], seconds: float) -> Iter
     title = case.kind if case.size is None else f"{case.size} {case.kind}"
     references = {"/ centerpoint": "centerpoint", "/ 100 filters": "filters", "/ SVD": "svd"}
     for name, tracker in trackers.items():
-        state = tracker.snapshot()
         about = {"case": title, "method": name, "tracks": np.mean(reported[name][-len(times[name]) :])}
-        cost = {"ms": medians[name], "p99": float(np.percentile(times[name], 99)), "MB": len(pickle.dumps(state)) / 1e6}
+        cost = {
+            "ms": medians[name],
+            "p99": float(np.percentile(times[name], 99)),
+            "MB": len(pickle.dumps(tracker.snapshot())) / 1e6,
+        }
         ratios = {column: medians[name] / medians.get(one, math.nan) for column, one in references.items()}
         yield "CPU time a frame", {**about, **cost, **ratios}
     for name, clock in clocks.items():

@@ -18,7 +18,6 @@ from benchmarks.gaps import chosen_lengths
 from benchmarks.recordings import RecordingSet, Score, chosen_sets, exact_set
 from benchmarks.runner import Data, Row, Rows, clocked, each, resampled
 from benchmarks.variants import COMPONENTS, SHIPPED, contenders
-from data_tools.datasets.source import names
 from data_tools.metrics import Interval, LabelErrors, calibration, error_summary, errors_by_class, paired_bootstrap
 from pipelines.cli.options import Config
 from pipelines.config import load_config
@@ -85,8 +84,7 @@ def tracking(
       python -m benchmarks tracking --data data --sets ngsim --passes 4 --lengths 2,3 --no-components
       python -m benchmarks tracking --data data --sets megvii --contenders 'saga,kf,graph matching'
     """
-    chosen = [variant.name for variant in (*SHIPPED, *(COMPONENTS if components else ()))]
-    wanted = names("--contenders", compared) if compared else chosen
+    wanted = compared or ",".join(variant.name for variant in (*SHIPPED, *(COMPONENTS if components else ())))
     for recordings in chosen_sets(sets, data, scenes, test, viewpoint):
         base = load_config(recordings.family, config)
         if passes:
@@ -115,9 +113,9 @@ def set_rows(recordings: RecordingSet, compared: Sequence[Contender], draws: int
         title = f"{recordings.name}: {len(scenes)} scenes; RMSE of position in m, of velocity in m/s"
         yield title, {**about, **rmse, "ms / frame": ms, "/ centerpoint": ratio}
     for name in names_of if KF in scores and draws else ():
-        if name not in (KF, BASELINE):
+        if name not in (KF, BASELINE) and (found := changes(scores[name], scores[KF], recordings.units, draws)):
             title = f"{recordings.name}: changes from kf (RMSE: relative), 95 % intervals over scenes"
-            yield title, {"variant": name, **changes(scores[name], scores[KF], recordings.units, draws)}
+            yield title, {"variant": name, **found}
     for label, errors_of in errors_by_class(LabelErrors.pool(scores[names_of[0]].errors)).items():
         c = calibration(errors_of)
         if c.enough_data:

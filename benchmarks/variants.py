@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from data_tools.files.error_messages import unknown_name
+from benchmarks.runner import chosen
 from pipelines.config import METHODS, Method, TrackConfig
 from pipelines.configuration import load_settings
 from pipelines.learning.gap_runs import Contender
@@ -101,15 +101,13 @@ def variants(family: str | Path) -> dict[str, Variant]:
     return {variant.name: variant for variant in found}
 
 
-def contenders(family: str | Path, base: TrackConfig, chosen: Sequence[str], own: Sequence[str]) -> list[Contender]:
-    """Variants of a configuration by name, without those that change nothing, and others from files.
+def contenders(family: str | Path, base: TrackConfig, wanted: str, own: Sequence[str]) -> list[Contender]:
+    """Variants of a configuration by name, with commas, without those that change nothing, and others from files.
 
     own  NAME[:METHOD]=FILE each. Raises `InputError` for an unknown name and a wrong file.
     """
     known, found = variants(family), list[Contender]()
-    for name in chosen:
-        if name not in known:
-            raise InputError(f"--contenders: {unknown_name('contender', name, tuple(known))}")
+    for name in chosen("--contenders", wanted, tuple(known)):
         made = known[name].contender(base)
         if not any((each.method, each.config) == (made.method, made.config) for each in found):
             found.append(made)

@@ -65,7 +65,7 @@ def test_parts_of_the_graph_are_contenders_where_they_are_configured() -> None:
     rules = variants("heterogeneous")["without lights"].contender(base).config.tracker.edges
     assert {type(rule) for rule in base.tracker.edges} - {type(rule) for rule in rules} == {RedLight}
     shipped = load_config("kitti")
-    assert [one.name for one in contenders("kitti", shipped, ("saga", "without lights", "kf"), ())] == ["saga", "kf"]
+    assert [one.name for one in contenders("kitti", shipped, "saga,without lights,kf", ())] == ["saga", "kf"]
 
 
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
@@ -162,18 +162,18 @@ def test_recordings_without_gaps_are_refused(refused, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--contenders nobody", "--contenders: unknown contender"),
+        ("--contenders nobody", "--contenders: unknown name"),
         ("--contender own", "expected a new NAME=FILE"),
-        ("--against turn --contenders saga,kf", "--against: unknown contender"),
+        ("--against turn --contenders saga,kf", "--against: unknown name"),
         ("--viewpoint mast", "--viewpoint: expected ngsim or openacc among --sets"),
         ("--longest 20", "--longest: expected ngsim or openacc among --sets"),
         ("--picture gap.jpg", "gap.jpg: expected a name that ends in .png"),
-        ("--test scene-0099", "--test: unknown recording"),
-        ("--fit edge", "--fit: unknown fit 'edge'"),
-        ("--of halting,red", "--of: unknown situation 'red'"),
+        ("--test scene-0099", "--test: unknown name"),
+        ("--fit edge", "--fit: unknown name 'edge'"),
+        ("--of halting,red", "--of: unknown name 'red'"),
         ("--folds 1", "--folds: expected a number of 2 or more, or place, got '1'"),
-        ("--lengths 4", "--lengths: expected some of 1, 2, 3, 5, got '4'"),
-        ("--sets foo", "--sets: unknown set 'foo'"),
+        ("--lengths 4", "--lengths: unknown name '4'"),
+        ("--sets foo", "--sets: unknown name 'foo'"),
     ],
 )
 def test_the_command_refuses(refused, arguments: str, message: str) -> None:
@@ -183,7 +183,7 @@ def test_the_command_refuses(refused, arguments: str, message: str) -> None:
 def test_the_picture_shows_the_gap_that_tells_most() -> None:
     drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
     found, base = real_gaps(drawn), load_config("file")
-    pair = contenders("file", base, ("centerpoint", "kf"), ())
+    pair = contenders("file", base, "centerpoint,kf", ())
     worse, better = ([run_of(drawn, found, one, life)] for one, life in zip(pair, ("shipped", "kept"), strict=True))
     assert telling_gap(better, worse) == ("drawn", found[0])
     figure = gap_picture(drawn, found[0], {one.name: judged_run(drawn, found, one, "kept") for one in pair})
