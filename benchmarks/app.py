@@ -1,23 +1,14 @@
-"""All benchmarks that are run from a clone, as one command."""
+"""All benchmarks, as one command: the function `NAME` of each module `benchmarks.NAME`."""
 
 from __future__ import annotations
 
-from benchmarks.fusion import fusion
-from benchmarks.metrics import metrics
-from benchmarks.scaling import scaling
-from benchmarks.settling import settling
-from benchmarks.signals import signals
-from benchmarks.smoothing import smoothing
-from benchmarks.streaming import streaming
-from benchmarks.synthetic import synthetic
-from pipelines.cli.console import new_command
+from importlib import import_module
 
-app = new_command()
+from benchmarks.runner import application
 
-for command in (fusion, metrics, scaling, settling, signals, smoothing, streaming, synthetic):
-    app.command()(command)
+NAMES = (
+    *("estimators", "gaps", "joint", "loops", "metrics", "scaling", "service"),
+    *("slam", "smoothing", "speed", "streaming", "tracking"),
+)
 
-
-@app.callback()
-def benchmarks() -> None:
-    """Measure: every figure is compared with a baseline in the same run."""
+app = application(getattr(import_module(f"benchmarks.{name}"), name) for name in NAMES)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks metrics`: our nuScenes tracking metrics beside the official development kit's.
+"""Our nuScenes tracking metrics beside the official development kit's.
 
 The kit needs NumPy 1, so it lives in an environment of its own and is run by that one's python.
 """
@@ -12,58 +12,84 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from benchmarks.runner import Rows
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
-from data_tools.figures import FigureTable
 from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from data_tools.simulator import SimulatedTraffic, write_nuscenes
-from pipelines.cli.console import working
-from pipelines.cli.options import Verbose
-from pipelines.cli.tables import JsonFile, report
 from pipelines.config import load_config
 from pipelines.process import one_thread
 from pipelines.tracking import track_dataset
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, SagaError
 
 PYTHON_VARIABLE = "SAGA_FG_DEVKIT_PYTHON"
 VERSION = "v1.0-mini"  # of simulated scenes
 TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True)
-class OfficialFigures:
-    """The kit's figures as it serialises them, and its CPU time, s."""
+def metrics(
+    result: Annotated[
+        Path | None, typer.Option("--result", help="Tracking-result JSON; without it, simulated scenes are tracked.")
+    ] = None,
+    dataroot: Annotated[Path | None, typer.Option("--dataroot", help="Folder that holds the folder of tables.")] = None,
+    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = VERSION,
+    split: Annotated[str, typer.Option("--split", help="The split to score.")] = "all",
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes, if there is no result.")] = 2,
+) -> Rows:
+    """Our nuScenes tracking metrics beside the official development kit's: the same figures? how much faster?
 
-    figures: dict[str, Any]
-    seconds: float
+    The kit needs NumPy 1: the variable SAGA_FG_DEVKIT_PYTHON names a python that has it (.ci/devkit-requirements.txt).
+    Fails if a figure differs by more than 1e-6.
 
-
-@dataclass(frozen=True)
-class Parity:
-    """Our figures beside the kit's.
-
-    difference  the largest of any figure, overall or of a class (inf where only one of the two is defined), and `where`
-    seconds     of CPU time: ours, theirs
+    \b
+    Examples:
+      export SAGA_FG_DEVKIT_PYTHON=devkit/bin/python
+      python -m benchmarks metrics
+      python -m benchmarks metrics --result tracks.json --dataroot data/nuscenes --split mini_train
     """
+    python = os.environ.get(PYTHON_VARIABLE)
+    if not python:
+        raise InputError(f"{PYTHON_VARIABLE}: expected the name of a python that has nuscenes-devkit, it is not set")
+    if (result is None) != (dataroot is None):
+        raise InputError("expected both --result and --dataroot, or neither")
+    with tempfile.TemporaryDirectory() as folder:
+        if result is None or dataroot is None:
+            dataroot = Path(folder) / "simulated"
+            result = tracked_simulation(dataroot, scenes)
+        row = parity(python, result, dataroot, version, split)
+    yield "nuScenes tracking metrics, ours beside the official ones", row
+    if row["largest difference"] > TOLERANCE:
+        raise SagaError(f"the figures differ: {row['where']}")
 
-    amota: float
-    difference: float
-    where: str
-    seconds: tuple[float, float]
 
-    @property
-    def ratio(self) -> float:
-        """The kit's time over ours."""
-        return self.seconds[1] / self.seconds[0]
+def parity(python: str, result: Path, dataroot: Path, version: str, split: str) -> dict[str, Any]:
+    """Score one result with both. Raises `InputError` for broken files or a kit that fails.
+
+    The largest difference is that of any figure, overall or of a class: inf where only one of the two is defined.
+    """
+    with one_thread():
+        begin = time.process_time()
+        scored = read_scored_scenes(result, dataroot, version, split_scenes(dataroot, version, split))
+        ours = nuscenes_tracking_metrics([each.tracking for each in scored.values()])
+        seconds = time.process_time() - begin
+    theirs, official = official_figures(python, result, dataroot, version, split)
+    where, difference = max(differences(ours, theirs), key=lambda named: named[1])
+    about = {"AMOTA": ours.overall.amota, "largest difference": difference, "where": where}
+    return {**about, "CPU time, s": seconds, "official": official, "times faster": official / seconds}
 
 
-def official_figures(python: str, result: Path, dataroot: Path, version: str, split: str) -> OfficialFigures:
-    """Run the kit. Raises `InputError` with the last line of its errors if it fails."""
+def official_figures(
+    python: str, result: Path, dataroot: Path, version: str, split: str
+) -> tuple[dict[str, Any], float]:
+    """The kit's figures as it serialises them, and its CPU time, s. Raises `InputError` with its last line if it fails.
+
+    JSON with `figures` and `seconds` is what `devkit_figures.py` prints.
+    """
     script = Path(__file__).with_name("devkit_figures.py")
     command = [python, str(script), *map(str, (result, dataroot, version, split))]
     try:
@@ -73,7 +99,8 @@ def official_figures(python: str, result: Path, dataroot: Path, version: str, sp
     if run.returncode != 0:
         last = run.stderr.strip().splitlines()[-1:] or ["no word"]
         raise InputError(f"{python}: the development kit failed: {last[0]}")
-    return OfficialFigures(**json.loads(run.stdout))
+    told = json.loads(run.stdout)
+    return told["figures"], told["seconds"]
 
 
 def tracked_simulation(dataroot: Path, scenes: int) -> Path:
@@ -83,18 +110,6 @@ def tracked_simulation(dataroot: Path, scenes: int) -> Path:
     runs = track_dataset(dataset, lambda: load_config("nuscenes").new_tracker("kf"))
     write_tracking_results(dataroot / "tracks.json", ((run.scene, run.tracks) for run in runs), dataset.meta)
     return dataroot / "tracks.json"
-
-
-def parity(python: str, result: Path, dataroot: Path, version: str, split: str) -> Parity:
-    """Score one result with both. Raises `InputError` for broken files or a kit that fails."""
-    with one_thread():
-        begin = time.process_time()
-        scored = read_scored_scenes(result, dataroot, version, split_scenes(dataroot, version, split))
-        ours = nuscenes_tracking_metrics([each.tracking for each in scored.values()])
-        seconds = time.process_time() - begin
-    theirs = official_figures(python, result, dataroot, version, split)
-    where, difference = max(differences(ours, theirs.figures), key=lambda named: named[1])
-    return Parity(ours.overall.amota, difference, where, (seconds, theirs.seconds))
 
 
 def differences(ours: NuScenesTrackingMetrics, theirs: dict[str, Any]) -> Iterator[tuple[str, float]]:
@@ -113,45 +128,3 @@ def _apart(a: float, b: float) -> float:
     if math.isnan(a) or math.isnan(b):
         return 0.0 if math.isnan(a) and math.isnan(b) else math.inf
     return abs(a - b)
-
-
-def metrics(
-    result: Annotated[
-        Path | None, typer.Option("--result", help="Tracking-result JSON; without it, simulated scenes are tracked.")
-    ] = None,
-    dataroot: Annotated[Path | None, typer.Option("--dataroot", help="Folder that holds the folder of tables.")] = None,
-    version: Annotated[str, typer.Option("--version", help="Name of the folder of tables.")] = VERSION,
-    split: Annotated[str, typer.Option("--split", help="The split to score.")] = "all",
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes, if there is no result.")] = 2,
-    json_file: JsonFile = None,
-    verbose: Verbose = False,
-) -> None:
-    """Our nuScenes tracking metrics beside the official development kit's: the same figures? how much faster?
-
-    The kit needs NumPy 1: the variable SAGA_FG_DEVKIT_PYTHON names a python that has it (.ci/devkit-requirements.txt).
-    Exit code 1 if a figure differs by more than 1e-6.
-
-    \b
-    Examples:
-      export SAGA_FG_DEVKIT_PYTHON=devkit/bin/python
-      python -m benchmarks metrics
-      python -m benchmarks metrics --result tracks.json --dataroot data/nuscenes --split mini_train
-    """
-    python = os.environ.get(PYTHON_VARIABLE)
-    if not python:
-        raise InputError(f"{PYTHON_VARIABLE}: expected the name of a python that has nuscenes-devkit, it is not set")
-    if (result is None) != (dataroot is None):
-        raise InputError("expected both --result and --dataroot, or neither")
-    with tempfile.TemporaryDirectory() as folder, working("scoring twice"):
-        if result is None or dataroot is None:
-            dataroot = Path(folder) / "simulated"
-            result = tracked_simulation(dataroot, scenes)
-        outcome = parity(python, result, dataroot, version, split)
-    ours, theirs = outcome.seconds
-    row = (f"{outcome.amota:.4f}", f"{outcome.difference:.1e}", f"{ours:.2f}", f"{theirs:.2f}", f"{outcome.ratio:.0f}")
-    columns = ("AMOTA", "largest difference", "CPU time, s", "official", "times faster")
-    table = FigureTable("nuScenes tracking metrics, ours beside the official ones", columns, (row,))
-    report([table], {"parity": outcome, "ratio": outcome.ratio}, json_file)
-    if outcome.difference > TOLERANCE:
-        typer.echo(f"the figures differ: {outcome.where}", err=True)
-        raise typer.Exit(1)

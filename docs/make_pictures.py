@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
 from concept_pictures import write_concept_pictures
 from heterogeneous_picture import write_heterogeneous_picture
 from running_graph_picture import write_running_graph_pictures
+from scaling_picture import write_scaling_picture
 from slam_loops_picture import write_loops_picture
 
-from benchmarks.scaling import ScalingSettings, bench_scaling, write_picture
 from data_tools.simulator import simulate_scene
 from data_tools.simulator.laser_drive import laser_drive
 from data_tools.simulator.street import SimulatedScans
@@ -43,14 +44,14 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 def main() -> None:
     """All pictures; those of recordings where the variable SAGA_FG_DATA names their folder."""
     write_concept_pictures(HERE)
-    write_picture(HERE / "scaling.png", bench_scaling(ScalingSettings()))
+    write_scaling_picture(HERE / "scaling.png")
     write_heterogeneous_picture(HERE)
     write_running_graph_pictures(HERE)
     write_loops_picture(HERE)
     if data := os.environ.get("SAGA_FG_DATA"):
-        gap = "bench gaps --sets ngsim --test USA_US101-12_1_T-1 --passes 2 --lengths 3,5 --life kept"
+        gap = "-m benchmarks gaps --sets ngsim --test USA_US101-12_1_T-1 --passes 2 --lengths 3,5 --life kept"
         subprocess.run(
-            ["saga-fg", *gap.split(), "--contenders", "saga,kf", "--data", data, "--picture", HERE / "gap.png"],
+            [sys.executable, *gap.split(), "--contenders", "saga,kf", "--data", data, "--picture", HERE / "gap.png"],
             check=True,
         )
     with tempfile.TemporaryDirectory() as folder:

@@ -9,7 +9,6 @@ import numpy as np
 from data_tools.plots import running_graph_picture
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from factors import bearing_range_factor
-from pipelines.bench.sampled_traffic import SampledTraffic, providers, sample_traffic
 from pipelines.config import load_config
 from pipelines.explaining import graph_picture
 from saga_fg import Tracker
@@ -17,6 +16,7 @@ from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable
 from saga_fg.tracking import Journal
 from saga_fg.tracking.graph_record import GraphRecord
+from tests.saga_fg.sampled_traffic import SampledTraffic, providers, sample_traffic
 
 SEED = 63
 POST = np.array([18.0, 9.0])

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.loops import drive_course
 from data_tools.files.atomic_files import write_bytes
 from data_tools.plots import paths_from_above, png
-from pipelines.bench.courses import drive_course
 
 SEED, DRIFT = 1, 30.0  # m
 

@@ -17,7 +17,7 @@ class Missing:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Missing)
 """
-OPTIONAL = ("open3d", "libusb_package", "pandas", "pyarrow", "rerun", "ray", "fsspec", "mcap", "trackeval", "sklearn")
+OPTIONAL = ("open3d", "libusb_package", "pandas", "pyarrow", "rerun", "ray", "fsspec", "mcap", "trackeval")
 LIBRARY = """
 from saga_fg import Detection, Detections, Frame, Tracker
 tracker = Tracker()

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from pipelines.cli.bench import bench_app
 from pipelines.cli.benchmark import benchmark_app
 from pipelines.cli.config import config
 from pipelines.cli.console import new_command
@@ -34,7 +33,6 @@ app.add_typer(learn_app, name="learn")
 app.add_typer(report_app, name="report")
 app.add_typer(view_app, name="view")
 app.add_typer(benchmark_app, name="benchmark")
-app.add_typer(bench_app, name="bench")
 app.add_typer(slam_app, name="slam")
 app.command()(explain)
 app.command()(simulate)

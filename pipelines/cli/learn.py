@@ -44,11 +44,11 @@ def _interactions(
     where detections are given, the tracks of a tracker.
     """
     from data_tools.files.atomic_files import check_writable, write_text
-    from pipelines.bench.gaps.learned import LearningSettings, learn_interactions
-    from pipelines.bench.gaps.learned_tables import learned_figures, learned_tables
     from pipelines.config import load_config, load_interactions
     from pipelines.configuration import write_settings
     from pipelines.learning import scenes_to_learn_from
+    from pipelines.learning.interaction_tables import learned_figures, learned_tables
+    from pipelines.learning.interactions import LearningSettings, learn_interactions
 
     check_writable(output)
     options.apart(output, *source.input_files(), *(() if start is None else (start,)))

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from benchmarks import smoothing
 from benchmarks.smoothing import true_objects
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.smoothing import load_smooth_config, smooth_known_objects
@@ -28,3 +30,11 @@ def test_detections_find_their_true_objects() -> None:
     at = states.rows_of(np.full(len(ids), k), ids)
     error = states.mean[at, :2] + evidence.origin - last.boxes.position[last.visible, :2]
     assert np.median(np.hypot(*error[at >= 0].T)) < 0.15
+
+
+def test_the_benchmark_compares_the_same_boxes(bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    short = replace(SimulatorSettings(), duration=4.0)
+    monkeypatch.setattr(smoothing, "SimulatedTraffic", lambda scenes, seed: SimulatedTraffic(short, scenes, seed))
+    (row,) = bench("smoothing --scenes 2")
+    assert row["boxes"] > 10
+    assert row["relative change"]["estimate"] == pytest.approx(row["with edges"] / row["without"] - 1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.bench.recordings import recording_set
+from benchmarks.recordings import recording_set
 from pipelines.config import load_config
 
 

@@ -8,16 +8,12 @@ import numpy as np
 import pytest
 
 from data_tools.simulator import simulate_scene
-from pipelines.bench.gaps.bench import Contender, hidden, run_of
-from pipelines.bench.gaps.contenders import contenders
-from pipelines.bench.gaps.gap import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
-from pipelines.bench.gaps.judging import CAP, JudgedRun, Links
-from pipelines.bench.gaps.labelled import LabelledScene
-from pipelines.bench.gaps.picture import drawn_gap, gap_picture, telling_gap
-from pipelines.bench.gaps.sources import RecordingSource
 from pipelines.config import load_config
-from saga_fg import InputError
-from tests.pipelines.drawn_gaps import (
+from pipelines.learning.gap_judging import CAP, JudgedRun, Links
+from pipelines.learning.gap_runs import hidden
+from saga_fg.learning.gaps import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
+from saga_fg.learning.labelled_scene import LabelledScene
+from tests.pipelines.sampled_gaps import (
     HIDDEN,
     SEEN,
     SHORT,
@@ -109,23 +105,6 @@ def test_a_tracker_that_reports_nothing_unseen_is_extrapolated() -> None:
     assert JudgedRun(drawn, found).outcome(gap).error == CAP
 
 
-def test_the_picture_shows_the_gap_that_tells_most() -> None:
-    drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
-    gaps, base = real_gaps(drawn), load_config("file")
-    pair = [Contender.of(contenders("file")[name], base) for name in ("centerpoint", "kf")]
-    worse, better = ([run_of(drawn, gaps, each, life)] for each, life in zip(pair, ("shipped", "kept"), strict=True))
-    assert telling_gap(better, worse) == ("drawn", gaps[0])
-    shown = [drawn_gap(drawn, gaps, gaps[0], each, "kept") for each in pair]
-    assert [each.holders[4] for each in shown] == [each.holders[9] for each in shown] != [None, None]
-    figure = gap_picture(drawn, gaps[0], shown)
-    assert [ax.get_title(loc="left").split(",")[0] for ax in figure.axes] == [
-        "centerpoint: identity kept",
-        "kf: identity kept",
-    ]
-    with pytest.raises(InputError, match="--picture: expected recordings with gaps"):
-        telling_gap([], [])
-
-
 def test_made_gaps_hide_one_object_among_others() -> None:
     config = load_config("simulated")
     traffic = LabelledScene.of(simulate_scene(SHORT, seed=4), config.sensors)
@@ -158,9 +137,3 @@ def test_made_gaps_hide_one_object_among_others() -> None:
     mine = [gap.row for gap in first]
     others = np.delete(traffic.detected, mine, axis=1)
     assert (np.delete(without_them.detected, mine, axis=1) == others).all()
-
-
-def test_nothing_is_hidden_from_above() -> None:
-    assert RecordingSource("ngsim").complete
-    assert not RecordingSource("ngsim", viewpoint="mast").complete
-    assert not RecordingSource("kitti").complete

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.variants import changed
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from pipelines.bench.variants import changed
 from pipelines.config import load_config
 from pipelines.learning import learn_noise, learned_fragment
 

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import pipelines.bench.gaps.learned as learned_module
-from pipelines.bench.gaps.bench import Contender, GapBenchSettings, bench_gaps
-from pipelines.bench.gaps.learned import (
+import pipelines.learning.interactions as learned_module
+from pipelines.cli import app
+from pipelines.config import load_config, load_interactions
+from pipelines.configuration import read_settings, write_settings
+from pipelines.learning.gap_runs import Contender, GapBenchSettings, bench_gaps
+from pipelines.learning.interactions import (
     BASE,
     LEARNED,
     NOWHERE,
@@ -20,9 +23,6 @@ from pipelines.bench.gaps.learned import (
     held_out_parts,
     learn_interactions,
 )
-from pipelines.cli import app
-from pipelines.config import load_config, load_interactions
-from pipelines.configuration import read_settings, write_settings
 from saga_fg.errors import InputError
 from saga_fg.learning import FittedInteractions, GapSettings, fit_interactions
 from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.recordings import recording_set
 from data_tools.datasets.parts import scene_digests
 from data_tools.simulator.recorded_source import NgsimSource
-from pipelines.bench.recordings import recording_set
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.learning import scenes_to_learn_from
@@ -48,7 +48,7 @@ def test_a_set_of_the_benchmarks_is_scored_at_every_moment(data: Path) -> None:
     recordings = recording_set("ngsim", data, 1)
     config = load_config(recordings.family)
     runs = {name: track_scene(recordings.dataset.scene(name), config.new_tracker("kf")) for name in ("A",)}
-    assert recordings.score(runs).figures["IDS"] == 0
+    assert recordings.score(runs).figures_of([0])["IDS"] == 0
 
 
 def test_what_is_given_of_the_road_is_part_of_the_digest(data: Path) -> None:

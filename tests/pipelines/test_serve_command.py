@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.bench.service import ServiceBenchSettings, bench_service
+from benchmarks.service.endurance import ServiceBenchSettings, bench_service
 from pipelines.serving import StreamClient, parse_address
 from saga_fg import InputError
 from tests.pipelines.running_service import COMMAND, frame, serving

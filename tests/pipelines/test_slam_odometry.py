@@ -1,22 +1,17 @@
-"""LiDAR odometry on simulated drives, where the true poses are known, and beside KISS-ICP."""
+"""LiDAR odometry on simulated drives, where the true poses are known."""
 
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from data_tools.datasets.kitti import KittiScans
 from data_tools.lidar import Scan
 from data_tools.simulator.featureless import tunnel
 from data_tools.simulator.scanner import ScannerSettings
-from data_tools.simulator.street import SimulatedScans, drive, scans, street
+from data_tools.simulator.street import drive, scans, street
 from data_tools.trajectories import Trajectory, trajectory_errors
-from pipelines.bench.slam import bench_slam
-from pipelines.cli import app
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -110,32 +105,3 @@ def test_time_runs_forwards_and_settings_are_checked() -> None:
         odometry.step(scan, 1.0)
     with pytest.raises(InputError, match="surfel_size: expected"):
         OdometrySettings(surfel_size=0.0)
-
-
-def test_the_benchmark_measures_both_on_the_same_scans() -> None:
-    pytest.importorskip("kiss_icp", reason="kiss-icp comes with the extra bench")
-    rows = bench_slam(SimulatedScans(2, 20))
-    assert [(row.case, row.contender) for row in rows] == [
-        (case, name) for case in ("as recorded", "de-skewed") for name in ("saga-fg", "kiss-icp")
-    ]
-    for row in rows:
-        assert row.errors.poses == 20
-        assert np.isfinite(row.errors.relative_translation)
-        assert 0 < row.residual < 0.1
-        assert row.milliseconds > 0
-    assert all(
-        row.errors.relative_translation < 0.05 for row in rows if row.contender == "saga-fg" and row.case == "de-skewed"
-    )
-
-
-def test_bench_slam_prints_and_writes_the_figures(recordings: Path, tmp_path: Path) -> None:
-    kitti = recordings / "kitti"
-    assert len(KittiScans(kitti, "0000")) == 90
-    result = CliRunner().invoke(
-        app,
-        ["bench", "slam", "--dataroot", str(kitti), "--scans", "30", "--no-kiss", "--json", str(tmp_path / "f.json")],
-    )
-    assert result.exit_code == 0, result.output
-    assert "as recorded" in result.stdout
-    assert "de-skewed" in result.stdout
-    assert (tmp_path / "f.json").read_text().count('"contender": "saga-fg"') == 2

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
+from benchmarks.variants import changed
 from data_tools.metrics import SceneMetrics, scene_metrics
 from data_tools.simulator import SimulatorSettings, simulate_scene
-from pipelines.bench.variants import changed
 from pipelines.config import load_config
 from pipelines.tracking import track_scene
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from factors import SolverSettings, gaussian_factor, marginal_moments, pose_prior_factor, prior_factor
-from pipelines.bench.sampled_traffic import providers, sample_traffic
 from saga_fg.estimators import BatchSmoother, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import (
     EGO_POSE,
@@ -24,6 +23,7 @@ from saga_fg.graph import (
     key_of,
 )
 from saga_fg.graph.keys import LARGEST, described
+from tests.saga_fg.sampled_traffic import providers, sample_traffic
 
 
 class Once:

@@ -7,7 +7,6 @@ import json
 import numpy as np
 
 from factors import ResidualFactors
-from pipelines.bench.sampled_traffic import providers, sample_traffic
 from saga_fg import Detection, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import OBJECT, Additions
@@ -15,6 +14,7 @@ from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.tracking import Journal
 from saga_fg.tracking.graph_record import GraphRecord
+from tests.saga_fg.sampled_traffic import providers, sample_traffic
 
 RULES = (Following(interaction=SharedVelocity(along_heading=True), rate=1.5),)
 

@@ -1,0 +1,152 @@
+"""A picture of one gap, a panel for each contender: the hidden object, its neighbours, and the tracks that hold it.
+
+The object travels from left to right. Its labels are a grey line, dotted where it has no detection; the boxes of its
+neighbours are grey, and crosses are detections, at the last moment of the gap. Each track that holds the object has a
+colour of its own, from the moment at which it does, with its 90 % ellipse at every second of the gap: one colour before
+and after the gap is one identity. Where there is a road map, its lanes are thin lines, and its stop lines have the
+colours that their lights show at the last moment of the gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.recordings import RecordingSet
+from data_tools.files.atomic_files import write_bytes
+from data_tools.plots import png
+from data_tools.plots.birds_eye import COLOURS, ellipse
+from pipelines.learning.gap_judging import CAP, JudgedRun
+from pipelines.learning.gap_runs import Contender, Run, judged_run
+from saga_fg.errors import InputError
+from saga_fg.learning.gaps import Gap
+from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.learning.situations import colours_at
+from saga_fg.numerics.arrays import FloatArray
+
+BEFORE, AFTER = 1.5, 1.0  # s
+MARGIN, HEIGHT = 12.0, 12.0  # m: before and after the object's way, and the least height of a panel
+RING = 0.9  # probability of the ellipses
+LIGHTS = {"red": "#d62728", "amber": "#ff9f0e", "green": "#2ca02c"}
+
+Turned = Callable[[FloatArray], FloatArray]  # points (n, 2) of the world as (2, n) along and across the object's way
+
+
+def telling_gap(first: Sequence[Run], second: Sequence[Run], situations: Sequence[str] = ()) -> tuple[str, Gap]:
+    """The recording and the gap in which the first contender does better than the second by most.
+
+    Where identity is kept by the first alone; among those, or else among all, of largest difference of errors. With
+    situations, among made gaps in which the object is in one of them. Raises `InputError` where there is no gap.
+    """
+    best: tuple[tuple[int, float], str, Gap] | None = None
+    for ours, theirs in zip(first, second, strict=True):
+        for gap, at, mine, other in zip(ours.gaps, ours.situations, ours.outcomes, theirs.outcomes, strict=True):
+            if situations and all(each.isdisjoint(situations) for each in at.values()):
+                continue
+            gain = float(np.nan_to_num(min(other.error, CAP) - mine.error))
+            worth = (int(mine.kept is True) - int(other.kept is True), gain)
+            if best is None or worth > best[0]:
+                best = worth, ours.recording, gap
+    if best is None:
+        raise InputError("--picture: expected recordings with gaps of the situations asked for, there are none")
+    return best[1], best[2]
+
+
+def write_telling_picture(
+    path: Path,
+    source: RecordingSet,
+    runs: Sequence[Run],
+    contenders: Sequence[Contender],
+    situations: Sequence[str] = (),
+) -> None:
+    """Draw the gap, in one of some situations or any, in which the second of two contenders beats the first by most.
+
+    Raises `InputError` for a path that is not writable, and where there is no gap.
+    """
+    life = runs[0].life
+    first, second = ([run for run in runs if (run.life, run.contender) == (life, c.name)] for c in contenders)
+    recording, gap = telling_gap(second, first, situations)
+    labelled = LabelledScene.of(source.scene(recording), contenders[0].config.sensors)
+    together = [one for run in first if run.recording == recording for one in run.gaps if one.run == gap.run]
+    drawn = {one.name: judged_run(labelled, together, one, life) for one in contenders}
+    write_bytes(path, png(gap_picture(labelled, gap, drawn)))
+
+
+def gap_picture(labelled: LabelledScene, gap: Gap, drawn: dict[str, JudgedRun]) -> Any:
+    """A matplotlib `Figure`."""
+    from matplotlib.figure import Figure
+
+    time = labelled.scene.timestamps
+    shown = np.flatnonzero((time >= time[gap.start] - BEFORE) & (time <= time[gap.stop] + AFTER))
+    labels = labelled.position[shown, gap.row]
+    known = labels[np.isfinite(labels[:, 0])]
+    offset, origin = known[-1] - known[0], known[0]
+    angle = np.arctan2(*offset[::-1]) if np.hypot(*offset) > 1.0 else np.nan_to_num(labelled.yaw[gap.start, gap.row])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+    def turned(points: FloatArray) -> FloatArray:
+        return np.asarray(((points - origin) @ turn).T)
+
+    along, across = turned(known)
+    left, right = along.min() - MARGIN, along.max() + MARGIN
+    height = max(float(np.ptp(across)) + MARGIN, HEIGHT)
+    size = (11.0, (11.0 * height / (right - left) + 0.6) * len(drawn) + 0.5)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(drawn), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for ax, (name, run) in zip(axes, drawn.items(), strict=True):
+        _draw_surroundings(ax, labelled, gap, turned)
+        seen = (shown <= gap.start) | (shown >= gap.stop)
+        ax.plot(*turned(labels), ":", color="#555555", linewidth=2.0, zorder=2, label="labels, no detection")
+        ax.plot(
+            *turned(np.where(seen[:, None], labels, np.nan)), color="#555555", linewidth=3.0, label="labels, detected"
+        )
+        _draw_tracks(ax, time, gap, shown.tolist(), run, turned)
+        outcome = run.outcome(gap)
+        fate = "identity kept" if outcome.kept else "identity lost"
+        ax.set_title(f"{name}: {fate}, mean error in the gap {outcome.error:.2f} m", loc="left", fontsize=10)
+        ax.set(aspect="equal", ylabel="m", xlim=(left, right))
+        ax.set_ylim(across.mean() - height / 2, across.mean() + height / 2)
+    axes[-1].set_xlabel(f"m; {labelled.label[gap.row]} without detections for {time[gap.stop] - time[gap.start]:.1f} s")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    return figure
+
+
+def _draw_surroundings(ax: Any, labelled: LabelledScene, gap: Gap, turned: Turned) -> None:
+    """Lanes, and stop lines in the colours of their lights; boxes and detections; at the last moment of the gap."""
+    k, truth = gap.stop - 1, labelled.scene.ground_truth
+    time = float(labelled.scene.timestamps[k])
+    road, colours = colours_at(labelled, time)
+    for lane in road.lanes if road is not None else ():
+        ax.plot(*turned(np.array(lane.centre)), color="#bcd0e0", linewidth=0.8, zorder=0)
+    for line in road.stop_lines if road is not None else ():
+        ax.plot(*turned(line.ends), color=LIGHTS.get(colours.get(line.light, ""), "#808080"), linewidth=3.0, zorder=2)
+    for name, corners in zip(truth[k].id.tolist(), truth[k].boxes.corners(), strict=True) if truth else ():
+        if np.isfinite(corners).all():
+            ax.fill(*turned(corners), color="#f3dcc4" if name == labelled.id[gap.row] else "#d8d8d8", zorder=1)
+    nearest = int(np.argmin([abs(frame.timestamp - time) for frame in labelled.scene.frames]))
+    there = labelled.boxes[nearest].position[:, :2]
+    ax.plot(*turned(there), "x", color="black", markersize=4, zorder=3, label="detections at the end")
+
+
+def _draw_tracks(ax: Any, time: FloatArray, gap: Gap, shown: list[int], run: JudgedRun, turned: Turned) -> None:
+    """The way of each track that holds the object before or after the gap, and its ellipses in the gap."""
+    holders = run.holders(gap)
+    for number, name in enumerate(dict.fromkeys(holders[k] for k in shown if holders[k] is not None)):
+        colour, seconds, places = COLOURS[number % len(COLOURS)], 1.0, list[FloatArray]()
+        for k in shown:
+            row = np.flatnonzero(run.tracks[k].id == name)
+            if len(row) == 0 or k < holders.index(name):
+                continue
+            if k == gap.stop and places:  # where the object returns, the track jumps to it
+                places.append(np.full(2, np.nan))
+            places.append(run.tracks[k].boxes.position[row[0], :2])
+            if gap.start < k < gap.stop and time[k] - time[gap.start] >= seconds - 1e-6:
+                seconds += 1.0
+                ring = places[-1] + ellipse(run.tracks[k].position_covariance[row[0]], RING)
+                ax.plot(*turned(ring), color=colour, linewidth=1.0, alpha=0.8, zorder=5)
+        if places:
+            label = f"track {name}, 90 % ellipses"
+            ax.plot(*turned(np.array(places)), "-o", color=colour, markersize=3, linewidth=1.2, zorder=6, label=label)

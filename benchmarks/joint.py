@@ -1,0 +1,327 @@
+"""The vehicle and the objects around it in one graph, against one after the other, with poor odometry.
+
+Decoupled: the odometry's path, and the tracker along it. Joint: odometry and objects in one graph. Held: objects by the
+same graph, with past and future, the path held where the odometry has it. Online: the joint estimate in a running
+graph, read out at every frame. All know the same odometry, degraded by errors sampled with a seed. Paths are aligned
+with the true one before their absolute trajectory error (ATE) is taken.
+
+A pair is an object at a frame, with a detection within `NEAR` of the truth along the true path, of a track that has
+detected it in at least `SETTLED` frames before: earlier, velocities are the priors of new tracks. Contenders are
+compared on the pairs that all of them have. With the estimated and the true pose (R, t), (R', t') of the vehicle,
+
+    in the world    p - p',  v - v'                     from it    R^T (p - t) - R'^T (p' - t'),  R^T v - R'^T v'
+
+Intervals are paired bootstraps over recordings, the seeds of one taken together, of changes of pooled errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import gtsam
+import numpy as np
+import typer
+
+from benchmarks.runner import Row, Rows, each
+from data_tools.datasets.kitti import KittiTracking
+from data_tools.metrics import paired_bootstrap
+from data_tools.simulator import simulate_scene
+from data_tools.trajectories import Trajectory, trajectory_errors
+from pipelines.cli.options import Config
+from pipelines.config import TrackConfig, load_config
+from pipelines.slam.joint import degraded_drive, path_tracker, run_joint, street
+from saga_fg.errors import InputError
+from saga_fg.graph import EGO_POSE, Additions, GraphView
+from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import Assignment, assign
+from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.slam.joint import JointSettings, LaneSettings, Observations, OnlineEstimator, estimate_jointly
+from saga_fg.slam.joint.estimate import ObjectStates
+from saga_fg.slam.joint.record import in_ego
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.landmark import Observation
+
+SENSOR = "lidar"
+NEAR, SETTLED, MOVING = 2.0, 3, 1.0  # m, of a detection from the object that it is of; frames; m/s
+SAME_TIME = 1e-3  # s, between a frame and its truth
+FIGURES = ("world position, m", "world velocity, m/s", "ego position, m", "ego velocity, m/s")
+GAP, OFFSET, SEEN = 25.0, 9.0, 0.8  # m between poles, and from the path, means; chance that one within reach is seen
+Pair = tuple[int, str]  # frame, object
+State = tuple[IntArray, FloatArray, FloatArray, Assignment]  # ids, states (n, 4), the vehicle's pose, detections
+At = Callable[[int, Frame, Detections], Mapping[str, State]]
+
+
+def joint(
+    dataroot: Annotated[
+        Path | None, typer.Option("--dataroot", help="KITTI tracking; without it, simulated streets.")
+    ] = None,
+    detections: Annotated[
+        Path | None, typer.Option("--detections", help="Folder of a detector: Car/, Pedestrian/, Cyclist/.")
+    ] = None,
+    sequences: Annotated[str | None, typer.Option("--sequences", help="KITTI sequences, by commas; all.")] = None,
+    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
+    first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first simulated scene.")] = 0,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
+    poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False,
+    lanes: Annotated[
+        bool, typer.Option("--lanes", help="Simulated: once more with vehicles drawn to the lanes of a map.")
+    ] = False,
+    parked: Annotated[
+        bool, typer.Option("--parked/--no-parked", help="Simulated: cars parked on both sides, or none.")
+    ] = True,
+    online: Annotated[bool, typer.Option("--online", help="In a running graph, frame by frame.")] = False,
+    lag: Annotated[float, typer.Option("--lag", min=0.0, help="Of the running graph, s.")] = 3.0,
+    config: Config = None,
+) -> Rows:
+    """Joint against decoupled estimation with degraded odometry: errors of the path and of the objects.
+
+    Decoupled: the odometry's path and the tracker along it; held: objects from the whole recording along that path.
+    The odometry has noise, a scale error and a bias of the yaw rate, all wandering, sampled anew for every seed.
+
+    \b
+    Examples:
+      python -m benchmarks joint --scenes 10 --poles
+      python -m benchmarks joint --scenes 10 --lanes --no-parked
+      python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
+      python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
+    """
+    if (dataroot is None) != (detections is None):
+        raise InputError("expected both --dataroot and --detections, or neither")
+    if dataroot is not None and (poles or lanes or not parked):
+        raise InputError("--poles, --lanes and --no-parked: expected with simulated streets only")
+    if online and (poles or lanes):
+        raise InputError("--online: expected neither --poles nor --lanes")
+    if dataroot is None:
+        many = [simulate_scene(street(parked, mapped=lanes), seed) for seed in range(first, first + scenes)]
+    else:
+        kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","), True)
+        many = [kitti.scene(name) for name in kitti.scenes]
+    base = load_config("simulated" if dataroot is None else "kitti", config)
+    run = partial(online_run, lag=lag) if online else partial(batch_run, poles=poles, lanes=lanes)
+    yield from joint_rows(many, range(seeds), partial(run, config=base, settings=JointSettings()))
+
+
+@dataclass
+class Outcome:
+    """A run: path by contender, (2,) sum of squared errors and number of poses; objects by contender and whether they
+    move, (4, 2) sum of squares of each of FIGURES and pairs; figures of the path."""
+
+    paths: dict[str, FloatArray] = field(default_factory=dict)
+    objects: dict[tuple[str, bool], FloatArray] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
+
+    def add_path(self, name: str, column: str, error: float, poses: int) -> None:
+        """Take in an error, RMS over the poses, m."""
+        self.paths[name], self.figures[column] = np.array([error**2 * poses, poses]), error
+
+
+PATHS = (("joint", "decoupled"), ("with poles", "joint"), ("in map with lanes", "in map"))
+OBJECTS = (("joint", "decoupled"), ("joint", "held"))
+
+
+def joint_rows(scenes: Sequence[Scene], seeds: Sequence[int], run: Callable[..., Outcome]) -> Iterator[Row]:
+    """A row for every run, and the changes of pooled errors: all scenes with the first seed, then with the next."""
+    runs: dict[str, list[Outcome]] = {scene.name: [] for scene in scenes}
+    for seed, scene in each([(seed, scene) for seed in seeds for scene in scenes], "runs"):
+        outcome = run(scene, seed)
+        runs[scene.name].append(outcome)
+        yield "error of the vehicle's path", {"recording": scene.name, "seed": seed, **outcome.figures}
+        for (name, moving), sums in outcome.objects.items():
+            if moving and sums[0, 1]:
+                rmse = dict(zip(FIGURES, np.sqrt(sums[:, 0] / sums[:, 1]), strict=True))
+                about = {"recording": scene.name, "seed": seed, "method": name, "pairs": int(sums[0, 1])}
+                yield "RMSE of moving objects, at every frame", {**about, **rmse}
+    known = next(iter(runs.values()))[0]
+    for name, base in PATHS:
+        if name in known.paths:
+            a, b = ([np.sum([o.paths[one] for o in some], axis=0) for some in runs.values()] for one in (name, base))
+            row = {"error": f"{name} against {base}", "change": paired_bootstrap(a, b)}
+            yield "changes of the pooled error of the path", row
+    for name, base in OBJECTS:
+        for moving in (True, False) if (base, True) in known.objects else ():
+            mine, theirs = (
+                np.array([np.sum([o.objects[one, moving] for o in some], axis=0) for some in runs.values()])
+                for one in (name, base)
+            )
+            changes = {figure: paired_bootstrap(mine[:, k], theirs[:, k]) for k, figure in enumerate(FIGURES)}
+            about = {"compared": f"{name} against {base}", "objects": "moving" if moving else "stationary"}
+            yield "changes of pooled errors of objects", {**about, **changes}
+
+
+def batch_run(
+    scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, poles: bool = False, lanes: bool = False
+) -> Outcome:
+    """From the whole recording; with `poles` once more with those beside the road, with `lanes` with those of a map."""
+    run, outcome = run_joint(scene, config, settings, SENSOR, seed), Outcome()
+    errors, n = run.errors(), len(run.frames)
+    outcome.figures["path, m"] = errors["odometry"].path_length
+    outcome.add_path("decoupled", "ATE, m: decoupled", errors["odometry"].ate, n)
+    outcome.add_path("joint", "joint", errors["joint"].ate, n)
+    relative = (errors[name].relative_translation for name in ("odometry", "joint"))
+    outcome.figures |= dict(zip(("m per 10 m: decoupled", "m per 10 m: joint"), relative, strict=True))
+    if poles:
+        see = partial(poles_at, seed=seed)
+        again = run_joint(scene, config, settings, SENSOR, seed, see)
+        outcome.add_path("with poles", "ATE with poles", again.errors()["joint"].ate, n)
+    if lanes:
+        drawn = run_joint(scene, config, replace(settings, lanes=LaneSettings()), SENSOR, seed)
+        for one, name in ((run, "in map"), (drawn, "in map with lanes")):
+            off = one.paths["joint"].positions - one.truth.positions
+            outcome.add_path(name, f"{name}, m", float(np.sqrt((off**2).sum(axis=1).mean())), n)
+    driven, tracker = run.odometry.world_T_ego, path_tracker(config)
+    once, new = replace(settings, passes=1), partial(path_tracker, config)
+    held = estimate_jointly(run.frames, run.increments, new, once, driven[0], new_providers=lambda: [HeldPath(driven)])
+
+    def at(k: int, frame: Frame, found: Detections) -> dict[str, State]:
+        tracks = tracker.step(Frame(frame.timestamp, frame.sensor, found, driven[k], "ego"))
+        states: dict[str, State] = {"decoupled": (tracks.id, _planar(tracks.boxes), driven[k], tracker.assignment)}
+        for name, one in (("held", held), ("joint", run.estimate)):
+            now = one.objects[k]
+            states[name] = now.id, _planar(now), one.world_T_ego[k], one.assignment(k)
+        return states
+
+    if scene.ground_truth is not None:
+        outcome.objects = object_sums(scene, run.frames, run.truth.world_T_ego, config, at)
+    return outcome
+
+
+def online_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, lag: float) -> Outcome:
+    """In a running graph, read out at every frame. Raises `InputError` for a scene without ground truth."""
+    if scene.ground_truth is None:
+        raise InputError(f"scene {scene.name}: expected ground truth")
+    frames, path, odometry = degraded_drive(scene, settings, SENSOR, seed)
+    driven, outcome = odometry.path(path.world_T_ego[0]), Outcome()
+    alone, joined = path_tracker(config), path_tracker(config)
+    estimator = OnlineEstimator(joined, lag, settings, start=path.world_T_ego[0])
+    newest, settled = list[FloatArray](), list[FloatArray]()
+
+    def at(k: int, frame: Frame, found: Detections) -> dict[str, State]:
+        tracks = alone.step(Frame(frame.timestamp, frame.sensor, found, driven[k], "ego"))
+        step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
+        newest.append(step.newest.world_T_ego[-1])
+        settled.extend([] if step.settled is None else step.settled.world_T_ego)
+        now = step.newest.objects[-1]
+        return {
+            "decoupled": (tracks.id, _planar(tracks.boxes), driven[k], alone.assignment),
+            "joint": (now.id, _planar(now), newest[-1], joined.assignment),
+        }
+
+    outcome.objects = object_sums(scene, frames, path.world_T_ego, config, at)
+    settled += [*estimator.window().world_T_ego]
+    for name, poses in (("decoupled", list(driven)), ("joint", newest), ("settled", settled)):
+        ate = trajectory_errors(Trajectory(path.timestamps, np.stack(poses)), path).ate
+        outcome.add_path(name, f"ATE, m: {name}", ate, len(frames))
+    return outcome
+
+
+def object_sums(
+    scene: Scene, frames: Sequence[Frame], true: FloatArray, config: TrackConfig, at: At
+) -> dict[tuple[str, bool], FloatArray]:
+    """Sums of squares (4, 2) with their counts, by contender and whether the objects move, over common pairs.
+
+    true: poses (n, 4, 4) of the vehicle; at: states of the contenders at a frame
+    """
+    found: dict[str, dict[Pair, FloatArray]] = {}
+    counts: dict[tuple[str, int, str], int] = {}
+    speeds: dict[Pair, float] = {}
+    for k, frame in enumerate(frames):
+        detections = in_ego(frame, path_tracker(config).sensor(frame.sensor))
+        contenders = at(k, frame, detections)
+        truth = _truth_at(scene, frame.timestamp)
+        if truth is None:
+            continue
+        objects = _true_objects(detections, frame.world_T_ego, truth)
+        for contender, (ids, states, pose, assignment) in contenders.items():
+            row, errors = {id_: n for n, id_ in enumerate(ids.tolist())}, found.setdefault(contender, {})
+            for id_, detection in zip(assignment.id.tolist(), assignment.detection.tolist(), strict=True):
+                if detection not in objects:
+                    continue
+                n = objects[detection]
+                name = str(truth.id[n])
+                before = counts.get((contender, id_, name), 0)
+                counts[contender, id_, name] = before + 1
+                real = np.concatenate([truth.boxes.position[n, :2], truth.boxes.velocity[n]])
+                speeds[k, name] = float(np.hypot(*real[2:]))
+                if id_ in row and before >= SETTLED and np.isfinite(real).all():
+                    state = states[row[id_]]
+                    seen = _from_vehicle(state, pose) - _from_vehicle(real, true[k])
+                    errors[k, name] = np.concatenate([state - real, seen])
+    common = sorted(set.intersection(*(set(errors) for errors in found.values()))) if found else []
+    sums = {}
+    for moving in (True, False):
+        chosen = [pair for pair in common if (speeds[pair] > MOVING) == moving]
+        for contender, errors in found.items():
+            off = np.array([errors[pair] for pair in chosen]).reshape(-1, len(FIGURES), 2)
+            squares = (off**2).sum(axis=(0, 2))
+            sums[contender, moving] = np.stack([squares, np.full(len(FIGURES), len(chosen))], axis=1)
+    return sums
+
+
+def _from_vehicle(state: FloatArray, pose: FloatArray) -> FloatArray:
+    R = pose[:2, :2]
+    return np.concatenate([(state[:2] - pose[:2, 3]) @ R, state[2:] @ R])
+
+
+def _truth_at(scene: Scene, time: float) -> Annotations | None:
+    """The truth of a moment, s; None where the scene has none then."""
+    moment = int(np.argmin(np.abs(scene.timestamps - time)))
+    there = scene.ground_truth is not None and abs(scene.timestamps[moment] - time) <= SAME_TIME
+    return scene.ground_truth[moment] if scene.ground_truth is not None and there else None
+
+
+def _planar(objects: Boxes | ObjectStates) -> FloatArray:
+    """States (n, 4) of objects: place and velocity in the plane."""
+    return np.concatenate([objects.position[:, :2], objects.velocity], axis=1)
+
+
+def _true_objects(detections: Detections, world_T_ego: FloatArray | None, truth: Annotations) -> dict[int, int]:
+    """Rows of the truth by those of detections in the vehicle's frame."""
+    boxes: Boxes = detections.boxes.transformed(np.eye(4) if world_T_ego is None else world_T_ego)
+    apart = boxes.position[:, None, :2] - truth.boxes.position[None, :, :2]
+    distance = np.hypot(apart[..., 0], apart[..., 1])
+    same = boxes.label[:, None] == truth.boxes.label[None, :]
+    return dict(zip(*(rows.tolist() for rows in assign(distance, same & (distance < NEAR), NEAR)), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class HeldPath:
+    """Provider that holds the vehicle on a path (n, 4, 4), so that objects are estimated along it."""
+
+    path: FloatArray
+    name: str = "held path"
+
+    def factors(self, view: GraphView) -> Additions:
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
+        pose = gtsam.Pose3(self.path[view.epoch])
+        return Additions(factors=[gtsam.PriorFactorPose3(view.key(EGO_POSE, 0), pose, noise)])
+
+
+def poles_at(frames: Sequence[Frame], seed: int, reach: float = 30.0, noise: float = 0.1) -> Observations:
+    """Observe poles beside the driven path, 1.5 m high, at frames with true poses.
+
+    reach: m; noise: standard deviation ahead and to the left, m
+    """
+    poses = np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None])
+    rng, places = np.random.default_rng(seed), []
+    driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
+    for side in (-1.0, 1.0):
+        along = np.arange(0.0, driven[-1] + reach, GAP)
+        along = along + rng.uniform(-0.3, 0.3, len(along)) * GAP
+        for s in along.tolist():
+            row = min(int(np.searchsorted(driven, s)), len(driven) - 1)
+            ahead, across = s - driven[row], side * (OFFSET + rng.normal(0, 1.0))
+            places.append(transform_points(poses[row], np.array([[ahead, across, 1.5]]))[0])
+    kind, R, result = PoleLandmark(), noise**2 * np.eye(2), []
+    for pose in poses:
+        local = transform_points(inverse_transform(pose), np.stack(places))
+        near = (np.hypot(*local[:, :2].T) <= reach) & (rng.random(len(local)) < SEEN)
+        local[:, :2] += noise * rng.standard_normal((len(local), 2))
+        result.append([Observation(kind, point, R) for point in local[near]])
+    return result

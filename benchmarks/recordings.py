@@ -1,0 +1,224 @@
+"""Sets of recordings to compare trackers on, each with the figures that its kind is judged by."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from math import inf
+from pathlib import Path
+
+from benchmarks.runner import chosen
+from data_tools.datasets.kitti import KittiTracking, write_kitti_results
+from data_tools.datasets.kitti.evaluation import CLASSES, kitti_label_errors
+from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
+from data_tools.datasets.ngsim.windows import NgsimWindows
+from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
+from data_tools.datasets.nuscenes.evaluation import nuscenes_label_errors
+from data_tools.datasets.openacc import OpenAccPlatoons
+from data_tools.datasets.overlapping import overlapping
+from data_tools.datasets.recorded_traffic import Stretches, TrafficRecordings
+from data_tools.datasets.source import ChosenScenes
+from data_tools.evaluation.placed_detections import placed_detections
+from data_tools.metrics import (
+    KittiTrackingSequence,
+    LabelErrors,
+    SceneBoxes,
+    SceneMetrics,
+    kitti_tracking_metrics,
+    label_errors,
+    nuscenes_tracking_metrics,
+    scene_metrics,
+)
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from data_tools.simulator.recorded_source import SensedRecordings
+from data_tools.simulator.recorded_world import MAST, VEHICLE
+from pipelines.config import Family
+from pipelines.tracking import TrackedScene
+from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset, Scene
+
+VERSION = "v1.0-mini"
+Runs = Mapping[str, TrackedScene]
+"""A tracker's output by scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """Headline figures of some scenes, by their numbers, of which any may occur more than once; errors at the labels,
+    scene by scene."""
+
+    figures_of: Callable[[Sequence[int]], dict[str, float]]
+    errors: tuple[LabelErrors, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingSet:
+    """Scenes of one kind, with ground truth.
+
+    score     judges a tracker's output on all scenes
+    clusters  for each scene the first of those that overlap with it in time; none where none do
+    exact     whether the truth is known at every frame
+    """
+
+    name: str
+    family: Family
+    dataset: Dataset
+    score: Callable[[Runs], Score]
+    clusters: Mapping[str, str] = field(default_factory=dict)
+    exact: bool = False
+
+    def scene(self, recording: str) -> Scene:
+        """Read a recording."""
+        return self.dataset.scene(recording)
+
+    @property
+    def units(self) -> list[list[int]]:
+        """The scenes by their numbers, those that overlap together."""
+        found: dict[str, list[int]] = {}
+        for row, name in enumerate(self.dataset.scenes):
+            found.setdefault(self.clusters.get(name, name), []).append(row)
+        return list(found.values())
+
+
+def _nuscenes(name: str, split: str, sensor: str, file: str, data: Path) -> RecordingSet:
+    root = data / "nuscenes"
+    detections = {sensor: root / "detections" / file}
+    dataset = NuScenes(root, VERSION, detections, split_scenes(root, VERSION, split), ground_truth=True)
+
+    def score(runs: Runs) -> Score:
+        """Write the official result, read it back, and score it."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "tracks.json"
+            write_tracking_results(path, ((run.scene, run.tracks) for run in runs.values()), dataset.meta)
+            scored = read_scored_scenes(path, root, VERSION, tuple(runs))
+        scenes = [each.tracking for each in scored.values()]
+
+        def figures_of(rows: Sequence[int]) -> dict[str, float]:
+            f = nuscenes_tracking_metrics([scenes[row] for row in rows]).overall
+            return {"AMOTA": f.amota, "AMOTP": f.amotp, "MOTA": f.mota, "IDS": f.ids, "FRAG": f.frag}
+
+        pairs = zip(scored, scenes, strict=True)
+        return Score(figures_of, tuple(nuscenes_label_errors(s, placed_detections(runs[n].scene)) for n, s in pairs))
+
+    return RecordingSet(name, "nuscenes", dataset, score)
+
+
+def _kitti(data: Path) -> RecordingSet:
+    root, detections = data / "kitti", data / "kitti" / "detections" / "pointrcnn"
+    dataset = KittiTracking(root, detections, None, ground_truth=True)
+
+    def score(runs: Runs) -> Score:
+        """Write the official results, read them back, and score them, in 3D and averaged over recall."""
+        with tempfile.TemporaryDirectory() as folder:
+            results = Path(folder) / "results"
+            write_kitti_results(results, dataset, ((run.scene, run.tracks) for run in runs.values()))
+            scored = read_scored_sequences(results, root, tuple(runs), detections)
+        pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
+
+        def figures_of(rows: Sequence[int]) -> dict[str, float]:
+            figures: dict[str, float] = {}
+            for label, iou in (*((label, 0.25) for label in CLASSES), ("car", 0.5)):
+                f = kitti_tracking_metrics([pairs[row] for row in rows], label, iou)
+                if f is not None:
+                    name = label if iou == 0.25 else f"{label} at {iou:g}"
+                    own = {"sAMOTA": f.samota, "safe sAMOTA": f.samota_safe, "AMOTA": f.amota, "MOTA": f.mota}
+                    figures |= {f"{name} {key}": value for key, value in (own | {"IDS": float(f.ids)}).items()}
+            return figures
+
+        return Score(figures_of, tuple(kitti_label_errors(each, CLASSES) for each in scored.values()))
+
+    return RecordingSet("kitti", "kitti", dataset, score)
+
+
+def exact_set(name: str, family: Family, dataset: Dataset, clusters: Mapping[str, str] | None = None) -> RecordingSet:
+    """Scenes with the exact truth at every frame, hidden objects by the track that last followed them."""
+    return RecordingSet(name, family, dataset, _against_truth, clusters or {}, exact=True)
+
+
+def _against_truth(runs: Runs) -> Score:
+    metrics, errors = [], []
+    for run in runs.values():
+        truth = run.scene.ground_truth
+        assert truth is not None
+        metrics.append(scene_metrics(truth, run.tracks))
+        labels = SceneBoxes.of_annotations(truth, hidden=False)
+        errors.append(label_errors(labels, SceneBoxes.of_tracks(run.tracks), labels.boxes.velocity))
+
+    def figures_of(rows: Sequence[int]) -> dict[str, float]:
+        m = SceneMetrics.pool(metrics[row] for row in rows)
+        return {"MOTA": m.mota, "IDS": float(m.switches), "hidden RMSE": m.carried.rmse}
+
+    return Score(figures_of, tuple(errors))
+
+
+def simulated_set(scenes: int, seed: int = 0, settings: SimulatorSettings | None = None) -> RecordingSet:
+    """Simulated traffic."""
+    return exact_set("simulated", "simulated", SimulatedTraffic(settings, scenes, seed))
+
+
+def recording_set(
+    name: str, data: Path | None, scenes: int, viewpoint: str | None = None, longest: float = inf
+) -> RecordingSet:
+    """A set by name; `data` holds a folder for each kind of recordings, `scenes` simulated ones are made.
+
+    viewpoint  of the sensors that see recorded traffic, see `data_tools.simulator.recorded_world`; None: the set's own
+    longest    of recorded traffic, s, from the middle of longer recordings
+
+    Raises `InputError` for missing recordings.
+    """
+    if name == "simulated":
+        return simulated_set(scenes)
+    if data is None:
+        raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
+    if name in SETS:
+        return SETS[name](data)
+    traffic, usual = TRAFFIC_SETS[name]
+    recordings: TrafficRecordings = Stretches(traffic(data), longest)
+    clusters = overlapping(map(recordings.recording, recordings.names)) if name == "ngsim" else {}
+    return exact_set(name, "traffic", SensedRecordings(recordings, viewpoint or usual, None, seed=0), clusters)
+
+
+def chosen_sets(
+    sets: str | None,
+    data: Path | None,
+    scenes: int,
+    test: str | None = None,
+    viewpoint: str | None = None,
+    longest: float | None = None,
+    usual: str | None = None,
+) -> list[RecordingSet]:
+    """The sets that options name, or all that need no --sets; with `test` those of its recordings alone.
+
+    usual  viewpoint where none is named, in place of that of a set
+
+    Raises `InputError` for a recording that no set has, and for options of recorded traffic without it.
+    """
+    wanted = (
+        chosen("--sets", sets, (*SETS, *TRAFFIC_SETS, "simulated"))
+        if sets
+        else (*(SETS if data is not None else ()), "simulated")
+    )
+    for option, value in (("--viewpoint", viewpoint), ("--longest", longest)):
+        if value is not None and not set(wanted) & set(TRAFFIC_SETS):
+            raise InputError(f"{option}: expected {' or '.join(TRAFFIC_SETS)} among --sets, others do not use it")
+    found = [recording_set(name, data, scenes, viewpoint or usual, longest or inf) for name in wanted]
+    if test is None:
+        return found
+    named = chosen("--test", test, [name for one in found for name in one.dataset.scenes])
+    mine = ((one, [name for name in one.dataset.scenes if name in named]) for one in found)
+    return [replace(one, dataset=ChosenScenes(one.dataset, ",".join(some))) for one, some in mine if some]
+
+
+SETS: dict[str, Callable[[Path], RecordingSet]] = {
+    "megvii": partial(_nuscenes, "megvii", "mini_train", "lidar", "megvii_lidar.json"),
+    "centerpoint": partial(_nuscenes, "centerpoint", "lidar_centerpoint", "lidar", "centerpoint_lidar.json"),
+    "camera": partial(_nuscenes, "camera", "camera", "camera", "fastbev_camera.json"),
+    "kitti": _kitti,
+}
+TRAFFIC_SETS: dict[str, tuple[Callable[[Path], TrafficRecordings], str]] = {
+    "ngsim": (lambda data: NgsimWindows(data / "ngsim"), MAST),
+    "openacc": (lambda data: OpenAccPlatoons(data / "openacc"), VEHICLE),
+}
+"""Recorded traffic, whose detections are made, and the usual viewpoint; taken only where it is asked for."""

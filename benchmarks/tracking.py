@@ -1,0 +1,180 @@
+"""The methods, and the graph-aware tracker with each component off, on the same recordings.
+
+Every variant tracks every scene, in turn; times are CPU times of the tracker alone. Changes from `kf` come with
+intervals over scenes: errors at labels from their sums, figures averaged over recall by scoring each drawn set of
+scenes anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from benchmarks.gaps import chosen_lengths
+from benchmarks.recordings import RecordingSet, Score, chosen_sets, exact_set
+from benchmarks.runner import Data, Row, Rows, clocked, each, resampled
+from benchmarks.variants import COMPONENTS, SHIPPED, contenders
+from data_tools.metrics import Interval, LabelErrors, calibration, error_summary, errors_by_class, paired_bootstrap
+from pipelines.cli.options import Config
+from pipelines.config import load_config
+from pipelines.learning.gap_runs import Contender, hidden
+from pipelines.tracking import TrackedScene, track_scene
+from saga_fg.errors import InputError
+from saga_fg.learning.gaps import made_gaps
+from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.model.sensor import Sensor
+from saga_fg.types.dataset import Dataset, Scene
+
+KF, BASELINE = "kf", "centerpoint"
+ERRORS = ("position", "velocity", "heading")
+
+
+def tracking(
+    data: Data = None,
+    sets: Annotated[
+        str | None,
+        typer.Option(
+            "--sets",
+            help="Of megvii, centerpoint, camera, kitti, simulated, ngsim, openacc.  [default: all but the last two]",
+        ),
+    ] = None,
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
+    viewpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--viewpoint",
+            help="Of the sensors in the sets ngsim and openacc: mast, above, vehicle, the id of one, or X,Y,Z in m.  "
+            "[default: mast, vehicle]",
+        ),
+    ] = None,
+    test: Annotated[
+        str | None, typer.Option("--test", help="Track these recordings alone, with commas.  [default: all]")
+    ] = None,
+    passes: Annotated[
+        int,
+        typer.Option(
+            "--passes",
+            min=0,
+            help="Track each recording so often with made gaps, in the sets simulated, ngsim and openacc; 0: as "
+            "detected.",
+        ),
+    ] = 0,
+    lengths: Annotated[str, typer.Option("--lengths", help="Of these gaps, s, with commas.")] = "1,2,3,5",
+    compared: Annotated[
+        str | None,
+        typer.Option("--contenders", help="Methods and components, by name, with commas.  [default: all]"),
+    ] = None,
+    components: Annotated[bool, typer.Option(help="Switch the components off one by one as well.")] = True,
+    draws: Annotated[int, typer.Option("--draws", min=0, help="Drawn sets of scenes for intervals; 0: none.")] = 200,
+    config: Config = None,
+) -> Rows:
+    """Track the same recordings by every method, and with every component off; compare accuracy and time.
+
+    The file of --config changes the shipped settings of every kind of data.
+
+    \b
+    Examples:
+      python -m benchmarks tracking --sets simulated --scenes 4 --draws 0
+      python -m benchmarks tracking --data data --json figures.json --markdown tables.md
+      python -m benchmarks tracking --data data --sets kitti --no-components
+      python -m benchmarks tracking --data data --sets ngsim --passes 4 --lengths 2,3 --no-components
+      python -m benchmarks tracking --data data --sets megvii --contenders 'saga,kf,graph matching'
+    """
+    wanted = compared or ",".join(variant.name for variant in (*SHIPPED, *(COMPONENTS if components else ())))
+    for recordings in chosen_sets(sets, data, scenes, test, viewpoint):
+        base = load_config(recordings.family, config)
+        if passes:
+            recordings = with_made_gaps(recordings, base.sensors, passes, chosen_lengths(lengths))
+        yield from set_rows(recordings, contenders(recordings.family, base, wanted, ()), draws)
+
+
+def set_rows(recordings: RecordingSet, compared: Sequence[Contender], draws: int) -> Iterator[Row]:
+    """Accuracy and time of all, changes from kf, and how many errors are within the ellipses."""
+    scenes, names_of = recordings.dataset.scenes, [one.name for one in compared]
+    runs: dict[str, dict[str, TrackedScene]] = {name: {} for name in names_of}
+    seconds = dict.fromkeys(names_of, 0.0)
+    for name in each(scenes, recordings.name):
+        scene = recordings.scene(name)
+        for one in compared:
+            runs[one.name][name], ms = clocked(track_scene, scene, one.config.new_tracker(one.method))
+            seconds[one.name] += ms / 1e3
+    frames = sum(run.frames for run in next(iter(runs.values())).values())
+    scores = {name: recordings.score(found) for name, found in runs.items()}
+    for name, score in scores.items():
+        errors = error_summary(LabelErrors.pool(score.errors))
+        about = {"variant": name, **score.figures_of(range(len(scenes)))}
+        rmse = {"position": errors.position, "velocity": errors.velocity, "velocity moving": errors.velocity_moving}
+        ms = 1e3 * seconds[name] / frames
+        ratio = seconds[name] / seconds[BASELINE] if BASELINE in seconds else None
+        title = f"{recordings.name}: {len(scenes)} scenes; RMSE of position in m, of velocity in m/s"
+        yield title, {**about, **rmse, "ms / frame": ms, "/ centerpoint": ratio}
+    for name in names_of if KF in scores and draws else ():
+        if name not in (KF, BASELINE) and (found := changes(scores[name], scores[KF], recordings.units, draws)):
+            title = f"{recordings.name}: changes from kf (RMSE: relative), 95 % intervals over scenes"
+            yield title, {"variant": name, **found}
+    for label, errors_of in errors_by_class(LabelErrors.pool(scores[names_of[0]].errors)).items():
+        c = calibration(errors_of)
+        if c.enough_data:
+            shares = {f"in {100 * p:g} %": share for p, share in c.coverage.items()}
+            about = {"class": label, "objects": c.objects, "boxes": c.boxes, "ANEES / 2": c.anees}
+            yield f"{recordings.name}: errors within the ellipses of {names_of[0]}", {**about, **shares}
+
+
+def changes(score: Score, base: Score, units: Sequence[Sequence[int]], draws: int) -> dict[str, Any]:
+    """Figures as differences, RMSEs as relative changes; none of less than two scenes that don't overlap."""
+    if len(units) < 2:
+        return {}
+
+    def figures(rows: Sequence[int]) -> dict[str, float]:
+        theirs = base.figures_of(rows)
+        found = {name: value - theirs[name] for name, value in score.figures_of(rows).items() if name in theirs}
+        return {**found, **({"IDS, relative": found["IDS"] / (theirs["IDS"] or np.nan)} if "IDS" in found else {})}
+
+    result: dict[str, Interval] = resampled(figures, units, draws)
+    for name in ERRORS:
+        a, b = (
+            [np.sum([one.errors[row].sample(name).square_sums for row in unit], axis=0) for unit in units]
+            for one in (score, base)
+        )
+        result[f"{name} RMSE"] = paired_bootstrap(a, b)
+    return result
+
+
+class HiddenRecordings:
+    """Each scene of a dataset in several passes, with other gaps in each. Windows of recorded traffic are short, and an
+    object seldom returns in one."""
+
+    def __init__(self, dataset: Dataset, sensors: Mapping[str, Sensor], passes: int, lengths: Sequence[float]) -> None:
+        self._dataset, self._sensors, self._passes, self._lengths = dataset, sensors, passes, lengths
+        every = ((name, k) for name in dataset.scenes for k in range(1, passes + 1))
+        self.pass_of = {f"{name}, pass {k}": (name, k) for name, k in every}
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the recordings with the numbers of the passes."""
+        return tuple(self.pass_of)
+
+    def scene(self, name: str) -> Scene:
+        """One pass; its name is that of the recording."""
+        recording, number = self.pass_of[name]
+        labelled = LabelledScene.of(self._dataset.scene(recording), self._sensors)
+        gaps = [gap for gap in made_gaps(labelled, self._passes, 0, self._lengths) if gap.run == number]
+        return replace(labelled.scene, frames=hidden(labelled, gaps))
+
+
+def with_made_gaps(
+    recordings: RecordingSet, sensors: Mapping[str, Sensor], passes: int, lengths: Sequence[float]
+) -> RecordingSet:
+    """The set in several passes, each with made gaps of some lengths, s; those of one recording are one for intervals.
+
+    Raises `InputError` for a set whose truth is not known at every frame.
+    """
+    if not recordings.exact:
+        raise InputError(f"--passes: set {recordings.name}: expected simulated or recorded traffic, of exact truth")
+    dataset = HiddenRecordings(recordings.dataset, sensors, passes, lengths)
+    clusters = {name: recordings.clusters.get(of, of) for name, (of, _) in dataset.pass_of.items()}
+    return exact_set(recordings.name, recordings.family, dataset, clusters)

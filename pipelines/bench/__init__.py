@@ -1,1 +1,0 @@
-"""Benchmarks: each prints figures as ratios to a baseline measured in the same run."""

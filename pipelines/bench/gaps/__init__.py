@@ -1,1 +1,0 @@
-"""The benchmark of gaps: objects that nobody sees for some seconds, through the whole tracker on detections."""

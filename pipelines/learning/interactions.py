@@ -1,0 +1,277 @@
+"""Interactions learned from recordings, in the form that does best in gaps of recordings held out.
+
+Edge rules can act in several forms, which differ in what they do to objects in view, whose detections say more than
+their neighbours. So the recordings are split into two parts, and every form, fitted to one part, tracks the other
+with made gaps (`pipelines.learning.gap_runs`), on the tracker's own configuration:
+
+    everywhere   edges act as fitted
+    hidden       edges are weighted by their information gain, low into objects in view, and fitted with it
+    refitted     the rules of the configuration, fitted
+    shipped      the rules of the configuration
+    nowhere      none of these
+
+The base motion is the tracker without rules that can be learned: trails, lights and lines stay, as they do beside the
+rules of a file. The form of the least ratio of errors to those of the base motion, whose ratio is 1, is fitted to all
+recordings and written: a tracker given the file is the tracker that was tried. The ratio is the mean over the lengths
+of the gaps of the larger of two ratios, of the means and of the medians, so that neither many small nor few large
+errors decide alone.
+Each group of classes between which there are edges has its own form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipelines.config import TrackConfig
+from pipelines.learning.gap_runs import Contender, GapBenchSettings, Run, bench_gaps
+from pipelines.tracking import Progress
+from saga_fg.errors import InputError
+from saga_fg.learning import MOST_GAPS, TEMPLATE, GapSettings, HiddenObjects, Rule, fit_interactions, hidden_objects
+from saga_fg.learning.gaps import LENGTHS
+from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
+from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.model.nonlinear_interactions import AccelerationLaw
+from saga_fg.types.dataset import Scene
+
+BASE, SHIPPED, LEARNED = "base motion", "shipped edges", "learned edges"
+NOWHERE = "nowhere"
+PLACE_NOISE = 0.1  # m: differences below it do not count
+Rules = tuple[Rule, ...]
+
+
+@dataclass(frozen=True)
+class LearningSettings:
+    """Settings of learning and of its test on recordings held out.
+
+    passes  number of times that each recording held out is tracked, each time with other made gaps
+    seed    of the choice of these gaps
+    gaps    choice of the gaps to learn from
+    most    largest number of these, a random sample
+    """
+
+    passes: int = 2
+    seed: int = 0
+    gaps: GapSettings = GapSettings()
+    most: int = MOST_GAPS
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedForms:
+    """The learned interactions; the form of each group of classes; runs on recordings held out, of three contenders.
+
+    held_out   what each recording that was held out was judged with
+    ratios     of each group: form -> ratio of its errors to those of the base motion
+    """
+
+    interactions: LearnedInteractions
+    forms: Mapping[tuple[str, ...], str]
+    ratios: Mapping[tuple[str, ...], Mapping[str, float]]
+    runs: tuple[Run, ...]
+    held_out: Mapping[str, LearnedInteractions]
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldScenes:
+    """Scenes at hand, as a source of the benchmark."""
+
+    name: str
+    scenes: Mapping[str, Scene]
+    clusters: Mapping[str, str]
+
+    def scene(self, recording: str) -> Scene:
+        return self.scenes[recording]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Recordings that are held out, with all forms fitted to the others: group -> form -> rules."""
+
+    tested: Mapping[str, Scene]
+    rules: Mapping[tuple[str, ...], Mapping[str, Rules]]
+
+
+def learn_interactions(
+    scenes: Mapping[str, Scene],
+    origin: str,
+    config: TrackConfig,
+    start: LearnedInteractions | None = None,
+    settings: LearningSettings | None = None,
+    progress: Progress | None = None,
+) -> LearnedForms:
+    """Learn from annotated scenes with detections; `origin` says in the file where from.
+
+    config   of the tracker: its motion, turns and stationarity are the base on which edges are learned
+    start    rules from which the search begins, in place of the forms of the template
+
+    Raises `InputError` where no object is followed for long enough.
+    """
+    settings = settings or LearningSettings()
+    gaps: dict[str, HiddenObjects | None] = {}
+    for done, (name, scene) in enumerate(scenes.items()):
+        gaps[name] = hidden_objects(scene, config.tracker, config.sensors, settings.gaps)
+        if progress is not None:
+            progress(f"base motion {name}", done + 1, len(scenes))
+    if not any(gaps.values()):
+        raise InputError(f"{origin}: expected objects that are followed for {settings.gaps.followed:g} s and more")
+    shipped = tuple(rule for rule in config.tracker.edges if isinstance(rule, Following | Neighbours))
+    templates = _forms(shipped) if start is None else {"refitted": start.edges}
+    groups = coupled_classes([*shipped, *(rule for rules in templates.values() for rule in rules)])
+
+    def fitted(names: Sequence[str], forms: Mapping[str, Rules], group: tuple[str, ...]) -> dict[str, Rules]:
+        parts = [part for name in names if (part := gaps[name]) is not None]
+        sample = HiddenObjects.pooled(parts) if parts else None
+        mine = None if sample is None else sample.select(np.flatnonzero(np.isin(sample.label, group)))
+        if mine is None or len(mine) == 0:
+            return {}
+        found: dict[str, Rules] = {}
+        for done, (form, rules) in enumerate(forms.items()):
+            if own := _of_group(rules, group):
+                found[form] = fit_interactions(mine, config.tracker, own, most=settings.most).rules
+            if progress is not None:
+                progress(f"fit {form}, {group[0]}, ...", done + 1, len(forms))
+        return found
+
+    first, second = held_out_parts(scenes)
+    parts = [
+        _Part(tested, {group: fitted(tuple(taught), templates, group) for group in groups})
+        for taught, tested in ((first, second), (second, first))
+    ]
+    trials = _trials(parts, config, origin, settings, progress)
+    ratios, chosen = {}, {}
+    for group in groups:
+        ratios[group] = {form: _ratio(runs, trials[BASE], group) for form, runs in trials.items() if form != BASE}
+        best = min(ratios[group], key=lambda form: ratios[group][form], default=NOWHERE)
+        chosen[group] = best if ratios[group].get(best, 1.0) < 1 else NOWHERE
+
+    def combined(fits: Mapping[tuple[str, ...], Mapping[str, Rules]], what: str) -> LearnedInteractions:
+        rules: list[Rule] = []
+        for group, form in chosen.items():
+            rules += _of_group(shipped, group) if form == SHIPPED else fits.get(group, {}).get(form, ())
+        return LearnedInteractions(
+            learned_from=what, edges=tuple(rules), explained_noise=config.tracker.explained_noise
+        )
+
+    held_out = {name: combined(part.rules, origin) for part in parts for name in part.tested}
+    runs = [run for form in (BASE, SHIPPED) for run in trials[form]]
+    forms = {BASE if form == NOWHERE else form for form in chosen.values()}
+    tried = trials.get(forms.pop(), []) if len(forms) == 1 else []
+    if len(tried) == len(trials[BASE]):  # all groups have the form of these runs
+        runs += [replace(run, contender=LEARNED) for run in tried]
+    else:
+        for part in parts:
+            if part.tested:
+                learned = Contender(LEARNED, "saga", config.with_interactions(combined(part.rules, origin)))
+                runs += _judged(part.tested, [learned], settings, progress)
+    everything = {
+        group: fitted(tuple(scenes), {form: templates[form]}, group)
+        for group, form in chosen.items()
+        if form in templates
+    }
+    return LearnedForms(combined(everything, origin), chosen, ratios, tuple(runs), held_out)
+
+
+def held_out_parts(scenes: Mapping[str, Scene]) -> tuple[dict[str, Scene], dict[str, Scene]]:
+    """The first and the second half of the recordings, as neighbours in order are often of one place and time.
+
+    The halves of a single one, by time.
+    """
+    names = list(scenes)
+    if len(names) > 1:
+        half = (len(names) + 1) // 2
+        return {name: scenes[name] for name in names[:half]}, {name: scenes[name] for name in names[half:]}
+    (only,) = scenes.values()
+    middle = len(only) // 2
+    return {only.name: _moments(only, slice(None, middle))}, {only.name: _moments(only, slice(middle, None))}
+
+
+def coupled_classes(rules: Sequence[Rule]) -> list[tuple[str, ...]]:
+    """Groups of classes; there are no edges between one and another."""
+    groups: list[set[str]] = []
+    for rule in rules:
+        mine = set(rule.classes)
+        touched = [group for group in groups if group & mine]
+        groups = [group for group in groups if group not in touched] + [mine.union(*touched)]
+    return [tuple(sorted(group)) for group in groups]
+
+
+def _forms(shipped: Rules) -> dict[str, Rules]:
+    return {
+        "everywhere": TEMPLATE,
+        "hidden": tuple(replace(rule, information_gain=HIDDEN) for rule in TEMPLATE),
+        "refitted": tuple(rule for rule in shipped if not isinstance(rule.interaction, AccelerationLaw)),
+    }
+
+
+def _of_group(rules: Sequence[Rule], group: Sequence[str]) -> Rules:
+    return tuple(rule for rule in rules if set(rule.classes) <= set(group))
+
+
+def _trials(
+    parts: Sequence[_Part],
+    config: TrackConfig,
+    origin: str,
+    settings: LearningSettings,
+    progress: Progress | None,
+) -> dict[str, list[Run]]:
+    """The runs of every form on the recordings held out, by form."""
+    found: dict[str, list[Run]] = {BASE: [], SHIPPED: []}
+    for part in parts:
+        if not part.tested:
+            continue
+        contenders = [Contender(SHIPPED, "saga", config)]
+        for form in (BASE, *dict.fromkeys(form for rules in part.rules.values() for form in rules)):
+            rules = tuple(rule for own in part.rules.values() for rule in own.get(form, ()))
+            learned = LearnedInteractions(
+                learned_from=origin, edges=rules, explained_noise=config.tracker.explained_noise
+            )
+            contenders.append(Contender(form, "saga", config.with_interactions(learned)))
+        for run in _judged(part.tested, contenders, settings, progress):
+            found.setdefault(run.contender, []).append(run)
+    return found
+
+
+def _judged(
+    scenes: Mapping[str, Scene],
+    contenders: Sequence[Contender],
+    settings: LearningSettings,
+    progress: Progress | None,
+) -> list[Run]:
+    source = _HeldScenes("held out", scenes, {})
+    bench = GapBenchSettings(settings.passes, lives=("kept",), seed=settings.seed, real=False)
+    return bench_gaps(source, tuple(scenes), contenders, bench, progress)
+
+
+def _ratio(runs: Sequence[Run], base: Sequence[Run], group: Sequence[str]) -> float:
+    """Errors of a form against those of the base motion, see the module; 1 without gaps."""
+    tried = {run.recording for run in runs}
+    mine, other = _errors(runs, group), _errors([run for run in base if run.recording in tried], group)
+    ratios = []
+    for length in LENGTHS:
+        both = [(a[length], b[length]) for a, b in zip(mine, other, strict=True) if length in a and length in b]
+        if both:
+            a, b = np.array(both).T
+            averages = (np.mean, np.median)
+            ratios.append(max(float((f(a) + PLACE_NOISE) / (f(b) + PLACE_NOISE)) for f in averages))
+    return float(np.mean(ratios)) if ratios else 1.0
+
+
+def _errors(runs: Sequence[Run], group: Sequence[str]) -> list[Mapping[float, float]]:
+    """The errors by length of all made gaps of the classes of a group."""
+    return [
+        outcome.at
+        for run in runs
+        for gap, label, outcome in zip(run.gaps, run.label, run.outcomes, strict=True)
+        if gap.run > 0 and label in group
+    ]
+
+
+def _moments(scene: Scene, kept: slice) -> Scene:
+    """The moments of a scene, with the frames of their time."""
+    time = scene.timestamps[kept]
+    assert scene.ground_truth is not None
+    frames = [f for f in scene.frames if len(time) and time[0] - 1e-6 <= f.timestamp <= time[-1] + 1e-6]
+    poses, truth = scene.world_T_ego[kept], scene.ground_truth[kept]
+    return Scene(scene.name, time, poses, scene.tokens[kept], frames, truth)

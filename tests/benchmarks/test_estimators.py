@@ -1,0 +1,96 @@
+"""The estimators' benchmark in miniature: it measures what it says, and everybody is exact."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.estimators import Vehicles, estimators
+from benchmarks.filters import GtsamWindow, Ours, OurWindow, Textbook
+from benchmarks.flocks import flock
+from saga_fg.estimators import IncrementalSmoother, JointKalmanFilter
+from saga_fg.graph import OBJECT
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    return [{"table": title, **row} for title, row in estimators("4,8", 2, 30.0, 4, 20, 6)]
+
+
+def test_every_exact_estimator_is_exact(rows) -> None:
+    ours = [row for row in rows if row.get("estimator") in ("kalman", "isam2", "fixed-lag", "batch") and "case" in row]
+    assert {(row["case"], row["estimator"]) for row in ours} == {
+        *(("filter", "kalman"), ("filter", "isam2"), ("fixed lag", "fixed-lag"), ("batch", "batch")),
+    }
+    for row in ours:
+        assert row["mean"] <= row["largest"] < 1e-8
+        assert row.get("covariance", 0.0) < 1e-9
+
+
+def test_ratios_are_those_of_the_times(rows) -> None:
+    baselines = {"filter": "textbook", "batch": "textbook", "fixed lag": "GTSAM's", "running graph": "linear"}
+    cases = [row for row in rows if "case" in row]
+    for row in cases:
+        same = [r for r in cases if all(r[key] == row[key] for key in ("case", "graph", "nodes"))]
+        (base,) = [r for r in same if r["estimator"] == baselines[row["case"]]]
+        assert row["ratio"] == pytest.approx(row["ms"] / base["ms"])
+    drivers = {row["graph"] for row in cases if row["estimator"] == "intelligent driver"}
+    assert drivers == {"connected", "components"}
+
+
+def test_the_endurance_run_tells_its_start_and_end(rows) -> None:
+    (row,) = [row for row in rows if row["table"] == "endurance"]
+    assert (row["estimator"], row["frames"]) == ("isam2", 20)
+    assert row["old / young"] == pytest.approx(row["ms at the end"] / row["ms, young"])
+
+
+@pytest.mark.parametrize("linear", [True, False])
+def test_vehicles_drive_in_rows(linear) -> None:
+    vehicles = Vehicles(6, 3, linear)
+    smoother = IncrementalSmoother([vehicles])
+    for k in range(8):
+        smoother.step(0.1 * k)
+    there = smoother.graph().of(OBJECT, 7)
+    places = np.stack([smoother.state(there[i].key)[:2] for i in range(6)])
+    assert np.abs(places - vehicles.start[:, :2] - [5.6, 0.0]).max() < 2.0
+
+
+@pytest.mark.parametrize("sizes", ["10,many", "1", ""])
+def test_sizes_that_are_none_are_one_line_of_error(refused, sizes: str) -> None:
+    assert "--sizes: expected whole numbers >= 2" in refused("estimators --sizes", sizes)
+
+
+@pytest.mark.parametrize("kind", ["connected", "components"])
+def test_flocks_are_what_their_names_say(kind) -> None:
+    scene = flock(kind, 20, 3, seed=1)
+    again = flock(kind, 20, 3, seed=1)
+    for frame, same in zip(scene.frames, again.frames, strict=True):
+        np.testing.assert_array_equal(frame.measurements.z, same.measurements.z)
+        (edges,) = frame.transition.graph.edges
+        assert np.bincount(edges.target, minlength=20).max() <= 4
+        assert not (edges.target == edges.source).any()
+    first, second = (frame.transition.graph.edges[0] for frame in scene.frames[:2])
+    assert first.rate.tolist()[:5] != second.rate.tolist()[:5]
+
+
+def test_the_windows_of_both_smoothers_hold_the_same_moments() -> None:
+    scene = flock("components", 6, 9, seed=2)
+    ours, theirs = OurWindow(5, scene), GtsamWindow(5, scene)
+    for frame in scene.frames:
+        for contender in (ours, theirs):
+            contender.prepare(frame)()
+        assert len(ours.window) == len(theirs.window)
+    np.testing.assert_allclose(np.array(ours.window), theirs.window, atol=1e-8)
+    np.testing.assert_allclose(ours.read()[1], theirs.read()[1], atol=1e-9)
+
+
+def test_the_textbook_is_driven_as_our_filter_is() -> None:
+    scene = flock("connected", 7, 4, seed=3)
+    ours, textbook = Ours(JointKalmanFilter(), scene), Textbook(scene)
+    for frame in scene.frames:
+        for contender in (ours, textbook):
+            contender.prepare(frame)()
+    for mine, theirs in zip(ours.read(), textbook.read(), strict=True):
+        np.testing.assert_allclose(mine, theirs, atol=1e-10)

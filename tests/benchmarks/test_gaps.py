@@ -1,0 +1,210 @@
+"""The benchmark of gaps: who is compared, what is fitted to what, and its command from end to end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from benchmarks import gaps, recordings
+from benchmarks.gap_picture import LIGHTS, gap_picture, telling_gap
+from benchmarks.gaps import rows_of, split_runs, splits_of
+from benchmarks.recordings import simulated_set
+from benchmarks.variants import contenders, variants
+from pipelines.config import Family, load_config
+from pipelines.learning.gap_runs import LIFE, GapBenchSettings, judged_run, prepared, run_of, with_life
+from pipelines.learning.interactions import LearnedForms
+from saga_fg import InputError
+from saga_fg.learning.gaps import real_gaps
+from saga_fg.learning.situations import situations_of
+from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.road.stopping import RedLight
+from saga_fg.model.turning import CoordinatedTurn
+from saga_fg.types.road_map import Lane
+from tests.pipelines.sampled_gaps import HIDDEN, SHORT, labelled, straight, without
+from tests.pipelines.test_situations import GAP, ROAD, STEADY, along
+from tests.pipelines.test_situations import labelled as labelled_on_road
+
+SEVEN_SECONDS = replace(SHORT, duration=7.0)
+
+
+@pytest.fixture
+def short_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulated scenes that last for seconds."""
+    monkeypatch.setattr(recordings, "simulated_set", lambda scenes: simulated_set(scenes, settings=SEVEN_SECONDS))
+
+
+@pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "file"])
+def test_contenders_and_lives_are_settings_of_every_kind_of_data(family: Family) -> None:
+    base = load_config(family)
+    for variant in variants(family).values():
+        made = variant.contender(base)
+        config = with_life(made.config, "kept")
+        config.new_tracker(made.method)
+        assert config.tracker.max_coasting == LIFE
+        assert with_life(config, "shipped") is config
+
+
+def test_classical_contenders_differ_in_motion_alone() -> None:
+    base, known = load_config("kitti"), variants("kitti")
+    turn = known["stationary + turn"].contender(base).config.tracker
+    assert isinstance(turn.classes["default"].motion, CoordinatedTurn)
+    assert isinstance(turn.classes["pedestrian"].motion, ConstantVelocity)
+    assert turn.stationarity.prior == 0.5
+    alone = known["constant velocity"].contender(base).config.tracker
+    assert alone.stationarity.prior == 0
+    assert alone.classes["default"].max_deviation == base.tracker.classes["default"].max_deviation
+
+
+def test_parts_of_the_graph_are_contenders_where_they_are_configured() -> None:
+    base = load_config("heterogeneous")
+    rules = variants("heterogeneous")["without lights"].contender(base).config.tracker.edges
+    assert {type(rule) for rule in base.tracker.edges} - {type(rule) for rule in rules} == {RedLight}
+    shipped = load_config("kitti")
+    assert [one.name for one in contenders("kitti", shipped, "saga,without lights,kf", ())] == ["saga", "kf"]
+
+
+def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
+    drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
+    kf = variants("file")["kf"].contender(load_config("file"))
+    found = real_gaps(drawn)
+    kept, shipped = (run_of(drawn, found, kf, life) for life in ("kept", "shipped"))
+    assert kept.outcomes[0].error < 0.5
+    rows = [*rows_of("set", [kept], "kf", False, False), *rows_of("set", [shipped], "kf", False, False)]
+    real = {title: row for title, row in rows if "real gaps" in title}
+    alive, ended = real["set, tracks kept alive: real gaps of 1 to 6 s"], list(real.values())[1]
+    assert (alive["identity kept"], ended["reported at the end"]) == (1.0, 0.0)
+    assert [row["right"] for title, row in rows if "links" in title] == [1, 1]  # the second one is re-linked
+
+
+def test_recordings_are_dealt(monkeypatch: pytest.MonkeyPatch) -> None:
+    five = replace(simulated_set(5), clusters={"scene-0003": "scene-0001"})
+    names = five.dataset.scenes
+    assert splits_of(five, None) == [((), names)]
+    first, second = splits_of(five, "2")
+    assert first[1] == (names[0], names[2], names[3])
+    assert second[1] == (names[1], names[4])
+    assert [set(train) | set(test) for train, test in (first, second)] == [set(names)] * 2
+    assert len(splits_of(five, "place")) == 4
+    with pytest.raises(InputError, match="--folds 6: expected recordings for two folds or more, there are 4 units"):
+        splits_of(five, "6")
+    sites = ("USA_Lanker-1_10_T-1", "USA_Lanker-2_4_T-1", "USA_US101-1_1_T-1")
+    dataset = type("Sites", (), {"scenes": sites})()
+    assert [test for _, test in splits_of(replace(five, name="ngsim", dataset=dataset), "place")] == [
+        sites[:2],
+        sites[2:],
+    ]
+
+
+def test_contenders_are_fitted_to_the_recordings_that_teach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Learning finds no interactions here: then saga is kf."""
+    taught_by = []
+
+    def learn(recordings, origin, base, *how):  # type: ignore[no-untyped-def]
+        taught_by.append(origin)
+        return LearnedForms(LearnedInteractions(learned_from=origin), {}, {}, (), {})
+
+    monkeypatch.setattr(gaps, "learn_interactions", learn)
+    base = load_config("simulated")
+    kf = variants("simulated")["kf"].contender(base)
+    source = simulated_set(2, settings=SEVEN_SECONDS)
+    runs = split_runs(source, "2", ("noise", "edges"), [kf], base, GapBenchSettings(0, ("kept",)))
+    assert taught_by == ["recordings scene-0002", "recordings scene-0001"]
+    names = ["kf", "kf, fitted noise", "saga, learned edges"]
+    assert [(run.recording, run.contender) for run in runs] == [
+        (s, n) for s in ("scene-0001", "scene-0002") for n in names
+    ]
+    assert runs[0].outcomes == runs[2].outcomes
+
+
+def test_gaps_may_be_of_some_situations_alone() -> None:
+    settings = GapBenchSettings(1, ("kept",), (2.0,), of=("visible leader", "turning"))
+    source = simulated_set(1, settings=SEVEN_SECONDS)
+    traffic, found = prepared(source, "scene-0001", settings, load_config("simulated").sensors)
+    made = [situations_of(traffic, gap)[2.0] for gap in found if gap.run > 0]
+    assert made
+    assert all(each & {"visible leader", "turning"} for each in made)
+
+
+@pytest.mark.usefixtures("short_scenes")
+def test_the_command_compares_on_the_same_gaps(bench, tmp_path: Path) -> None:
+    own, picture = tmp_path / "own.yaml", tmp_path / "gap.png"
+    own.write_text("tracker: {explained_noise: 0.5}\n")
+    options = "gaps --sets simulated --scenes 1 --passes 1 --life kept --situations --lengths 2 --contenders kf"
+    rows = bench(options, "--contender", f"own:saga={own}", "--picture", str(picture))
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    made = [row for row in rows if row["table"].endswith("made gaps")]
+    assert {row["contender"] for row in made} == {"kf", "own"}
+    for base, mine in zip(made[::2], made[1::2], strict=True):
+        assert (base["contender"], mine["contender"]) == ("kf", "own")
+        assert (base["objects"], base["gaps"]) == (mine["objects"], mine["gaps"])
+        assert mine["relative change"]["estimate"] == pytest.approx(mine["error, m"] / base["error, m"] - 1)
+        assert mine["relative change"]["low"] is None, "one recording has no interval"
+    counts = [row for row in made if row["objects"].endswith(", 2 s") and row["contender"] == "kf"]
+    (everything,) = [
+        r for r in rows if r.get("objects") == "all" and r["contender"] == "kf" and "after 2 s" in r["table"]
+    ]
+    assert everything["gaps"] + everything["lost"] == sum(row["gaps"] for row in counts)
+
+
+def test_recordings_without_gaps_are_refused(refused, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = replace(SHORT, duration=1.0)
+    monkeypatch.setattr(recordings, "simulated_set", lambda scenes: simulated_set(scenes, settings=settings))
+    said = refused("gaps --sets simulated --scenes 1 --passes 1 --contenders kf")
+    assert "set simulated: expected recordings with gaps" in said
+
+
+@pytest.mark.usefixtures("short_scenes")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--contenders nobody", "--contenders: unknown name"),
+        ("--contender own", "expected a new NAME=FILE"),
+        ("--against turn --contenders saga,kf", "--against: unknown name"),
+        ("--viewpoint mast", "--viewpoint: expected ngsim or openacc among --sets"),
+        ("--longest 20", "--longest: expected ngsim or openacc among --sets"),
+        ("--picture gap.jpg", "gap.jpg: expected a name that ends in .png"),
+        ("--test scene-0099", "--test: unknown name"),
+        ("--fit edge", "--fit: unknown name 'edge'"),
+        ("--of halting,red", "--of: unknown name 'red'"),
+        ("--folds 1", "--folds: expected a number of 2 or more, or place, got '1'"),
+        ("--lengths 4", "--lengths: unknown name '4'"),
+        ("--sets foo", "--sets: unknown name 'foo'"),
+    ],
+)
+def test_the_command_refuses(refused, arguments: str, message: str) -> None:
+    assert message in refused(f"gaps --sets simulated --scenes 1 {arguments}")
+
+
+def test_the_picture_shows_the_gap_that_tells_most() -> None:
+    drawn = labelled({"a": straight()}, {"a": without(straight(), HIDDEN)})
+    found, base = real_gaps(drawn), load_config("file")
+    pair = contenders("file", base, "centerpoint,kf", ())
+    worse, better = ([run_of(drawn, found, one, life)] for one, life in zip(pair, ("shipped", "kept"), strict=True))
+    assert telling_gap(better, worse) == ("drawn", found[0])
+    figure = gap_picture(drawn, found[0], {one.name: judged_run(drawn, found, one, "kept") for one in pair})
+    titles = [ax.get_title(loc="left").split(",")[0] for ax in figure.axes]
+    assert titles == ["centerpoint: identity kept", "kf: identity kept"]
+    with pytest.raises(InputError, match="--picture: expected recordings with gaps"):
+        telling_gap([], [])
+
+
+def test_lanes_and_stop_lines_show_what_their_lights_show() -> None:
+    lane, made = Lane("lane", ((-50.0, 0.0), (80.0, 0.0))), [replace(GAP, run=1)]
+    ways = {"a": STEADY, "b": along(STEADY[:, 0] + 8)}
+    scene = labelled_on_road(ways, colour="red", road=replace(ROAD, lanes=(lane,)))
+    kf = variants("file")["kf"].contender(load_config("file"))
+    (ax,) = gap_picture(scene, made[0], {"kf": judged_run(scene, made, kf, "kept")}).axes
+    wide = [to_hex(line.get_color()) for line in ax.lines if line.get_linewidth() == 3.0]
+    assert LIGHTS["red"] in wide
+    assert any(np.ptp(line.get_xdata()) == pytest.approx(130.0) for line in ax.lines), "the lane"
+    (track,) = [line for line in ax.lines if line.get_marker() == "o"]
+    assert np.isnan(track.get_xdata()).sum() == 1, "it breaks off where the object returns"
+    run = run_of(scene, made, kf, "kept", real=False)
+    assert telling_gap([run], [run], ("at red",))[1] == made[0]
+    with pytest.raises(InputError, match="--picture"):
+        telling_gap([run], [run], ("starting",))

@@ -1,0 +1,82 @@
+"""The benchmark of the service among hostile clients, on a small scale."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.service.good_client import GoodClient
+from benchmarks.service.hostile_messages import EPOCH, KINDS, MOST, SENSORS, hostile_line
+from benchmarks.service.hostile_service import HostileBench, HostileBenchSettings, bench_hostile_service
+from pipelines.config import load_config
+from pipelines.serving import StreamTracker
+from pipelines.serving.messages import encode
+
+FINE = HostileBench(7, 10, 10, 0, 0, 2, 1, 3, 40, 20, 0.1, 0.0, (100.0, 101.0), 0, 0, {}, 2.0)
+
+
+def test_no_good_frame_is_lost_or_doubled_by_kills_and_floods():
+    bench = bench_hostile_service(HostileBenchSettings(messages=400, objects=3, pace=20.0))
+    assert (bench.valid, bench.answered, bench.lost, bench.doubled) == (80, 80, 0, 0)
+    assert bench.hostile == 320
+    assert 0 < bench.tracked <= 80 - bench.late - bench.unconfirmed
+    assert bench.refused > 0
+    assert bench.sent_again > 0
+    assert bench.first_answer > 0
+
+
+def test_what_falls_short_is_named():
+    assert FINE.shortcomings == []
+    bad = replace(FINE, lost=1, doubled=2, longest_stall=0.7, memory=(100.0, 106.0))
+    assert [text.split(",")[0] for text in bad.shortcomings] == [
+        *("1 frames lost", "2 frames doubled"),
+        *("a stall of 0.700 s", "memory grew to 1.060 of the start"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("taken", "answers", "counted", "expected"),
+    [
+        ([0, 1, 2], ["tracks", "late", "tracks"], 3, (0, 0)),
+        ([0, 2], ["tracks", "unconfirmed", "tracks"], 2, (0, 0)),
+        ([0, 2], ["tracks", "repeat", "tracks"], 3, (0, 0)),
+        ([0, 0, 1, 2], ["tracks"] * 3, 4, (0, 1)),
+        ([0, 0, 1, 2], ["tracks"] * 3, 3, (1, 1)),  # one was taken in twice, and another is not counted
+        ([0, 0, 1], ["tracks"] * 2, 3, (1, 1)),
+        ([0, 1, 2], ["tracks"] * 3, 4, (0, 1)),
+    ],
+)
+def test_what_is_lost_does_not_make_up_for_what_is_doubled(
+    taken: list[int], answers: list[str], counted: int, expected: tuple[int, int]
+):
+    client = GoodClient.__new__(GoodClient)
+    client.frames, client.taken, client.answers = 3, Counter(taken), dict(enumerate(answers))
+    assert client.lost_and_doubled(counted) == expected
+
+
+def test_no_message_in_the_name_of_a_good_sensor_takes_its_numbers():
+    config, rng = load_config("file"), np.random.default_rng(0)
+    config = replace(config, tracker=replace(config.tracker, min_hits=1))  # so that one message is answered by tracks
+    service = StreamTracker[None](lambda: config.new_tracker("kf"))
+    for sensor in SENSORS:
+        service.handle(encode({"timestamp": EPOCH, "sensor": sensor, "seq": 0, "detections": []}), None)
+    numbered = heavy = 0
+    for kind in KINDS:
+        service.handle(b'{"type": "reset"}', None)
+        for line in b"\n".join(kind(rng, EPOCH) for _ in range(5)).split(b"\n"):
+            ((_, answer),) = service.handle(line, None) or [(None, {"type": ""})]
+            heavy += answer["type"] == "tracks" and len(answer["tracks"]) > MOST / 2
+            numbered += "seq: expected at most" in answer.get("message", "")
+    assert numbered == 5
+    assert {sensor: service.status()["last_seq"][sensor] for sensor in SENSORS} == dict.fromkeys(SENSORS, 0)
+    assert heavy > 0
+
+
+def test_hostile_messages_are_lines_of_every_kind():
+    rng = np.random.default_rng(0)
+    for kind in KINDS:
+        assert all(0 < line.count(b"\n") + 1 < 3 for line in [kind(rng, EPOCH)])
+    assert hostile_line(np.random.default_rng(5), EPOCH) == hostile_line(np.random.default_rng(5), EPOCH)
