@@ -166,7 +166,7 @@ class IncrementalSmoother:
     def joint_gaussian(self, layout: StateLayout, keys: Sequence[int]) -> BlockGaussian:
         """The joint Gaussian of variables by components, as `saga_fg.estimators.joint_gaussian` has it."""
         engine = self._ready()
-        return joint_gaussian(self._graph, engine.linear(), layout, keys)
+        return joint_gaussian(self._graph, engine.covariance, layout, keys)
 
     def handed_over(self) -> IncrementalSmoother:
         """Return a smoother that takes over the present iSAM2; this one builds another when it is needed."""

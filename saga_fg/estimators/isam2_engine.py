@@ -108,6 +108,10 @@ class Engine:
         except (RuntimeError, np.linalg.LinAlgError):
             return None
 
+    def covariance(self, keys: list[int]) -> FloatArray:
+        """Joint covariance of variables on increments from the base, in the order given, as the tree has it."""
+        return np.asarray(self.isam.jointMarginalCovariance(keys).fullMatrix())
+
     def linear(self) -> gtsam.GaussianFactorGraph:
         """All linear factors that it holds, the sharpest first."""
         held, linear = self.isam.getFactorsUnsafe(), gtsam.GaussianFactorGraph()

@@ -8,23 +8,20 @@ its variable.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
-import gtsam
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from factors import FactorError, joint_prior_factor, marginal_factors, marginal_moments
-from factors.marginal import Elimination
+from factors import FactorError, joint_prior_factor
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics, noise_ratio, predict
 from saga_fg.estimators.filter_steps import predicted
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import Partition, zeros
-from saga_fg.graph.messages import solver_error, with_names
+from saga_fg.graph.messages import with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
@@ -34,30 +31,21 @@ _LIMIT_WIDE = 1e6  # the same by Cholesky
 
 
 def joint_gaussian(
-    graph: SceneFactorGraph, linear: gtsam.GaussianFactorGraph, layout: StateLayout, keys: Sequence[int]
+    graph: SceneFactorGraph, covariance: Callable[[list[int]], FloatArray], layout: StateLayout, keys: Sequence[int]
 ) -> BlockGaussian:
-    """The joint Gaussian of variables, whose ids in `layout` are those of nodes or their keys.
+    """The joint Gaussian of variables by components, whose ids in `layout` are those of nodes or their keys.
 
-    Nodes with their states, other variables with increments from their base; linear: all factors of the graph.
+    Nodes with their states, other variables with increments from their base; covariance: joint one of some variables.
     """
-    factors = [linear.at(k) for k in range(linear.size())]
-    involved = [factor.keys() for factor in factors]
-    label = components(involved)
-    parts = {label[key]: gtsam.GaussianFactorGraph() for key in keys}
-    for factor, its in zip(factors, involved, strict=True):
-        if (part := parts.get(label[its[0]])) is not None:
-            part.push_back(factor)
-    number, own = np.unique([label[key] for key in keys], return_inverse=True)
+    part = components(held.factors.rows[row] for held in graph.groups.values() for row in held.rows.tolist())
+    _, own = np.unique([part[key] for key in keys], return_inverse=True)
     partition = Partition(layout, own.astype(np.int64))
-    blocks = zeros(partition)
-    for k, name in enumerate(number.tolist()):
-        rows = np.flatnonzero(own == k)
-        mine, wide = [keys[row] for row in rows.tolist()], int(layout.dims[rows].sum()) > _SMALL
-        try:
-            P = _covariance(parts[name], mine, "cholesky" if wide else "qr")
-        except FactorError as error:
-            raise solver_error(graph.variables, graph.groups, error) from error
-        blocks[partition.group[rows[0]]][partition.row[rows[0]]] = P
+    members: dict[int, list[int]] = {}
+    for k, label in enumerate(own.tolist()):
+        members.setdefault(label, []).append(k)
+    blocks, group, component = zeros(partition), partition.group.tolist(), partition.row.tolist()
+    for its in members.values():
+        blocks[group[its[0]]][component[its[0]]] = covariance([keys[k] for k in its])
     base = graph.base
     mean = [
         np.asarray(graph.state(key))
@@ -66,15 +54,6 @@ def joint_gaussian(
         for node, key in zip(layout.nodes.tolist(), keys, strict=True)
     ]
     return BlockGaussian(partition, np.concatenate([np.empty(0), *mean]), blocks)
-
-
-def _covariance(linear: gtsam.GaussianFactorGraph, keys: Sequence[int], elimination: Elimination) -> FloatArray:
-    """The joint covariance (D, D) of variables, all others eliminated."""
-    others = set(linear.keyVector()) - set(keys)
-    if elimination == "cholesky":  # where it fails, QR has twice the digits
-        with contextlib.suppress(FactorError):
-            linear = marginal_factors(linear, others, elimination)
-    return marginal_moments(linear, keys, "qr")[1]
 
 
 def components(factors: Iterable[Sequence[int]]) -> dict[int, int]:
