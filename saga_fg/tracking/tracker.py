@@ -27,6 +27,8 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.clock import TimeVerdict
+from saga_fg.tracking.clock_comparison import compare_left_out_frame, compare_used_frame
+from saga_fg.tracking.clock_offsets import SensorTime, sensor_times
 from saga_fg.tracking.deletion import delete_tracks
 from saga_fg.tracking.existence import update_existence
 from saga_fg.tracking.handover import hand_over
@@ -139,7 +141,9 @@ class Tracker:
         sensor = self.sensor(frame.sensor)
         timestamp = frame.timestamp + sensor.time_offset
         if state.accept_time(timestamp, frame.sensor, self._clock, self.max_delay):
-            return self._process_frame(state, frame, sensor, state.relative(timestamp))
+            time = state.relative(state.clock.time_of(timestamp, frame.sensor))
+            return self._process_frame(state, frame, sensor, time)
+        compare_left_out_frame(state, timestamp, frame, sensor)
         state.assignment = Assignment.empty()
         return report_tracks(state, state.clock.newest)
 
@@ -170,6 +174,7 @@ class Tracker:
         self._notify("associate", state, frame.sensor, measurements, matching)
 
         update_tracks(state, measurements, matching)
+        compare_used_frame(state, frame.timestamp + sensor.time_offset, measurements, matching)
         if delay == 0:
             infer_signals(state, matching)
         self._notify("update", state, frame.sensor, measurements, matching)
@@ -253,6 +258,11 @@ class Tracker:
     def time_verdict(self) -> TimeVerdict:
         """The verdict on the timestamp of the latest frame, see `saga_fg.tracking.clock`."""
         return self._state.time_verdict
+
+    @property
+    def sensor_times(self) -> dict[str, SensorTime]:
+        """The clock of each sensor against the consensus of all: offset, its standard deviation, drift and jitter."""
+        return sensor_times(self._state.clock, self._state.shared)
 
     @property
     def late_frames(self) -> int:
