@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -31,7 +31,7 @@ from pipelines.serving.settings import StreamSettings
 from pipelines.tracking import OnlineTracker, PredictingTracker
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking import TimeVerdict
+from saga_fg.tracking import SensorTime, TimeVerdict
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +68,11 @@ class StreamedTracker(OnlineTracker, Protocol):
     @property
     def max_jump(self) -> float:
         """Distance from the newest time, s, beyond which a frame has to be confirmed by another."""
+        ...
+
+    @property
+    def sensor_times(self) -> dict[str, SensorTime]:
+        """The clock of each sensor against the consensus of all."""
         ...
 
     def snapshot(self) -> Any:
@@ -165,8 +170,14 @@ class StreamTracker(Generic[Client]):
             "cpu_seconds": round(time.process_time(), 3),
             "last_seq": dict(self._numbering.last),
             "taken": dict(self._numbering.taken),
+            "clocks": {name: _rounded(asdict(each)) for name, each in self.clocks().items()},
             **kept,
         }
+
+    def clocks(self) -> dict[str, SensorTime]:
+        """Return the clocks of the sensors, where there are several."""
+        clocks = self._tracker.sensor_times
+        return clocks if len(clocks) > 1 else {}
 
     def state(self) -> tuple[dict[str, Any], dict[str, int], int]:
         """Return the state (without held frames) as a tree of values, the last number of each sensor, the version."""
@@ -335,3 +346,8 @@ def _origin(error: Exception) -> tuple[str, int]:
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
     return type(error).__name__, 0 if trace is None else trace.tb_lineno
+
+
+def _rounded(values: Answer) -> Answer:
+    """Return the times to the microsecond."""
+    return {name: round(value, 6) if isinstance(value, float) else value for name, value in values.items()}

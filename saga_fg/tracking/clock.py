@@ -39,7 +39,7 @@ REMEMBERED = 200  # accepted frames, by which repeated frames are recognised
 MANY_SENSORS = 32  # from here on, sensors of short records are forgotten: names come from outside
 REGULAR = 2.2  # steps of a sensor, up to which the next frame may take: one frame may be missing
 QUIET = 1.0  # s; a sensor that has sent nothing for longer, and for four steps, has no vote
-LEAD = 0.9  # of max_delay: a sensor may lead the others by this much
+LEAD = 0.8  # of max_delay: a sensor may lead the others by this much
 LEFT_OUT = 0.1  # factor on the record of a sensor whose frames are left out
 SMOOTHING = 1 / 8  # weight of the latest frame in the jitter and in the lead
 LONG_RECORD = 1000  # frames; older ones count less and less
@@ -73,7 +73,7 @@ class SensorClock:
     step       its usual time between two frames, 0 while unknown
     jitter     mean deviation from that step
     offset     subtracted from its timestamps
-    lead       mean time of its frames less the newest time before them, since its latest break
+    lead       mean time of its frames less the newest time, since its latest break; frames that set that are at 0
     kept       frames that kept its step
     broken     frames that did not
     segment    number of breaks of its time so far; what was learned of its offset before the latest is void
@@ -128,7 +128,7 @@ class SensorClock:
         return abs(time - start - (elapsed - self.taken)) <= max_delay + REGULAR * self.step
 
     def leading(self, apart: float) -> SensorClock:
-        """After a frame so far ahead of the newest time, s."""
+        """After a frame so far ahead of the newest time, s; a frame that sets it is at 0."""
         return self.changed(lead=self.lead + SMOOTHING * (apart - self.lead) if self.lead else apart)
 
     def arrived(self, timestamp: float, elapsed: float, waited: float) -> SensorClock:
@@ -243,7 +243,7 @@ class Clock:
         time = own.stamp - own.offset
         first = self.newest == -math.inf
         apart = 0.0 if first else time - self.newest
-        own = own.leading(apart).changed(time=time, taken=elapsed, doubt=None, run=0)
+        own = own.leading(min(apart, 0.0)).changed(time=time, taken=elapsed, doubt=None, run=0)
         accepted = (*self.accepted, (own.name, own.stamp))[-REMEMBERED:]
         step = apart if apart > max_jump else 0.0
         return self._changed(newest=max(self.newest, time), accepted=accepted, step=step, elapsed=elapsed)._with(own)

@@ -197,21 +197,25 @@ class SharedObservations:
                 against.setdefault(pair.first, {})[pair.second] = found
                 opposite = replace(found, offset=-found.offset, drift=-found.drift)
                 against.setdefault(pair.second, {})[pair.first] = opposite
-        weights = {sensor: (len(found), records[sensor]) for sensor, found in against.items()}
+        places = {sensor: place for place, sensor in enumerate(records)}
+        weights = {s: (len(found), round(records[s], 1), -places[s], records[s]) for s, found in against.items()}
         estimates = {sensor: _consensus(sensor, found, weights) for sensor, found in against.items()}
         return {sensor: replace(e, steady=e.steady and sensor not in open_) for sensor, e in estimates.items()}
 
 
 def _consensus(
-    sensor: str, against: Mapping[str, OffsetEstimate], weights: Mapping[str, tuple[int, float]]
+    sensor: str, against: Mapping[str, OffsetEstimate], weights: Mapping[str, tuple[float, ...]]
 ) -> OffsetEstimate:
-    """The median of the offsets against others, and that against itself; weights: number of those, and record."""
+    """The median of the offsets against others, and that against itself, by the last of the `weights`, the record.
+
+    Of two sensors the one of more weight is right: with more others to compare with, of a better record, heard first.
+    """
     own = replace(min(against.values(), key=lambda each: each.deviation), offset=0.0, drift=0.0)
     if len(against) == 1:
         ((other, each),) = against.items()
         return each if weights[other] > weights[sensor] else own
-    votes = [(each.offset, weights[other][1]) for other, each in against.items()]
-    median = weighted_median([*votes, (0.0, weights[sensor][1])])
+    votes = [(each.offset, weights[other][-1]) for other, each in against.items()]
+    median = weighted_median([*votes, (0.0, weights[sensor][-1])])
     return next((each for each in against.values() if each.offset == median), own)
 
 

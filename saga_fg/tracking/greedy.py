@@ -19,6 +19,7 @@ from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
+from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.by_class import DEFAULT, class_numbers
 from saga_fg.types.frame import Frame
@@ -153,6 +154,11 @@ class GreedyTracker:
         """The tracks seen in the newest frame, projected to `timestamp` (s)."""
         newest = self._memory.select(np.flatnonzero(self._memory.last_seen == self._clock.newest))
         return _tracks(newest, timestamp)
+
+    @property
+    def sensor_times(self) -> dict[str, SensorTime]:
+        """The clock of each sensor against the consensus of all, by the order of arrival."""
+        return sensor_times(self._clock, SharedObservations())
 
     @property
     def max_jump(self) -> float:
