@@ -6,9 +6,9 @@ a and b have measured at z_a and z_b,
     (tau_a - tau_b) - (z_a - z_b)^T v / |v|^2  =  o_a - o_b + noise,
     variance  =  (u^T (R_a + R_b) u + s^2 u^T P_v u) / |v|^2,     u = v / |v|,
 
-where tau are the timestamps as sent and s is the time between the two measurements. The velocities are those of the
-tracks, which a constant offset does not change; the positions are those measured, so that the estimate does not depend
-on whose measurements the tracks follow. Each frame is compared once with the latest frame of each other sensor; all
+where tau are the timestamps as sent and s is the time between the two measurements. Positions and velocities are
+those that the sensor itself has measured, the velocity from its earlier frames: nothing depends on tracks, which a
+wrong clock spoils. Each frame is compared once with the latest frame of each other sensor; all
 pairs of detections of one class are candidates that lie on a line along v, up to `WINDOW` s apart. False pairs scatter,
 true ones agree: the estimate is the mean of the densest cluster, as a line over time where the clocks drift apart.
 
@@ -31,8 +31,10 @@ from saga_fg.tracking.clock import Clock, weighted_median
 
 WINDOW = 2.5  # s; candidates are up to this far apart along their velocity
 LEAST_SPEED = 2.0  # m/s; slower objects tell little, and errors of their velocity matter
-SPEED_RATIO = 25.0  # squared speed by its variance, from which the velocity of a track counts as known
+SPEED_RATIO = 9.0  # squared speed by its variance, from which a velocity counts as known
 ACROSS = 9.0  # squared deviations across the velocity
+LONGEST_STEP, FASTEST = 1.0, 40.0  # s, m/s; objects are found again in a sensor's next frame up to these
+BASELINE = 0.8  # s, over which velocities are measured
 MOST_OBJECTS = 50  # of a frame
 MOST_SAMPLES = 400  # of a pair of sensors
 MOST_SENSORS = 12  # whose frames are compared
@@ -55,8 +57,10 @@ class SeenObjects:
     label              (k,) classes
     position           (k, 2) as measured, world, m
     variance           (k,) of a coordinate, m^2
-    velocity           (k, 2) of their tracks, m/s, NaN where unknown
+    velocity           (k, 2) between the anchor and the frame before this one, m/s, NaN where unknown
     velocity_variance  (k,) of a component, (m/s)^2
+    anchor             (k, 2) earlier positions, m
+    anchor_stamp       (k,) and their times on the sensor's clock, s
     compared           sensors whose frames it was compared with
     """
 
@@ -67,7 +71,40 @@ class SeenObjects:
     variance: FloatArray
     velocity: FloatArray
     velocity_variance: FloatArray
+    anchor: FloatArray
+    anchor_stamp: FloatArray
     compared: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, sensor: str, stamp: float, label: StrArray, position: FloatArray, variance: FloatArray) -> SeenObjects:
+        """Objects of which nothing is known from earlier frames."""
+        k = len(label)
+        unknown = np.full((k, 2), np.nan)
+        return cls(sensor, stamp, label, position, variance, unknown, unknown[:, 0], position, np.full(k, stamp))
+
+    def after(self, before: SeenObjects) -> SeenObjects:
+        """With the velocities of objects that are in the frame before as well."""
+        interval = self.stamp - before.stamp
+        if not 0 < interval <= LONGEST_STEP or len(self.label) == 0 or len(before.label) == 0:
+            return self
+        apart = np.hypot(*(self.position[:, None] - before.position[None]).transpose(2, 0, 1))
+        apart[self.label[:, None] != before.label[None]] = np.inf
+        j, rows = apart.argmin(axis=1), np.arange(len(apart))
+        nearest = apart[rows, j]
+        mutual = (apart.argmin(axis=0)[j] == rows) & (nearest <= FASTEST * interval)
+        apart[rows, j] = np.inf
+        i = (mutual & (apart.min(axis=1) > 2 * nearest)).nonzero()[0]
+        j = j[i]
+        age = before.stamp - before.anchor_stamp[j]
+        far = before.position[j] - before.anchor[j]
+        half = np.where(age > BASELINE, 0.5, 0.0)  # an old anchor moves on half the way
+        velocity, of_velocity = self.velocity.copy(), self.velocity_variance.copy()
+        anchor, anchor_stamp = self.anchor.copy(), self.anchor_stamp.copy()
+        known = (age >= BASELINE / 3).nonzero()[0]
+        velocity[i[known]] = far[known] / age[known, None]
+        of_velocity[i[known]] = 2 * self.variance[i[known]] / age[known] ** 2
+        anchor[i], anchor_stamp[i] = before.anchor[j] + half[:, None] * far, before.anchor_stamp[j] + half * age
+        return replace(self, velocity=velocity, velocity_variance=of_velocity, anchor=anchor, anchor_stamp=anchor_stamp)
 
 
 @dataclass(frozen=True)
@@ -165,6 +202,9 @@ class SharedObservations:
     def with_frame(self, frame: SeenObjects, time: float) -> SharedObservations:
         """After a frame at a time of the tracker, s, which is compared with the latest one of each other sensor."""
         others, pairs = [], {(each.first, each.second): each for each in self.pairs}
+        for other in self.seen:
+            if other.sensor == frame.sensor:
+                frame = frame.after(other)
         for other in self.seen:
             if other.sensor == frame.sensor:
                 continue

@@ -27,7 +27,7 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.clock import TimeVerdict
-from saga_fg.tracking.clock_comparison import compare_left_out_frame, compare_used_frame
+from saga_fg.tracking.clock_comparison import compare_clocks, compare_left_out
 from saga_fg.tracking.clock_offsets import SensorTime, sensor_times
 from saga_fg.tracking.deletion import delete_tracks
 from saga_fg.tracking.existence import update_existence
@@ -143,7 +143,7 @@ class Tracker:
         if state.accept_time(timestamp, frame.sensor, self._clock, self.max_delay):
             time = state.relative(state.clock.time_of(timestamp, frame.sensor))
             return self._process_frame(state, frame, sensor, time)
-        compare_left_out_frame(state, timestamp, frame, sensor)
+        compare_left_out(state, timestamp, frame, sensor)
         state.assignment = Assignment.empty()
         return report_tracks(state, state.clock.newest)
 
@@ -167,6 +167,7 @@ class Tracker:
         likelihood = state.class_groups.likelihood(measurements.boxes.label, sensor)
         relative = state.ego.relative_positions(measurements, frame)
         measurements = measurements.with_context(delay, likelihood, relative)
+        compare_clocks(state, frame.timestamp + sensor.time_offset, measurements)
         state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
         self._notify("measure", state, frame.sensor, measurements)
 
@@ -174,7 +175,6 @@ class Tracker:
         self._notify("associate", state, frame.sensor, measurements, matching)
 
         update_tracks(state, measurements, matching)
-        compare_used_frame(state, frame.timestamp + sensor.time_offset, measurements, matching)
         if delay == 0:
             infer_signals(state, matching)
         self._notify("update", state, frame.sensor, measurements, matching)
