@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -59,6 +59,10 @@ class ClockComparing(Protocol):
     @property
     def sensor_times(self) -> dict[str, SensorTime]:
         """The clock of each sensor against the consensus of all."""
+        ...
+
+    def take_clocks(self, other: Any) -> None:
+        """Take over the usual steps and the records of the sensors from the tracker of the scene before."""
         ...
 
 

@@ -35,6 +35,7 @@ RADAR_RATES = (5.0, 15.0, 20.0)
 NOISE = 0.2  # m
 JUMP = 10.0  # s; largest jump of a clock that jumps every second
 OBSERVATIONS = 200  # after which an offset is judged
+TRACKED, MOST_ERROR, MOST_RATIO, WITHIN = 0.99, 0.01, 1.05, 0.95  # to reach; the second in s
 OFFSETS = (0.05, 0.1, 0.3, 0.5, 1.0, 2.0)  # s, either way
 
 
@@ -95,7 +96,7 @@ class WrongClock:
 class SteadyOffset:
     """A steady offset, s, in several recordings; times in s.
 
-    errors       (n,) of the estimates after `OBSERVATIONS` shared observations, of most used sensors' samples
+    errors       (n,) of the estimates after `OBSERVATIONS` shared observations
     within       share of them within two standard deviations
     rmse         root mean square error of positions in the last third, m, and that without an offset
     """
@@ -199,6 +200,24 @@ def bench_steady_offsets(settings: ClockBenchSettings, progress: Progress | None
         found.append(SteadyOffset(wrong, offset, errors, within, (math.sqrt(float(np.mean(rmse**2))), without)))
         if progress is not None:
             progress("steady offsets", done + 1, len(cases))
+    return found
+
+
+def clock_shortcomings(wrong: list[WrongClock], steady: list[SteadyOffset]) -> list[str]:
+    """One text for each figure that is out of bounds."""
+    found = [
+        f"{w.sensor} {w.fault}, radar at {w.radar_rate:g} Hz: {100 * least:.1f} % tracked, expected {100 * TRACKED:g} %"
+        for w in wrong
+        if (least := min(w.tracked.values())) < TRACKED
+    ]
+    for each in steady:
+        name, largest = f"{each.sensor} {each.offset:g} s", float(np.abs(each.errors).max())
+        if not largest <= MOST_ERROR:
+            found.append(f"{name}: estimate off by {1e3 * largest:.1f} ms, expected {1e3 * MOST_ERROR:g} ms")
+        if each.rmse[0] > MOST_RATIO * each.rmse[1]:
+            found.append(f"{name}: error of positions {each.rmse[0] / each.rmse[1]:.3f} times that without an offset")
+    if steady and (within := float(np.mean([each.within for each in steady]))) < WITHIN:
+        found.append(f"{100 * within:.0f} % of estimates within two deviations, expected {100 * WITHIN:g} %")
     return found
 
 

@@ -28,7 +28,7 @@ from pipelines.serving.messages import (
 from pipelines.serving.numbering import Numbering
 from pipelines.serving.reordering import Reordering
 from pipelines.serving.settings import StreamSettings
-from pipelines.tracking import OnlineTracker, PredictingTracker
+from pipelines.tracking import ClockComparing, OnlineTracker, PredictingTracker
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import SensorTime, TimeVerdict
@@ -68,11 +68,6 @@ class StreamedTracker(OnlineTracker, Protocol):
     @property
     def max_jump(self) -> float:
         """Distance from the newest time, s, beyond which a frame has to be confirmed by another."""
-        ...
-
-    @property
-    def sensor_times(self) -> dict[str, SensorTime]:
-        """The clock of each sensor against the consensus of all."""
         ...
 
     def snapshot(self) -> Any:
@@ -176,7 +171,7 @@ class StreamTracker(Generic[Client]):
 
     def clocks(self) -> dict[str, SensorTime]:
         """Return the clocks of the sensors, where there are several."""
-        clocks = self._tracker.sensor_times
+        clocks = self._tracker.sensor_times if isinstance(self._tracker, ClockComparing) else {}
         return clocks if len(clocks) > 1 else {}
 
     def state(self) -> tuple[dict[str, Any], dict[str, int], int]:
@@ -217,7 +212,10 @@ class StreamTracker(Generic[Client]):
             return [(client, self._predictions(message.horizons))]
         answers = self._flush()  # held frames would bring numbers back
         if message.sensor is None:
+            before = self._tracker
             self._begin_anew()
+            if isinstance(self._tracker, ClockComparing):
+                self._tracker.take_clocks(before)
             return [*answers, (client, {"type": "reset"})]
         self._forget(message.sensor)
         self.version += 1

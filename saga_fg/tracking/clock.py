@@ -9,13 +9,14 @@ timestamp less the offset of its sensor (`saga_fg.tracking.clock_offsets`), and 
     else                                   late: left out
 
 A time ahead of the newest one is out of consensus where it surprises its own sensor and most of the others that are
-live, by their records and not by their rates. It surprises a sensor r with
+live, by their records and not by their rates, itself included. It surprises a sensor r with
 
     t - t_r > max(max_delay, w_r + max_delay / 2, 2.2 step_r)
 
-with t_r the time of that sensor's latest frame and w_r how long ago that came: the elapsed time, which advances by the
-usual steps of whatever arrives, whatever the clocks show. Were such a frame accepted, the next frames of the others
-would be late. So it is unconfirmed. So is a sensor whose frames lead those of the others by nearly `max_delay`.
+with t_r the time of that sensor's latest frame and w_r how long ago that came: the elapsed time, which advances with
+the newest time, but with each frame by a few usual steps of its sensor at most. Were such a frame accepted, the next
+frames of the others would be late. So it is unconfirmed. So is a frame of a sensor that leads the others by nearly
+`max_delay`. A sensor too slow to tell has no vote.
 
 Frames that are left out are evidence for another time, on which the sensors vote by their records. Those that propose
 about the same time set the clock once they outweigh those that go on at the newest one. If no other sensor is live, a
@@ -106,13 +107,15 @@ class SensorClock:
 
     @property
     def record(self) -> float:
-        """Weight of its vote, 0 to 1: the share of frames that kept its step, small while there are few."""
-        return (self.kept + 1) / (self.kept + self.broken + 4)
+        """Weight of its vote, 0 to 1: the share of frames that kept its step, small while there are few, and where
+        steps are irregular."""
+        regular = self.step / (self.step + self.jitter) if self.step else 1.0
+        return regular * (self.kept + 1) / (self.kept + self.broken + 4)
 
     @property
     def trusted(self) -> bool:
-        """Return True if its latest frame was accepted."""
-        return self.time is not None and self.doubt is None
+        """Return True if its frames are accepted, but for one at most."""
+        return self.time is not None and self.run <= 1
 
     def live(self, elapsed: float) -> bool:
         """Return True if it has a usual step and its latest frame is not long ago."""
@@ -121,6 +124,14 @@ class SensorClock:
     def surprised(self, time: float, waited: float, max_delay: float) -> bool:
         """Return True if a time, s, is further ahead than its next frame may be, `waited` s after its latest."""
         return self.time is None or time - self.time > max(max_delay, waited + max_delay / 2, REGULAR * self.step)
+
+    def slower(self, time: float, max_delay: float) -> bool:
+        """Return True if it is too slow to tell whether such a time, s, is right: its next frame may be further off."""
+        return self.time is not None and max_delay < time - self.time <= REGULAR * self.step
+
+    def with_time(self, time: float, elapsed: float, max_delay: float) -> bool:
+        """Return True if its latest accepted frame was about as far before a time, s, as it came before it."""
+        return self.time is not None and abs(self.time + elapsed - self.seen - time) <= max_delay + REGULAR * self.step
 
     def paced(self, time: float, elapsed: float, max_delay: float) -> bool:
         """Return True if a time, s, has advanced as the elapsed time has: the frame does not come after a stall."""
@@ -131,9 +142,17 @@ class SensorClock:
         """After a frame so far ahead of the newest time, s; a frame that sets it is at 0."""
         return self.changed(lead=self.lead + SMOOTHING * (apart - self.lead) if self.lead else apart)
 
-    def arrived(self, timestamp: float, elapsed: float, waited: float) -> SensorClock:
+    def step_to(self, timestamp: float) -> float:
+        """The time, s, from its latest frame to one with this timestamp; from its latest accepted one if that is
+        nearer."""
+        d = timestamp - self.stamp
+        if self.doubt is None or self.time is None:
+            return d
+        return min(d, timestamp - self.offset - self.time, key=abs)
+
+    def arrived(self, timestamp: float, waited: float) -> SensorClock:
         """After a frame with this timestamp, s, `waited` s of elapsed time after the one before."""
-        d, step = timestamp - self.stamp, self.step
+        d, step = self.step_to(timestamp), self.step
         broken = d < -max(0.05, step) or (step > 0 and d > 2.5 * step + 0.1 and d > waited + step + 0.1)
         jitter = self.jitter
         if step == 0 and d > 0:
@@ -146,7 +165,6 @@ class SensorClock:
             kept, breaks = kept // 2, breaks // 2
         return self.changed(
             stamp=timestamp,
-            seen=elapsed,
             step=step,
             jitter=jitter,
             kept=kept,
@@ -163,7 +181,8 @@ class Clock:
     newest       of the frames accepted, -inf before the first
     accepted     the latest of them, since the clock was set, by their timestamps
     step         the latest step of a slow stream, 0 of others, s
-    elapsed      time since the start by the usual steps of all sensors, s
+    elapsed      time since the start, without the jumps of the newest time, s
+    reached      of that, when the newest time was last advanced
     sensors      their clocks
     """
 
@@ -171,6 +190,7 @@ class Clock:
     accepted: tuple[Stamp, ...] = ()
     step: float = 0.0
     elapsed: float = 0.0
+    reached: float = 0.0
     sensors: tuple[SensorClock, ...] = ()
 
     def sensor(self, name: str) -> SensorClock | None:
@@ -186,23 +206,30 @@ class Clock:
         """The weights of the sensors' votes by name; those of sensors that are left out are small."""
         return {r.name: r.record * (1.0 if r.trusted else LEFT_OUT) for r in self.sensors if r.step > 0}
 
+    def begun_anew(self) -> Clock:
+        """Without the time, as a new scene begins: what stays are the steps and records of the sensors."""
+        forgotten = {"offset": 0.0, "time": None, "doubt": None, "run": 0, "lead": 0.0}
+        return Clock(
+            elapsed=self.elapsed, reached=self.elapsed, sensors=tuple(r.changed(**forgotten) for r in self.sensors)
+        )
+
     def judged(
         self, timestamp: float, sensor: str, settings: ClockSettings, max_delay: float
     ) -> tuple[TimeVerdict, Clock]:
         """Judge a frame of `sensor` by its timestamp, s; frames up to `max_delay` s old are used."""
         before = self.sensor(sensor) or SensorClock(sensor, timestamp, self.elapsed)
-        d = max(timestamp - before.stamp, 0.0)
-        elapsed = max(self.elapsed, before.seen + min(d, 2.5 * before.step if before.step > 0 else QUIET))
-        own = before.arrived(timestamp, elapsed, self.elapsed - before.seen)
+        own = before.arrived(timestamp, self.elapsed - before.seen)
         limit = max(settings.max_jump, 2 * self.step)
         right = (own,) if own.offset == 0 else (own, own.changed(offset=0.0))  # it may have been set right
         for tried in right:
-            if self._agrees(tried, before, elapsed, limit, max_delay):
-                return "accepted", self._accepting(tried, elapsed, settings.max_jump)
+            if self._agrees(tried, before, limit, max_delay):
+                return "accepted", self._accepting(tried, settings.max_jump)
         if (sensor, timestamp) in self.accepted or (before.doubt is not None and timestamp == before.stamp):
             far = abs(timestamp - own.offset - self.newest) > limit
             return "unconfirmed" if far else "late", self  # sent again: no second opinion
-        return self._doubting(own, elapsed, limit, settings.reset_after, max_delay)
+        d = min(max(before.step_to(timestamp), 0.0), before.step, QUIET / 4)
+        elapsed = max(self.elapsed, before.seen + d)
+        return self._doubting(own.changed(seen=elapsed), elapsed, limit, settings.reset_after, max_delay)
 
     def corrected(self, sensor: str, offset: float) -> Clock:
         """After the offset of a sensor's clock, s, has been estimated anew."""
@@ -213,7 +240,7 @@ class Clock:
         time, doubt = (None if t is None else t + moved for t in (own.time, own.doubt))
         return self._with(own.changed(offset=offset, time=time, doubt=doubt, first=own.first + moved, lead=0.0))
 
-    def _agrees(self, own: SensorClock, before: SensorClock, elapsed: float, limit: float, max_delay: float) -> bool:
+    def _agrees(self, own: SensorClock, before: SensorClock, limit: float, max_delay: float) -> bool:
         """Return True if the latest frame of a sensor is in time and in consensus."""
         time = own.stamp - own.offset
         apart = time - self.newest
@@ -221,15 +248,19 @@ class Clock:
             return True
         if not -max_delay <= apart <= limit:
             return False
-        others = self._voters(own.name, elapsed)
+        others = [r for r in self.sensors if r.name != own.name and r.trusted and r.live(self.elapsed)]
         if not others:
             return True
         if self._leads(own, others, max_delay):
             return False
+        against = total = 0.0
+        for r in others:
+            surprised = r.surprised(time, self.elapsed - r.seen, max_delay)
+            if surprised or not r.slower(time, max_delay):
+                against, total = against + surprised * r.record, total + r.record
         if not before.surprised(time, self.elapsed - before.seen, max_delay):
-            return True
-        against = sum(r.record for r in others if r.surprised(time, elapsed - r.seen, max_delay))
-        return 2 * against <= sum(r.record for r in others)
+            total += own.record
+        return 2 * against <= total
 
     def _leads(self, own: SensorClock, others: list[SensorClock], max_delay: float) -> bool:
         """Return True if the frames of a sensor have led those of most others by nearly `max_delay`."""
@@ -238,52 +269,78 @@ class Clock:
         votes = [(r.lead, r.record) for r in others if r.kept >= 1 / SMOOTHING]
         return len(votes) > 1 and own.lead - weighted_median([*votes, (own.lead, own.record)]) > LEAD * max_delay
 
-    def _accepting(self, own: SensorClock, elapsed: float, max_jump: float) -> Clock:
+    def _accepting(self, own: SensorClock, max_jump: float) -> Clock:
         """After an accepted frame."""
         time = own.stamp - own.offset
         first = self.newest == -math.inf
         apart = 0.0 if first else time - self.newest
-        own = own.leading(min(apart, 0.0)).changed(time=time, taken=elapsed, doubt=None, run=0)
+        elapsed = max(self.elapsed, self.reached + min(max(apart, 0.0), 2.5 * own.step or QUIET))
+        reached = elapsed if apart > 0 else self.reached
+        own = own.leading(min(apart, 0.0)).changed(time=time, seen=elapsed, taken=elapsed, doubt=None, run=0)
         accepted = (*self.accepted, (own.name, own.stamp))[-REMEMBERED:]
         step = apart if apart > max_jump else 0.0
-        return self._changed(newest=max(self.newest, time), accepted=accepted, step=step, elapsed=elapsed)._with(own)
+        newest = max(self.newest, time)
+        return self._changed(newest=newest, accepted=accepted, step=step, elapsed=elapsed, reached=reached)._with(own)
 
     def _doubting(
         self, own: SensorClock, elapsed: float, limit: float, reset_after: int, max_delay: float
     ) -> tuple[TimeVerdict, Clock]:
         """After a frame that is left out, or with which the clock is set."""
         time = own.stamp - own.offset
-        own = own.leading(time - self.newest)
         far = time > self.newest or self.newest - time > limit
         agrees = self._supports(own, time, limit) if far else own.doubt is not None and not self._far(own.doubt, limit)
         backward = far or own.time is None or time < own.time or own.paced(time, elapsed, max_delay)
+        own = own.leading(time - self.newest) if agrees else own
         run = (own.run if agrees else 0) + backward
         if own.doubt is None or not agrees:
             own = own.changed(first=time, taken=elapsed if own.time is None else own.taken)
-        paced = far or (run > 1 and own.paced(time, elapsed, max_delay))
-        others = [r for r in self.sensors if r.name != own.name and r.live(elapsed)]
-        with_it = [r for r in others if r.doubt is not None and self._same(r, own, time, elapsed, max_delay)]
-        against = sum(r.record for r in others if r.trusted)
-        if far:
-            needed = reset_after if own.time is None else 1 if len(self.accepted) == 1 else 2
-        else:
-            needed = reset_after
-            paced = paced and all(r.run > 1 for r in with_it)
-        if against:
-            enough = paced and bool(with_it) and own.record + sum(r.record for r in with_it) > against
-        else:
-            enough = (far and bool(with_it) and own.time is not None) or (
-                run >= needed and (far or own.time is None or time < own.time)
-            )
+        own = own.changed(run=run)
+        with_it = [r for r in self._others(own, elapsed) if self._same(r, own, time, elapsed, max_delay)]
+        enough = self._enough(own, with_it, elapsed, far, limit, reset_after, max_delay)
         last = self.newest if own.doubt is None else own.doubt
-        own = own.changed(doubt=time, run=run)
+        own = own.changed(doubt=time)
         if not enough:
             return "unconfirmed" if far else "late", self._changed(elapsed=elapsed)._with(own)
         verdict: TimeVerdict = (
             "set_back" if time < self.newest else "accepted" if time - self.newest <= limit else "set_ahead"
         )
-        step = time - last if time - last > limit else 0.0
+        step = time - last if time - last > limit and time > self.newest and not with_it else 0.0
         return verdict, self._set(own, with_it, elapsed, step)
+
+    def _others(self, own: SensorClock, elapsed: float) -> list[SensorClock]:
+        """The other sensors that have a say: those that are live, and any one while there is but a single frame."""
+        begins = len(self.accepted) == 1
+        others = [r for r in self.sensors if r.name != own.name]
+        return [r for r in others if r.live(elapsed) or (begins and r.doubt is not None)]
+
+    def _enough(
+        self,
+        own: SensorClock,
+        with_it: list[SensorClock],
+        elapsed: float,
+        far: bool,
+        limit: float,
+        reset_after: int,
+        max_delay: float,
+    ) -> bool:
+        """Return True if the clock is to be set to the latest time of a sensor, which some others support."""
+        time, begins = own.stamp - own.offset, len(self.accepted) == 1
+        against = [r for r in self._others(own, elapsed) if r.trusted and r not in with_it]
+        # sensors of which nothing has come since are no evidence for the newest time
+        going_on = [r for r in against if far or not r.with_time(time, elapsed, max_delay)]
+        outweighs = own.record + sum(r.record for r in with_it) > sum(r.record for r in going_on)
+        if with_it and outweighs and (begins or (going_on and far)):
+            return True
+        repeated = own.run > 1 and own.paced(time, elapsed, max_delay) and all(r.run > 1 for r in with_it)
+        if with_it and outweighs and not far and repeated:
+            return True
+        if going_on:
+            return False
+        if not far:
+            return own.run >= reset_after and (own.time is None or time < own.time)
+        if with_it and own.time is not None and (own.run > 1 or time - self.newest <= limit):
+            return True
+        return own.run >= (reset_after if own.time is None else 1 if begins else 2)
 
     def _set(self, own: SensorClock, with_it: list[SensorClock], elapsed: float, step: float) -> Clock:
         """After the clock was set to the time of a frame, which these other sensors support."""
@@ -294,11 +351,12 @@ class Clock:
             time = r.doubt if r.name in names else None
             sensors.append(r.changed(time=time, taken=r.seen, doubt=None, run=0, lead=0.0))
         assert own.time is not None
-        return Clock(own.time, ((own.name, own.stamp),), step, elapsed, tuple(sensors))._with(own)
+        return Clock(own.time, ((own.name, own.stamp),), step, elapsed, elapsed, tuple(sensors))._with(own)
 
     def _same(self, r: SensorClock, own: SensorClock, time: float, elapsed: float, max_delay: float) -> bool:
         """Return True if the doubtful time of a sensor, s, is about this one of another."""
-        assert r.doubt is not None
+        if r.doubt is None:
+            return False
         apart = time - r.doubt - (elapsed - r.seen)
         return abs(apart) <= max_delay + REGULAR * max(r.step, own.step)
 
@@ -312,10 +370,6 @@ class Clock:
             return False
         step = time - own.doubt
         return abs(step) <= limit or 0 < step <= 1.5 * (own.doubt - self.newest)
-
-    def _voters(self, name: str, elapsed: float) -> list[SensorClock]:
-        """The other sensors that are live and in time."""
-        return [r for r in self.sensors if r.name != name and r.trusted and r.live(elapsed)]
 
     def _changed(self, **values: Any) -> Clock:
         """With other values of some attributes."""

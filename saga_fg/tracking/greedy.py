@@ -175,6 +175,10 @@ class GreedyTracker:
         self._memory, self._next_id, self._clock = snapshot.memory, snapshot.next_id, snapshot.clock
         self.time_verdict = snapshot.time_verdict
 
+    def take_clocks(self, other: GreedyTracker) -> None:
+        """Take over the usual steps and the records of the sensors' clocks from a tracker of the scene before."""
+        self._clock = other._clock.begun_anew()
+
     def _match(self, boxes: Boxes, p: FloatArray, now: float) -> IntArray:
         """(m,) row of the track each detection takes, or -1."""
         match = np.full(len(boxes), -1, dtype=np.int64)

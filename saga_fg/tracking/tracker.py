@@ -245,6 +245,10 @@ class Tracker:
 
     __setstate__ = restore
 
+    def take_clocks(self, other: Tracker) -> None:
+        """Take over the usual steps and the records of the sensors' clocks from a tracker of the scene before."""
+        self._state.clock = other._state.clock.begun_anew()
+
     def sensor(self, name: str) -> Sensor:
         """The model of a sensor."""
         return sensor_model(self.sensors, name)

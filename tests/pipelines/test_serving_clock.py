@@ -19,7 +19,6 @@ class ScriptedTracker:
         self.verdicts = list(verdicts)
         self.time_verdict = "accepted"
         self.seen: list[float] = []
-        self.sensor_times: dict[str, Any] = {}
 
     def step(self, frame: Frame) -> Tracks:
         self.time_verdict = self.verdicts.pop(0) if self.verdicts else "accepted"
