@@ -32,7 +32,7 @@ from pipelines.bench.attack import Attack
 from pipelines.bench.good_client import JUDGED, GoodClient
 from pipelines.bench.hostile_messages import EPOCH, SENSORS
 from pipelines.bench.served import Served
-from pipelines.bench.service import INTERVAL, CirclingObjects
+from pipelines.bench.service import CirclingObjects
 from pipelines.serving import Address, StreamClient
 from pipelines.serving.messages import encode
 from pipelines.tracking import Progress
@@ -52,7 +52,7 @@ class HostileBenchSettings(Settings):
 
     messages: PositiveInt = setting(20_000, "messages in all, a fifth of them valid frames of two good clients")
     objects: PositiveInt = setting(50, "objects in each valid frame")
-    pace: Positive = setting(50.0, "frames a good client sends in a second; their own clocks show 10 a second")
+    pace: Positive = setting(50.0, "frames a good client sends in a second")
     seed: int = setting(0, "seed of messages and faults")
 
     @property
@@ -126,7 +126,7 @@ class _Run:
     ) -> None:
         self._settings = settings
         self._address = address
-        self._options = ("--listen", str(address), "--snapshot", str(state), "--every", "1")
+        self._options = ("--listen", str(address), "--snapshot", str(state), "--every", "0.2")
         self._progress = progress
         self._rng = np.random.default_rng([settings.seed, 5])
         self._pulse = _Pulse()
@@ -136,7 +136,7 @@ class _Run:
         settings = self._settings
         server = Served(*self._options)
         hostile = settings.messages - len(SENSORS) * settings.frames
-        attack = Attack(self._address, settings.seed, hostile, settings.frames * INTERVAL)
+        attack = Attack(self._address, settings.seed, hostile, settings.frames / settings.pace)
         clients = [self._good_client(number) for number in range(len(SENSORS))]
         try:
             with _Background(partial(_listen, self._address)), _Background(self._pulse.run):
@@ -165,9 +165,9 @@ class _Run:
 
         def line(seq: int) -> bytes:
             rng = np.random.default_rng([self._settings.seed, number, seq])
-            detections = self._objects.detections(seq * INTERVAL, rng)
-            time = round(EPOCH + seq * INTERVAL + 0.05 * number, 6)
-            return encode({"seq": seq, "timestamp": time, "sensor": sensor, "detections": detections})
+            elapsed = (seq + number / len(SENSORS)) / self._settings.pace
+            message = {"seq": seq, "timestamp": round(EPOCH + elapsed, 6), "sensor": sensor}
+            return encode(message | {"detections": self._objects.detections(elapsed, rng)})
 
         dies_at = int(self._rng.integers(frames // 10, max(2, frames // 3))) if number == 0 else -1
         return GoodClient(self._address, sensor, frames, self._settings.pace, line, dies_at)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,9 +31,7 @@ def service(
     ] = 20_000,
     pace: Annotated[
         float,
-        typer.Option(
-            "--pace", min=1, help="With --hostile: frames a second of a good client, whose clock shows 10 a second."
-        ),
+        typer.Option("--pace", min=1, help="With --hostile: frames a good client sends in a second."),
     ] = 50.0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of objects and mishaps.")] = 0,
     json_file: JsonFile = None,
@@ -44,9 +43,8 @@ def service(
 
     With --hostile, two good clients among hostile ones: poisonous, broken and random messages, clocks that are wrong,
     drift or jump in both directions, a listener that does not read, a good client that is killed, and a service that
-    is killed half-way and goes on from its snapshot. Frames are 0.1 s apart on the clients' own clocks and are sent
-    faster than that, see --pace. Fails if less than 99 % of the valid frames are tracked, one is lost or judged twice,
-    a good client waits for more than 0.5 s outside the restart, or memory grows by more than 5 %.
+    is killed half-way and goes on from its snapshot. Fails if less than 99 % of the valid frames are tracked, one is
+    lost or judged twice, a good client waits for more than 0.5 s outside the restart, or memory grows by more than 5 %.
 
     With --clocks, three sensors in one process, one with a wrong clock: which share of the frames of the others is
     tracked; and how well steady offsets are estimated. Fails below 99 %, above 10 ms, and where positions are more than
@@ -125,6 +123,7 @@ def _clocks(seed: int, json_file: Path | None) -> None:
         clock_tables,
     )
 
+    logging.getLogger("saga_fg.tracking").setLevel(logging.ERROR)  # each frame that is left out is warned of
     settings = ClockBenchSettings(seed=seed)
     with progress_bar() as progress:
         wrong, steady = bench_wrong_clocks(settings, progress), bench_steady_offsets(settings, progress)

@@ -40,7 +40,7 @@ REMEMBERED = 200  # accepted frames, by which repeated frames are recognised
 MANY_SENSORS = 32  # from here on, sensors of short records are forgotten: names come from outside
 REGULAR = 2.2  # steps of a sensor, up to which the next frame may take: one frame may be missing
 QUIET = 1.0  # s; a sensor that has sent nothing for longer, and for four steps, has no vote
-LEAD = 0.8  # of max_delay: a sensor may lead the others by this much
+LEAD = 0.9  # of max_delay: a sensor may lead the others by this much
 LEFT_OUT = 0.1  # factor on the record of a sensor whose frames are left out
 SMOOTHING = 1 / 8  # weight of the latest frame in the jitter and in the lead
 LONG_RECORD = 1000  # frames; older ones count less and less
@@ -74,7 +74,7 @@ class SensorClock:
     step       its usual time between two frames, 0 while unknown
     jitter     mean deviation from that step
     offset     subtracted from its timestamps
-    lead       mean time of its frames less the newest time, since its latest break; frames that set that are at 0
+    lead       mean time of its accepted frames less the newest time, where those that set it are at 0
     kept       frames that kept its step
     broken     frames that did not
     segment    number of breaks of its time so far; what was learned of its offset before the latest is void
@@ -157,7 +157,7 @@ class SensorClock:
         jitter = self.jitter
         if step == 0 and d > 0:
             step = min(d, QUIET)
-        elif d > 0:
+        elif d > 0 and not broken:
             jitter += SMOOTHING * (min(abs(d - step), step) - jitter)
             step *= min(max(d / step, 0.8), 1.25)
         kept, breaks = self.kept + (not broken), self.broken + broken
@@ -266,7 +266,7 @@ class Clock:
         """Return True if the frames of a sensor have led those of most others by nearly `max_delay`."""
         if max_delay == 0 or own.kept < 1 / SMOOTHING:
             return False
-        votes = [(r.lead, r.record) for r in others if r.kept >= 1 / SMOOTHING]
+        votes = [(r.lead, r.record) for r in others if r.kept >= 1 / SMOOTHING and r.doubt is None]
         return len(votes) > 1 and own.lead - weighted_median([*votes, (own.lead, own.record)]) > LEAD * max_delay
 
     def _accepting(self, own: SensorClock, max_jump: float) -> Clock:
@@ -274,8 +274,9 @@ class Clock:
         time = own.stamp - own.offset
         first = self.newest == -math.inf
         apart = 0.0 if first else time - self.newest
-        elapsed = max(self.elapsed, self.reached + min(max(apart, 0.0), 2.5 * own.step or QUIET))
+        elapsed = max(self.elapsed, self.reached + min(max(apart, 0.0), 2.5 * own.step or QUIET / 4))
         reached = elapsed if apart > 0 else self.reached
+        own = own.changed(lead=0.0) if own.doubt is not None else own  # it has caught up
         own = own.leading(min(apart, 0.0)).changed(time=time, seen=elapsed, taken=elapsed, doubt=None, run=0)
         accepted = (*self.accepted, (own.name, own.stamp))[-REMEMBERED:]
         step = apart if apart > max_jump else 0.0
@@ -290,7 +291,6 @@ class Clock:
         far = time > self.newest or self.newest - time > limit
         agrees = self._supports(own, time, limit) if far else own.doubt is not None and not self._far(own.doubt, limit)
         backward = far or own.time is None or time < own.time or own.paced(time, elapsed, max_delay)
-        own = own.leading(time - self.newest) if agrees else own
         run = (own.run if agrees else 0) + backward
         if own.doubt is None or not agrees:
             own = own.changed(first=time, taken=elapsed if own.time is None else own.taken)
@@ -308,10 +308,9 @@ class Clock:
         return verdict, self._set(own, with_it, elapsed, step)
 
     def _others(self, own: SensorClock, elapsed: float) -> list[SensorClock]:
-        """The other sensors that have a say: those that are live, and any one while there is but a single frame."""
-        begins = len(self.accepted) == 1
+        """The other sensors that have a say: those that are live, and those that have only been left out so far."""
         others = [r for r in self.sensors if r.name != own.name]
-        return [r for r in others if r.live(elapsed) or (begins and r.doubt is not None)]
+        return [r for r in others if r.live(elapsed) or (r.step == 0 and r.doubt is not None)]
 
     def _enough(
         self,
@@ -328,8 +327,10 @@ class Clock:
         against = [r for r in self._others(own, elapsed) if r.trusted and r not in with_it]
         # sensors of which nothing has come since are no evidence for the newest time
         going_on = [r for r in against if far or not r.with_time(time, elapsed, max_delay)]
+        names = {name for name, _ in self.accepted}
+        of_one = len(names) == 1 and names.isdisjoint(r.name for r in (own, *with_it))  # wrong from the start, maybe
         outweighs = own.record + sum(r.record for r in with_it) > sum(r.record for r in going_on)
-        if with_it and outweighs and (begins or (going_on and far)):
+        if with_it and outweighs and (of_one or (going_on and far)):
             return True
         repeated = own.run > 1 and own.paced(time, elapsed, max_delay) and all(r.run > 1 for r in with_it)
         if with_it and outweighs and not far and repeated:

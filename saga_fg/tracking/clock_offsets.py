@@ -341,13 +341,13 @@ def sensor_times(clock: Clock, shared: SharedObservations) -> dict[str, SensorTi
     """The clocks of all sensors with a usual step, by name."""
     known = [each for each in clock.sensors if each.step > 0]
     found = shared.estimates(clock.records())
-    leads = [(each.lead + each.offset, each.record) for each in known if each.kept > 1]
-    usual = weighted_median(leads) if leads else 0.0
+    leads = {r.name: r.offset + (r.lead if r.doubt is None else r.doubt - clock.newest) for r in known}
+    usual = weighted_median((leads[r.name], r.record) for r in known) if known else 0.0
     result = {}
     for each in known:
         estimate = found.get(each.name)
         if estimate is None:  # a frame may have arrived anywhere in a step
-            values = each.lead + each.offset - usual, each.step / math.sqrt(12) + each.jitter, 0.0
+            values = leads[each.name] - usual, each.step / math.sqrt(12) + each.jitter, 0.0
         else:
             values = estimate.offset, estimate.deviation, estimate.drift
         count = 0 if estimate is None else estimate.observations
