@@ -78,7 +78,7 @@ class ClockBenchSettings(Settings):
     """Number of objects and of repetitions."""
 
     objects: PositiveInt = setting(10, "objects that all sensors see")
-    repetitions: PositiveInt = setting(20, "recordings of every steady offset")
+    repetitions: PositiveInt = setting(10, "recordings of every steady offset")
     seed: int = setting(0, "seed of objects and noise")
 
 
