@@ -8,7 +8,7 @@ from benchmarks.runner import application
 
 NAMES = (
     *("estimators", "gaps", "joint", "loops", "metrics", "scaling", "service"),
-    *("slam", "smoothing", "speed", "streaming", "tracking"),
+    *("settling", "slam", "smoothing", "speed", "streaming", "tracking"),
 )
 
 app = application(getattr(import_module(f"benchmarks.{name}"), name) for name in NAMES)

@@ -1,6 +1,6 @@
-"""`python -m benchmarks settling`: does the incremental smoother settle at the minimum of nonlinear graphs, and say so?
+"""Does the incremental smoother settle at the minimum of nonlinear graphs, and say so?
 
-Scenes are sampled from the model itself (`pipelines.bench.sampled_traffic`): a vehicle drives by odometry and sees, in
+Scenes are sampled from the model itself (`benchmarks.sampled_traffic`): a vehicle drives by odometry and sees, in
 range and bearing, cars that follow each other (intelligent driver) and pedestrians who keep apart (social force). In
 others two pedestrians 2 m apart walk into each other and come closer than 0.5 m, either as the law says or, against it,
 straight on. Nothing is marginalised. After each frame every variable of `IncrementalSmoother` is compared with that of
@@ -12,6 +12,7 @@ starts from there: where it stays, the smoother is at another minimum of the sam
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -20,8 +21,8 @@ import gtsam
 import numpy as np
 import typer
 
-from data_tools.figures import FigureTable, cell
-from pipelines.bench.sampled_traffic import (
+from benchmarks.runner import Rows, Seed, each
+from benchmarks.sampled_traffic import (
     INITIAL_STATE_COVARIANCE,
     RANGE_BEARING_COVARIANCE,
     SampledFrame,
@@ -31,48 +32,16 @@ from pipelines.bench.sampled_traffic import (
     providers,
     sample_traffic,
 )
-from pipelines.cli.console import progress_bar
-from pipelines.cli.options import Verbose
-from pipelines.cli.tables import JsonFile, report
 from pipelines.process import one_thread
-from pipelines.tracking import Progress
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.numerics.arrays import FloatArray
 
+TITLE = "the incremental smoother against Levenberg-Marquardt on the whole graph"
 MIXED, EVADING, STRAIGHT = "mixed", "crossing, evading", "crossing, straight on"
 SILENT = 0.01  # standard deviations
 NEAR = 0.5  # m, that two who cross come to each other at least
 APART = 2.0  # m, at the start
 INTERVAL = 0.2  # s, of crossings
-
-
-@dataclass(frozen=True)
-class SettlingSettings:
-    """Numbers of mixed scenes and of crossings, and of frames of each."""
-
-    mixed: int = 150
-    crossings: int = 50
-    frames: int = 12
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class SettlingRow:
-    """Scenes of one kind.
-
-    settled: share of frames in which the smoother says so; difference: largest from the batch solver in those, in
-    standard deviations; silent: number of frames farther off than `SILENT`, other_minimum: those of them at another
-    minimum; unsettled_batch: number of frames in which the batch solver has not settled, which are left out of these
-    """
-
-    kind: str
-    scenes: int
-    frames: int
-    settled: float
-    difference: float
-    silent: int
-    other_minimum: int
-    unsettled_batch: int
 
 
 @dataclass(frozen=True)
@@ -83,23 +52,30 @@ class _Frame:
     other_minimum: bool
 
 
-def bench_settling(settings: SettlingSettings, progress: Progress | None = None) -> tuple[SettlingRow, ...]:
-    """A row for every kind of scenes."""
-    evading = settings.crossings // 2
-    wanted = {MIXED: settings.mixed, EVADING: evading, STRAIGHT: settings.crossings - evading}
-    rows, done = [], 0
+def settling(
+    mixed: Annotated[int, typer.Option("--mixed", min=0, help="Scenes of cars and pedestrians.")] = 150,
+    crossings: Annotated[
+        int, typer.Option("--crossings", min=0, help="Scenes of two pedestrians who walk into each other.")
+    ] = 50,
+    frames: Annotated[int, typer.Option("--frames", min=8, help="Length of a scene.")] = 12,
+    seed: Seed = 0,
+) -> Rows:
+    """Whether the incremental smoother settles at the minimum that Levenberg-Marquardt finds on the whole graph.
+
+    \b
+    Examples:
+      python -m benchmarks settling
+      python -m benchmarks settling --mixed 10 --crossings 10 --json figures.json
+    """
+    evading = crossings // 2
+    wanted = {MIXED: mixed, EVADING: evading, STRAIGHT: crossings - evading}
     with one_thread():
         for place, (kind, scenes) in enumerate(wanted.items()):
             found: list[_Frame] = []
-            for number in range(scenes):
-                rng = np.random.default_rng([settings.seed, place, number])
-                found += _compared(sample_scene(kind, rng, settings.frames))
-                done += 1
-                if progress is not None:
-                    progress(kind, done, sum(wanted.values()))
+            for number in each(range(scenes), kind):
+                found += _compared(sample_scene(kind, np.random.default_rng([seed, place, number]), frames))
             if found:
-                rows.append(_row(kind, scenes, found))
-    return tuple(rows)
+                yield TITLE, {"scenes": kind, "number": scenes, **_figures(found)}
 
 
 def sample_scene(kind: str, rng: np.random.Generator, frames: int) -> SampledTraffic:
@@ -167,65 +143,15 @@ def largest_difference(smoother: IncrementalSmoother, batch: BatchSolver) -> flo
     return largest
 
 
-def _row(kind: str, scenes: int, found: Sequence[_Frame]) -> SettlingRow:
+def _figures(found: Sequence[_Frame]) -> dict[str, float]:
+    """Of frames that have settled by both: the largest difference, and how many are farther off than `SILENT`."""
     judged = [one for one in found if one.settled and one.batch_settled]
     silent = [one for one in judged if one.difference > SILENT]
-    return SettlingRow(
-        kind,
-        scenes,
-        len(found),
-        sum(one.settled for one in found) / len(found),
-        max((one.difference for one in judged), default=float("nan")),
-        len(silent),
-        sum(one.other_minimum for one in silent),
-        sum(not one.batch_settled for one in found),
-    )
-
-
-def settling(
-    mixed: Annotated[int, typer.Option("--mixed", min=0, help="Scenes of cars and pedestrians.")] = 150,
-    crossings: Annotated[
-        int, typer.Option("--crossings", min=0, help="Scenes of two pedestrians who walk into each other.")
-    ] = 50,
-    frames: Annotated[int, typer.Option("--frames", min=8, help="Length of a scene.")] = 12,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the sampled scenes.")] = 0,
-    json_file: JsonFile = None,
-    verbose: Verbose = False,
-) -> None:
-    """Whether the incremental smoother settles at the minimum that Levenberg-Marquardt finds on the whole graph.
-
-    \b
-    Examples:
-      python -m benchmarks settling
-      python -m benchmarks settling --mixed 10 --crossings 10 --json figures.json
-    """
-    settings = SettlingSettings(mixed, crossings, frames, seed)
-    with progress_bar(unit="scenes") as progress:
-        rows = bench_settling(settings, progress)
-    columns = (
-        "scenes",
-        "number",
-        "frames",
-        "settled, %",
-        "off by, sigma",
-        "silent",
-        "at another minimum",
-        "LM unsettled",
-    )
-    shown = [
-        (
-            row.kind,
-            str(row.scenes),
-            str(row.frames),
-            cell(100 * row.settled, 2),
-            f"{row.difference:.1e}",
-            str(row.silent),
-            str(row.other_minimum),
-            str(row.unsettled_batch),
-        )
-        for row in rows
-    ]
-    table = FigureTable(
-        "the incremental smoother against Levenberg-Marquardt on the whole graph", columns, tuple(shown)
-    )
-    report([table], {"settings": settings, "rows": rows}, json_file)
+    return {
+        "frames": len(found),
+        "settled, %": 100 * sum(one.settled for one in found) / len(found),
+        "off by, sigma": max((one.difference for one in judged), default=math.nan),
+        "silent": len(silent),
+        "at another minimum": sum(one.other_minimum for one in silent),
+        "LM unsettled": sum(not one.batch_settled for one in found),
+    }

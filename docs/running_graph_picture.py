@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.sampled_traffic import SampledTraffic, providers, sample_traffic
 from data_tools.plots import running_graph_picture
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from factors import bearing_range_factor
@@ -16,7 +17,6 @@ from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable
 from saga_fg.tracking import Journal
 from saga_fg.tracking.graph_record import GraphRecord
-from tests.saga_fg.sampled_traffic import SampledTraffic, providers, sample_traffic
 
 SEED = 63
 POST = np.array([18.0, 9.0])

@@ -89,6 +89,20 @@ def journal_innovations(journal: Path) -> dict[str, FloatArray]:
     return {label: np.array(values) for label, values in sorted(found.items())}
 
 
+def clock_lines(journal: Path, scene: str | None) -> list[str]:
+    """Return what is known of the sensors' clocks at the end of a scene, a line each. Raises as `read_events`."""
+    events = [e for e in read_events(journal) if e.get("event") == "clocks" and scene in (None, e.get("scene"))]
+    lines = []
+    for name, clock in (events[-1]["clocks"] if events else {}).items():
+        by = f"{clock['objects']} objects in common" if clock["objects"] else "the order of arrival"
+        text = f"clock of {name}: {clock['offset']:+.3f} s (+- {clock['deviation']:.3f} s by {by})"
+        since = next((e["time"] for e in events if e["clocks"].get(name, {}).get("corrected")), None)
+        if clock["corrected"]:
+            text += f", corrected by {-clock['corrected']:+.3f} s, first at {since:.3f} s"
+        lines.append(text + ("" if clock["verdict"] == "used" else "; its frames are left out"))
+    return lines
+
+
 def read_graphs(journal: Path) -> dict[str, list[Event]]:
     """Read the graphs of all frames, in order of time, by scene. Raises `InputError` as `read_events`."""
     graphs: dict[str, list[Event]] = {}

@@ -9,11 +9,11 @@ With horizons, the tracks reported at t are predicted to t plus each of them as 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from data_tools.datasets.detection_files import prediction_writer, predictions_p
 from pipelines.process import one_thread
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.tracking import SensorTime
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
 from saga_fg.types.predicted_tracks import LONGEST, PredictedTracks
@@ -51,18 +52,34 @@ class PredictingTracker(Protocol):
         ...
 
 
+@runtime_checkable
+class ClockComparing(Protocol):
+    """A tracker that compares the clocks of its sensors."""
+
+    @property
+    def sensor_times(self) -> dict[str, SensorTime]:
+        """The clock of each sensor against the consensus of all."""
+        ...
+
+    def take_clocks(self, other: Any) -> None:
+        """Take over the usual steps and the records of the sensors from the tracker of the scene before."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class TrackedScene:
     """A scene and its tracks, one table for each of its timestamps.
 
     milliseconds  that the tracker took for each frame
     predictions   made at its timestamps, where horizons were given
+    clocks        of its sensors, at the end, where there are several
     """
 
     scene: Scene
     tracks: tuple[Tracks, ...]
     milliseconds: tuple[float, ...]
     predictions: tuple[PredictedTracks, ...] = ()
+    clocks: Mapping[str, SensorTime] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
@@ -98,7 +115,9 @@ def track_scene(
             wanted.append(latest if latest is not None and latest.timestamp == moment else tracker.tracks(moment))
             if horizons is not None and latest is not None:
                 predicted += _predicted(tracker, moment, horizons, latest.timestamp)
-    return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted))
+    clocks = tracker.sensor_times if isinstance(tracker, ClockComparing) else {}
+    compared = clocks if len(clocks) > 1 else {}
+    return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted), compared)
 
 
 def _predicted(

@@ -139,6 +139,19 @@ def _wrong_clock(rng: Random, now: float) -> bytes:
     return _line(_frame(rng, now + 3600.0, sensor=str(rng.choice(SENSORS))))
 
 
+def _wrong_sensor(rng: Random, now: float) -> bytes:
+    """A sensor of its own with a steadily wrong, a drifting or a jumping clock, whose frames are valid."""
+    second = int(now - EPOCH)
+    offset = {
+        "ahead": 1.0,
+        "behind": -3600.0,
+        "drifting": 1e-2 * (now - EPOCH),
+        "jumping": float(np.random.default_rng(second).uniform(-10.0, 10.0)),
+    }
+    name = str(rng.choice(list(offset)))
+    return _line(_frame(rng, now + offset[name], sensor=name))
+
+
 def _names(rng: Random, now: float) -> bytes:
     return _line(_frame(rng, now, sensor=f"hostile-{rng.integers(10**9)}"))
 
@@ -154,6 +167,7 @@ def _valid(rng: Random, now: float) -> bytes:
 WEIGHTED: dict[Callable[[Random, float], bytes], float] = {
     **dict.fromkeys((_numbers, _far, _range_rate, _bits, _types, _damaged, _valid), 3.0),
     **dict.fromkeys((_integer, _constant, _bytes, _names, _request, _glitch, _number), 2.0),
+    _wrong_sensor: 4.0,
     **dict.fromkeys((_deep, _clock, _wrong_clock), 0.5),
     **dict.fromkeys((_long, _crowd, _heavy), 0.1),
 }

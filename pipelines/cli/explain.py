@@ -39,7 +39,7 @@ def explain(
     from data_tools.figures import write_figures
     from data_tools.files.atomic_files import atomic_file, check_writable
     from data_tools.files.error_messages import error_context
-    from pipelines.explaining import graph_picture, journal_of, read_graphs, read_track, story
+    from pipelines.explaining import clock_lines, graph_picture, journal_of, read_graphs, read_track, story
     from saga_fg.errors import InputError
 
     journal = journal_of(result)
@@ -58,7 +58,7 @@ def explain(
         check_writable(json_file)
     events = read_track(journal, track, scene)
     with error_context(str(journal)):
-        lines = story(events)
+        lines = [*clock_lines(journal, str(events[0].get("scene"))), *story(events)]
     for line in lines:
         typer.echo(line)
     if json_file is not None:

@@ -64,6 +64,7 @@ def serve(
         str | None,
         typer.Option("--predict", help="Answer every frame with its tracks these s later, as well.", metavar="S,S,..."),
     ] = None,
+    learn_offsets: how.LearnOffsetsOption = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -92,6 +93,7 @@ def serve(
     if not verbose:
         for handler in logging.getLogger().handlers:
             handler.addFilter(LogLimitFilter())
+    how.check_learn_offsets(learn_offsets, method)
     settings = how.configured("file", config, method, estimator, lag, association, interactions)
     bounds = StreamSettings() if limits is None else load_settings(StreamSettings, limits)
     if reorder is not None:
@@ -107,6 +109,8 @@ def serve(
         if keeper is not None:
             keeper.stop()
         typer.echo(_summary(stream.status()), err=True)
+        if learn_offsets is not None:
+            how.write_offsets(learn_offsets, [stream.clocks()], settings, "a stream")
     if stop.number == signal.SIGTERM:
         raise typer.Exit(TERMINATED)
 
@@ -207,6 +211,14 @@ def _summary(answer: dict[str, Any]) -> str:
     latency = ", ".join(f"{name} {ms:g}" for name, ms in answer["latency_ms"].items()) or "none yet"
     error = (answer.get("state") or {}).get("error")
     kept = "" if error is None else f"\nthe state is not kept: {error}"
-    return (
-        f"{counts}{kept}\nlatency, ms: {latency}\nmemory: {answer['memory_mb']:g} MB, up for {answer['seconds']:.0f} s"
-    )
+    clocks = "".join(f"\n{_clock(name, each)}" for name, each in answer.get("clocks", {}).items())
+    memory = f"memory: {answer['memory_mb']:g} MB, up for {answer['seconds']:.0f} s"
+    return f"{counts}{kept}{clocks}\nlatency, ms: {latency}\n{memory}"
+
+
+def _clock(name: str, clock: dict[str, Any]) -> str:
+    """The clock of a sensor in words."""
+    by = f"{clock['objects']} objects in common" if clock["objects"] else "the order of arrival"
+    state = "" if clock["verdict"] == "used" else "; its frames are left out"
+    corrected = f", corrected by {-clock['corrected']:+.3f} s" if clock["corrected"] else ""
+    return f"clock of {name}: {clock['offset']:+.3f} s (+- {clock['deviation']:.3f} s by {by}){corrected}{state}"

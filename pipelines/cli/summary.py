@@ -12,6 +12,7 @@ import typer
 if TYPE_CHECKING:
     from pipelines.config import TrackConfig
     from pipelines.tracking import TrackedScene
+    from saga_fg.tracking import SensorTime
 
 
 @dataclass
@@ -26,6 +27,7 @@ class Summary:
     best_score: dict[tuple[str, int], float] = field(default_factory=dict)  # of each track, by scene and id
     milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
     classes: set[str] = field(default_factory=set)
+    clocks: dict[str, Mapping[str, SensorTime]] = field(default_factory=dict)  # of the sensors, by scene
 
     def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
         """Pass runs on and count them."""
@@ -34,6 +36,8 @@ class Summary:
             self.frames += run.frames
             self.seconds += run.seconds
             self.milliseconds[run.scene.name] = run.milliseconds
+            if run.clocks:
+                self.clocks[run.scene.name] = run.clocks
             self.boxes += sum(len(tracks) for tracks in run.tracks)
             for tracks in run.tracks:
                 self.classes.update(tracks.boxes.label.tolist())
@@ -49,7 +53,9 @@ class Summary:
 
         rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
         configuration = write_settings(settings, comments=False)
-        write_run_record(self.output, RunRecord(method, configuration, rounded, recordings=recordings))
+        write_run_record(
+            self.output, RunRecord(method, configuration, rounded, recordings=recordings, clocks=self.clocks)
+        )
 
     def show(self) -> None:
         """Print the line on stdout."""

@@ -12,7 +12,7 @@ from pipelines.cli import tracking_options as how
 from pipelines.cli.console import progress_bar
 from pipelines.cli.datasets import Source, dataset_commands
 from pipelines.cli.scaling import RayAddress, Workers, at_scale, exit_on_failures, run_at_scale
-from pipelines.cli.summary import Summary
+from pipelines.cli.summary import Summary, counted
 
 if TYPE_CHECKING:
     from data_tools.datasets.source import DatasetSource
@@ -28,6 +28,7 @@ def _track(
     interactions: how.InteractionsOption = None,
     predict: how.PredictOption = None,
     explain: how.ExplainOption = False,
+    learn_offsets: how.LearnOffsetsOption = None,
     workers: Workers = None,
     ray: RayAddress = None,
     config: options.Config = None,
@@ -42,6 +43,7 @@ def _track(
 
     settings = how.configured(source.family, config, method, estimator, lag, association, interactions)
     options.apart(output, *source.input_files())
+    how.check_learn_offsets(learn_offsets, method, at_scale(workers, ray))
     kept, horizons = how.journal(explain, output, at_scale(workers, ray)), how.horizons(predict, method)
     doubts = Doubts(settings.of_method(method), load_config(source.family), source.option_for)
     if at_scale(workers, ray):
@@ -64,6 +66,10 @@ def _track(
     doubts.add(summary.classes)
     doubts.finish()
     summary.show()
+    if learn_offsets is not None:
+        how.write_offsets(
+            learn_offsets, summary.clocks.values(), settings, f"{counted(summary.scenes, 'scene')}, {source.name}"
+        )
 
 
 _EXAMPLES = (

@@ -11,8 +11,11 @@ from saga_fg.errors import InputError
 from saga_fg.tracking import AssociationName, EstimatorName
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
     from pipelines.config import Method, TrackConfig
     from saga_fg.numerics.arrays import FloatArray
+    from saga_fg.tracking import SensorTime
 
 _METHOD = typer.Option(
     "--method",
@@ -50,6 +53,15 @@ InteractionsOption = Annotated[
 ExplainOption = Annotated[
     bool,
     typer.Option("--explain", help="Keep a journal beside the output, for `saga-fg explain`: OUTPUT.journal.jsonl."),
+]
+LearnOffsetsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--learn-offsets",
+        help="YAML file to write: the offsets of the sensors' clocks, from objects that several of them see, for "
+        "`--config`.",
+        metavar="FILE",
+    ),
 ]
 PredictOption = Annotated[
     str | None,
@@ -128,3 +140,27 @@ def journal(explain: bool, output: Path, at_scale: bool) -> Path | None:
     if explain and at_scale:
         raise InputError("--explain: goes without --workers and --ray")
     return journal_of(output) if explain else None
+
+
+def check_learn_offsets(path: Path | None, method: str, at_scale: bool = False) -> None:
+    """Raise `InputError` where --learn-offsets would have no effect, or its file is not writable."""
+    from data_tools.files.atomic_files import check_writable
+
+    if path is None:
+        return
+    if method == "centerpoint":
+        raise InputError("--learn-offsets: expected --method saga or kf")
+    if at_scale:
+        raise InputError("--learn-offsets: goes without --workers and --ray")
+    check_writable(path)
+
+
+def write_offsets(path: Path, scenes: Iterable[Mapping[str, SensorTime]], settings: TrackConfig, origin: str) -> None:
+    """Write the file of --learn-offsets, and say what is in it."""
+    from data_tools.files.atomic_files import write_text
+    from pipelines.learning import offset_fragment
+
+    text, offsets = offset_fragment(scenes, settings.sensors, origin)
+    write_text(path, text)
+    found = ", ".join(f"{name} {offset:+.4f} s" for name, offset in offsets.items())
+    typer.echo(f"{path}: {found or 'no two sensors have moving objects in common'}", err=True)

@@ -13,6 +13,7 @@ from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable
 from pipelines.config import load_config
+from pipelines.learning import clock_table
 from pipelines.report.charts import Chart, accuracy_charts, latency_chart
 from pipelines.report.images import thumbnails
 from pipelines.report.page import Report
@@ -56,6 +57,7 @@ def result_report(source: DatasetSource, result: Path, beside: Path | None = Non
         if each.record is not None:
             times = [ms for of_scene in each.record.milliseconds.values() for ms in of_scene]
             own_charts += [latency_chart(np.array(times))] if times else []
+            own_tables += [clock_table(each.record.clocks)] if each.record.clocks else []
         tables += [replace(table, title=prefix + table.title) for table in own_tables]
         charts += [replace(chart, title=prefix + chart.title) for chart in own_charts]
     first = results[0]

@@ -1,7 +1,7 @@
 """The record of a run, written beside its result for reports: method, version, configuration and times.
 
 {"method": "saga", "version": "0.1.0", "configuration": YAML, "milliseconds": {scene: [of each frame]},
- "recordings": how they were read}
+ "recordings": how they were read, "clocks": {scene: {sensor: its clock}} where there are several}
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from data_tools.files.atomic_files import write_text
 from data_tools.files.input_files import read_bytes
 from data_tools.files.json_stream import parsed_json
 from saga_fg.errors import InputError
+from saga_fg.tracking import SensorTime
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class RunRecord:
     """method; version of saga-fg; configuration, YAML; milliseconds in the tracker for every frame, by scene.
 
     recordings  how the dataset was read, `DatasetSource.kept`
+    clocks      of the sensors by scene
     """
 
     method: str
@@ -32,6 +34,7 @@ class RunRecord:
     milliseconds: Mapping[str, Sequence[float]]
     version: str = version("saga-fg")
     recordings: Mapping[str, Any] = field(default_factory=dict)
+    clocks: Mapping[str, Mapping[str, SensorTime]] = field(default_factory=dict)
 
 
 def record_path(result: Path) -> Path:
@@ -53,7 +56,10 @@ def read_run_record(result: Path) -> RunRecord | None:
     try:
         milliseconds = {str(name): [float(ms) for ms in times] for name, times in raw["milliseconds"].items()}
         kept = dict(raw.get("recordings", {}))
-        return RunRecord(str(raw["method"]), str(raw["configuration"]), milliseconds, str(raw["version"]), kept)
+        clocks = {
+            str(name): {str(k): SensorTime(**v) for k, v in of.items()} for name, of in raw.get("clocks", {}).items()
+        }
+        return RunRecord(str(raw["method"]), str(raw["configuration"]), milliseconds, str(raw["version"]), kept, clocks)
     except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: expected the record of a run: {error}") from error
 

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -28,10 +28,10 @@ from pipelines.serving.messages import (
 from pipelines.serving.numbering import Numbering
 from pipelines.serving.reordering import Reordering
 from pipelines.serving.settings import StreamSettings
-from pipelines.tracking import OnlineTracker, PredictingTracker
+from pipelines.tracking import ClockComparing, OnlineTracker, PredictingTracker
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking import TimeVerdict
+from saga_fg.tracking import SensorTime, TimeVerdict
 
 log = logging.getLogger(__name__)
 
@@ -165,8 +165,14 @@ class StreamTracker(Generic[Client]):
             "cpu_seconds": round(time.process_time(), 3),
             "last_seq": dict(self._numbering.last),
             "taken": dict(self._numbering.taken),
+            "clocks": {name: _rounded(asdict(each)) for name, each in self.clocks().items()},
             **kept,
         }
+
+    def clocks(self) -> dict[str, SensorTime]:
+        """Return the clocks of the sensors, where there are several."""
+        clocks = self._tracker.sensor_times if isinstance(self._tracker, ClockComparing) else {}
+        return clocks if len(clocks) > 1 else {}
 
     def state(self) -> tuple[dict[str, Any], dict[str, int], int]:
         """Return the state (without held frames) as a tree of values, the last number of each sensor, the version."""
@@ -206,7 +212,10 @@ class StreamTracker(Generic[Client]):
             return [(client, self._predictions(message.horizons))]
         answers = self._flush()  # held frames would bring numbers back
         if message.sensor is None:
+            before = self._tracker
             self._begin_anew()
+            if isinstance(self._tracker, ClockComparing):
+                self._tracker.take_clocks(before)
             return [*answers, (client, {"type": "reset"})]
         self._forget(message.sensor)
         self.version += 1
@@ -335,3 +344,8 @@ def _origin(error: Exception) -> tuple[str, int]:
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
     return type(error).__name__, 0 if trace is None else trace.tb_lineno
+
+
+def _rounded(values: Answer) -> Answer:
+    """Return the times to the microsecond."""
+    return {name: round(value, 6) if isinstance(value, float) else value for name, value in values.items()}

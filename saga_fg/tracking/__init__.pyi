@@ -1,4 +1,5 @@
 from .clock import ClockSettings, TimeVerdict
+from .clock_offsets import SensorTime
 from .greedy import GreedySettings, GreedyTracker
 from .journal import Journal
 from .names import AssociationName, EstimatorName
@@ -27,6 +28,7 @@ __all__ = [
     "GreedyTracker",
     "Journal",
     "Observer",
+    "SensorTime",
     "SpeedPriorSettings",
     "Stage",
     "StationaritySettings",

@@ -19,6 +19,7 @@ from saga_fg.numerics.columns import Columns
 from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
+from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.by_class import DEFAULT, class_numbers
 from saga_fg.types.frame import Frame
@@ -155,6 +156,11 @@ class GreedyTracker:
         return _tracks(newest, timestamp)
 
     @property
+    def sensor_times(self) -> dict[str, SensorTime]:
+        """The clock of each sensor against the consensus of all, by the order of arrival."""
+        return sensor_times(self._clock, SharedObservations())
+
+    @property
     def max_jump(self) -> float:
         """Distance from the newest frame from which another has to be confirmed, s."""
         return self.settings.clock.max_jump
@@ -168,6 +174,10 @@ class GreedyTracker:
         require_type("snapshot", snapshot, GreedySnapshot)
         self._memory, self._next_id, self._clock = snapshot.memory, snapshot.next_id, snapshot.clock
         self.time_verdict = snapshot.time_verdict
+
+    def take_clocks(self, other: GreedyTracker) -> None:
+        """Take over the usual steps and the records of the sensors' clocks from a tracker of the scene before."""
+        self._clock = other._clock.begun_anew()
 
     def _match(self, boxes: Boxes, p: FloatArray, now: float) -> IntArray:
         """(m,) row of the track each detection takes, or -1."""

@@ -4,6 +4,7 @@
     matched    candidates with their squared distances in sigmas, the chosen one, and why the others were not chosen
     missed     candidates, none of which was chosen
     deleted    time without a detection, existence, and the limit that was passed
+    clocks     offsets of the sensors' clocks, whenever one is corrected anew, or its frames are left out or used again
     graph      running graph of the interval that the frame ended (`saga_fg.tracking.graph_record`), once a frame
 
 `matched` and `missed` also list the edges that acted on the prediction, and the effect of each. Positions are in world
@@ -13,6 +14,7 @@ coordinates.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,7 @@ class Journal:
         self._matched: TrackerView | None = None
         self._effects: list[EdgeEffect] = []
         self._start: float | None = None
+        self._clocks: dict[str, tuple[float, str]] = {}
 
     def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
         """Take note of a stage."""
@@ -63,7 +66,17 @@ class Journal:
         elif stage == "delete":
             now = view()
             self._write_deletions(now)
+            self._write_clocks(now)
             self._before = now
+
+    def _write_clocks(self, now: TrackerView) -> None:
+        state: dict[str, tuple[float, str]] = {
+            name: (round(each.corrected, 2), each.verdict) for name, each in now.clocks.items()
+        }
+        if state != self._clocks:
+            clocks = {name: asdict(each) for name, each in now.clocks.items()}
+            self._write({"event": "clocks", "time": now.timestamp, "sensor": now.sensor, "clocks": clocks})
+            self._clocks = state
 
     def _edge_effects(self, now: TrackerView) -> list[EdgeEffect]:
         before = self._before

@@ -16,6 +16,7 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
+from saga_fg.tracking.clock_offsets import SensorTime, sensor_times
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.prediction import node_table
 from saga_fg.tracking.track_table import TrackTable
@@ -40,6 +41,7 @@ class TrackerView:
     matching      rows of tracks and of measurements, from the stage `associate` on
     initiated     (b,) rows of the measurements that initiated the last b tracks, at the stage `initiate`
     boxes         of the tracks, in the world
+    clocks        of the sensors
     running       the running graph, where factor providers take part; its positions are local
     """
 
@@ -54,6 +56,7 @@ class TrackerView:
     matching: Matching | None
     initiated: IntArray
     boxes: Boxes
+    clocks: dict[str, SensorTime]
     running: SceneFactorGraph | None
 
     @classmethod
@@ -81,6 +84,7 @@ class TrackerView:
             matching,
             np.empty(0, dtype=np.int64) if initiated is None else initiated,
             replace(state.boxes(now.position, now.velocity)),
+            sensor_times(state.clock, state.shared) if len(state.clock.sensors) > 1 else {},
             state.joint.estimator.graph() if state.providers else None,
         )
 

@@ -27,6 +27,8 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.clock import TimeVerdict
+from saga_fg.tracking.clock_comparison import compare_clocks, compare_left_out
+from saga_fg.tracking.clock_offsets import SensorTime, sensor_times
 from saga_fg.tracking.deletion import delete_tracks
 from saga_fg.tracking.existence import update_existence
 from saga_fg.tracking.handover import hand_over
@@ -140,7 +142,9 @@ class Tracker:
         sensor = self.sensor(frame.sensor)
         timestamp = frame.timestamp + sensor.time_offset
         if state.accept_time(timestamp, frame.sensor, self._clock, self.max_delay):
-            return self._process_frame(state, frame, sensor, state.relative(timestamp))
+            time = state.relative(state.clock.time_of(timestamp, frame.sensor))
+            return self._process_frame(state, frame, sensor, time)
+        compare_left_out(state, timestamp, frame, sensor)
         state.assignment = Assignment.empty()
         return report_tracks(state, state.clock.newest)
 
@@ -164,6 +168,7 @@ class Tracker:
         likelihood = state.class_groups.likelihood(measurements.boxes.label, sensor)
         relative = state.ego.relative_positions(measurements, frame)
         measurements = measurements.with_context(delay, likelihood, relative)
+        compare_clocks(state, frame.timestamp + sensor.time_offset, measurements)
         state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
         self._notify("measure", state, frame.sensor, measurements)
 
@@ -241,6 +246,10 @@ class Tracker:
 
     __setstate__ = restore
 
+    def take_clocks(self, other: Tracker) -> None:
+        """Take over the usual steps and the records of the sensors' clocks from a tracker of the scene before."""
+        self._state.clock = other._state.clock.begun_anew()
+
     def sensor(self, name: str) -> Sensor:
         """The model of a sensor."""
         return sensor_model(self.sensors, name)
@@ -254,6 +263,11 @@ class Tracker:
     def time_verdict(self) -> TimeVerdict:
         """The verdict on the timestamp of the latest frame, see `saga_fg.tracking.clock`."""
         return self._state.time_verdict
+
+    @property
+    def sensor_times(self) -> dict[str, SensorTime]:
+        """The clock of each sensor against the consensus of all: offset, its standard deviation, drift and jitter."""
+        return sensor_times(self._state.clock, self._state.shared)
 
     @property
     def late_frames(self) -> int:

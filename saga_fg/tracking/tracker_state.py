@@ -25,6 +25,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, s
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
+from saga_fg.tracking.clock_offsets import SharedObservations
 from saga_fg.tracking.ego_node import EgoNode
 from saga_fg.tracking.joint_state import JointTrackState, new_estimator
 from saga_fg.tracking.kinematics import Kinematics
@@ -53,7 +54,8 @@ class TrackerSnapshot:
     time          of the state, s
     origin        (2,) of local positions in the world, m
     next_id       of the next new track
-    clock         timestamps accepted so far
+    clock         newest time, and the clocks of the sensors
+    shared        objects that several sensors have seen, which tell the offsets of their clocks
     time_verdict  on the timestamp of the latest frame
     late_frames   number of frames left out because they came late
     assignment    of the latest frame
@@ -70,6 +72,7 @@ class TrackerSnapshot:
     origin: FloatArray
     next_id: int
     clock: Clock
+    shared: SharedObservations
     time_verdict: TimeVerdict
     late_frames: int
     assignment: Assignment
@@ -90,7 +93,7 @@ class TrackerState:
         self.graph: SceneGraph | None = None
         self.start, self.time, self.origin = 0.0, 0.0, np.zeros(2)
         self.next_id = 1
-        self.clock = Clock()
+        self.clock, self.shared = Clock(), SharedObservations()
         self.time_verdict: TimeVerdict = "accepted"
         self.late_frames = 0
         self.assignment = Assignment.empty()
@@ -155,13 +158,16 @@ class TrackerState:
         self.origin = np.round(place)
 
     def accept_time(self, timestamp: float, sensor: str, settings: ClockSettings, max_delay: float) -> bool:
-        """Judge the time of a frame, s; return whether it is to be used.
+        """Judge the timestamp of a frame, s; return whether it is to be used, at `clock.time_of` it.
 
         Where the clock was set back, all tracks are deleted; where it was set ahead, those that coast for too long.
         """
-        before = self.clock.newest
+        before, known = self.clock.newest, self.clock.sensor(sensor)
         verdict, self.clock = self.clock.judged(timestamp, sensor, settings, max_delay)
-        self.time_verdict = verdict
+        self.time_verdict, own = verdict, self.clock.sensor(sensor)
+        if known is not None and own is not None and own.segment != known.segment:
+            self.shared = self.shared.without(sensor)
+        timestamp = self.clock.time_of(timestamp, sensor)
         if verdict in ("late", "unconfirmed"):
             self.late_frames += verdict == "late"
             text = "frame of %s at %.3f s is left out: %s, %+.3f s from the newest one"

@@ -15,7 +15,7 @@ from pipelines.config import load_config
 from pipelines.serving import StreamTracker
 from pipelines.serving.messages import encode
 
-FINE = HostileBench(7, 10, 10, 0, 0, 2, 1, 3, 40, 20, 0.1, 0.0, (100.0, 101.0), 0, 0, {}, 2.0)
+FINE = HostileBench(10, 10, 10, 0, 0, 0, 0, 3, 40, 20, 0.1, 0.0, (100.0, 101.0), 0, 0, {}, 2.0)
 
 
 def test_no_good_frame_is_lost_or_doubled_by_kills_and_floods():
@@ -30,9 +30,9 @@ def test_no_good_frame_is_lost_or_doubled_by_kills_and_floods():
 
 def test_what_falls_short_is_named():
     assert FINE.shortcomings == []
-    bad = replace(FINE, lost=1, doubled=2, longest_stall=0.7, memory=(100.0, 106.0))
+    bad = replace(FINE, tracked=9, lost=1, doubled=2, longest_stall=0.7, memory=(100.0, 106.0))
     assert [text.split(",")[0] for text in bad.shortcomings] == [
-        *("1 frames lost", "2 frames doubled"),
+        *("1 frames lost", "2 frames doubled", "9 of 10 frames tracked"),
         *("a stall of 0.700 s", "memory grew to 1.060 of the start"),
     ]
 

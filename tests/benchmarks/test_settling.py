@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.app import app
+from benchmarks.sampled_traffic import providers
 from benchmarks.settling import APART, EVADING, MIXED, NEAR, SILENT, STRAIGHT, largest_difference, sample_scene
-from pipelines.bench.sampled_traffic import providers
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 
 
@@ -40,5 +40,5 @@ def test_the_command_prints_a_row_for_every_kind(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, f"settling --mixed 1 --crossings 2 --frames 8 --json {figures}".split())
     assert result.exit_code == 0, result.output
     rows = json.loads(figures.read_text())["rows"]
-    assert [row["kind"] for row in rows] == [MIXED, EVADING, STRAIGHT]
-    assert all(row["frames"] == 8 and 0 <= row["settled"] <= 1 for row in rows)
+    assert [row["scenes"] for row in rows] == [MIXED, EVADING, STRAIGHT]
+    assert all(row["frames"] == 8 and 0 <= row["settled, %"] <= 100 for row in rows)

@@ -5,6 +5,13 @@ import copy
 import numpy as np
 import pytest
 
+from benchmarks.sampled_traffic import (
+    DetectionProvider,
+    ObjectProvider,
+    VehicleProvider,
+    providers,
+    sample_traffic,
+)
 from factors import ResidualFactors, prior_factor
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver, GraduatedNonConvexity, IncrementalSmoother, RelinearisationSettings
@@ -13,13 +20,6 @@ from tests.saga_fg.estimator_programs import random_program
 from tests.saga_fg.graph.test_running_graph_linear import MILLISECONDS, USUAL, largest_errors
 from tests.saga_fg.graph_estimator import GraphEstimator
 from tests.saga_fg.random_graphs import CAR, CONE
-from tests.saga_fg.sampled_traffic import (
-    DetectionProvider,
-    ObjectProvider,
-    VehicleProvider,
-    providers,
-    sample_traffic,
-)
 
 
 class Batch(GraphEstimator):

@@ -1,6 +1,6 @@
 """Law 2 of the running graph: nothing marginalised, iSAM2 is Levenberg-Marquardt on everything; with a lag, consistent.
 
-Scenes (`tests.saga_fg.sampled_traffic`): intelligent drivers, pedestrians who keep apart, range and bearing, the
+Scenes (`benchmarks.sampled_traffic`): intelligent drivers, pedestrians who keep apart, range and bearing, the
 vehicle's own pose.
 """
 
@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factors import Robust, SolverSettings
-from saga_fg.estimators import IncrementalSmoother, RelinearisationSettings
-from saga_fg.graph import EGO_POSE, OBJECT
-from tests.saga_fg.sampled_traffic import (
+from benchmarks.sampled_traffic import (
     DetectionProvider,
     ObjectProvider,
     VehicleProvider,
     providers,
     sample_traffic,
 )
+from factors import Robust, SolverSettings
+from saga_fg.estimators import IncrementalSmoother, RelinearisationSettings
+from saga_fg.graph import EGO_POSE, OBJECT
 
 EXACT = SolverSettings(tolerance=1e-7)
 

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from benchmarks.sampled_traffic import providers, sample_traffic
 from factors import SolverSettings, gaussian_factor, marginal_moments, pose_prior_factor, prior_factor
 from saga_fg.estimators import BatchSmoother, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import (
@@ -23,7 +24,6 @@ from saga_fg.graph import (
     key_of,
 )
 from saga_fg.graph.keys import LARGEST, described
-from tests.saga_fg.sampled_traffic import providers, sample_traffic
 
 
 class Once:

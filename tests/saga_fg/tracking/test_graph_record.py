@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 
+from benchmarks.sampled_traffic import providers, sample_traffic
 from factors import ResidualFactors
 from saga_fg import Detection, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.estimators import IncrementalSmoother
@@ -14,7 +15,6 @@ from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.tracking import Journal
 from saga_fg.tracking.graph_record import GraphRecord
-from tests.saga_fg.sampled_traffic import providers, sample_traffic
 
 RULES = (Following(interaction=SharedVelocity(along_heading=True), rate=1.5),)
 
