@@ -107,10 +107,10 @@ class SensorClock:
 
     @property
     def record(self) -> float:
-        """Weight of its vote, 0 to 1: the share of frames that kept its step, small while there are few, and where
-        steps are irregular."""
+        """Weight of its vote, 0 to 1: the squared share of frames that kept its step, small while there are few, and
+        where steps are irregular. By the square a few regular sensors outweigh many irregular ones."""
         regular = self.step / (self.step + self.jitter) if self.step else 1.0
-        return regular * (self.kept + 1) / (self.kept + self.broken + 4)
+        return (regular * (self.kept + 1) / (self.kept + self.broken + 4)) ** 2
 
     @property
     def trusted(self) -> bool:
@@ -131,7 +131,7 @@ class SensorClock:
 
     def with_time(self, time: float, elapsed: float, max_delay: float) -> bool:
         """Return True if its latest accepted frame was about as far before a time, s, as it came before it."""
-        return self.time is not None and abs(self.time + elapsed - self.seen - time) <= max_delay + REGULAR * self.step
+        return self.time is not None and abs(self.time + elapsed - self.seen - time) <= max_delay / 2 + self.step
 
     def paced(self, time: float, elapsed: float, max_delay: float) -> bool:
         """Return True if a time, s, has advanced as the elapsed time has: the frame does not come after a stall."""
@@ -329,11 +329,9 @@ class Clock:
         going_on = [r for r in against if far or not r.with_time(time, elapsed, max_delay)]
         names = {name for name, _ in self.accepted}
         of_one = len(names) == 1 and names.isdisjoint(r.name for r in (own, *with_it))  # wrong from the start, maybe
-        outweighs = own.record + sum(r.record for r in with_it) > sum(r.record for r in going_on)
-        if with_it and outweighs and (of_one or (going_on and far)):
-            return True
-        repeated = own.run > 1 and own.paced(time, elapsed, max_delay) and all(r.run > 1 for r in with_it)
-        if with_it and outweighs and not far and repeated:
+        steady = [r for r in with_it if r.run > 1] if own.run > 1 and own.paced(time, elapsed, max_delay) else []
+        for_it = with_it if of_one or (going_on and far) else [] if far else steady
+        if for_it and own.record + sum(r.record for r in for_it) > sum(r.record for r in going_on):
             return True
         if going_on:
             return False
@@ -359,7 +357,7 @@ class Clock:
         if r.doubt is None:
             return False
         apart = time - r.doubt - (elapsed - r.seen)
-        return abs(apart) <= max_delay + REGULAR * max(r.step, own.step)
+        return abs(apart) <= max_delay + min(REGULAR * max(r.step, own.step), QUIET / 2)
 
     def _far(self, time: float, limit: float) -> bool:
         return abs(time - self.newest) > limit

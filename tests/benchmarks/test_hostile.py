@@ -80,3 +80,21 @@ def test_hostile_messages_are_lines_of_every_kind():
     for kind in KINDS:
         assert all(0 < line.count(b"\n") + 1 < 3 for line in [kind(rng, EPOCH)])
     assert hostile_line(np.random.default_rng(5), EPOCH) == hostile_line(np.random.default_rng(5), EPOCH)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_clocks_of_others_leave_out_hardly_any_frame(seed: int):
+    """Three seconds of hostile messages, four of them between two good frames; nobody resets."""
+    config, rng, answers = load_config("file"), np.random.default_rng([seed, 7]), Counter[str]()
+    service = StreamTracker[None](lambda: config.new_tracker("kf"))
+    for seq in range(150):
+        for number, sensor in enumerate(SENSORS):
+            elapsed = (seq + number / 2) / 50
+            for _ in range(4):
+                for line in hostile_line(rng, EPOCH + elapsed).split(b"\n"):
+                    if b"reset" not in line and len(line) < 2**12:
+                        service.handle(line, None)
+            frame = {"seq": seq, "timestamp": EPOCH + elapsed, "sensor": sensor, "detections": []}
+            ((_, answer),) = service.handle(encode(frame), None)
+            answers[answer["type"]] += seq > 10
+    assert answers["tracks"] >= 0.97 * (answers.total())
