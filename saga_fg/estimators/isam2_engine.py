@@ -109,8 +109,15 @@ class Engine:
             return None
 
     def covariance(self, keys: list[int]) -> FloatArray:
-        """Joint covariance of variables on increments from the base, in the order given, as the tree has it."""
-        return np.asarray(self.isam.jointMarginalCovariance(keys).fullMatrix())
+        """Joint covariance of variables on increments from the base, in the order given, as the tree has it.
+
+        Where the tree has too few digits, all factors are eliminated anew; raises `FactorError` where that fails, too.
+        """
+        with contextlib.suppress(RuntimeError):
+            P = np.asarray(self.isam.jointMarginalCovariance(keys).fullMatrix())
+            if np.isfinite(P).all():
+                return P
+        return marginal_moments(self.linear(), keys, "qr")[1]
 
     def linear(self) -> gtsam.GaussianFactorGraph:
         """All linear factors that it holds, the sharpest first."""

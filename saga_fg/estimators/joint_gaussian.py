@@ -21,7 +21,7 @@ from saga_fg.estimators.dynamics import Dynamics, noise_ratio, predict
 from saga_fg.estimators.filter_steps import predicted
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import Partition, zeros
-from saga_fg.graph.messages import with_names
+from saga_fg.graph.messages import solver_error, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
@@ -36,6 +36,7 @@ def joint_gaussian(
     """The joint Gaussian of variables by components, whose ids in `layout` are those of nodes or their keys.
 
     Nodes with their states, other variables with increments from their base; covariance: joint one of some variables.
+    Raises `GraphError` where they are not determined.
     """
     part = components(held.factors.rows[row] for held in graph.groups.values() for row in held.rows.tolist())
     _, own = np.unique([part[key] for key in keys], return_inverse=True)
@@ -44,8 +45,11 @@ def joint_gaussian(
     for k, label in enumerate(own.tolist()):
         members.setdefault(label, []).append(k)
     blocks, group, component = zeros(partition), partition.group.tolist(), partition.row.tolist()
-    for its in members.values():
-        blocks[group[its[0]]][component[its[0]]] = covariance([keys[k] for k in its])
+    try:
+        for its in members.values():
+            blocks[group[its[0]]][component[its[0]]] = covariance([keys[k] for k in its])
+    except FactorError as error:
+        raise solver_error(graph.variables, graph.groups, error) from error
     base = graph.base
     mean = [
         np.asarray(graph.state(key))

@@ -9,16 +9,16 @@ import pytest
 
 from saga_fg import Edges, SceneGraph
 from saga_fg.errors import InputError
-from saga_fg.estimators import IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.estimators import GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import OBJECT
 from saga_fg.model.discretisation import discretise
 from tests.saga_fg.estimator_scenario import covariance_error, random_covariance
 from tests.saga_fg.random_graphs import CAR, POLE, random_graph
 
 
-def running(rng, leaving=()):
+def running(rng, leaving=(), estimator=None):
     """After two intervals with measurements; some nodes leave at the end."""
-    estimator = IncrementalFilter()
+    estimator = IncrementalFilter() if estimator is None else estimator
     estimator.add(range(4), rng.normal(size=(4, 4)), random_covariance(rng, 4, 4))
     for _ in range(2):
         estimator.predict(discretise(random_graph(rng, (CAR,) * 4, range(4), density=0.7), 0.3))
@@ -109,3 +109,31 @@ def test_a_node_without_noise_that_edges_act_on_is_named():
     np.testing.assert_allclose(estimator.joint_covariance([7, 8]), expected.joint_covariance([7, 8]), atol=1e-12)
     with pytest.raises(InputError, match="graph: node 7: expected process noise in all directions"):
         estimator.graph()
+
+
+class TreeWithoutDigits:
+    """An iSAM2 whose joint marginals fail, as where pivots of the tree have rounded to zero, or are not finite."""
+
+    def __init__(self, isam, failure):
+        self.isam, self.failure = isam, failure
+
+    def __getattr__(self, name):
+        return getattr(self.isam, name)
+
+    def jointMarginalCovariance(self, keys):
+        if isinstance(self.failure, Exception):
+            raise self.failure
+        return self
+
+    def fullMatrix(self):
+        return self.failure
+
+
+@pytest.mark.parametrize("failure", [RuntimeError("indeterminate"), np.full((4, 4), np.nan)], ids=["error", "nan"])
+def test_where_the_tree_has_too_few_digits_the_posterior_is_eliminated_anew(failure):
+    estimator = running(np.random.default_rng(4), estimator=GraphFilter())
+    expected = estimator.joint_covariance(range(4))
+    twin = running(np.random.default_rng(4), estimator=GraphFilter())
+    engine = twin._smoother._ready()
+    engine.isam = TreeWithoutDigits(engine.isam, failure)
+    np.testing.assert_allclose(twin.joint_covariance(range(4)), expected, rtol=0, atol=1e-9 * np.abs(expected).max())
