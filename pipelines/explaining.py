@@ -20,6 +20,7 @@ from data_tools.files.input_files import open_bytes
 from data_tools.files.json_stream import parsed_json
 from data_tools.plots import running_graph_picture
 from pipelines.config import Method, TrackConfig
+from pipelines.sensor_clocks import clock_text
 from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -55,8 +56,10 @@ def trackers(
         )
 
 
-def read_track(journal: Path, track: str, scene: str | None) -> list[Event]:
-    """Read the events of one track; `track` is its number, or SCENE-NUMBER as in nuScenes results.
+def read_track(journal: Path, track: str, scene: str | None) -> tuple[list[Event], list[Event]]:
+    """Read the events of one track, and those of the sensors' clocks in its scene.
+
+    `track` is its number, or SCENE-NUMBER as in nuScenes results.
 
     Raises `InputError` for a journal that is not there or broken, a track that is not in it, or one that is in several
     scenes of which none is named.
@@ -66,14 +69,19 @@ def read_track(journal: Path, track: str, scene: str | None) -> list[Event]:
     if not track.isdecimal() or len(track) > 19:
         raise InputError(f"--track {track[:40]}: expected the number of a track, or SCENE-NUMBER")
     number = int(track)
-    events = [e for e in read_events(journal) if e.get("track") == number and scene in (None, e.get("scene"))]
+    events, clocks = [], []
+    for event in read_events(journal):
+        if event.get("event") == "clocks":
+            clocks.append(event)
+        elif event.get("track") == number and scene in (None, event.get("scene")):
+            events.append(event)
     if not events:
         where = "" if scene is None else f" of scene {scene}"
         raise InputError(f"{journal}: expected events of track {number}{where}, there are none")
     scenes = sorted({str(event.get("scene")) for event in events})
     if len(scenes) > 1:
         raise InputError(f"--track {number}: expected --scene, the track is in {', '.join(scenes)}")
-    return events
+    return events, [event for event in clocks if str(event.get("scene")) == scenes[0]]
 
 
 def journal_innovations(journal: Path) -> dict[str, FloatArray]:
@@ -89,17 +97,12 @@ def journal_innovations(journal: Path) -> dict[str, FloatArray]:
     return {label: np.array(values) for label, values in sorted(found.items())}
 
 
-def clock_lines(journal: Path, scene: str | None) -> list[str]:
-    """Return what is known of the sensors' clocks at the end of a scene, a line each. Raises as `read_events`."""
-    events = [e for e in read_events(journal) if e.get("event") == "clocks" and scene in (None, e.get("scene"))]
+def clock_lines(events: Sequence[Event]) -> list[str]:
+    """Return what is known of the sensors' clocks at the end of a scene, from its events of clocks, a line each."""
     lines = []
     for name, clock in (events[-1]["clocks"] if events else {}).items():
-        by = f"{clock['objects']} objects in common" if clock["objects"] else "the order of arrival"
-        text = f"clock of {name}: {clock['offset']:+.3f} s (+- {clock['deviation']:.3f} s by {by})"
         since = next((e["time"] for e in events if e["clocks"].get(name, {}).get("corrected")), None)
-        if clock["corrected"]:
-            text += f", corrected by {-clock['corrected']:+.3f} s, first at {since:.3f} s"
-        lines.append(text + ("" if clock["verdict"] == "used" else "; its frames are left out"))
+        lines.append(clock_text(name, clock, since))
     return lines
 
 

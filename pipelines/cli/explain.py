@@ -56,9 +56,9 @@ def explain(
         raise InputError("expected --track, or --graph")
     if json_file is not None:
         check_writable(json_file)
-    events = read_track(journal, track, scene)
+    events, clocks = read_track(journal, track, scene)
     with error_context(str(journal)):
-        lines = [*clock_lines(journal, str(events[0].get("scene"))), *story(events)]
+        lines = [*clock_lines(clocks), *story(events)]
     for line in lines:
         typer.echo(line)
     if json_file is not None:

@@ -192,6 +192,8 @@ def status(
 
 
 def _summary(answer: dict[str, Any]) -> str:
+    from pipelines.sensor_clocks import clock_text
+
     counts = ", ".join(
         f"{answer[name]} {text}"
         for name, text in (
@@ -211,14 +213,6 @@ def _summary(answer: dict[str, Any]) -> str:
     latency = ", ".join(f"{name} {ms:g}" for name, ms in answer["latency_ms"].items()) or "none yet"
     error = (answer.get("state") or {}).get("error")
     kept = "" if error is None else f"\nthe state is not kept: {error}"
-    clocks = "".join(f"\n{_clock(name, each)}" for name, each in answer.get("clocks", {}).items())
+    clocks = "".join(f"\n{clock_text(name, each)}" for name, each in answer.get("clocks", {}).items())
     memory = f"memory: {answer['memory_mb']:g} MB, up for {answer['seconds']:.0f} s"
     return f"{counts}{kept}{clocks}\nlatency, ms: {latency}\n{memory}"
-
-
-def _clock(name: str, clock: dict[str, Any]) -> str:
-    """The clock of a sensor in words."""
-    by = f"{clock['objects']} objects in common" if clock["objects"] else "the order of arrival"
-    state = "" if clock["verdict"] == "used" else "; its frames are left out"
-    corrected = f", corrected by {-clock['corrected']:+.3f} s" if clock["corrected"] else ""
-    return f"clock of {name}: {clock['offset']:+.3f} s (+- {clock['deviation']:.3f} s by {by}){corrected}{state}"

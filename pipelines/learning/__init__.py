@@ -2,12 +2,11 @@
 
 from pipelines.learning.fragment import learned_fragment
 from pipelines.learning.noise import LearnedNoise, learn_noise, learned_motions
-from pipelines.learning.offsets import clock_table, offset_fragment
+from pipelines.learning.offsets import offset_fragment
 from pipelines.learning.scenes import scenes_to_learn_from
 
 __all__ = [
     "LearnedNoise",
-    "clock_table",
     "learn_noise",
     "learned_fragment",
     "learned_motions",

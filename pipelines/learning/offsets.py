@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping
 
 import yaml
 
-from data_tools.figures import FigureTable, count
 from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.tracking import SensorTime
 
@@ -49,18 +48,3 @@ def _joined(parts: list[SensorTime]) -> tuple[float, float]:
     mean = sum(w * each.offset for w, each in zip(weights, parts, strict=True)) / total
     chi2 = sum(w * (each.offset - mean) ** 2 for w, each in zip(weights, parts, strict=True))
     return mean, math.sqrt(max(1.0, chi2 / max(len(parts) - 1, 1)) / total)
-
-
-def clock_table(clocks: Mapping[str, Mapping[str, SensorTime]]) -> FigureTable:
-    """A table of the sensors' clocks by scene, at the end of each."""
-    columns = (
-        *("sensor", "offset, s", "deviation, s", "corrected by, s", "drift, ms/s", "jitter, s", "objects in common"),
-        "latest frame",
-    )
-    rows = []
-    for scene, sensors in clocks.items():
-        for name, each in sensors.items():
-            times = (f"{each.offset:+.4f}", f"{each.deviation:.4f}", f"{-each.corrected:+.4f}")
-            rates = (f"{1e3 * each.drift:+.3f}", f"{each.jitter:.4f}", count(each.objects), each.verdict)
-            rows.append((f"{scene}: {name}" if len(clocks) > 1 else name, *times, *rates))
-    return FigureTable("Clocks of the sensors", columns, tuple(rows))

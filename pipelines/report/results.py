@@ -13,13 +13,13 @@ from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable
 from pipelines.config import load_config
-from pipelines.learning import clock_table
 from pipelines.report.charts import Chart, accuracy_charts, latency_chart
 from pipelines.report.images import thumbnails
 from pipelines.report.page import Report
 from pipelines.report.run_record import RunRecord, read_run_record
 from pipelines.report.scenes import ReportScene
 from pipelines.report.track_figures import track_charts, track_figures
+from pipelines.sensor_clocks import clock_table
 from saga_fg.errors import InputError
 
 
