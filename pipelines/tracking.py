@@ -115,9 +115,13 @@ def track_scene(
             wanted.append(latest if latest is not None and latest.timestamp == moment else tracker.tracks(moment))
             if horizons is not None and latest is not None:
                 predicted += _predicted(tracker, moment, horizons, latest.timestamp)
+    return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted), compared_clocks(tracker))
+
+
+def compared_clocks(tracker: OnlineTracker) -> dict[str, SensorTime]:
+    """The clocks of a tracker's sensors, where there are several."""
     clocks = tracker.sensor_times if isinstance(tracker, ClockComparing) else {}
-    compared = clocks if len(clocks) > 1 else {}
-    return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted), compared)
+    return clocks if len(clocks) > 1 else {}
 
 
 def _predicted(

@@ -28,7 +28,7 @@ from pipelines.serving.messages import (
 from pipelines.serving.numbering import Numbering
 from pipelines.serving.reordering import Reordering
 from pipelines.serving.settings import StreamSettings
-from pipelines.tracking import ClockComparing, OnlineTracker, PredictingTracker
+from pipelines.tracking import ClockComparing, OnlineTracker, PredictingTracker, compared_clocks
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import SensorTime, TimeVerdict
@@ -171,8 +171,7 @@ class StreamTracker(Generic[Client]):
 
     def clocks(self) -> dict[str, SensorTime]:
         """Return the clocks of the sensors, where there are several."""
-        clocks = self._tracker.sensor_times if isinstance(self._tracker, ClockComparing) else {}
-        return clocks if len(clocks) > 1 else {}
+        return compared_clocks(self._tracker)
 
     def state(self) -> tuple[dict[str, Any], dict[str, int], int]:
         """Return the state (without held frames) as a tree of values, the last number of each sensor, the version."""

@@ -26,7 +26,7 @@ from typing import Literal
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.tracking.clock import Clock, weighted_median
 
 WINDOW = 2.5  # s; candidates are up to this far apart along their velocity
@@ -287,13 +287,13 @@ def _candidates(a: SeenObjects, b: SeenObjects, known: PairSamples) -> tuple[Flo
     return offset[chosen], variance[chosen]
 
 
-def _moving(objects: SeenObjects) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _moving(objects: SeenObjects) -> BoolArray:
     """(k,) objects whose velocity is known well enough to tell time by."""
     speed2 = (objects.velocity**2).sum(axis=1)
     return np.asarray((speed2 >= LEAST_SPEED**2) & (speed2 >= SPEED_RATIO * objects.velocity_variance))
 
 
-def _cluster(offset: FloatArray, variance: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _cluster(offset: FloatArray, variance: FloatArray) -> BoolArray:
     """(n,) samples of the densest cluster."""
     if len(offset) == 0:
         return np.zeros(0, dtype=bool)

@@ -70,11 +70,10 @@ class Journal:
             self._before = now
 
     def _write_clocks(self, now: TrackerView) -> None:
-        state: dict[str, tuple[float, str]] = {
-            name: (round(each.corrected, 2), each.verdict) for name, each in now.clocks.items()
-        }
+        known = now.clocks
+        state: dict[str, tuple[float, str]] = {n: (round(each.corrected, 2), each.verdict) for n, each in known.items()}
         if state != self._clocks:
-            clocks = {name: asdict(each) for name, each in now.clocks.items()}
+            clocks = {name: asdict(each) for name, each in known.items()}
             self._write({"event": "clocks", "time": now.timestamp, "sensor": now.sensor, "clocks": clocks})
             self._clocks = state
 

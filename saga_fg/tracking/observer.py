@@ -16,7 +16,8 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
-from saga_fg.tracking.clock_offsets import SensorTime, sensor_times
+from saga_fg.tracking.clock import Clock
+from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.prediction import node_table
 from saga_fg.tracking.track_table import TrackTable
@@ -41,7 +42,7 @@ class TrackerView:
     matching      rows of tracks and of measurements, from the stage `associate` on
     initiated     (b,) rows of the measurements that initiated the last b tracks, at the stage `initiate`
     boxes         of the tracks, in the world
-    clocks        of the sensors
+    clock, shared of the sensors, and what their frames have in common, see `clocks`
     running       the running graph, where factor providers take part; its positions are local
     """
 
@@ -56,7 +57,8 @@ class TrackerView:
     matching: Matching | None
     initiated: IntArray
     boxes: Boxes
-    clocks: dict[str, SensorTime]
+    clock: Clock
+    shared: SharedObservations
     running: SceneFactorGraph | None
 
     @classmethod
@@ -84,9 +86,15 @@ class TrackerView:
             matching,
             np.empty(0, dtype=np.int64) if initiated is None else initiated,
             replace(state.boxes(now.position, now.velocity)),
-            sensor_times(state.clock, state.shared) if len(state.clock.sensors) > 1 else {},
+            state.clock,
+            state.shared,
             state.joint.estimator.graph() if state.providers else None,
         )
+
+    @property
+    def clocks(self) -> dict[str, SensorTime]:
+        """The clocks of the sensors, where there are several."""
+        return sensor_times(self.clock, self.shared) if len(self.clock.sensors) > 1 else {}
 
     def positions(self) -> FloatArray:
         """(n, 2) positions of the tracks in the world, m."""
