@@ -12,13 +12,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.runner import Rows, Seed
-from benchmarks.service.clocks import (
-    ClockBenchSettings,
-    bench_steady_offsets,
-    bench_wrong_clocks,
-    clock_rows,
-    clock_shortcomings,
-)
+from benchmarks.service.clocks import bench_steady_offsets, bench_wrong_clocks, clock_rows, clock_shortcomings
 from benchmarks.service.endurance import ServiceBenchSettings, bench_service
 from benchmarks.service.hostile_service import HostileBenchSettings, bench_hostile_service
 from pipelines.cli.console import progress_bar
@@ -81,9 +75,9 @@ def service(
 
 def _clocks(seed: int) -> Rows:
     logging.getLogger("saga_fg.tracking").setLevel(logging.ERROR)  # each frame that is left out is warned of
-    settings = ClockBenchSettings(seed=seed)
-    with progress_bar() as progress:
-        wrong, steady = bench_wrong_clocks(settings, progress), bench_steady_offsets(settings, progress)
-    yield from clock_rows(wrong, steady)
+    wrong = bench_wrong_clocks(seed)
+    yield from clock_rows(wrong, [])
+    steady = bench_steady_offsets(seed)
+    yield from clock_rows([], steady)
     if shortcomings := clock_shortcomings(wrong, steady):
         raise SagaError("; ".join(shortcomings))

@@ -18,11 +18,9 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks.runner import Rows
+from benchmarks.runner import Rows, each
 from pipelines.config import load_config
-from pipelines.tracking import Progress
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import PositiveInt, Settings, setting
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
@@ -36,6 +34,7 @@ NOISE = 0.2  # m
 JUMP = 10.0  # s; largest jump of a clock that jumps every second
 OBSERVATIONS = 200  # after which an offset is judged
 TRACKED, MOST_ERROR, MOST_RATIO, WITHIN = 0.99, 0.01, 1.05, 0.95  # to reach; the second in s
+OBJECTS, REPETITIONS = 10, 10  # seen by all sensors; recordings of every steady offset
 OFFSETS = (0.05, 0.1, 0.3, 0.5, 1.0, 2.0)  # s, either way
 
 
@@ -71,15 +70,6 @@ FAULTS = (
     ClockFault("drift", 1e-3),
     ClockFault("jumps"),
 )
-
-
-@dataclass(frozen=True)
-class ClockBenchSettings(Settings):
-    """Number of objects and of repetitions."""
-
-    objects: PositiveInt = setting(10, "objects that all sensors see")
-    repetitions: PositiveInt = setting(10, "recordings of every steady offset")
-    seed: int = setting(0, "seed of objects and noise")
 
 
 @dataclass(frozen=True)
@@ -176,30 +166,22 @@ def offset_run(objects: int, wrong: str, offset: float, seed: int) -> tuple[floa
     return error, deviation, math.sqrt(float(np.mean(squares)))
 
 
-def bench_wrong_clocks(settings: ClockBenchSettings, progress: Progress | None = None) -> list[WrongClock]:
+def bench_wrong_clocks(seed: int) -> list[WrongClock]:
     """All faults of the radar and of the lidar, at all rates of the radar."""
     cases = [(wrong, rate, fault) for wrong in ("radar", "lidar") for rate in RADAR_RATES for fault in FAULTS]
-    found = []
-    for done, (wrong, rate, fault) in enumerate(cases):
-        found.append(wrong_clock(settings.objects, wrong, rate, fault, settings.seed))
-        if progress is not None:
-            progress("wrong clocks", done + 1, len(cases))
-    return found
+    return [wrong_clock(OBJECTS, wrong, rate, fault, seed) for wrong, rate, fault in each(cases, "wrong clocks")]
 
 
-def bench_steady_offsets(settings: ClockBenchSettings, progress: Progress | None = None) -> list[SteadyOffset]:
+def bench_steady_offsets(first_seed: int) -> list[SteadyOffset]:
     """Steady offsets of the radar and of the lidar from the start, either way in turn."""
-    seeds = range(settings.seed, settings.seed + settings.repetitions)
-    none = {seed: offset_run(settings.objects, "radar", 0.0, seed)[2] for seed in seeds}
-    without = math.sqrt(float(np.mean(np.square(list(none.values())))))
+    seeds = range(first_seed, first_seed + REPETITIONS)
+    without = math.sqrt(float(np.mean(np.square([offset_run(OBJECTS, "radar", 0.0, seed)[2] for seed in seeds]))))
     cases, found = [(wrong, offset) for wrong in ("radar", "lidar") for offset in OFFSETS], []
-    for done, (wrong, offset) in enumerate(cases):
-        runs = np.array([offset_run(settings.objects, wrong, offset * (-1) ** seed, seed) for seed in seeds])
+    for wrong, offset in each(cases, "steady offsets"):
+        runs = np.array([offset_run(OBJECTS, wrong, offset * (-1) ** seed, seed) for seed in seeds])
         errors, deviations, rmse = runs.T
         within = float(np.mean(np.abs(errors) <= 2 * deviations))
         found.append(SteadyOffset(wrong, offset, errors, within, (math.sqrt(float(np.mean(rmse**2))), without)))
-        if progress is not None:
-            progress("steady offsets", done + 1, len(cases))
     return found
 
 
@@ -210,13 +192,13 @@ def clock_shortcomings(wrong: list[WrongClock], steady: list[SteadyOffset]) -> l
         for w in wrong
         if (least := min(w.tracked.values())) < TRACKED
     ]
-    for each in steady:
-        name, largest = f"{each.sensor} {each.offset:g} s", float(np.abs(each.errors).max())
+    for one in steady:
+        name, largest = f"{one.sensor} {one.offset:g} s", float(np.abs(one.errors).max())
         if not largest <= MOST_ERROR:
             found.append(f"{name}: estimate off by {1e3 * largest:.1f} ms, expected {1e3 * MOST_ERROR:g} ms")
-        if each.rmse[0] > MOST_RATIO * each.rmse[1]:
-            found.append(f"{name}: error of positions {each.rmse[0] / each.rmse[1]:.3f} times that without an offset")
-    if steady and (within := float(np.mean([each.within for each in steady]))) < WITHIN:
+        if one.rmse[0] > MOST_RATIO * one.rmse[1]:
+            found.append(f"{name}: error of positions {one.rmse[0] / one.rmse[1]:.3f} times that without an offset")
+    if steady and (within := float(np.mean([one.within for one in steady]))) < WITHIN:
         found.append(f"{100 * within:.0f} % of estimates within two deviations, expected {100 * WITHIN:g} %")
     return found
 
@@ -228,15 +210,15 @@ def clock_rows(wrong: list[WrongClock], steady: list[SteadyOffset]) -> Rows:
         mine = {(sensor, rate): figure for (sensor, rate, which), figure in share.items() if which == fault}
         figures = {f"of the {sensor}, radar at {rate:g} Hz": figure for (sensor, rate), figure in mine.items()}
         yield "frames of right sensors tracked, the worse of two, %", {"fault of the clock": str(fault), **figures}
-    for each in steady:
+    for one in steady:
         yield (
             f"offsets after {OBSERVATIONS} shared observations",
             {
-                "steady offset": f"{each.sensor}, +-{each.offset:g} s",
-                "largest error, ms": 1e3 * float(np.nanmax(np.abs(each.errors))),
-                "rms error, ms": 1e3 * float(np.sqrt(np.nanmean(each.errors**2))),
-                "within two deviations, %": 100 * each.within,
-                "error of positions, m": each.rmse[0],
-                "by that without an offset": each.rmse[0] / each.rmse[1],
+                "steady offset": f"{one.sensor}, +-{one.offset:g} s",
+                "largest error, ms": 1e3 * float(np.nanmax(np.abs(one.errors))),
+                "rms error, ms": 1e3 * float(np.sqrt(np.nanmean(one.errors**2))),
+                "within two deviations, %": 100 * one.within,
+                "error of positions, m": one.rmse[0],
+                "by that without an offset": one.rmse[0] / one.rmse[1],
             },
         )
