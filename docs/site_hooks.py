@@ -1,4 +1,4 @@
-"""Hooks of MkDocs: pages at the top of the repository become pages of the site, links to them included.
+"""Hooks of MkDocs: the tables of all settings, and pages at the top of the repository, links to them included.
 
 In the repository a page of docs/ links to `../CONTRIBUTING.md`, which is outside the folder that MkDocs knows.
 """
@@ -28,7 +28,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links between docs/ and the top folder, as they are on the site: both are one folder there."""
+    """Add the tables of settings; rewrite links between docs/ and the top folder, which are one folder on the site."""
+    if page.file.src_uri == "configuration.md":
+        from make_configuration import configuration_tables
+
+        return f"{markdown}\n{configuration_tables()}"
     if page.file.src_uri in TOP_PAGES:
         return re.sub(r"\]\(docs/", "](", markdown)
     return re.sub(rf"\]\(((?:\.\./)*)\.\./({'|'.join(map(re.escape, TOP_PAGES))})", r"](\1\2", markdown)
