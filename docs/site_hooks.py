@@ -30,9 +30,30 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Add the tables of settings; rewrite links between docs/ and the top folder, which are one folder on the site."""
     if page.file.src_uri == "configuration.md":
-        from make_configuration import configuration_tables
-
         return f"{markdown}\n{configuration_tables()}"
     if page.file.src_uri in TOP_PAGES:
         return re.sub(r"\]\(docs/", "](", markdown)
     return re.sub(rf"\]\(((?:\.\./)*)\.\./({'|'.join(map(re.escape, TOP_PAGES))})", r"](\1\2", markdown)
+
+
+def configuration_tables() -> str:
+    """Tables of all settings in Markdown, from their dataclasses."""
+    from data_tools.simulator import SimulatorSettings
+    from pipelines.config import TrackConfig
+    from pipelines.configuration import settings_reference
+    from pipelines.serving import StreamSettings
+    from pipelines.slam.configuration import SlamSettings
+    from saga_fg import providers
+    from saga_fg.smoothing import SmoothingSettings
+
+    classes = {
+        "Tracking (`saga-fg track`, `saga-fg demo`)": TrackConfig,
+        "Smoothing (`saga-fg smooth`, below `smoothing`)": SmoothingSettings,
+        "SLAM (`saga-fg slam`, below `slam`)": SlamSettings,
+        "Limits of the service (`saga-fg serve --limits`)": StreamSettings,
+        "The simulator (`saga-fg simulate`)": SimulatorSettings,
+    }
+    for name in ("Odometry", "Gps", "Imu", "Wheels", "Landmarks", "LaneKeeping", "StationaryObjects"):
+        classes[f"Factor provider `saga_fg.providers:{name}`"] = getattr(providers, name)
+    documented: dict[tuple[type, str], str] = {}
+    return "\n".join(f"## {title}\n\n{settings_reference(cls, documented)}" for title, cls in classes.items())
