@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.recorded_traffic import PERIOD, RecordedTraffic, StateRows
-from data_tools.files.arrow_tables import NUMBERS, WHOLE, all_of, numpy_columns, read_arrow_table
+from data_tools.files.arrow_tables import NUMBERS, WHOLE, all_of, read_arrow_arrays
 from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -155,7 +155,7 @@ def _courses(vehicle: IntArray, position: FloatArray) -> FloatArray:
 
 def _columns(path: Path) -> dict[str, Any]:
     """The columns of the file as arrays; numbers may be NaN where the file has nothing."""
-    table = read_arrow_table(path, all_of(path, (*_COLUMNS, _GAP)))
-    columns = numpy_columns(path, table, _COLUMNS, ("setting", "run", "t", "veh"))
+    filled = ("setting", "run", "t", "veh")
+    columns = read_arrow_arrays(path, all_of(path, (*_COLUMNS, _GAP)), _COLUMNS, filled)
     types = {_TEXT: np.str_, WHOLE: np.int64, NUMBERS: np.float64}
     return {name: column.astype(types[_COLUMNS.get(name, NUMBERS)]) for name, column in columns.items()}

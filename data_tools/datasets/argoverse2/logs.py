@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
-from data_tools.files.arrow_tables import WHOLE, all_of, numpy_columns, read_arrow_table
+from data_tools.files.arrow_tables import WHOLE, all_of, read_arrow_arrays
 from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
@@ -154,4 +154,4 @@ def columns_of(path: Path, names: tuple[str, ...], may_lack: tuple[str, ...] = (
     def choose(there: list[str]) -> list[str]:
         return [*all_of(path, names)(there), *(name for name in may_lack if name in there)]
 
-    return numpy_columns(path, read_arrow_table(path, choose), KINDS, names)
+    return read_arrow_arrays(path, choose, KINDS, names)

@@ -18,7 +18,7 @@ from data_tools.datasets.detection_files.column_names import Columns, meaning, u
 from data_tools.datasets.detection_files.columns import COLUMNS, POSE, REQUIRED, RawTable, Values, clock_of
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.units import Clock
-from data_tools.files.arrow_tables import SUFFIXES, read_arrow_table
+from data_tools.files.arrow_tables import SUFFIXES, read_arrow_columns
 from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes, open_text
 from data_tools.files.json_stream import parsed_json
@@ -292,23 +292,16 @@ def _read_arrow(reading: _Reading) -> Iterator[RawTable]:
         found = reading.understood(names)
         return list(found.names.values())
 
-    table = read_arrow_table(reading.path, choose)
-    columns = {ours: _arrow_values(table[theirs], ours) for ours, theirs in found.names.items()}
-    yield RawTable(reading.path, columns, len(table), _row, False, found, reading.way(list(found.names)))
+    theirs = read_arrow_columns(reading.path, choose)
+    columns = {ours: _names(theirs[name]) if ours in NAMED else theirs[name] for ours, name in found.names.items()}
+    length = len(next(iter(columns.values())))
+    yield RawTable(reading.path, columns, length, _row, False, found, reading.way(list(found.names)))
 
 
-def _arrow_values(column: Any, ours: str) -> Values:
-    """The values of a column of Arrow: dates as text in ISO 8601, whole numbers as text where names are expected."""
-    kind = str(column.type)
-    if kind.startswith(("timestamp", "date")):
-        return [None if value is None else value.isoformat() for value in column.cast("timestamp[us]").to_pylist()]
-    values: list[Any] = column.to_pylist()
-    if ours in NAMED:
-        return [str(value) if type(value) is int else value for value in values]
-    if column.null_count or kind in ("string", "large_string", "null") or kind.startswith("dictionary"):
-        return values
-    array: Values = column.to_numpy()
-    return array
+def _names(values: Values) -> Values:
+    """Whole numbers as text, where names are expected."""
+    values = values.tolist() if isinstance(values, np.ndarray) else values
+    return [str(value) if type(value) is int else value for value in values]
 
 
 def _row(row: int) -> str:

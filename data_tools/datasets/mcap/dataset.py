@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from data_tools.datasets.mcap.messages import (
     OBJECT_TYPES,
     ODOMETRY_TYPES,
     TRANSFORM_TYPES,
-    transform_records,
+    recorded_messages,
 )
 from data_tools.datasets.mcap.objects import MessageObjects, MessageType, message_objects
 from data_tools.datasets.mcap.recording import LoggedMessage, Recording
@@ -92,19 +92,12 @@ class McapRecording:
         poses = self._pose_topics()
         seen: list[tuple[LoggedMessage, MessageObjects]] = []
         records: list[TransformRecord] = []
-        for logged in self._recording.messages([*sensor_of, *poses]):
-            with error_context(f"{self._recording.path}: {logged.topic.name}: message {logged.number}"):
-                try:
-                    if logged.topic.name in sensor_of:
-                        rows = OBJECT_TYPES[logged.topic.type].rows(logged.message)
-                        rows.stamp = rows.stamp or logged.log_time
-                        seen.append((_without_content(logged), message_objects(rows, self.options.classes)))
-                    else:
-                        records += transform_records(logged)
-                except AttributeError as error:
-                    raise InputError(
-                        f"{error.name}: expected this field in {logged.topic.type}, its definition here has none"
-                    ) from error
+        for logged in recorded_messages(self._recording, [*sensor_of, *poses]):
+            if logged.topic.name in sensor_of:
+                with error_context(f"{self._recording.path}: {logged.topic.name}: message {logged.number}"):
+                    seen.append((replace(logged, message=None), message_objects(logged.message, self.options.classes)))
+            else:
+                records += logged.message
         with error_context(str(self._recording.path)):
             if not seen:
                 raise InputError(f"expected messages of {', '.join(sensor_of)}, there are none")
@@ -243,7 +236,3 @@ def _frames(
             sensor, token = sensor_of[logged.topic.name], str(objects.stamp)
             frames.append(Frame(objects.stamp / 1e9, sensor, detections, pose, "ego" if in_ego else "world", token))
     return frames
-
-
-def _without_content(logged: LoggedMessage) -> LoggedMessage:
-    return LoggedMessage(logged.topic, logged.number, logged.log_time, None)

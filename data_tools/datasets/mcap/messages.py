@@ -1,21 +1,51 @@
-"""The types of messages that hold objects, and those that hold poses."""
+"""The types of messages that hold objects, those that hold poses, and what is taken from them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
 from data_tools.datasets.mcap import autoware, scene_update, vision
 from data_tools.datasets.mcap.objects import MessageType, frame_name, nanoseconds, wxyz, xyz
-from data_tools.datasets.mcap.recording import LoggedMessage
+from data_tools.datasets.mcap.recording import LoggedMessage, Recording, Topic, decoded_messages
 from data_tools.datasets.mcap.transforms import TransformRecord
+from data_tools.files.error_messages import error_context
+from data_tools.files.isolated_reading import isolated
+from saga_fg.errors import InputError
 
 MODULES: tuple[ModuleType, ...] = (autoware, vision, scene_update)
 OBJECT_TYPES: dict[str, MessageType] = {name: cast(MessageType, module) for module in MODULES for name in module.TYPES}
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "foxglove.FrameTransforms", "foxglove.FrameTransform")
 ODOMETRY_TYPES = ("nav_msgs/Odometry",)
 DEFAULT_EGO = "base_link"
+
+
+def recorded_messages(recording: Recording, topics: Collection[str]) -> Iterator[LoggedMessage]:
+    """The messages of some topics, in the order of the files, read in a child process.
+
+    Each has its `ObjectRows`, with a stamp, or a list of its `TransformRecord`s as the message. Raises `InputError`
+    naming file, topic, message and field.
+    """
+    return isolated("not readable", _contents, recording.path, recording.files, recording.chosen(topics))
+
+
+def _contents(path: Path, files: Sequence[Path], topics: Mapping[str, Topic]) -> Iterator[LoggedMessage]:
+    for logged in decoded_messages(files, topics):
+        with error_context(f"{path}: {logged.topic.name}: message {logged.number}"):
+            try:
+                if logged.topic.type in OBJECT_TYPES:
+                    content: Any = OBJECT_TYPES[logged.topic.type].rows(logged.message)
+                    content.stamp = content.stamp or logged.log_time
+                else:
+                    content = list(transform_records(logged))
+            except AttributeError as error:
+                raise InputError(
+                    f"{error.name}: expected this field in {logged.topic.type}, its definition here has none"
+                ) from error
+        yield replace(logged, message=content)
 
 
 def transform_records(logged: LoggedMessage) -> Iterator[TransformRecord]:

@@ -9,19 +9,22 @@ Sources: https://mcap.dev/spec; the storage plugins of https://github.com/ros2/r
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Collection, Iterator
-from contextlib import closing, contextmanager, redirect_stderr
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from io import SEEK_END, StringIO
+from importlib.util import find_spec
+from io import SEEK_END
 from pathlib import Path
 from typing import Any
 
 from data_tools.datasets.mcap.definitions import definition, plain_type
 from data_tools.files.error_messages import unknown_name
 from data_tools.files.input_files import open_bytes
+from data_tools.files.isolated_reading import isolated, one_line
 from saga_fg.errors import InputError, MissingExtraError
 
 SUFFIXES = (".mcap", ".db3")
+_NO_BAG = "expected a bag of ROS 2 in SQLite"
 _MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of a file
 Decode = Callable[[bytes], Any]
 
@@ -37,7 +40,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class LoggedMessage:
-    """A message; number: from 1 within its topic, in the order of the recording; log_time: ns."""
+    """A message, or what is taken from it; number: from 1 within its topic, in their order; log_time: ns."""
 
     topic: Topic
     number: int
@@ -46,18 +49,19 @@ class LoggedMessage:
 
 
 class Recording:
-    """The topics of a recording, and their messages, which are read when asked for.
+    """The files and topics of a recording.
 
     Raises `InputError` where `path` is no recording, `MissingExtraError` without the extra [mcap].
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        load_mcap()
+        if any(find_spec(name) is None for name in ("foxglove_schemas_protobuf", "mcap_protobuf", "mcap_ros2")):
+            raise MissingExtraError("recordings of ROS 2 need mcap: pip install 'saga-fg[mcap]'")
         self.files = _files(self.path)
         self.topics: dict[str, Topic] = {}
         for file in self.files:
-            for found in _reader(file).topics():
+            for found in isolated("not readable", _topics, file):
                 before = self.topics.get(found.name, found)
                 if before.type != found.type:
                     raise InputError(f"{file}: {found.name}: expected messages of {before.type}, got {found.type}")
@@ -69,18 +73,32 @@ class Recording:
         """Name of the file without its suffix, or of the folder."""
         return self.path.name if self.path.is_dir() else self.path.stem
 
-    def messages(self, topics: Collection[str]) -> Iterator[LoggedMessage]:
-        """Messages of some topics, in the order of the files. Raises `InputError` for one that cannot be decoded."""
-        counts = dict.fromkeys(topics, 0)
+    def chosen(self, topics: Collection[str]) -> dict[str, Topic]:
+        """Topics by name. Raises `InputError` for one that is not there."""
         for name in topics:
             if name not in self.topics:
                 raise InputError(f"{self.path}: {unknown_name('topic', name, tuple(sorted(self.topics)))}")
-        for file in self.files:
+        return {name: self.topics[name] for name in topics}
+
+
+def decoded_messages(files: Sequence[Path], topics: Mapping[str, Topic]) -> Iterator[LoggedMessage]:
+    """Messages of some topics in the order of the files, to be read in a child process.
+
+    Raises `InputError` for one that cannot be decoded.
+    """
+    counts = dict.fromkeys(topics, 0)
+    for file in files:
+        with _readable(file):
             for topic, time, decode, data in _reader(file).messages(topics):
                 counts[topic] += 1
-                with _library_errors(f"{file}: {topic}: message {counts[topic]}"):
+                with one_line("not readable", f"{file}: {topic}: message {counts[topic]}"):
                     message = decode(data)
-                yield LoggedMessage(self.topics[topic], counts[topic], time, message)
+                yield LoggedMessage(topics[topic], counts[topic], time, message)
+
+
+def _topics(file: Path) -> Iterator[Topic]:
+    with _readable(file):
+        yield from _reader(file).topics()
 
 
 @dataclass(frozen=True)
@@ -90,7 +108,7 @@ class _McapFile:
     def topics(self) -> list[Topic]:
         from mcap.reader import make_reader
 
-        with open_bytes(self.path) as file, _library_errors(str(self.path), self.path):
+        with open_bytes(self.path) as file:
             summary = make_reader(file).get_summary()
             if summary is not None and summary.statistics is not None:
                 counts = summary.statistics.channel_message_counts
@@ -102,7 +120,7 @@ class _McapFile:
                     if each.schema_id in schemas
                 ]
         found: dict[str, Topic] = {}  # a file without a summary is read from end to end
-        with open_bytes(self.path) as file, _library_errors(str(self.path), self.path):
+        with open_bytes(self.path) as file:
             for schema, channel, _ in make_reader(file).iter_messages(log_time_order=False):
                 if schema is not None:
                     count = found[channel.topic].count if channel.topic in found else 0
@@ -114,30 +132,26 @@ class _McapFile:
 
         decoders: dict[int, Decode] = {}
         with open_bytes(self.path) as file:
-            found = iter(make_reader(file, validate_crcs=True).iter_messages(topics=list(topics), log_time_order=False))
-            while True:
-                with _library_errors(str(self.path), self.path):
-                    record = next(found, None)
-                if record is None:
-                    return
-                schema, channel, message = record
-                decode = decoders.get(channel.id)
-                if decode is None:
-                    with _library_errors(f"{self.path}: {channel.topic}"):
-                        decode = _decoder(schema, channel.message_encoding)
-                    decoders[channel.id] = decode
-                yield channel.topic, message.log_time, decode, message.data
+            reader = make_reader(file, validate_crcs=True)
+            for schema, channel, message in reader.iter_messages(topics=list(topics), log_time_order=False):
+                if channel.id not in decoders:
+                    decoders[channel.id] = _decoder(f"{self.path}: {channel.topic}", schema, channel.message_encoding)
+                yield channel.topic, message.log_time, decoders[channel.id], message.data
 
 
 @dataclass(frozen=True)
 class _SqliteFile:
+    """A bag in SQLite, of which plain tables alone are read: a view may compute for ever."""
+
     path: Path
 
     def topics(self) -> list[Topic]:
         query = """SELECT topics.name, topics.type, COUNT(messages.id)
                    FROM topics LEFT JOIN messages ON messages.topic_id = topics.id GROUP BY topics.id"""
-        with self._opened() as rows:
-            return [Topic(str(name), plain_type(str(type_)), int(count)) for name, type_, count in rows(query)]
+        with self._opened() as (database, _):
+            return [
+                Topic(str(name), plain_type(str(type_)), int(count)) for name, type_, count in database.execute(query)
+            ]
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Decode, bytes]]:
         from mcap.records import Schema
@@ -147,37 +161,53 @@ class _SqliteFile:
         query = f"""SELECT topics.name, topics.type, topics.serialization_format, messages.timestamp, messages.data
                     FROM messages JOIN topics ON messages.topic_id = topics.id
                     WHERE topics.name IN ({marks}) ORDER BY messages.timestamp, messages.id"""
-        with self._opened() as rows:
-            definitions = self._definitions(rows)
-            for topic, type_, encoding, time, data in rows(query, *topics):
+        with self._opened() as (database, tables):
+            definitions = self._definitions(database) if "message_definitions" in tables else {}
+            for topic, type_, encoding, time, data in database.execute(query, tuple(topics)):
                 if topic not in decoders:
-                    with _library_errors(f"{self.path}: {topic}"):
-                        text = definitions.get(type_, "")
-                        schema = Schema(id=1, name=type_, encoding="ros2msg" if text else "", data=text.encode())
-                        decoders[topic] = _decoder(schema, encoding)
+                    text = definitions.get(type_, "")
+                    schema = Schema(id=1, name=type_, encoding="ros2msg" if text else "", data=text.encode())
+                    decoders[topic] = _decoder(f"{self.path}: {topic}", schema, encoding)
                 yield topic, int(time), decoders[topic], bytes(data)
 
     @staticmethod
-    def _definitions(rows: Callable[..., Iterator[Any]]) -> dict[str, str]:
+    def _definitions(database: sqlite3.Connection) -> dict[str, str]:
         """Definitions by type, of bags that hold them."""
-        tables = {name for (name,) in rows("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if "message_definitions" not in tables:
-            return {}
         query = "SELECT topic_type, encoded_message_definition FROM message_definitions WHERE encoding = 'ros2msg'"
-        return {str(type_): str(text) for type_, text in rows(query) if text}
+        return {str(type_): str(text) for type_, text in database.execute(query) if text}
 
     @contextmanager
-    def _opened(self) -> Iterator[Callable[..., Iterator[Any]]]:
+    def _opened(self) -> Iterator[tuple[sqlite3.Connection, set[str]]]:
+        """The database, opened to be read, and the names of its plain tables."""
         open_bytes(self.path).close()
         with closing(sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+            database.execute("PRAGMA trusted_schema = OFF")
+            query = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql LIKE 'CREATE TABLE%'"
+            tables = {str(name) for (name,) in database.execute(query)}
+            for name in ("topics", "messages"):
+                if name not in tables:
+                    raise InputError(f"{self.path}: {_NO_BAG}: it has no plain table {name}")
+            database.set_authorizer(_plain_reading)
+            yield database, tables
 
-            def rows(query: str, *values: Any) -> Iterator[Any]:
-                try:
-                    yield from database.execute(query, values)
-                except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
-                    raise InputError(f"{self.path}: expected a bag of ROS 2 in SQLite: {error}") from error
 
-            yield rows
+def _plain_reading(action: int, _: str | None, __: str | None, ___: str | None, view: str | None) -> int:
+    """Allow what reads tables and calls functions, none of it on behalf of a view or a trigger."""
+    allowed = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
+    return sqlite3.SQLITE_OK if action in allowed and view is None else sqlite3.SQLITE_DENY
+
+
+@contextmanager
+def _readable(file: Path) -> Iterator[None]:
+    """Errors about a file, with a hint where a file of MCAP was cut off."""
+    problem = _NO_BAG if file.suffix == ".db3" else "not readable"
+    try:
+        with one_line(problem, file):
+            yield
+    except InputError as error:
+        if str(error).startswith(f"{file}: not readable") and _cut_off(file):
+            raise InputError(f"{error}; the file may be cut off: mcap recover") from error
+        raise
 
 
 def _reader(path: Path) -> _McapFile | _SqliteFile:
@@ -206,8 +236,8 @@ def _split_number(path: Path) -> tuple[str, int, str]:
     return (stem, int(number), "") if number.isdecimal() else ("", 0, path.stem)
 
 
-def _decoder(schema: Any, encoding: str) -> Decode:
-    """The function that decodes messages of a schema. Raises `InputError` where there is none."""
+def _decoder(where: str, schema: Any, encoding: str) -> Decode:
+    """The function that decodes messages of a schema. Raises `InputError` that begins with `where` for none."""
     import mcap_protobuf.decoder
     import mcap_ros2.decoder
     from mcap.records import Schema
@@ -215,28 +245,16 @@ def _decoder(schema: Any, encoding: str) -> Decode:
     if schema is not None and encoding == "cdr" and schema.encoding != "ros2msg":
         text = definition(schema.name)
         if text is None:
-            raise InputError(f"expected the definition of {schema.name} in the recording, it has none as ros2msg")
+            raise InputError(
+                f"{where}: expected the definition of {schema.name} in the recording, it has none as ros2msg"
+            )
         schema = Schema(id=schema.id or 1, name=schema.name, encoding="ros2msg", data=text.encode())
     for factory in (mcap_ros2.decoder.DecoderFactory(), mcap_protobuf.decoder.DecoderFactory()):
-        with redirect_stderr(StringIO()):  # where broken definitions are printed, before they are raised
+        with one_line("not readable", where):
             decode = factory.decoder_for(encoding, schema)
         if decode is not None:
             return decode
-    raise InputError(f"expected messages encoded as cdr (ROS 2) or protobuf, got {encoding!r}")
-
-
-@contextmanager
-def _library_errors(where: str, mcap: Path | None = None) -> Iterator[None]:
-    """An `InputError` that names the place for whatever a library raises about broken bytes, as of a file of MCAP."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-    except Exception as error:  # the libraries trust what they read: any exception may come
-        reason = str(error).strip().splitlines()
-        text = f"{where}: not readable: {reason[0] if reason else type(error).__name__}"
-        hint = "; the file may be cut off: mcap recover" if mcap is not None and _cut_off(mcap) else ""
-        raise InputError(text + hint) from error
+    raise InputError(f"{where}: expected messages encoded as cdr (ROS 2) or protobuf, got {encoding!r}")
 
 
 def _cut_off(path: Path) -> bool:
@@ -245,13 +263,3 @@ def _cut_off(path: Path) -> bool:
         start = file.read(len(_MAGIC))
         file.seek(-len(start), SEEK_END)
         return start == _MAGIC != file.read()
-
-
-def load_mcap() -> None:
-    """Raise `MissingExtraError` where the packages that read recordings are not installed."""
-    try:
-        import foxglove_schemas_protobuf  # noqa: F401
-        import mcap_protobuf  # noqa: F401
-        import mcap_ros2  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("recordings of ROS 2 need mcap: pip install 'saga-fg[mcap]'") from error

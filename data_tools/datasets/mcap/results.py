@@ -14,7 +14,7 @@ import numpy as np
 from data_tools.datasets.detection_files import TrackRows
 from data_tools.datasets.mcap.dataset import McapRecording, RecordedScene
 from data_tools.datasets.mcap.definitions import definition
-from data_tools.datasets.mcap.messages import OBJECT_TYPES
+from data_tools.datasets.mcap.messages import OBJECT_TYPES, recorded_messages
 from data_tools.datasets.mcap.objects import MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import Recording
 from data_tools.files.atomic_files import atomic_file
@@ -74,11 +74,9 @@ def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, 
             raise InputError(f"{path}: expected a topic {topic} with tracks, there are {', '.join(fit) or 'none'}")
         topic = fit[0]
     parts: list[MessageObjects] = []
-    for logged in recording.messages([topic]):
+    for logged in recorded_messages(recording, [topic]):
         with error_context(f"{path}: {topic}: message {logged.number}"):
-            rows = OBJECT_TYPES[logged.topic.type].rows(logged.message)
-            rows.stamp = rows.stamp or logged.log_time
-            found = message_objects(rows, classes)
+            found = message_objects(logged.message, classes)
             if (found.id == "").any():
                 raise InputError(f"expected objects with ids, object {int(np.argmax(found.id == ''))} has none")
             if len(found.id) and found.frame not in ("", scene.world.lstrip("/")):
