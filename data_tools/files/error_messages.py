@@ -11,10 +11,12 @@ from saga_fg.errors import InputError
 
 @contextmanager
 def error_context(where: str) -> Iterator[None]:
-    """Prefix every `InputError` of the block with `where`."""
+    """Prefix every `InputError` of the block with `where`, unless it begins so."""
     try:
         yield
     except InputError as error:
+        if str(error).startswith(f"{where}: "):
+            raise
         raise InputError(f"{where}: {error}") from error
 
 

@@ -15,7 +15,7 @@ elsewhere they are errors. Sources: development kits of KITTI (https://www.cvlib
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,12 +25,15 @@ from numpy.typing import NDArray
 from data_tools.files.atomic_files import write_bytes
 from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes
+from data_tools.files.isolated_reading import isolated
 from data_tools.files.numpy_files import load_archive, load_array
 from data_tools.lidar.cloud_headers import check_pcd, check_ply
 from data_tools.lidar.open3d_loader import load_open3d
 from data_tools.lidar.scan import Scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
+
+_PROBLEM = "expected a point cloud that Open3D can read"
 
 
 def read_scan(path: str | Path) -> Scan:
@@ -92,8 +95,8 @@ def _array(file: BinaryIO, _: Path) -> Scan:
     return _of_columns(np.asarray(array, dtype=np.float64))
 
 
-def _arrays(file: BinaryIO, _: Path) -> Scan:
-    columns = load_archive(file, ("points", "intensity", "time"))[1]
+def _arrays(_: BinaryIO, path: Path) -> Scan:
+    columns = load_archive(path, ("points", "intensity", "time"))[1]
     if "points" not in columns:
         raise InputError("expected the array points (N, 3)")
     scan = Scan.of(columns["points"])
@@ -101,22 +104,21 @@ def _arrays(file: BinaryIO, _: Path) -> Scan:
 
 
 def _cloud(file: BinaryIO, path: Path) -> Scan:
-    open3d = load_open3d()
     check = check_pcd if path.suffix.lower() == ".pcd" else check_ply
     check(file.read())
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        try:
-            cloud = open3d.t.io.read_point_cloud(str(path))
-        except RuntimeError as error:
-            raise InputError(f"expected a point cloud that Open3D can read: {str(error).splitlines()[-1]}") from error
-    if "positions" not in cloud.point:
-        raise InputError("expected a point cloud that Open3D can read, with x, y, z of each point")
-    points = cloud.point["positions"].numpy().astype(np.float64)
-    scan = Scan.of(points[np.isfinite(points).all(axis=1)])
-    if "intensity" not in cloud.point:
-        return scan
-    intensity = cloud.point["intensity"].numpy().astype(np.float64).reshape(len(points))
-    return Scan(scan.points, intensity[np.isfinite(points).all(axis=1)])
+    ((points, intensity),) = isolated(_PROBLEM, _open3d_columns, path)
+    finite = np.isfinite(points).all(axis=1)
+    scan = Scan.of(points[finite])
+    return scan if intensity is None else Scan(scan.points, intensity.reshape(len(points))[finite])
+
+
+def _open3d_columns(path: Path) -> Iterator[tuple[FloatArray, FloatArray | None]]:
+    """Points (N, 3) and intensities (N,) or (N, 1), as they are in the file."""
+    cloud = load_open3d().t.io.read_point_cloud(str(path)).point
+    if "positions" not in cloud:
+        raise InputError(f"{path}: {_PROBLEM}, with x, y, z of each point")
+    intensity = cloud["intensity"].numpy().astype(np.float64) if "intensity" in cloud else None
+    yield cloud["positions"].numpy().astype(np.float64), intensity
 
 
 def _of_columns(columns: FloatArray) -> Scan:

@@ -19,7 +19,6 @@ from data_tools.datasets.detection_files.columns import COLUMNS, POSE, REQUIRED,
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.units import Clock
 from data_tools.files.arrow_tables import SUFFIXES, read_arrow_columns
-from data_tools.files.error_messages import error_context
 from data_tools.files.input_files import open_bytes, open_text
 from data_tools.files.json_stream import parsed_json
 from data_tools.files.numpy_files import load_archive
@@ -268,13 +267,9 @@ def _line(lines: list[int], row: int) -> str:
 
 def _read_npz(reading: _Reading) -> Iterator[RawTable]:
     path = reading.path
-    with open_bytes(path) as file:
-        with error_context(str(path)):
-            names, _ = load_archive(file, ())
-        found = reading.understood(names)
-        file.seek(0)
-        with error_context(str(path)):
-            _, arrays = load_archive(file, found.names.values())
+    names, _ = load_archive(path, ())
+    found = reading.understood(names)
+    _, arrays = load_archive(path, found.names.values())
     columns: dict[str, Values] = {ours: arrays[theirs] for ours, theirs in found.names.items()}
     first = "timestamp" if "timestamp" in columns else next(iter(columns))
     length = len(columns[first]) if np.ndim(columns[first]) == 1 else 0
