@@ -85,6 +85,11 @@ class DetectionFileSource(DatasetSource):
         "YAML file with the same, for --truth alone.", None, flag="--truth-import", metavar="FILE", verbs=JUDGED
     )
     scenes: str | None = option("Scene names with commas between them; all if left out.", None)
+    hosts: str | None = option(
+        "Hosts, or buckets, that URLs in lists may name and lead to, besides those of the URLs given here.",
+        None,
+        metavar="HOST,...",
+    )
     table: Literal["csv", "ndjson"] = option("Format of the tables, in parallel.", "csv", verbs=("track",))
 
     def __post_init__(self) -> None:
@@ -117,7 +122,7 @@ class DetectionFileSource(DatasetSource):
             with self._true_scenes() as dataset:
                 yield dataset
             return
-        with local_copy(self._table()) as path:
+        with local_copy(self._table(), self._hosts) as path:
             dataset = read_detections(path, self.how)
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{path}: --scenes")
 
@@ -132,7 +137,7 @@ class DetectionFileSource(DatasetSource):
     def parts(self) -> Iterator[Parts]:
         if self.scenes is not None:
             raise InputError("--scenes: all scenes of a file are done with --workers or --ray")
-        parts = [DetectionFilePart(url, self.how) for url in expanded(self.detections or ())]
+        parts = [DetectionFilePart(url, self.how, self._hosts) for url in expanded(self.detections or (), self._hosts)]
         yield Parts([part.name for part in parts], parts)
 
     def stream(self) -> AbstractContextManager[Iterator[Scene]]:
@@ -141,7 +146,7 @@ class DetectionFileSource(DatasetSource):
     @contextmanager
     def _stream(self) -> Iterator[Iterator[Scene]]:
         chosen = None if self.scenes is None else names("--scenes", self.scenes)
-        with local_copy(self._table()) as path:
+        with local_copy(self._table(), self._hosts) as path:
             yield read_scenes_in_parts(path, scenes=chosen, how=self.how)
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
@@ -167,7 +172,7 @@ class DetectionFileSource(DatasetSource):
     def option_for(self, mend: Mend) -> str:
         names: Mapping[str, str] = {}
         if mend.columns and self.detections:
-            with local_copy(expanded(self.detections)[0]) as path:
+            with local_copy(expanded(self.detections, self._hosts)[0], self._hosts) as path:
                 names = column_names(path, self.how)
         return self.how.option_for(mend, names)
 
@@ -190,13 +195,17 @@ class DetectionFileSource(DatasetSource):
         """The scenes of --truth, with the frames of the detections where these are there."""
         assert self.truth is not None
         how = self.how if self.truth_import is None else self.truth_import
-        with local_copy(self.truth) as path:
+        with local_copy(self.truth, self._hosts) as path:
             truth = TruthFile(path, how)
         dataset: Dataset = truth
         if self.detections is not None:
-            with local_copy(self._table()) as path:
+            with local_copy(self._table(), self._hosts) as path:
                 dataset = DetectedTruth(truth, read_detections(path, self.how))
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{self.truth}: --scenes")
+
+    @property
+    def _hosts(self) -> tuple[str, ...]:
+        return () if self.hosts is None else tuple(names("--hosts", self.hosts))
 
     def _table(self) -> str:
         if len(self.detections or ()) != 1:
@@ -230,6 +239,7 @@ class DetectionFilePart:
 
     url: str
     how: TableImport = field(default_factory=TableImport)
+    hosts: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -239,5 +249,5 @@ class DetectionFilePart:
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
         """Open with the digest of the file."""
-        with local_copy(self.url) as path:
+        with local_copy(self.url, self.hosts) as path:
             yield OpenedPart({name_of(self.url): file_digest(path)}, lambda: read_detections(path, self.how))

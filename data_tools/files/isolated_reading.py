@@ -33,6 +33,7 @@ T = TypeVar("T")
 SECONDS = 60.0  # of CPU time for any file
 SECONDS_A_MEGABYTE = 2.0  # of CPU time besides, for each megabyte of the file
 PATIENCE = 4.0  # seconds on the clock for each second of CPU time, on machines with other work
+FOR_EVER = 1e9  # s of CPU time for a remote file, whose size is unknown
 SILENCE = 120.0  # s on the clock for the next piece of a remote file
 MEMORY = max(2**30, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2)  # bytes in the child, and of output
 DOWNLOAD = 2**36  # bytes of a remote file
@@ -58,13 +59,13 @@ def isolated(
     reader come as they are.
     """
     remote = "://" in str(location)
-    seconds = float("inf") if remote else SECONDS + SECONDS_A_MEGABYTE * _size(Path(location)) / 1e6
+    seconds = FOR_EVER if remote else SECONDS + SECONDS_A_MEGABYTE * _size(Path(location)) / 1e6
     silence, left = (SILENCE, DOWNLOAD) if remote else (PATIENCE * seconds, MEMORY)
     child: _Child | None = None
     done = False
     try:
         child = _idle_or_new()
-        child.connection.send((problem, reader, (location, *arguments), seconds, hosts))
+        child.connection.send((problem, reader, (location, *arguments), seconds, hosts, Path.cwd()))
         while True:
             if not child.connection.poll(silence):
                 raise TimeoutError(f"its reader gave nothing for {silence:.0f} s")
@@ -127,7 +128,7 @@ class _Child:
             self._process.wait(5.0)
         code = self._process.returncode or 0
         if code == -signal.SIGXCPU:
-            return f"its reader took more than {seconds:.0f} s of CPU time"
+            return f"its reader took more than {seconds:g} s of CPU time"
         if code == -signal.SIGKILL:
             return "its reader was killed, as systems do that run out of memory"
         return f"its reader crashed ({signal.Signals(-code).name if code < 0 else f'exit code {code}'})"
@@ -164,7 +165,7 @@ def one_line(problem: str, location: str | Path) -> Iterator[None]:
     """An `InputError` of one line for whatever a library raises."""
     try:
         yield
-    except (InputError, MissingExtraError, GeneratorExit):
+    except (InputError, MissingExtraError):
         raise
     except MemoryError as error:
         raise InputError(f"{location}: {problem}: it takes more memory than this machine has for it") from error
@@ -179,12 +180,13 @@ def serve(handle: int) -> None:
     """Serve the parent at the other end of a connection until it goes away; the child's only function."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     threading.Thread(target=_end_with_parent, args=(handle,), daemon=True).start()
-    limits = {resource.RLIMIT_AS: MEMORY + _HEADROOM, resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: WRITTEN}
-    for what, most in limits.items():
-        _limit(what, most)
+    _limit(resource.RLIMIT_AS, MEMORY + _HEADROOM)
+    _limit(resource.RLIMIT_CORE, 0)
+    _limit(resource.RLIMIT_FSIZE, WRITTEN)
     network, connection = _Network(), Connection(handle)
     while connection.poll(IDLE):
-        problem, reader, arguments, seconds, hosts = connection.recv()
+        problem, reader, arguments, seconds, hosts, folder = connection.recv()
+        os.chdir(folder)
         network.hosts, network.addresses = hosts, set()
         used = resource.getrusage(resource.RUSAGE_SELF)
         _limit(resource.RLIMIT_CPU, used.ru_utime + used.ru_stime + seconds + 1)
@@ -198,10 +200,8 @@ def serve(handle: int) -> None:
 
 
 def _limit(what: int, most: float) -> None:
-    hard = resource.getrlimit(what)[1]
-    allowed = [int(each) for each in (most, hard) if each not in (float("inf"), resource.RLIM_INFINITY)]
-    with suppress(ValueError, OSError):  # systems that have no such limit
-        resource.setrlimit(what, (min(allowed, default=resource.RLIM_INFINITY), hard))
+    with suppress(ValueError, OSError):  # where a smaller one holds, or the system has no such limit
+        resource.setrlimit(what, (int(most), resource.getrlimit(what)[1]))
 
 
 def _end_with_parent(handle: int) -> None:

@@ -1,6 +1,7 @@
 """Doubts about data: what is probably wrong in them although it can be read, each with what mends it."""
 
 from data_tools.plausibility.checks import (
+    days_taken_for_times,
     ego_taken_for_world,
     far_too_fast,
     frames_taken_for_seconds,
@@ -26,6 +27,7 @@ __all__ = [
     "Doubt",
     "Mend",
     "Sample",
+    "days_taken_for_times",
     "doubts_of",
     "ego_taken_for_world",
     "far_too_fast",

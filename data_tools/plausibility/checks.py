@@ -133,6 +133,15 @@ def frames_taken_for_seconds(column: str, time: FloatArray) -> Doubt | None:
     return Doubt("frames", what, "expected seconds", Mend(units={"time": "10Hz"}))
 
 
+def days_taken_for_times(time: FloatArray) -> Doubt | None:
+    """Times (n,), s, of dates, all of which are of midnight."""
+    known = time[np.isfinite(time)]
+    if len(known) < 2 or (known % 86_400).any():
+        return None
+    what = "dates have no time of day: all rows of a day are one frame"
+    return Doubt("days", what, "expected a date and time for each frame")
+
+
 def ego_taken_for_world(
     frame: IntArray, position: FloatArray, world_T_ego: FloatArray, in_world: BoolArray, sensor: StrArray
 ) -> Doubt | None:

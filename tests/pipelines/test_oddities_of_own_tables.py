@@ -197,3 +197,49 @@ def test_the_examples_of_the_help_run(tmp_path: Path, monkeypatch: pytest.Monkey
     for line in lines:
         result = run_line(line)
         assert result.exit_code == 0, result.output
+
+
+POSE = {"ego_x": 0.0, "ego_y": 0.0, "ego_yaw": 0.0}
+GOOD = {"timestamp": 0.0, "x": 1.0, "y": 2.0, "scene": "a", "vx": 0.5, "length": 4.0, **POSE}
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ({"x": 2e9}, "line 5: x: expected a finite number within 1e+09, got 2e+09"),
+        ({"y": -1e300}, "line 5: y: expected a finite number within 1e+09, got -1e+300"),
+        ({"vx": 1e7}, "line 5: vx: expected a finite number within 1e+06, got 1e+07"),
+        ({"length": 1e6}, "line 5: length: expected a finite number within 100000, got 1e+06"),
+        ({"length": 0}, "line 5: length: expected a positive number of metres, got 0"),
+        ({"ego_x": 1e12}, "line 5: ego_x: expected a finite number within 1e+09, got 1e+12"),
+        ({"ego_yaw": 1.0}, "line 6: ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time"),
+        ({"scene": "n" * 300}, "line 5: scene: expected a name of at most 256 characters"),
+    ],
+)
+def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(
+    tmp_path: Path, row: dict[str, object], message: str
+) -> None:
+    found = [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("abcd")]
+    table = write(tmp_path / "d.csv", [*found[:3], found[3] | row, found[3]])
+    tracked = saga_fg("track", "file", table, "--output", tmp_path / "t.csv")
+    assert tracked.exit_code == 2
+    assert tracked.stderr.startswith(f"error: {table}: ")
+    assert message in tracked.stderr
+    look = saga_fg("inspect", table)
+    assert message in look.stdout + look.stderr
+    assert look.exit_code == 2 or "Next, when the table is mended:" in look.stdout
+
+
+def test_a_look_sees_scenes_that_are_scattered_in_a_long_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("data_tools.datasets.detection_files.survey.ROWS", 3)
+    table = write(tmp_path / "d.csv", [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("aabbaabb")])
+    look = saga_fg("inspect", table).stdout
+    assert "rows are not in order of time; add --sort" in look
+    assert "--sort --output tracks.csv" in look
+
+
+def test_a_look_says_that_dates_are_no_times(tmp_path: Path) -> None:
+    table = write(tmp_path / "d.csv", [{**GOOD, "timestamp": "2024-05-01"}] * 3)
+    look = saga_fg("inspect", table)
+    assert "timestamp: expected times with the time of day" in look.stdout
+    assert "Next, when the table is mended:" in look.stdout

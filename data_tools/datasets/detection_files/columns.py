@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import shlex
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,10 +16,12 @@ import numpy as np
 from data_tools.datasets.detection_files.column_names import Columns
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.units import ISO, Clock, factor, is_date, seconds_of_dates
-from data_tools.plausibility import FILL_IN, Doubt, frames_taken_for_seconds, headings_in_degrees
+from data_tools.plausibility import FILL_IN, Doubt, days_taken_for_times, frames_taken_for_seconds, headings_in_degrees
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED
+from saga_fg.types.frame import LATEST
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +34,13 @@ GPS = ("gps_x", "gps_y", "gps_z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ROTATIONS = {"yaw": QUATERNION, "ego_yaw": tuple(f"ego_{name}" for name in QUATERNION)}
 COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, *ODOMETRY, *GPS, *QUATERNION, *ROTATIONS["ego_yaw"], "empty")
+LIMITS = {
+    "timestamp": LATEST,
+    **dict.fromkeys(("x", "y", "z", *POSE[:3], *ODOMETRY[:2], *GPS), MAX_POSITION),
+    **dict.fromkeys(("length", "width", "height"), MAX_SIZE),
+    **dict.fromkeys(("vx", "vy", "range_rate"), MAX_SPEED),
+}
+"""Largest numbers of columns, in our units."""
 _ARGOVERSE = {"log_id", "timestamp_ns", "category", "length_m", "qw", "qz", "tx_m", "ty_m", "tz_m"}
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 LONGEST_NAME = 256  # characters; NumPy stores all texts of an array as wide as the widest
@@ -120,6 +130,8 @@ class RawTable:
     def doubts(self) -> list[Doubt]:
         """Doubts about columns as they are given, which cannot be seen in frames."""
         doubts = [headings_in_degrees(self.numbers("yaw"))]
+        if self.clock.unit == ISO:
+            doubts.append(days_taken_for_times(self.numbers("timestamp")))
         if "timestamp" in self.columns and "time" not in self.how.units and self.clock.unit == "s":
             doubts.append(frames_taken_for_seconds(self.found.names.get("timestamp", ""), self.numbers("timestamp")))
         command = self.argoverse_command()
@@ -205,9 +217,11 @@ class RawTable:
                 of, power = _measured(name)
                 unit = self.how.unit(of, self.found.units.get(of))
                 numbers = numbers if unit is None else numbers * factor(of, unit) ** power
-        if np.isinf(numbers).any():
-            where = self.where(int(np.argmax(np.isinf(numbers))))
-            raise InputError(f"{self.path}: {where}: {self.title(name)}: expected a finite number, got inf")
+        large = np.abs(numbers) > LIMITS.get(name, sys.float_info.max)
+        if large.any():
+            row = int(np.argmax(large))
+            within = f" within {LIMITS[name]:g}" if np.isfinite(numbers[row]) else ""
+            raise self.fault(row, f"{self.title(name)}: expected a finite number{within}, got {numbers[row]:g}")
         return numbers
 
     def plain_numbers(self, name: str) -> FloatArray:
@@ -225,6 +239,9 @@ class RawTable:
                 row = int(error.args[0])
                 got = f"got {str(values[row])[:40]!r}"
                 raise self.fault(row, f"{self.title(name)}: expected a date and time of ISO 8601, {got}") from error
+        if name == "timestamp" and is_date(next((value for value in values if value is not None), None), "day"):
+            got = "got dates without one, of which all rows of a day would be one frame"
+            raise InputError(f"{self.path}: {self.title(name)}: expected times with the time of day, {got}")
         return self._converted(name, values)
 
     def _converted(self, name: str, values: Sequence[Any]) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files.columns import BOX, GPS, ODOMETRY, POSE, RawTable
 from data_tools.datasets.detection_files.ego_columns import EgoColumns
-from data_tools.datasets.detection_files.formats import read_raw_parts, read_raw_table
+from data_tools.datasets.detection_files.formats import ROWS, read_raw_parts, read_raw_table
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
@@ -126,7 +126,7 @@ def read_detections(path: str | Path, how: TableImport | None = None) -> Detecti
 
 
 def read_scenes_in_parts(
-    path: str | Path, rows: int = 50_000, scenes: Collection[str] | None = None, how: TableImport | None = None
+    path: str | Path, rows: int = ROWS, scenes: Collection[str] | None = None, how: TableImport | None = None
 ) -> Iterator[Scene]:
     """The scenes of a table as they come, each as successive `Scene`s of about `rows` rows: without holding them all.
 

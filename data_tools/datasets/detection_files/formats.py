@@ -27,6 +27,7 @@ from saga_fg.errors import InputError
 log = logging.getLogger(__name__)
 
 Row = TypeVar("Row")
+ROWS = 50_000  # of a part of a table
 NAMED = ("label", "sensor", "scene", "coordinates", "id", "source", "quality")
 TRACK_MEANINGS = ("id",)  # of tracks, which need no word where detections are read
 _OPEN_QUOTE = "a quote is opened and not closed on this line"
@@ -86,7 +87,7 @@ def read_raw_parts(
     path: Path,
     layout: Layout | None = None,
     how: TableImport | None = None,
-    rows: int = 50_000,
+    rows: int = ROWS,
     own: Collection[str] | None = None,
 ) -> Iterator[RawTable]:
     """Read a table in parts of about `rows` rows, in their order; rows of one scene and time stay together.

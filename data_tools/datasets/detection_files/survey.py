@@ -10,7 +10,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files.columns import BOX, COLUMNS, POSE, QUATERNION, REQUIRED, ROTATIONS, RawTable
 from data_tools.datasets.detection_files.dataset import DetectionFile
-from data_tools.datasets.detection_files.formats import Layout, read_raw_table, sorted_by_time
+from data_tools.datasets.detection_files.formats import ROWS, Layout, read_raw_table, sorted_by_time
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS
 from data_tools.plausibility import Doubt, Sample, doubts_of
@@ -73,14 +73,16 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
     _, of_scene = np.unique(scene, return_inverse=True)
     backwards = np.diff(time[np.argsort(of_scene, kind="stable")]) < 0
     backwards &= np.diff(np.sort(of_scene)) == 0
-    in_order = not backwards.any()
+    scattered = raw.length > ROWS and np.count_nonzero(np.diff(of_scene)) > of_scene.max()
+    in_order = not backwards.any() and not scattered  # longer tables are read in parts, a scene after the other
     ordered = raw if in_order else sorted_by_time(raw)
     doubts = raw.doubts()
     if not faults:
         try:
             table = DetectionFile(replace(ordered, columns={k: v for k, v in ordered.columns.items() if k in COLUMNS}))
-            for name in table.scenes[:3]:
-                doubts += doubts_of(Sample.of(table.scene(name).frames))
+            for number, name in enumerate(table.scenes):
+                frames = table.scene(name).frames
+                doubts += doubts_of(Sample.of(frames)) if number < 3 else []
         except InputError as error:
             faults.append(str(error).removeprefix(f"{path}: "))
     known = {doubt.kind: doubt for doubt in reversed(doubts)}

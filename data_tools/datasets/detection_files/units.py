@@ -49,6 +49,7 @@ kind_of: Mapping[str, Kind] = MappingProxyType(_KINDS)
 _PER_SECOND = {"m": "m/s", "km": "km/h", "ft": "ft/s"}
 _LARGEST_SECONDS = 1e11  # beyond, numbers are no seconds
 _LONGEST_STEP = 10.0  # s between frames, beyond which a finer unit is likelier
+_ISO_DAY = re.compile(r"\s*\d{4}-\d\d-\d\d\s*$")
 _ISO_DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[T ]\d\d")
 
 
@@ -116,9 +117,9 @@ def checked_unit(kind: str, unit: str) -> str:
     return unit
 
 
-def is_date(value: Any) -> bool:
-    """True for a text that begins like a date with a time of ISO 8601."""
-    return isinstance(value, str) and _ISO_DATE.match(value) is not None
+def is_date(value: Any, to: Literal["day", "minute"] = "minute") -> bool:
+    """True for a text that begins like a date with a time of ISO 8601, or is one without a time (`to` the day)."""
+    return isinstance(value, str) and (_ISO_DATE if to == "minute" else _ISO_DAY).match(value) is not None
 
 
 def seconds_of_dates(values: Sequence[Any]) -> FloatArray:

@@ -272,3 +272,47 @@ def test_definitions_hold_all_that_they_are_made_of():
     for part in ("MSG: unique_identifier_msgs/UUID", "uint8[16] uuid", "MSG: builtin_interfaces/Time"):
         assert part in text
     assert definition("std_msgs/String") is None
+
+
+HOSTILE = {
+    "a view that never ends": """DROP TABLE messages; CREATE VIEW messages AS WITH RECURSIVE
+        n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
+        SELECT id, 1 AS topic_id, 0 AS timestamp, x'' AS data FROM n""",
+    "topics as a view": "ALTER TABLE topics RENAME TO others; CREATE VIEW topics AS SELECT * FROM others",
+    "a virtual table": "DROP TABLE messages; CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data)",
+    "a view called a table": """ALTER TABLE messages RENAME TO others;
+        CREATE VIEW messages AS SELECT * FROM others; PRAGMA writable_schema = ON;
+        UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'""",
+    "no tables": "DROP TABLE messages; DROP TABLE topics",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_bag_is_read_from_plain_tables_alone(tmp_path, name):
+    path = example.write_bag(tmp_path / "drive", example.drive())
+    file = next(path.glob("*.db3"))
+    with sqlite3.connect(file) as database:
+        database.execute("PRAGMA foreign_keys = OFF")
+        database.executescript(HOSTILE[name])
+    database.close()
+    with pytest.raises(InputError, match=rf"{file.name}: expected a bag of ROS 2 in SQLite"):
+        read(path)
+
+
+def test_a_bag_is_not_written_to(tmp_path):
+    path = example.write_bag(tmp_path / "drive", example.drive())
+    file = next(path.glob("*.db3"))
+    before = file.read_bytes()
+    file.chmod(0o444)
+    is_the_drive(read(path))
+    assert file.read_bytes() == before
+    assert {each.name for each in path.iterdir()} == {file.name, "metadata.yaml"}
+
+
+def test_chunks_that_are_damaged_are_one_line(tmp_path):
+    path = example.write_mcap(tmp_path / "drive.mcap", example.drive())
+    content = bytearray(path.read_bytes())
+    content[200:264] = b"\xff" * 64
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"^[^\n]*drive\.mcap: [^\n]*$"):
+        read(path)

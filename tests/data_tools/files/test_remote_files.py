@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from data_tools.files.remote_files import expanded, local_copy, local_tree, name_of
+from data_tools.files.remote_files import PROTOCOLS, expanded, local_copy, local_tree, name_of
 from saga_fg.errors import InputError, MissingExtraError
 
 
@@ -91,3 +94,68 @@ def test_a_list_in_itself_is_refused(tmp_path: Path) -> None:
     other.write_text(f"{one}\n")
     with pytest.raises(InputError, match=r"one\.txt: expected a list of files, this one is in itself"):
         expanded([str(one)])
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("zip://a.csv::file:///nowhere/a.zip", "got zip://"),
+        ("zip://a.csv::https://localhost/a.zip", "got zip://"),
+        ("reference://a.csv", "got reference://"),
+        ("file:///a.csv::https://localhost/b", "got a chain"),
+        ("simplecache::s3://bucket/a.csv", "got simplecache::s3://"),
+        ("github://a:b@/c.csv", "got github://"),
+        ("://a.csv", "got ://"),
+    ],
+)
+@pytest.mark.parametrize("read", [local_copy, lambda url: local_tree(url, ["*"]), lambda url: expanded([f"{url}*"])])
+def test_other_protocols_and_chains_are_refused(url: str, message: str, read: Callable[[str], Any]) -> None:
+    with pytest.raises(InputError) as caught, ExitStack() as stack:
+        stack.enter_context(read(url))
+    assert f"expected a URL of one protocol, one of {', '.join(PROTOCOLS)}, {message}" in str(caught.value)
+
+
+@pytest.mark.parametrize("url", ["file:///nowhere", "http://localhost:1/a", "ftp://localhost:1/a.csv"])
+def test_what_is_not_there_is_one_line(url: str) -> None:
+    pytest.importorskip("fsspec")
+    with pytest.raises((InputError, MissingExtraError)) as caught, local_copy(url):
+        pass
+    assert str(caught.value).startswith(f"{url}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_list_names_no_other_host_unless_it_is_given(tmp_path: Path) -> None:
+    path = tmp_path / "list.txt"
+    path.write_text("https://data.example.org/a.csv\ns3://bucket/b.csv\n")
+    with pytest.raises(InputError) as caught:
+        expanded([str(path)])
+    assert str(caught.value) == (
+        f"{path}: https://data.example.org/a.csv: this list names another host; "
+        "if you know it: --hosts data.example.org"
+    )
+    with pytest.raises(InputError, match="--hosts bucket"):
+        expanded([str(path)], ["data.example.org"])
+    both = ["https://data.example.org/a.csv", "s3://bucket/b.csv"]
+    assert expanded([str(path)], ["data.example.org", "bucket"]) == both
+    assert expanded(["s3://bucket/c.csv", str(path)], ["data.example.org"]) == ["s3://bucket/c.csv", *both]
+
+
+def test_a_list_from_a_url_names_no_local_files(tmp_path: Path) -> None:
+    memory = pytest.importorskip("fsspec").filesystem("memory")
+    for entry in ("/etc/passwd", "file:///etc/passwd", "a.csv", "*.csv"):
+        memory.pipe_file("/lists/one.txt", f"{entry}\n".encode())
+        with pytest.raises(InputError, match=r"memory://lists/one\.txt: .* expected URLs in a list"):
+            expanded(["memory://lists/one.txt"])
+    memory.pipe_file("/lists/one.txt", b"memory://lists/a.csv\n")
+    assert expanded(["memory://lists/one.txt"]) == ["memory://lists/a.csv"]
+    memory.store.clear()
+
+
+def test_pieces_of_a_large_file_are_put_together(tmp_path: Path) -> None:
+    pytest.importorskip("fsspec")
+    content = bytes(range(256)) * 40_000  # more than one piece
+    (tmp_path / "large.bin").write_bytes(content)
+    with local_copy(f"file://{tmp_path}/large.bin") as path:
+        assert path.read_bytes() == content
+    with local_tree(f"file://{tmp_path}", ["*.bin", "l*"]) as folder:
+        assert (folder / "large.bin").read_bytes() == content
