@@ -119,7 +119,7 @@ def test_paths_are_those_of_this_process(tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_reader_that_nobody_waits_for_ends() -> None:
     found = isolated(PROBLEM, readers.process, "a")
     child = next(found)
-    found.close()
+    del found  # which closes it
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
 
