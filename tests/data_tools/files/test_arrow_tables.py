@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_tools.datasets.detection_files import read_detections
+from data_tools.datasets.detection_files import TableImport, read_detections
 from data_tools.files.arrow_tables import all_of, read_arrow_columns
 from saga_fg.errors import InputError
 
