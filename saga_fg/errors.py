@@ -27,3 +27,7 @@ class UnknownNodeError(SagaError, KeyError):
 
 class MissingExtraError(SagaError, ImportError):
     """An optional dependency is not installed; the text names the extra that brings it."""
+
+
+class KernelError(SagaError, RuntimeError):
+    """A kernel cannot be compiled, as Numba is missing or does not fit; the text names the reason."""

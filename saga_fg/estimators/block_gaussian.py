@@ -9,11 +9,9 @@ import numpy as np
 
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, flattened, regrouped
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.components import node_blocks, uncorrelated_labels
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
-_IN_CACHE = 100_000  # entries of components that are compared at once
 _UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
 
 
@@ -67,7 +65,7 @@ class BlockGaussian:
         kept = keep.nonzero()[0]
         old = self.partition
         partition = old.restricted(self.layout.without(rows), kept)
-        blocks = _left(self.blocks, old, partition, rows, kept)
+        blocks = regrouped(self.blocks, old, partition, kept)
         return BlockGaussian(partition, self.mean[self.layout.places(kept)], blocks)
 
     def decoupled(self) -> BlockGaussian:
@@ -117,72 +115,17 @@ class BlockGaussian:
         return variances
 
 
-@compiled_by(lambda blocks, old, new, rows, kept: regrouped(blocks, old, new, kept))
-def _left(blocks: BlockDiagonal, old: Partition, new: Partition, rows: IntArray, kept: IntArray) -> BlockDiagonal:
-    """The blocks of the `kept` nodes, without those at `rows`."""
-    if old.count - new.count < len(rows):
-        return regrouped(blocks, old, new, kept)
-    leaving = [old.row[rows[old.group[rows] == number]] for number in range(len(blocks))]  # nodes without partners
-    left = (np.delete(P, of_group, axis=0) for P, of_group in zip(blocks, leaving, strict=True))
-    return tuple(P for P in left if len(P))
-
-
-def _uncorrelated_by_kernel(x: BlockGaussian, tolerance: float) -> Partition:
+def _uncorrelated(x: BlockGaussian, tolerance: float) -> Partition:
     at, layout, label = x.partition.block_places, x.layout, x.partition.label
     return Partition(layout, uncorrelated_labels(x.flat, label, at.start, at.size, at.offset, layout.dims, tolerance))
 
 
-@compiled_by(_uncorrelated_by_kernel)
-def _uncorrelated(x: BlockGaussian, tolerance: float) -> Partition:
-    partition, layout = x.partition, x.layout
-    node_of = np.repeat(np.arange(len(layout)), layout.dims)
-    a, b = [], []
-    for places, P in zip(partition.groups, x.blocks, strict=True):
-        node, (c, s) = node_of[places], places.shape
-        d = int(layout.dims[node[0, 0]])
-        if s == d and (node == node[:, :1]).all():  # nodes on their own
-            continue
-        alike = s % d == 0 and (layout.dims[node] == d).all()  # then node by node
-        of_nodes = d if alike else 1
-        chunk = max(1, _IN_CACHE // (s * s))
-        tied = [_tied(P[first : first + chunk], tolerance, of_nodes) for first in range(0, c, chunk)]
-        node = node[:, ::of_nodes]
-        k, i, j = np.nonzero(np.concatenate(tied))
-        once = i < j
-        a.append(node[k[once], i[once]])
-        b.append(node[k[once], j[once]])
-    return Partition.apart(layout).joined(np.concatenate(a), np.concatenate(b))
-
-
-def _tied(P: FloatArray, tolerance: float, d: int) -> BoolArray:
-    """(c, s / d, s / d) which nodes, of d states each, any correlation above `tolerance` ties; P (c, s, s)."""
-    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    tied = np.abs(P) > tolerance * sigma[:, :, None] * sigma[:, None, :]
-    columns = np.logical_or.reduce([tied[:, :, k::d] for k in range(d)])
-    return np.asarray(np.logical_or.reduce([columns[:, k::d] for k in range(d)]))
-
-
-def _diagonal_by_kernel(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
-    place, d = partition.block_places, int(partition.layout.dims[rows[0]])
-    return node_blocks(flattened(blocks), place.start, place.size, place.offset, rows, d)
-
-
-@compiled_by(_diagonal_by_kernel, where=lambda blocks, partition, rows: len(rows) > 0)
 def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
     """(k, d, d) blocks of the nodes at `rows`, whose states have equal size d."""
-    d = int(partition.layout.dims[rows[0]]) if len(rows) else 0
-    result = np.empty((len(rows), d, d))
     if len(rows) == 0:
-        return result
-    if partition.size:
-        own = np.empty((len(partition.layout), d, d))
-        for (nodes, row, slot), block in zip(partition.nodes_by_group, blocks, strict=True):
-            own[nodes] = partition.by_nodes(block)[row, slot, slot]
-        return own if len(rows) == len(own) and (rows == np.arange(len(own))).all() else own[rows]
-    for number, members, at in partition.members(rows, d):
-        row = partition.row[rows[members]]
-        result[members] = blocks[number][row[:, None, None], at[:, :, None], at[:, None, :]]
-    return result
+        return np.empty((0, 0, 0))
+    place, d = partition.block_places, int(partition.layout.dims[rows[0]])
+    return node_blocks(flattened(blocks), place.start, place.size, place.offset, rows, d)
 
 
 def joint_block(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:

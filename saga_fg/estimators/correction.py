@@ -10,7 +10,6 @@ H P = R K^T, so that the measured rows are as exact as in Joseph's form.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -20,11 +19,9 @@ import scipy.linalg
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.partition import Partition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
-_AT_ONCE = 25_000  # entries of components that are corrected at once where memory counts
 _BATCHED_BELOW = 10  # size from which a triangular system is worth a call of its own
 
 
@@ -54,14 +51,6 @@ def correct(
     gains: list[Gain] = []
     posterior, misfit = _posterior(x, _stacks(x, rows, z, H, R), gains.append)
     return posterior, tuple(gains), -0.5 * z.size * math.log(2 * math.pi) - misfit
-
-
-def posterior_of(
-    x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray
-) -> tuple[BlockGaussian, float]:
-    """Return the posterior and the log-likelihood of the innovation, as `correct`; no gains, in little memory."""
-    posterior, misfit = _posterior(x, _stacks(x, rows, z, H, R, _AT_ONCE))
-    return posterior, -0.5 * z.size * math.log(2 * math.pi) - misfit
 
 
 class WhitenedFactor(NamedTuple):
@@ -127,12 +116,10 @@ def _half_mahalanobis(L: FloatArray, whitened: FloatArray) -> float:
     return 0.5 * float(np.vdot(whitened, whitened) + 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum())
 
 
-def _stacks(
-    x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray, most: int = sys.maxsize
-) -> Iterator[_Stacked]:
+def _stacks(x: BlockGaussian, rows: IntArray, z: FloatArray, H: FloatArray, R: FloatArray) -> Iterator[_Stacked]:
     """Stack the measurements of each group of components, of `most` entries at once."""
     partition, mean, (k, d) = x.partition, x.mean, H.shape[1:]
-    for number, members, at in _members(partition, rows, d, most):
+    for number, members, at in partition.members(rows, d):
         component, places = partition.row[rows[members]], partition.groups[number]
         measured = np.flatnonzero(np.bincount(component, minlength=len(places)))
         active: IntArray | slice = slice(None)
@@ -161,20 +148,6 @@ def _stacks(
         a = deep * k
         stacked = H_P.reshape(c, a, s), H_all.reshape(c, a, s), R_all.reshape(c, a, a), innovation.reshape(c, a, 1)
         yield _Stacked(number, active, places, P, *stacked)
-
-
-def _members(partition: Partition, rows: IntArray, dim: int, most: int) -> Iterator[tuple[int, IntArray, IntArray]]:
-    """`Partition.members`, of components of `most` entries at once."""
-    for number, members, at in partition.members(rows, dim):
-        count, size = partition.groups[number].shape
-        some = max(1, most // size**2)
-        if count <= some:
-            yield number, members, at
-            continue
-        part = partition.row[rows[members]] // some
-        for k in np.unique(part).tolist():
-            mine = np.flatnonzero(part == k)
-            yield number, members[mine], at[mine]
 
 
 def _factor_stacks(x: BlockGaussian, factors: Sequence[WhitenedFactor]) -> Iterator[_Stacked]:

@@ -1,6 +1,6 @@
-"""The steps of the joint Kalman filter: by kernels, or by `dynamics.predict` and `correction.correct`.
+"""The steps of the joint Kalman filter, by the kernels of `saga_fg.kernels.filtering`.
 
-In kernels components are worked on one after the other, and so are measurements.
+Components are worked on one after the other, and so are measurements.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.bounds import ComponentBounds
-from saga_fg.estimators.correction import CANCELLATION, lost_in_rounding, posterior_of
-from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.correction import CANCELLATION, lost_in_rounding
+from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.measurements import LinearisedMeasurements
 from saga_fg.estimators.partition import Partition, unflattened
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.filtering import corrected_state, predicted_state, tie_strengths
 from saga_fg.model.transition import Blocks
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -32,9 +31,11 @@ class _FlatBlocks(NamedTuple):
     values: FloatArray
 
 
-def _predicted_by_kernel(
-    x: BlockGaussian, dynamics: Dynamics, bounds: ComponentBounds | None, look: bool
-) -> BlockGaussian:
+def predicted(x: BlockGaussian, dynamics: Dynamics, bounds: ComponentBounds | None, look: bool) -> BlockGaussian:
+    """The prior after the interval. Raises `InputError` where it is not finite.
+
+    look: for components that have fallen apart, where there are no `bounds`, which always look
+    """
     F, Q = _flat(dynamics.F), _flat(dynamics.Q)
     if bounds is None:
         x = dynamics.separated(x) if look else x
@@ -52,17 +53,6 @@ def _predicted_by_kernel(
     return BlockGaussian(x.partition, mean, unflattened(flat, x.partition))
 
 
-@compiled_by(_predicted_by_kernel)
-def predicted(x: BlockGaussian, dynamics: Dynamics, bounds: ComponentBounds | None, look: bool) -> BlockGaussian:
-    """The prior after the interval. Raises `InputError` where it is not finite.
-
-    look: for components that have fallen apart, where there are no `bounds`, which always look
-    """
-    if bounds is None:
-        return predict(dynamics.separated(x) if look else x, dynamics)
-    return predict(x, *bounds.applied(x, dynamics))
-
-
 def _bounded(x: BlockGaussian, bounds: ComponentBounds, F: _FlatBlocks) -> Partition:
     """The components within `bounds`; blocks of F between them are inputs."""
     parts, at = x.uncorrelated(bounds.tolerance), x.partition.block_places
@@ -72,19 +62,14 @@ def _bounded(x: BlockGaussian, bounds: ComponentBounds, F: _FlatBlocks) -> Parti
     return parts.joined_up_to(parts.label[F.target[strong]], parts.label[F.source[strong]], bounds.most)
 
 
-def _corrected_by_kernel(x: BlockGaussian, seen: LinearisedMeasurements) -> tuple[BlockGaussian, float]:
+def corrected(x: BlockGaussian, seen: LinearisedMeasurements) -> tuple[BlockGaussian, float]:
+    """The posterior and the log-likelihood of the innovation. Raises `InputError` as `correction.correct` does."""
     at, offsets = x.partition.block_places, x.layout.offsets
     where = at.start, at.size, at.offset, offsets, at.first, at.places
     definite, mean, flat, log_likelihood = corrected_state(x.mean, x.flat, *where, *seen, CANCELLATION)
     if not definite:
         raise lost_in_rounding(x.variances().max())
     return BlockGaussian(x.partition, mean, unflattened(flat, x.partition)), log_likelihood
-
-
-@compiled_by(_corrected_by_kernel)
-def corrected(x: BlockGaussian, seen: LinearisedMeasurements) -> tuple[BlockGaussian, float]:
-    """The posterior and the log-likelihood of the innovation. Raises `InputError` as `correction.correct` does."""
-    return posterior_of(x, *seen)
 
 
 def _flat(groups: Sequence[Blocks]) -> _FlatBlocks:

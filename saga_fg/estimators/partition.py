@@ -17,7 +17,6 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from saga_fg.estimators.layout import StateLayout
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.components import component_tables, regrouped_blocks
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -80,7 +79,7 @@ class Partition:
     @property
     def offset(self) -> IntArray:
         """(n,) where each node's state begins within its component."""
-        return self._tables[3]
+        return self.block_places.offset
 
     @cached_property
     def size(self) -> int | None:
@@ -106,14 +105,8 @@ class Partition:
         return self.offset // self.size
 
     @cached_property
-    def nodes_by_group(self) -> tuple[tuple[IntArray, IntArray, IntArray], ...]:
-        """For each group, the nodes in it, the rows of their components and their slots there. Only with `size`."""
-        nodes = [(self.group == number).nonzero()[0] for number in range(len(self.groups))]
-        return tuple((of_group, self.row[of_group], self.slot[of_group]) for of_group in nodes)
-
-    @cached_property
-    def _compiled_tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, BlockPlaces]:
-        """Groups, group and row as by `_tables`, made by a kernel, and what other kernels need."""
+    def _tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, BlockPlaces]:
+        """Groups, group and row of each node, and what kernels need."""
         group, row, offset, start, size, first, sizes, counts, places = component_tables(self.label, self.layout.dims)
         groups, at = [], 0
         for s, c in zip(sizes.tolist(), counts.tolist(), strict=True):
@@ -124,11 +117,7 @@ class Partition:
     @property
     def block_places(self) -> BlockPlaces:
         """Index of the blocks, for kernels."""
-        return self._compiled_tables[3]
-
-    @cached_property
-    def _tables(self) -> _Tables:
-        return _made_tables(self)
+        return self._tables[3]
 
     def members(self, rows: IntArray, dim: int) -> list[tuple[int, IntArray, IntArray]]:
         """Node rows (m,) of states of size `dim`, by group of components: its number, which of them, where.
@@ -196,38 +185,6 @@ class Partition:
         return Partition(layout, _without_gaps(self.label[rows]))
 
 
-_Tables = tuple[tuple[IntArray, ...], IntArray, IntArray, IntArray]  # groups; group, row, offset of each node
-
-
-def _tables_by_kernel(partition: Partition) -> _Tables:
-    return (*partition._compiled_tables[:3], partition.block_places.offset)
-
-
-@compiled_by(_tables_by_kernel)
-def _made_tables(partition: Partition) -> _Tables:
-    layout, label = partition.layout, partition.label
-    none = np.empty(0, dtype=np.int64)
-    if len(label) == 0:
-        return (), none, none, none
-    order = np.argsort(label, kind="stable")
-    size = np.bincount(label, weights=layout.dims).astype(np.int64)
-    start = np.cumsum(size) - size
-    ends = np.cumsum(layout.dims[order])
-    first = ends - layout.dims[order]  # of each node, in the order of components
-    offset = np.empty(len(label), dtype=np.int64)
-    offset[order] = first - start[label[order]]
-    places = np.repeat(layout.offsets[:-1][order] - first, layout.dims[order]) + np.arange(layout.size)
-    sizes = np.bincount(size).nonzero()[0]
-    group = np.searchsorted(sizes, size)
-    row = np.empty(len(size), dtype=np.int64)
-    groups = []
-    for number, s in enumerate(sizes.tolist()):
-        members = (group == number).nonzero()[0]
-        row[members] = np.arange(len(members))
-        groups.append(places[start[members][:, None] + np.arange(s)])
-    return tuple(groups), group[label], row[label], offset
-
-
 def _united(count: int, a: IntArray, b: IntArray) -> IntArray:
     """(count,) number of the set that each of `count` elements is in when a[k] and b[k] are in one, without gaps."""
     if len(a) > _PAIRS:
@@ -280,50 +237,15 @@ def unflattened(flat: FloatArray, partition: Partition) -> BlockDiagonal:
     return tuple(blocks)
 
 
-def _regrouped_by_kernel(blocks: BlockDiagonal, old: Partition, new: Partition, source: IntArray) -> BlockDiagonal:
-    here, there, length = old.block_places, new.block_places, sum(p.size * p.shape[1] for p in new.groups)
-    before = flattened(blocks), old.label, here.start, here.size, here.offset, old.layout.dims
-    after = new.label, there.start, there.size, there.offset
-    return unflattened(regrouped_blocks(*before, source, *after, length), new)
-
-
-@compiled_by(_regrouped_by_kernel, where=lambda blocks, old, new, source: len(new.label) > 0)
 def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: IntArray) -> BlockDiagonal:
     """Copy the blocks of a matrix over to another partition.
 
     source: for each node of `new` its row in `old`, -1 for none; a row may serve several nodes. Entries between nodes
     in different components of either partition are zero.
     """
-    result = zeros(new)
-    to = (source >= 0).nonzero()[0]
-    if len(to) == 0:
-        return result
-    # a piece: nodes that share a component, before and after
-    _, piece = np.unique(old.label[source[to]] * new.count + new.label[to], return_inverse=True)
-    order = np.argsort(piece, kind="stable")
-    to, piece = to[order], piece[order]
-    origin = source[to]
-    dims = old.layout.dims[origin]
-    within = np.arange(dims.sum()) - np.repeat(np.cumsum(dims) - dims, dims)
-    before = np.repeat(old.offset[origin], dims) + within
-    after = np.repeat(new.offset[to], dims) + within
-    size = np.bincount(piece, weights=dims).astype(np.int64)
-    start = np.cumsum(size) - size
-    first = np.searchsorted(piece, np.arange(len(size)))  # a node of each piece
-    kind = (old.group[origin[first]] * len(new.groups) + new.group[to[first]]) * (new.layout.size + 1) + size
-    for number in np.unique(kind).tolist():
-        alike = (kind == number).nonzero()[0]
-        i, j = origin[first[alike]], to[first[alike]]
-        s = int(size[alike[0]])
-        places = start[alike][:, None] + np.arange(s)
-        a, b, given, copy = before[places], after[places], blocks[old.group[i[0]]], result[new.group[j[0]]]
-        i, j = old.row[i], new.row[j]
-        if given.shape[1] == s == copy.shape[1]:  # components that stay as they are
-            part = ((a != np.arange(s)) | (b != np.arange(s))).any(axis=1)
-            copy[j[~part]] = given[i[~part]]
-            i, j, a, b = i[part], j[part], a[part], b[part]
-        if old.size and old.size == new.size and given.flags.c_contiguous:  # node by node
-            a, b = a[:, :: old.size] // old.size, b[:, :: old.size] // old.size
-            given, copy = old.by_nodes(given), new.by_nodes(copy)
-        copy[j[:, None, None], b[:, :, None], b[:, None, :]] = given[i[:, None, None], a[:, :, None], a[:, None, :]]
-    return result
+    if len(new.label) == 0:
+        return ()
+    here, there, length = old.block_places, new.block_places, sum(p.size * p.shape[1] for p in new.groups)
+    before = flattened(blocks), old.label, here.start, here.size, here.offset, old.layout.dims
+    after = new.label, there.start, there.size, there.offset
+    return unflattened(regrouped_blocks(*before, source, *after, length), new)

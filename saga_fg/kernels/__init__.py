@@ -1,5 +1,5 @@
-"""Loops over tracks, nodes and pairs, compiled by Numba where that is installed (`saga_fg[fast]`).
+"""Loops over tracks, nodes and pairs, compiled by Numba. See `saga_fg.kernels.compilation`.
 
-Each does what a NumPy version beside its call does as well, which is used without Numba and which tests compare it
-with. See `saga_fg.kernels.compilation`.
+Each is the only implementation of what its docstring states. Tests compare it with the textbook, and compiled with the
+same function as plain Python.
 """

@@ -1,15 +1,14 @@
 """Compilation of kernels: functions over arrays that Numba compiles at their first call, and keeps on disk.
 
 Compiled code is kept beside the source, or in the cache folder of the user where that is read-only (`NUMBA_CACHE_DIR`
-names another place). Without a Numba that works, or with `NUMBA_DISABLE_JIT=1`, `compiled_kernels` is false: then
-callers take their NumPy versions, and kernels are never called.
+names another place). With `NUMBA_DISABLE_JIT=1` kernels run as plain Python, without Numba: some hundred times slower,
+for tests and for debugging.
 """
 
 from __future__ import annotations
 
 import gc
 import importlib
-import importlib.util
 import logging
 import os
 import pkgutil
@@ -20,6 +19,7 @@ from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import saga_fg.kernels
+from saga_fg.errors import KernelError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -29,52 +29,23 @@ _OPTIONS = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 _SCALARS = {"f": "float64", "i": "int64", "b": "boolean", "u": "uint32"}
 _kernels: list[Kernel[Any, Any]] = []  # of the modules that were imported
 _parts: set[Callable[..., Any]] = set()  # functions that kernels of the same module call
-_enabled: bool | None = None  # None: nobody has asked yet
 _listening = False
 _said: set[str] = set()
 
 
-def compiled_kernels() -> bool:
-    """True where kernels are used, false where NumPy alone is; Numba is imported at the first call."""
-    global _enabled
-    if _enabled is None:
-        _enabled = _numba_works()
-    return _enabled
-
-
-@contextmanager
-def only_numpy() -> Iterator[None]:
-    """Do without kernels, to compare with."""
-    global _enabled
-    before, _enabled = _enabled, False
-    try:
-        yield
-    finally:
-        _enabled = before
-
-
 def load_kernels() -> None:
     """Load or compile all kernels, so that no frame waits for it."""
-    if compiled_kernels():
-        for module in pkgutil.iter_modules(saga_fg.kernels.__path__):
-            importlib.import_module(f"saga_fg.kernels.{module.name}")
-        for each in _kernels:
-            each.load()
-
-
-def _numba_works() -> bool:
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1" or importlib.util.find_spec("numba") is None:
-        return False
-    try:
-        numba: Any = importlib.import_module("numba")  # takes as long as all else that a command imports
-    except Exception as error:  # too old for this NumPy, or a library that is missing
-        log.warning("Numba does not work here, NumPy is used instead: %s", error)
-        return False
-    return not numba.config.DISABLE_JIT
+    for module in pkgutil.iter_modules(saga_fg.kernels.__path__):
+        importlib.import_module(f"saga_fg.kernels.{module.name}")
+    for each in _kernels:
+        each.load()
 
 
 class Kernel(Generic[P, R]):
-    """A function that is compiled when it is first called; `source` is the function itself."""
+    """A function that is compiled when it is first called; `source` is the function itself.
+
+    Raises `KernelError` where Numba cannot be imported, or does not compile it.
+    """
 
     def __init__(self, source: Callable[P, R], arguments: str) -> None:
         self.source = source
@@ -89,8 +60,11 @@ class Kernel(Generic[P, R]):
     def load(self) -> Callable[P, R]:
         """Compile it, or load it from disk, unless that is done."""
         if self._compiled is None:
-            with _garbage_uncollected():
-                self._compiled = cast(Callable[P, R], _compiled(self.source, self._arguments))
+            if os.environ.get("NUMBA_DISABLE_JIT") == "1":
+                self._compiled = self.source
+            else:
+                with _garbage_uncollected():
+                    self._compiled = cast(Callable[P, R], _compiled(self.source, self._arguments))
         return self._compiled
 
 
@@ -101,33 +75,6 @@ def kernel(arguments: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
     many dimensions, which is only read, of any strides, or contiguous where a c follows.
     """
     return lambda source: Kernel(source, arguments)
-
-
-class Choice(Generic[P, R]):
-    """A function in two versions of the same arguments and results: `compiled` where kernels are used, else NumPy's."""
-
-    def __init__(
-        self, numpy_version: Callable[P, R], compiled: Callable[P, R], where: Callable[P, bool] | None
-    ) -> None:
-        self.numpy_version, self.compiled, self.where = numpy_version, compiled, where
-        self.__name__ = numpy_version.__name__
-        update_wrapper(self, numpy_version)
-        choices.append(self)
-
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        if not (_enabled or compiled_kernels()) or (self.where is not None and not self.where(*args, **kwargs)):
-            return self.numpy_version(*args, **kwargs)
-        return self.compiled(*args, **kwargs)
-
-
-choices: list[Choice[Any, Any]] = []  # of the modules that were imported
-
-
-def compiled_by(
-    compiled: Callable[P, R], where: Callable[P, bool] | None = None
-) -> Callable[[Callable[P, R]], Choice[P, R]]:
-    """Decorate a NumPy function: a kernel, or its caller, does its work where kernels are used and `where` holds."""
-    return lambda numpy_version: Choice(numpy_version, compiled, where)
 
 
 def kernel_part(source: Callable[P, R]) -> Callable[P, R]:
@@ -148,8 +95,16 @@ def _garbage_uncollected() -> Iterator[None]:
             gc.enable()
 
 
+@cache
+def _numba() -> Any:
+    try:
+        return importlib.import_module("numba")  # takes as long as all else that a command imports
+    except Exception as error:  # missing, too old for this NumPy, or a library of it is missing
+        raise KernelError(f"Numba cannot be imported: {_in_one_line(error)}; `pip install --upgrade numba`") from error
+
+
 def _compiled(source: Callable[..., Any], arguments: str) -> Any:
-    numba: Any = importlib.import_module("numba")
+    numba = _numba()
     _announce_compilation()
     signature = tuple(_argument(numba.types, kind) for kind in arguments.split())
     source = _with_compiled_parts(source)
@@ -160,16 +115,36 @@ def _compiled(source: Callable[..., Any], arguments: str) -> Any:
             function.compile(signature)
             break
         except Exception as error:  # no folder to keep it in, a damaged file there, a full disk
+            if isinstance(error, numba.core.errors.NumbaError):
+                raise _not_compiled(source, error) from error
             folder = function.stats.cache_path or "disk"
             _say_once("kernels cannot be loaded from %s or kept there, and are compiled anew: %s", folder, repr(error))
             if function.signatures:
                 break
             if attempt == "last":
-                return numba.njit(signature, **_OPTIONS)(source)
+                return _compiled_without_disk(source, signature)
             with suppress(Exception):
                 function._cache.flush()  # what is damaged is forgotten, and written anew
     function.disable_compile()
     return function
+
+
+def _compiled_without_disk(source: Callable[..., Any], signature: tuple[Any, ...]) -> Any:
+    try:
+        return _numba().njit(signature, **_OPTIONS)(source)
+    except Exception as error:
+        raise _not_compiled(source, error) from error
+
+
+def _not_compiled(source: Callable[..., Any], error: Exception) -> KernelError:
+    numba = _numba()
+    return KernelError(
+        f"kernel {source.__name__}: Numba {numba.__version__} does not compile it: {_in_one_line(error)}"
+    )
+
+
+def _in_one_line(error: Exception) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 def _with_compiled_parts(source: Callable[..., Any]) -> Callable[..., Any]:
@@ -183,8 +158,7 @@ def _with_compiled_parts(source: Callable[..., Any]) -> Callable[..., Any]:
 
 @cache  # kernels share their parts
 def _compiled_part(source: Callable[..., Any]) -> Any:
-    numba: Any = importlib.import_module("numba")
-    return numba.njit(**_OPTIONS, no_cpython_wrapper=True)(_with_compiled_parts(source))
+    return _numba().njit(**_OPTIONS, no_cpython_wrapper=True)(_with_compiled_parts(source))
 
 
 def _argument(types: Any, kind: str) -> Any:
@@ -210,7 +184,7 @@ def _announce_compilation() -> None:
 
     class Announcement(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:
-            _say_once("compiling kernels that this installation has not run yet: up to twenty seconds")
+            _say_once("compiling kernels that this installation has not run yet: up to twelve seconds")
 
         def on_end(self, event: Any) -> None:
             pass

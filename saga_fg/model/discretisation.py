@@ -34,7 +34,6 @@ from functools import lru_cache
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise, with_edges, with_motions
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
@@ -146,30 +145,9 @@ def _move_by_modes(
             if len(target) == 0 or values.shape[1] != own_b.shape[1]:
                 continue
             tied = bool(coupled[target[0]])  # and so are all of these blocks
-            values, noise, own_b = _with_motions(values, Q[of_Q].values, place[target], own.F, own_b, own.Q, back, tied)
+            values, noise, own_b = with_motions(values, Q[of_Q].values, place[target], own.F, own_b, own.Q, back, tied)
             F[of_F], Q[of_Q] = Blocks(target, target, values), Blocks(target, target, noise)
         b[offsets[rows][:, None] + np.arange(own_b.shape[1])] += own_b
-
-
-@compiled_by(with_motions)
-def _with_motions(
-    values: FloatArray,
-    noise: FloatArray,
-    at: IntArray,
-    F: FloatArray,
-    b: FloatArray,
-    Q: FloatArray,
-    back: FloatArray,
-    coupled: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    values, noise, b, mine = values.copy(), noise.copy(), b.copy(), (at >= 0).nonzero()[0]
-    F, Q = F.take(at[mine], 0), Q.take(at[mine], 0)
-    if coupled:
-        G = values[mine] @ back
-        F, Q = G @ F, G @ Q @ np.swapaxes(G, 1, 2)
-        b[at[mine]] = (G @ b[at[mine]][:, :, None])[:, :, 0]
-    values[mine], noise[mine] = F, (Q + np.swapaxes(Q, 1, 2)) / 2
-    return values, noise, b
 
 
 @lru_cache(maxsize=64)
@@ -192,18 +170,8 @@ def _own_dynamics(
     for edges in graph.edges:
         at = position[edges.target]
         if edges.A_self.shape[1] == M.shape[1] and len(at):
-            M, c = _with_edges(M, c, at, edges.rate, edges.A_self, edges.b)
+            M, c = with_edges(M, c, at, edges.rate, edges.A_self, edges.b)
     return M, Qc, c
-
-
-@compiled_by(with_edges)
-def _with_edges(
-    M: FloatArray, c: FloatArray, at: IntArray, rate: FloatArray, A_self: FloatArray, b: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    M, c, acting = M.copy(), c.copy(), rate > 0
-    np.add.at(M, at[acting], rate[acting, None, None] * A_self[acting])
-    np.add.at(c, at[acting], rate[acting, None] * b[acting])
-    return M, c
 
 
 def _nilpotency(kinds: Sequence[NodeType]) -> int | None:
@@ -222,39 +190,7 @@ def _phi_and_noise(
     degrees = _TAYLOR_DEGREE, _TAYLOR_DEGREE + 1, _TAYLOR_RADIUS
     if nilpotency is not None:
         degrees = max(nilpotency - 1, 0), max(2 * nilpotency - 1, 1), math.inf
-    return _series(M, Qc, dt, order, *degrees)
-
-
-@compiled_by(phi_and_noise)
-def _series(
-    M: FloatArray, Qc: FloatArray, dt: float, order: int, degree: int, noise_degree: int, radius: float
-) -> tuple[FloatArray, FloatArray]:
-    """phi_0 ... phi_order (order + 1, m, d, d) and Q by Taylor series at M dt / 2^s of at most `radius`, doubled."""
-    doublings = _doublings(float(np.abs(M).sum(axis=-1).max(initial=0.0)) * dt, radius)
-    h = dt / 2**doublings
-    Z = M * h
-    eye = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
-    # phi_k(Z) = sum_j Z^j / (j + k)!, by Horner from the highest order down; lower ones by phi_k = Z phi_{k+1} + I/k!
-    phi = eye / math.factorial(order + degree)
-    for j in range(degree - 1, -1, -1):
-        phi = Z @ phi + eye / math.factorial(order + j)
-    phis = [phi]
-    for k in range(order - 1, -1, -1):
-        phis.insert(0, Z @ phis[0] + eye / math.factorial(k))
-    Q = term = Qc * h
-    for j in range(2, noise_degree + 1):
-        half = Z @ term
-        term = (half + np.swapaxes(half, -1, -2)) / j
-        Q = Q + term
-    for _ in range(doublings):
-        # int_0^2h = int_0^h + exp(M h) int_0^h exp(M^T h); phi_k(2Z) 2^k = phi_0 phi_k + sum_j phi_j / (k - j)!
-        Q = Q + phis[0] @ Q @ np.swapaxes(phis[0], -1, -2)
-        doubled = [phis[0] @ phis[0]]
-        for k in range(1, order + 1):
-            tail = sum((phis[j] / math.factorial(k - j) for j in range(1, k + 1)), np.zeros_like(phi))
-            doubled.append((phis[0] @ phis[k] + tail) / 2**k)
-        phis = doubled
-    return np.stack(phis), (Q + np.swapaxes(Q, -1, -2)) / 2
+    return phi_and_noise(M, Qc, dt, order, *degrees)
 
 
 def _coupling_blocks(
@@ -275,36 +211,12 @@ def _coupling_blocks(
     A = np.stack([kinds[k].generator for k in numbers.tolist()])
     steps = _nilpotency([kinds[k] for k in numbers.tolist()])
     if steps is None:
-        return Blocks(target, source, _van_loan(M, at, C, A, of_edge, dt, _TAYLOR_DEGREE, _TAYLOR_RADIUS))
+        return Blocks(target, source, coupling_integrals(M, at, C, A, of_edge, dt, _TAYLOR_DEGREE, _TAYLOR_RADIUS))
     values = np.zeros_like(C)
     for k in range(steps):
         values += dt ** (k + 1) * (phi[k + 1][at] @ C)
         C = C @ A[of_edge]
     return Blocks(target, source, values)
-
-
-@compiled_by(coupling_integrals)
-def _van_loan(
-    M: FloatArray, at: IntArray, C: FloatArray, A: FloatArray, of: IntArray, dt: float, degree: int, radius: float
-) -> FloatArray:
-    """int_0^dt exp(M_at (dt - s)) C exp(A_of s) ds for stacks M (n, d_i, d_i), C (m, d_i, d_j), A (k, d_j, d_j).
-
-    at (m,) and of (m,) are rows of M and A. This is the corner of the exponential of [[M, C], [0, A]] dt, whose other
-    blocks are those of a node and of a type.
-    """
-    row_sums = np.abs(M).sum(axis=-1)[at] + np.abs(C).sum(axis=-1)
-    doublings = _doublings(dt * max(row_sums.max(initial=0.0), np.abs(A).sum(axis=-1).max(initial=0.0)), radius)
-    h = dt / 2**doublings
-    M, C, A, mine = M * h, C * h, A * h, M[at] * h
-    first, second = (np.broadcast_to(np.eye(Z.shape[-1]), Z.shape) for Z in (M, A))
-    corner = np.zeros_like(C)
-    for j in range(degree, 0, -1):
-        corner = (mine @ corner + C @ second[of]) / j
-        first, second = (np.eye(Z.shape[-1]) + Z @ power / j for Z, power in ((M, first), (A, second)))
-    for _ in range(doublings):
-        corner = first[at] @ corner + corner @ second[of]
-        first, second = first @ first, second @ second
-    return np.asarray(corner)
 
 
 def _doublings(norm: float, radius: float = _TAYLOR_RADIUS) -> int:

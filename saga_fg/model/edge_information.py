@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from saga_fg.model.interactions import NodeTable
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import NonNegative, Settings, setting, settings_group
 
 
@@ -27,13 +27,6 @@ def information_setting() -> Any:
         lambda: None,
         "weight edges by their information gain, as edges into well-known velocities tell little; null: full weight",
     )
-
-
-def weighted_by_gain(
-    rate: FloatArray, information: EdgeInformation | None, nodes: NodeTable, target: IntArray, source: IntArray
-) -> FloatArray:
-    """Rates (E,) of edges source[k] -> target[k] (rows of `nodes`) times their information gain; None: as they are."""
-    return rate if information is None else rate * information.gains(nodes, target, source)
 
 
 @dataclass(frozen=True)
@@ -46,12 +39,6 @@ class EdgeInformation(Settings):
     unseen_acceleration: NonNegative = setting(
         0.0, "growth of the velocity deviation of undetected objects, m/s^2; higher: edges out of them gain less"
     )
-
-    def gains(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
-        """Information gains (E,), in [0, 1], of the edges source[k] -> target[k] (rows of `nodes`)."""
-        variance = self.variances(nodes)
-        total = variance[target] + variance[source] + self.spread**2
-        return np.divide(variance[target], total, out=np.zeros(len(target)), where=total > 0)
 
     def variances(self, nodes: NodeTable) -> FloatArray:
         """s^2 (n,) of the module."""

@@ -19,12 +19,11 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.kernels import edges
-from saga_fg.kernels.compilation import compiled_by
+from saga_fg.kernels.edges import leader_rates, neighbour_rates
+from saga_fg.kernels.lanes import pairs_ahead
 from saga_fg.model.cone_geometry import ConeGeometry, anticipated
-from saga_fg.model.edge_features import STEEPEST, EdgeFeatures, features_of
-from saga_fg.model.edge_information import EdgeInformation, information_setting, weighted_by_gain
-from saga_fg.model.edge_pairs import LEAST, none_before, pairs_ahead, pairs_within, strongest
+from saga_fg.model.edge_information import EdgeInformation, information_setting
+from saga_fg.model.edge_pairs import LEAST, pairs_within, strongest
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
@@ -115,17 +114,6 @@ class Neighbours(Settings):
     )
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
-    def strength(self, f: EdgeFeatures) -> FloatArray:
-        """Rates (...), 1/s, of edges with these features, before classes are considered."""
-        exponent = (f.distance / self.distance_scale) ** 2 + (f.turn / self.heading_scale) ** 2
-        if self.parked:  # creeping objects do not share the errors that make parked ones seem to move
-            able = (f.target_moved == 0) & (f.source_moved == 0)
-            exponent = exponent + (f.target_speed**2 + f.source_speed**2) / self.speed_scale**2
-        else:
-            able = (f.target_speed >= self.min_speed) & (f.source_speed >= self.min_speed)
-        rate = self.rate * np.exp(-(exponent + (f.velocity_difference / self.speed_scale) ** 2) / 2)
-        return np.where(able & (f.distance <= self.max_distance), rate, 0.0)
-
     def pairs(self, nodes: NodeTable) -> Pairs:
         able = of_classes(nodes.label, self.classes)
         if not self.parked:
@@ -186,26 +174,6 @@ class Following(Settings):
         (), "classes that lead but do not follow, such as trailers, which go where their truck goes"
     )
 
-    def strength(self, f: EdgeFeatures) -> FloatArray:
-        """Rates (...), 1/s, of edges with these features, before classes and nearest leaders are considered."""
-        share = f.target_moved
-        if self.parked:
-            share = np.where(np.abs(f.lateral) <= self.lateral_scale, 1.0, share)
-        if self.leaders != "any":
-            share = share * (f.source_moved if self.leaders == "moving" else 1 - f.source_moved)
-        exponent = (f.turn / self.heading_scale) ** 2 + (f.lateral / self.lateral_scale) ** 2
-        rate = self.rate * np.exp(-f.ahead / self.gap_scale - exponent / 2)
-        return np.where(self.in_lane(f), share * rate, 0.0)
-
-    def in_lane(self, f: EdgeFeatures) -> BoolArray:
-        """Mask (...) of the sources ahead in the lane of their targets, near enough to lead or to be in between."""
-        lane = (np.abs(f.lateral) < 3 * self.lateral_scale) & (np.abs(f.turn) < 3 * self.heading_scale)
-        return np.asarray(lane & (f.ahead > 0) & (f.distance <= self.max_gap))
-
-    def remoteness(self, f: EdgeFeatures) -> FloatArray:
-        """Measure, m, that is least for the leader among all vehicles ahead."""
-        return np.asarray(f.ahead + 10 * np.abs(f.lateral))
-
     def pairs(self, nodes: NodeTable) -> Pairs:
         seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
         target, source = self._ahead(seen)
@@ -257,6 +225,8 @@ class Repulsion(Settings):
         return Pairs(target[near], source[near], np.full(len(near), self.rate))
 
 
+_STEEPEST = 1.5  # rad, turn of an arc
+
 HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
 """Edges act on objects that are hidden, and hardly on others."""
 
@@ -301,42 +271,22 @@ def _columns(nodes: NodeTable, information: EdgeInformation | None) -> tuple[Flo
     return exists, moved, information.variances(nodes), information.spread
 
 
-def _neighbours_by_kernel(rule: Neighbours, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
+def _neighbours(rule: Neighbours, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
+    """The strongest of these pairs, with their rates."""
     _, moved, variance, spread = _columns(nodes, rule.information_gain)
     direction = nodes.along(target, source).direction
     columns = nodes.position, nodes.velocity, nodes.heading, moved, variance
     scales = rule.rate, rule.distance_scale, rule.heading_scale, rule.speed_scale
     limits = rule.max_distance, rule.min_speed, rule.parked, rule.max_degree
-    return Pairs(*edges.neighbour_rates(target, source, direction, *columns, *scales, *limits, spread))
+    return Pairs(*neighbour_rates(target, source, direction, *columns, *scales, *limits, spread))
 
 
-@compiled_by(_neighbours_by_kernel, where=lambda rule, nodes, target, source: type(rule) is Neighbours)
-def _neighbours(rule: Neighbours, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
-    """The strongest of these pairs, with their rates."""
-    strength = rule.strength(features_of(nodes, target, source))
-    rate = weighted_by_gain(strength, rule.information_gain, nodes, target, source)
-    kept = strongest(target, rate, len(nodes), rule.max_degree)
-    return Pairs(target[kept], source[kept], rate[kept])
-
-
-def _leaders_by_kernel(rule: Following, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
+def _leaders(rule: Following, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
+    """Those of these pairs whose sources lead, with their rates."""
     exists, moved, variance, spread = _columns(nodes, rule.information_gain)
     columns = nodes.position, nodes.heading, nodes.length, moved, exists, variance
     scales = rule.rate, rule.max_gap, rule.gap_scale, rule.lateral_scale, rule.heading_scale
     leaders = ("any", "moving", "stationary").index(rule.leaders)
     leading = rule.parked, leaders, rule.min_separation
     ends = target, source, *nodes.along(target, source)
-    return Pairs(*edges.leader_rates(*ends, *columns, *scales, *leading, spread, STEEPEST, LEAST))
-
-
-@compiled_by(_leaders_by_kernel, where=lambda rule, nodes, target, source: type(rule) is Following)
-def _leaders(rule: Following, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
-    """Those of these pairs whose sources lead, with their rates."""
-    features = features_of(nodes, target, source)
-    near = rule.min_separation * (nodes.length[target] + nodes.length[source]) / 2
-    ahead = (rule.in_lane(features) & (features.ahead >= near)).nonzero()[0]
-    exists = np.ones(len(nodes)) if nodes.existence is None else nodes.existence
-    rate = weighted_by_gain(rule.strength(features), rule.information_gain, nodes, target, source)[ahead]
-    rate = rate * none_before(target[ahead], rule.remoteness(features)[ahead], exists[source[ahead]])
-    target, source, led = target[ahead], source[ahead], rate > 0
-    return Pairs(target[led], source[led], rate[led])
+    return Pairs(*leader_rates(*ends, *columns, *scales, *leading, spread, _STEEPEST, LEAST))

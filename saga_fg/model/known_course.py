@@ -39,8 +39,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
-from saga_fg.kernels.turning import Turning, course_inputs, course_motions
+from saga_fg.kernels.turning import course_inputs, course_motions
 from saga_fg.model.discretisation import linear_motions
 from saga_fg.model.motion import Curvilinear, NodeType
 from saga_fg.model.scene_graph import MatchedMotion
@@ -90,7 +89,7 @@ class KnownCourses(Columns):
         """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2; settling
         across (n,) variance of the velocity across, (m/s)^2; these and pull 0 if not given."""
         settling, across, pull = (np.zeros(len(ids)) if each is None else each for each in (settling, across, pull))
-        noise, brake = _inputs(heading, rate_variance, mean, settling, across, dt, RATE_CORRELATION)
+        noise, brake = course_inputs(heading, rate_variance, mean, settling, across, dt, RATE_CORRELATION)
         return cls(ids, heading, rate, noise, brake, settling, pull, node_type)
 
     def predicted(self, dt: float, scale: FloatArray) -> tuple[KnownCourses, MatchedMotion]:
@@ -99,7 +98,7 @@ class KnownCourses(Columns):
         assert isinstance(motion, Curvilinear)
         tau = max(motion.turn_time, _LEAST_TIME)
         theta = self.rate * turning_time(motion, dt)
-        F, b, Q = _motions(
+        F, b, Q = course_motions(
             self.heading,
             theta,
             self.lateral_noise,
@@ -116,59 +115,6 @@ class KnownCourses(Columns):
         return later, MatchedMotion(F, b, Q)
 
 
-@compiled_by(course_inputs)
-def _inputs(
-    heading: FloatArray,
-    rate_variance: FloatArray,
-    mean: FloatArray,
-    settling: FloatArray,
-    across: FloatArray,
-    dt: float,
-    correlation: float,
-) -> tuple[FloatArray, FloatArray]:
-    u = _unit(heading)
-    speed, acceleration = (mean[:, _V] * u).sum(axis=1), (mean[:, _A] * u).sum(axis=1)
-    reverses = (acceleration < 0) & (speed + acceleration * dt < 0)
-    square = (mean[:, _V] ** 2).sum(axis=1)
-    noise = 2 * (correlation * rate_variance * square + settling * across)
-    return noise, np.where(reverses, acceleration, 0.0)[:, None] * u
-
-
-@compiled_by(course_motions)
-def _motions(
-    heading: FloatArray,
-    theta: FloatArray,
-    lateral_noise: FloatArray,
-    brake: FloatArray,
-    settling: FloatArray,
-    pull: FloatArray,
-    scale: FloatArray,
-    dt: float,
-    least: float,
-    F_axis: FloatArray,
-    Q_axis: FloatArray,
-) -> Turning:
-    u = _unit(heading)
-    ahead = u[:, :, None] * u[:, None]
-    aside = np.eye(2) - ahead
-    F = _planar(F_axis[0], ahead) + _planar(F_axis[1], aside)
-    Q = _planar(Q_axis[0], ahead) + _planar(Q_axis[1] + lateral_noise[:, None, None] * Q_axis[2], aside)
-    b = -(F[:, :, _A] @ brake[:, :, None])[:, :, 0]
-    pulled = pull[:, None] * u
-    b[:, _P] += dt * dt / 2 * pulled
-    b[:, _V] += dt * pulled
-    chord, turn = np.sinc(theta / (2 * np.pi))[:, None, None] * _rotation(theta / 2), _rotation(theta)
-    if settling.any():
-        passed = np.maximum(settling * dt, least)
-        faded = -np.expm1(-passed)
-        chord = _less_across(heading + theta / 2, 1 - faded / passed) @ chord
-        turn = _less_across(heading + theta, faded) @ turn
-    F[:, _P, 2:], b[:, _P] = chord @ F[:, _P, 2:], (chord @ b[:, _P, None])[:, :, 0]
-    for part in (_V, _A):
-        F[:, part], b[:, part] = turn @ F[:, part], (turn @ b[:, part, None])[:, :, 0]
-    return F, b, Q * scale[:, None, None]
-
-
 @lru_cache(maxsize=64)  # many sensors have one interval, again and again
 def _one_axis(motion: Curvilinear, dt: float) -> tuple[FloatArray, FloatArray]:
     """F and Q (3, 3, 3) along the heading, across it, and across it of white acceleration of density 1."""
@@ -181,24 +127,3 @@ def turning_time(motion: Curvilinear, dt: float) -> float:
     """The time, s, in which an undiminished rate turns as far as one that fades does within `dt`."""
     tau = max(motion.turn_time, _LEAST_TIME)
     return float(tau * -np.expm1(-dt / tau))
-
-
-def _planar(one_axis: FloatArray, projection: FloatArray) -> FloatArray:
-    """(n, 6, 6) of the matrix, (3, 3) or (n, 3, 3), of one axis; projection (n, 2, 2) on that axis."""
-    spread = np.broadcast_to(one_axis, (len(projection), 3, 3))[:, :, None, :, None] * projection[:, None, :, None]
-    return spread.reshape(len(projection), 6, 6)
-
-
-def _unit(heading: FloatArray) -> FloatArray:
-    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-
-
-def _less_across(course: FloatArray, share: FloatArray) -> FloatArray:
-    """Matrices (n, 2, 2) that take away a share (n,) of what is across a course (n,)."""
-    normal = _unit(course + np.pi / 2)
-    return np.asarray(np.eye(2) - share[:, None, None] * normal[:, :, None] * normal[:, None])
-
-
-def _rotation(theta: FloatArray) -> FloatArray:
-    c, s = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)

@@ -7,16 +7,13 @@ heading.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.paths import path_cones, places_along
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 from saga_fg.numerics.columns import Columns
-from saga_fg.numerics.polyline import Polylines
 
 SHARP = 1.2  # rad, turn from which nothing is said about where a path is
 _ROUNDING = 1 + 1e-9
@@ -39,11 +36,6 @@ class Paths(Columns):
     weight: FloatArray
     certainty: FloatArray
     disagreement: FloatArray
-
-    @cached_property
-    def lines(self) -> Polylines:
-        """The paths as polylines."""
-        return Polylines.of(list(self.position))
 
     def cones(self, most: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Direction (k,) at the start of each path, how far it turns from there, rad, and a margin (k,), m.
@@ -82,43 +74,15 @@ class Along(NamedTuple):
     predicted: BoolArray
 
 
-def _cones_by_kernel(paths: Paths, most: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _cones(paths: Paths, most: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`Paths.cones`."""
     return path_cones(paths.position, most, SHARP, _ROUNDING)
 
 
-@compiled_by(_cones_by_kernel)
-def _cones(paths: Paths, most: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`Paths.cones`."""
-    if len(paths) == 0:
-        return np.empty(0), np.empty(0), np.empty(0)
-    angle = paths.lines.angle.reshape(len(paths), -1)
-    turn, corner = np.abs(angle - angle[:, :1]).max(1), np.abs(np.diff(angle, axis=1)).max(1, initial=0.0)
-    return angle[:, 0], turn, _ROUNDING * most / np.cos(np.minimum(corner, SHARP))
-
-
-def _along_by_kernel(
-    position: FloatArray, heading: FloatArray, paths: Paths | None, target: IntArray, source: IntArray
-) -> Along:
-    paths, path = NO_PATHS if paths is None else paths, np.full(len(position), -1)
-    path[paths.row] = np.arange(len(paths.row))
-    return Along(*places_along(position, heading, path, paths.position, target, source))
-
-
-@compiled_by(_along_by_kernel)
 def along_paths(
     position: FloatArray, heading: FloatArray, paths: Paths | None, target: IntArray, source: IntArray
 ) -> Along:
     """Places of nodes `source` (E,) on the paths of nodes `target` (E,); position (n, 2), heading (n,) of all nodes."""
-    dx, dy = (position[source] - position[target]).T
-    direction = heading[target]
-    c, s = np.cos(direction), np.sin(direction)
-    ahead, aside = dx * c + dy * s, dy * c - dx * s
-    predicted = np.zeros(len(target), dtype=np.bool_)
-    if paths is not None and len(paths) and len(target):
-        line = np.minimum(np.searchsorted(paths.row, target), len(paths) - 1)
-        predicted = paths.row[line] == target
-        bent = predicted.nonzero()[0]
-        at = paths.lines.feet(line[bent], position[source[bent]])
-        ahead[bent], aside[bent] = at.s, at.e
-        direction[bent] = np.arctan2(at.direction[:, 1], at.direction[:, 0])
-    return Along(ahead, aside, direction, predicted)
+    paths, path = NO_PATHS if paths is None else paths, np.full(len(position), -1)
+    path[paths.row] = np.arange(len(paths.row))
+    return Along(*places_along(position, heading, path, paths.position, target, source))

@@ -22,7 +22,6 @@ from typing import Annotated, Literal
 import numpy as np
 
 from saga_fg.errors import InputError, require_type
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.covariances import measured_covariances
 from saga_fg.model.sensor_geometry import Extrinsics, FieldOfView
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, distinct
@@ -265,25 +264,15 @@ class Sensor(Settings):
         return np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
 
 
-def _noise_by_kernel(
+def measurement_covariance(
     sensor: Sensor, detections: Detections, origin: FloatArray | None, probability: FloatArray
 ) -> FloatArray:
+    """R (N, 4, 4) of positions, m^2, and velocities, (m/s)^2, as by `detection_covariance`, `velocity_covariance`."""
     boxes, reported = detections.boxes, detections.position_covariance
     names = "position", "range_noise", "bearing_noise", "velocity", "low_score_growth"
     own, along, across, velocity, growth = sensor.deviations(boxes.label, *names)
     offset = boxes.position[:, :2] - (boxes.position[:, :2] if origin is None else origin)
     return measured_covariances(offset, own, along, across, velocity, growth, probability, reported)
-
-
-@compiled_by(_noise_by_kernel)
-def measurement_covariance(
-    sensor: Sensor, detections: Detections, origin: FloatArray | None, probability: FloatArray
-) -> FloatArray:
-    """R (N, 4, 4) of positions, m^2, and velocities, (m/s)^2, as by `detection_covariance`, `velocity_covariance`."""
-    R = np.zeros((len(detections), 4, 4))
-    R[:, :2, :2] = sensor.detection_covariance(detections, origin, probability)
-    R[:, 2:, 2:] = sensor.velocity_covariance(detections.boxes.label, probability)
-    return R
 
 
 def _score_factor(low_score_growth: FloatArray, probability: FloatArray) -> FloatArray:

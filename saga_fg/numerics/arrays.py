@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Container
-from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -19,11 +18,9 @@ from saga_fg.kernels.array_types import BoolArray as BoolArray
 from saga_fg.kernels.array_types import FloatArray as FloatArray
 from saga_fg.kernels.array_types import IntArray as IntArray
 from saga_fg.kernels.array_types import StrArray as StrArray
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.labels import numbered_rows
 
 Values = Literal["finite", "finite-or-nan", "any"]
-_REMEMBERED = 1 << 16  # bytes; tables of whole recordings are not kept
 _MOST = np.iinfo(np.int64).max
 T = TypeVar("T")
 
@@ -185,29 +182,17 @@ def _unchanging(base: object) -> bool:
 
 
 _Distinct = tuple[tuple[str, ...], IntArray]
+_NO_ROWS: IntArray = np.empty(0, dtype=np.int64)
+_NO_ROWS.flags.writeable = False
 _of_array: dict[int, tuple[weakref.ref[StrArray], _Distinct]] = {}  # by id, while the array lives
 
 
-def _numbered_by_rows(label: StrArray) -> _Distinct:
+def _numbered(label: StrArray) -> _Distinct:
+    if len(label) == 0:
+        return (), _NO_ROWS
     number, first = numbered_rows(np.ascontiguousarray(label).view(np.uint32).reshape(len(label), -1))
     number.flags.writeable = False
     return tuple(label[first].tolist()), number
-
-
-@compiled_by(_numbered_by_rows, where=lambda label: len(label) > 0)
-def _numbered(label: StrArray) -> _Distinct:
-    look = _distinct if label.nbytes < _REMEMBERED else _distinct.__wrapped__
-    return look(np.ascontiguousarray(label).tobytes(), label.dtype.str, len(label))
-
-
-@lru_cache(maxsize=256)
-def _distinct(label: bytes, dtype: str, count: int) -> _Distinct:
-    of_row = np.frombuffer(label, dtype=dtype, count=count).tolist()
-    names = tuple(dict.fromkeys(of_row))
-    number = dict(zip(names, range(len(names)), strict=True))
-    index = np.array([number[name] for name in of_row], dtype=np.int64)
-    index.flags.writeable = False
-    return names, index
 
 
 def of_classes(label: StrArray, classes: Container[str]) -> BoolArray:

@@ -1,6 +1,6 @@
 """Pairs of places that are near each other, from a k-d tree where there are many.
 
-Up to `MOST_COMPARED` distances are all computed at once, which is faster. Beyond, rows whose reach differs by less than
+Up to `MOST_COMPARED` distances are compared by a kernel, which is faster. Beyond, rows whose reach differs by less than
 a factor of two are searched together, so that a few far-reaching ones do not widen the search of all others.
 """
 
@@ -9,12 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.pairs import compared_pairs
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
-MOST_COMPARED = 30_000  # distances that are computed at once: those of 170 places to each other
-MOST_LOOPED = 500_000  # distances that a kernel computes
+MOST_COMPARED = 500_000  # distances that the kernel compares
 _LEAST = 1e-9  # m, so that a reach of 0 has a logarithm
 
 
@@ -29,16 +27,15 @@ def near_pairs(
     return _near_pairs(a, b, reach, further if further.ndim else np.full(len(b), further))
 
 
-@compiled_by(compared_pairs, where=lambda a, b, reach, further: len(a) * len(b) <= MOST_LOOPED)
 def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
     if len(a) * len(b) <= MOST_COMPARED:
-        return _compared(a, b, reach, further)
+        return compared_pairs(a, b, reach, further)
     i, j = (~np.isnan(reach)).nonzero()[0], (~np.isnan(further)).nonzero()[0]
     if len(i) == 0 or len(j) == 0:
         return i[:0], j[:0]
     widest = reach[i] + further[j].max()
     bounded = np.isfinite(widest)
-    all_i, all_j = _compared(a[i[~bounded]], b[j], reach[i[~bounded]], further[j])
+    all_i, all_j = compared_pairs(a[i[~bounded]], b[j], reach[i[~bounded]], further[j])
     found, tree = [i[~bounded][all_i] * len(b) + j[all_j]], cKDTree(b[j])
     i, widest = i[bounded], widest[bounded]
     octave = np.ceil(np.log2(np.maximum(widest, _LEAST)))
@@ -51,12 +48,6 @@ def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatA
         found.append(row[within] * len(b) + column[within])
     row, column = np.divmod(np.sort(np.concatenate(found)), len(b))
     return row, column
-
-
-def _compared(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
-    """The pairs by all distances."""
-    i, j = np.nonzero(_square(a[:, None], b) <= (reach[:, None] + further) ** 2)
-    return i, j
 
 
 def _square(a: FloatArray, b: FloatArray) -> FloatArray:

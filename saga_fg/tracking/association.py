@@ -27,11 +27,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.pairs import gated_pairs
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, distinct
-from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total, mahalanobis_of_pairs
-from saga_fg.numerics.near_pairs import MOST_LOOPED, near_pairs
+from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total
 from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.numerics.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.class_belief import ClassEvidence
@@ -154,7 +152,7 @@ def candidates(
     return found._replace(gain=found.gain - unmatched)
 
 
-def _gated_by_kernel(
+def _gated(
     predicted: Boxes,
     P: FloatArray,
     reach: FloatArray,
@@ -162,6 +160,7 @@ def _gated_by_kernel(
     measurements: FrameMeasurements,
     evidence: ClassEvidence | None,
 ) -> CandidatePairs:
+    """The pairs inside the `gates` (n,), without overlap."""
     boxes = measurements.boxes
     if evidence is None:
         (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(boxes.label)
@@ -172,34 +171,6 @@ def _gated_by_kernel(
         belief, likelihood = evidence.belief, evidence.likelihood
     tracks = predicted.position[:, :2], P, reach, gates, of_track, belief
     return CandidatePairs(*gated_pairs(*tracks, boxes.position[:, :2], measurements.R, of_detection, likelihood))
-
-
-@compiled_by(
-    _gated_by_kernel,
-    where=lambda predicted, P, reach, gates, measurements, evidence: len(predicted) * len(measurements) <= MOST_LOOPED,
-)
-def _gated(
-    predicted: Boxes,
-    P: FloatArray,
-    reach: FloatArray,
-    gates: FloatArray,
-    measurements: FrameMeasurements,
-    evidence: ClassEvidence | None,
-) -> CandidatePairs:
-    """The pairs inside the `gates` (n,), without overlap."""
-    (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(measurements.boxes.label)
-    same = np.array([c == s for c in classes for s in seen], dtype=bool).reshape(len(classes), len(seen))
-    if evidence is not None:
-        same = evidence.groups.same_group(np.array(classes), np.array(seen))
-    t, d = near_pairs(predicted.position[:, :2], measurements.boxes.position[:, :2], reach)
-    alike = same[of_track[t], of_detection[d]].nonzero()[0]
-    t, d = t[alike], d[alike]
-    innovation = measurements.boxes.position[d, :2] - predicted.position[t, :2]
-    S = P[t] + measurements.R[d, :2, :2]
-    d2, log_det = mahalanobis_of_pairs(innovation, S)
-    of_class = 0.0 if evidence is None else evidence.costs(t, d)
-    inside = (d2 + of_class < gates[t]).nonzero()[0]
-    return CandidatePairs(t, d, innovation, S, d2, d2 + log_det + of_class).select(inside)
 
 
 def _overlap(found: CandidatePairs, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:

@@ -59,11 +59,6 @@ class ClassGroups:
         """(K,) whether the classes of labels[i] and others[j], i and j (K,), are one or share a group."""
         return np.asarray(self.numbers(labels)[i] == self.numbers(others)[j])
 
-    def number_of_group(self, labels: StrArray) -> IntArray:
-        """(n,) how many of the labels (n,) are of the same class or group as each."""
-        number = self.numbers(labels)
-        return np.bincount(number)[number]
-
     def likelihood(self, label: StrArray, sensor: Sensor) -> FloatArray:
         """L (m, C) of detections of the classes `label` (m,) by a sensor."""
         if not self.classes:
@@ -119,8 +114,3 @@ class ClassEvidence:
     groups: ClassGroups
     belief: FloatArray
     likelihood: FloatArray
-
-    def costs(self, track: IntArray, detection: IntArray) -> FloatArray:
-        """(K,) costs of pairs by their classes, see the module."""
-        chance = (self.belief[track] * self.likelihood[detection]).sum(axis=1)
-        return np.asarray(-2 * np.log(np.where(chance > 0, chance, 1.0)))

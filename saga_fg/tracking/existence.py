@@ -21,7 +21,6 @@ import math
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.covariances import existences
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
@@ -70,20 +69,6 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     table.last_in_view[t] = state.time
 
 
-def _existence_by_kernel(
-    before: FloatArray,
-    missed: BoolArray,
-    chance: FloatArray,
-    rows: IntArray,
-    probability: FloatArray,
-    elapsed: float,
-    settings: ExistenceSettings,
-) -> FloatArray:
-    survival = math.exp(-elapsed / settings.lifetime)
-    return existences(before, missed, chance, rows, probability, survival, settings.neutral_score)
-
-
-@compiled_by(_existence_by_kernel)
 def _existence(
     before: FloatArray,
     missed: BoolArray,
@@ -95,24 +80,8 @@ def _existence(
 ) -> FloatArray:
     """Existence (n,) after a frame in which tracks are `missed` (n,), by the chance (n,) to detect them, and those of
     `rows` (k,) have detections of a probability (k,)."""
-    after = before.copy()
-    after[missed] = after_miss(before[missed], chance[missed], elapsed, settings)
-    after[rows] = after_hit(before[rows], probability, settings)
-    return after
-
-
-def after_miss(existence: FloatArray, p_detect: FloatArray, elapsed: float, settings: ExistenceSettings) -> FloatArray:
-    """Existence (k,) of tracks without a detection, `elapsed` s after the frame before."""
-    missed = existence * (1 - p_detect) / np.maximum(1 - existence * p_detect, 1e-9)
-    return np.asarray(missed * math.exp(-elapsed / settings.lifetime))
-
-
-def after_hit(existence: FloatArray, probability: FloatArray, settings: ExistenceSettings) -> FloatArray:
-    """Existence (k,) of tracks matched to a detection of some `probability` (k,)."""
-    odds = probability / (1 - probability) * (1 - settings.neutral_score) / settings.neutral_score
-    before = np.clip(existence, 1e-3, 1 - 1e-3)
-    after = before / (1 - before) * odds
-    return np.clip(after / (1 + after), 0.0, 0.999)
+    survival = math.exp(-elapsed / settings.lifetime)
+    return existences(before, missed, chance, rows, probability, survival, settings.neutral_score)
 
 
 def covered(boxes: Boxes, viewpoint: FloatArray, opaque: BoolArray) -> FloatArray:

@@ -26,13 +26,10 @@ import math
 
 import numpy as np
 
-from saga_fg.estimators.protocol import LatestMarginals
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.returns import return_evidence, returned_pairs
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
-from saga_fg.numerics.near_pairs import MOST_LOOPED, near_pairs
+from saga_fg.numerics.assignment import Matching, least_total
 from saga_fg.tracking.initiation import unmeasured_velocity
 from saga_fg.tracking.relinking import area, least_log_odds, log_survival
 from saga_fg.tracking.tracker_state import TrackerState
@@ -73,36 +70,11 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     return _returned(state, new, old)
 
 
-def _returned_by_kernel(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+def _returned(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """The candidates among `new` and `old` tracks."""
     now, still, table = state.kinematics(), state.table.stationarity, state.table
     group, places = state.class_groups.numbers(table.label), (now.position, now.P, still.position, still.P)
     return returned_pairs(new, old, group, table.initiated, table.last_detected, *places, _FARTHEST)
-
-
-@compiled_by(_returned_by_kernel, where=lambda state, new, old: len(new) * len(old) <= MOST_LOOPED)
-def _returned(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """The candidates among `new` and `old` tracks."""
-    table = state.table
-    i, j = _near(state, new, old)
-    alike = state.class_groups.pairs_of_group(table.label[new], table.label[old], i, j)
-    chosen = alike & (table.last_detected[old[j]] < table.initiated[new[i]])
-    i, j = i[chosen], j[chosen]
-    return new[i], old[j], state.class_groups.number_of_group(table.label[new])[i]
-
-
-def _near(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray]:
-    """Pairs (k,) of `new` and `old` near enough, moving or stationary, for their densities to count at all."""
-    if len(old) == 0:
-        return old, old
-    now, still, found = state.kinematics(), state.table.stationarity, []
-    for position, P in ((now.position, now.P), (still.position, still.P)):
-        spread = P[:, 0, 0] + P[:, 1, 1]
-        reach = np.sqrt(_FARTHEST * (spread[new] + spread[old].max()))  # no direction's variance exceeds the trace
-        i, j = near_pairs(position[new], position[old], reach)
-        d2, _ = mahalanobis_of_pairs(position[new[i]] - position[old[j]], P[new[i]] + P[old[j]])
-        found.append((i * len(old) + j)[d2 < _FARTHEST])
-    i, j = np.divmod(np.unique(np.concatenate(found)), len(old))
-    return i, j
 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -116,44 +88,15 @@ def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[Fl
     return _evidence(state, new, old, V_0[of_pair], p[of_pair])
 
 
-def _evidence_by_kernel(
+def _evidence(
     state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
+    """`_log_evidence` of velocities V_0 (k, 2, 2) that nobody has measured, and prior probabilities p (k,)."""
     estimator, table, still = state.joint.estimator, state.table, state.table.stationarity
     places, place, D, s = state.joint.places(table.label), still.position, still.P, still.probability
     (x, P), (x_old, P_old) = (estimator.planar_marginals(table.id[k], places[k]) for k in (new, old))
     if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
     return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0, p, *if_still)
-
-
-@compiled_by(
-    _evidence_by_kernel, where=lambda state, new, old, V_0, p: isinstance(state.joint.estimator, LatestMarginals)
-)
-def _evidence(
-    state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """`_log_evidence` of velocities V_0 (k, 2, 2) that nobody has measured, and prior probabilities p (k,)."""
-    table, stationarity, p = state.table, state.table.stationarity, np.clip(p, 1e-9, 1 - 1e-9)
-    s, s_new = (np.clip(stationarity.probability[rows], 0.0, 1 - 1e-9) for rows in (old, new))
-    moving = np.log1p(-s) + np.log1p(-s_new) - np.log1p(-p)
-    for node_type, rows in state.joint.rows_by_type(table.label[new]):
-        at = node_type.index(POSITION + VELOCITY if node_type.has(VELOCITY) else POSITION)
-        mean, P = _marginals(state, np.concatenate([old[rows], new[rows]]), at)
-        k = len(rows)
-        moving[rows] += _log_density(mean[k:] - mean[:k], P[k:] + P[:k])
-        if node_type.has(VELOCITY):
-            moving[rows] -= _log_density(np.zeros((len(rows), 2)), V_0[rows])
-    apart = stationarity.position[new] - stationarity.position[old]
-    still = _log_density(apart, stationarity.P[old] + stationarity.P[new])
-    with np.errstate(divide="ignore"):
-        return moving, np.asarray(np.log(s) + np.log(s_new) - np.log(p) + still)
-
-
-def _marginals(state: TrackerState, rows: IntArray, at: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Means (k, d) and covariances (k, d, d) of the components `at` (d,) of tracks `rows` (k,), which may repeat."""
-    each, of_row = np.unique(rows, return_inverse=True)
-    estimator, ids = state.joint.estimator, state.table.id[each]
-    return estimator.mean(ids)[:, at][of_row], estimator.covariance(ids)[:, at[:, None], at][of_row]
 
 
 def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatArray) -> None:
@@ -187,13 +130,3 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
     table.has_moved[old] |= table.has_moved[new]
     table.existence[old] = np.maximum(table.existence[old], table.existence[new])
     table.last_existence[old] = table.existence[old]
-
-
-def _log_density(x: FloatArray, S: FloatArray) -> FloatArray:
-    """(k,) log N(x; 0, S) in 2 or 4 dimensions: that of the first two, and of the others given these."""
-    d2, log_det = mahalanobis_of_pairs(x[:, :2], S[:, :2, :2])
-    if x.shape[1] > 2:
-        gain = np.swapaxes(np.linalg.solve(S[:, :2, :2], S[:, :2, 2:]), 1, 2)
-        given = mahalanobis_of_pairs(x[:, 2:] - (gain @ x[:, :2, None])[:, :, 0], S[:, 2:, 2:] - gain @ S[:, :2, 2:])
-        d2, log_det = d2 + given[0], log_det + given[1]
-    return np.asarray(-0.5 * (d2 + log_det + x.shape[1] * math.log(2 * math.pi)))

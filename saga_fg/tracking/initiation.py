@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.covariances import velocities_along
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
@@ -102,15 +101,4 @@ def unmeasured_velocity(
     the world, heading (k,), rad, and traffic."""
     speed, drift = state.class_values(label, "initial_speed_deviation", "initial_lateral_speed_deviation")
     stationary, mean, variance = speed_prior(state.traffic, label, place, yaw, speed**2, prior)
-    return *_velocities(yaw, mean, variance, speed, drift), stationary
-
-
-@compiled_by(velocities_along)
-def _velocities(
-    yaw: FloatArray, speed: FloatArray, variance: FloatArray, any_way: FloatArray, lateral: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    known = np.isfinite(yaw)
-    ahead = np.nan_to_num(np.stack([np.cos(yaw), np.sin(yaw)], axis=-1))
-    along = np.where(known, variance - lateral**2, 0.0)[:, None, None] * (ahead[:, :, None] * ahead[:, None])
-    P = along + (np.where(known, lateral, any_way) ** 2)[:, None, None] * np.eye(2)
-    return speed[:, None] * ahead, P
+    return *velocities_along(yaw, mean, variance, speed, drift), stationary

@@ -14,9 +14,7 @@ import gtsam
 import numpy as np
 
 from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
-from saga_fg.estimators.protocol import LatestMarginals
 from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.model.discretisation import discretise, own_motion
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import POSITION, VELOCITY
@@ -216,7 +214,8 @@ class JointTrackState:
 
     def kinematics_of(self, ids: IntArray, label: StrArray) -> Kinematics:
         """The estimates of some nodes, which need not be tracks."""
-        return _kinematics(self, ids, label)
+        x, P = self.estimator.planar_marginals(ids, self.places(label))
+        return Kinematics(x[:, :2], x[:, 2:], P[:, :2, :2], P[:, 2:, 2:])
 
     def places(self, label: StrArray) -> IntArray:
         """(n, 4) where x, y, vx, vy are in the state of each track, -1 for none."""
@@ -330,22 +329,3 @@ def _local_pose(graph: SceneFactorGraph) -> FloatArray | None:
         return None
     pose = graph.state(key)
     return pose.matrix() if isinstance(pose, gtsam.Pose3) else yaw_transform(pose.x(), pose.y(), 0.0, pose.theta())
-
-
-def _kinematics_by_kernel(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
-    x, P = joint.estimator.planar_marginals(ids, joint.places(label))
-    return Kinematics(x[:, :2], x[:, 2:], P[:, :2, :2], P[:, 2:, 2:])
-
-
-@compiled_by(_kinematics_by_kernel, where=lambda joint, ids, label: isinstance(joint.estimator, LatestMarginals))
-def _kinematics(joint: JointTrackState, ids: IntArray, label: StrArray) -> Kinematics:
-    n = len(ids)
-    result = Kinematics(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
-    for node_type, rows in joint.rows_by_type(label):
-        mean, covariance = joint.estimator.mean(ids[rows]), joint.estimator.covariance(ids[rows])
-        at_p = node_type.index(POSITION)
-        result.position[rows], result.P[rows] = mean[:, at_p], covariance[:, at_p[:, None], at_p]
-        if node_type.has(VELOCITY):
-            at_v = node_type.index(VELOCITY)
-            result.velocity[rows], result.P_velocity[rows] = mean[:, at_v], covariance[:, at_v[:, None], at_v]
-    return result

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.track_limits import states_within
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
@@ -51,29 +50,7 @@ class Kinematics(NamedTuple):
         Means and standard deviations have to be within `MAX_POSITION` and `MAX_SPEED`, variances of positions above 0,
         of velocities at least 0. NaN never is within.
         """
-        return _within(*self, origin, MAX_POSITION, MAX_SPEED)
-
-
-@compiled_by(states_within)
-def _within(
-    position: FloatArray,
-    velocity: FloatArray,
-    P: FloatArray,
-    P_velocity: FloatArray,
-    origin: FloatArray,
-    farthest: float,
-    fastest: float,
-) -> BoolArray:
-    variance, velocity_variance = (np.diagonal(C, axis1=1, axis2=2) for C in (P, P_velocity))
-    within = (
-        (np.abs(position + origin) <= farthest)
-        & (np.abs(velocity) <= fastest)
-        & (variance > 0)
-        & (variance <= farthest**2)
-        & (velocity_variance >= 0)
-        & (velocity_variance <= fastest**2)
-    )
-    return np.asarray(within.all(axis=1))
+        return states_within(*self, origin, MAX_POSITION, MAX_SPEED)
 
 
 @dataclass(frozen=True, eq=False)

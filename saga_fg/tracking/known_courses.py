@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.turning import mean_courses
 from saga_fg.model.known_course import KnownCourses, turning_time
 from saga_fg.model.motion import Curvilinear
@@ -49,7 +48,7 @@ def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
     speed = np.hypot(*now.velocity.T)
     curvature = np.where(speed > MOVING, rate[rows], 0.0) / np.maximum(speed, MOVING)
     box, v, P = table.box, now.velocity, now.P_velocity
-    heading = _courses(box.yaw[rows], box.yaw_variance[rows], v, P, _ASTRAY, _LEAST)
+    heading = mean_courses(box.yaw[rows], box.yaw_variance[rows], v, P, _ASTRAY, _LEAST)
     found = paths(state.traffic, table.id[rows], now.position + state.origin, heading, curvature, STEPS)
     return unchecked(Paths, **vars(found) | {"row": rows, "position": found.position - state.origin})
 
@@ -122,14 +121,3 @@ def _at(column: FloatArray, way: FloatArray) -> FloatArray:
     share = np.minimum(way / STEP, most)
     k = np.minimum(share.astype(np.int64), most - 1)
     return np.asarray(column[each, k] + (share - k) * (column[each, k + 1] - column[each, k]))
-
-
-@compiled_by(mean_courses)
-def _courses(
-    yaw: FloatArray, variance: FloatArray, velocity: FloatArray, P: FloatArray, astray: float, least: float
-) -> FloatArray:
-    v = velocity
-    across, square = np.stack([-v[:, 1], v[:, 0]], axis=-1), np.maximum((v**2).sum(axis=1), least)
-    off = wrap_angle(np.arctan2(v[:, 1], v[:, 0]) - yaw)
-    variance_v = np.einsum("ki,kij,kj->k", across, P, across) / square**2
-    return np.asarray(yaw + np.where(np.abs(off) < astray, variance / (variance + variance_v), 0.0) * off)

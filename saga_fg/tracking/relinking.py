@@ -25,18 +25,14 @@ import math
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.pairs import relinking_pairs
 from saga_fg.kernels.track_limits import log_peaks
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
-from saga_fg.numerics.near_pairs import MOST_LOOPED, near_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.stationarity import log_density
 from saga_fg.tracking.tracker_state import TrackerState
 
 _ROUNDING = 1 + 1e-6
-_LEAST = 1e-300  # determinant that rounding leaves
 NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite: a disc of 40 m, in which most objects are detected
 
 
@@ -65,26 +61,6 @@ def relinked(
     return matching.append(Matching(t, rows[j], distance))
 
 
-def _pairs_by_kernel(
-    state: TrackerState,
-    tracks: IntArray,
-    position: FloatArray,
-    P: FloatArray,
-    label: StrArray,
-    z: FloatArray,
-    R: FloatArray,
-) -> tuple[IntArray, IntArray, FloatArray]:
-    still, number = state.table.stationarity, state.class_groups.numbers
-    group, of_place = number(state.table.label), number(label)
-    log_density = np.log(np.bincount(of_place)[of_place] / area(state))
-    objects = position, P, still.position, still.P, still.probability, log_survival(state)
-    return relinking_pairs(tracks, group, *objects, z, R, of_place, log_density, least_log_odds(state), _ROUNDING)
-
-
-@compiled_by(
-    _pairs_by_kernel,
-    where=lambda state, tracks, position, P, label, z, R: len(tracks) * len(z) <= MOST_LOOPED,
-)
 def _pairs(
     state: TrackerState,
     tracks: IntArray,
@@ -96,37 +72,11 @@ def _pairs(
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Rows of tracks, of places `z` (m, 2) of classes `label` (m,), and costs (k,) of pairs
     that re-linking pays for."""
-    i, j = _within_reach(state, tracks, position, P, z, R)
-    alike = state.class_groups.pairs_of_group(state.table.label[tracks], label, i, j)
-    t, j = tracks[i[alike]], j[alike]
-    still, others = state.table.stationarity, state.class_groups.number_of_group(label)[j]
-    moving = _log_density(z[j] - position[t], P[t] + R[j])
-    standing = _log_density(z[j] - still.position[t], still.P[t] + R[j])
-    s = np.clip(still.probability[t], 0.0, 1 - 1e-9)
-    log_odds = log_survival(state)[t] + _mixed(s, moving, standing) - np.log(others / area(state))
-    cost = least_log_odds(state) - log_odds
-    paying = (cost < 0).nonzero()[0]
-    return t[paying], j[paying], cost[paying]
-
-
-def _within_reach(
-    state: TrackerState, tracks: IntArray, position: FloatArray, P: FloatArray, z: FloatArray, R: FloatArray
-) -> tuple[IntArray, IntArray]:
-    """Pairs (K,) of `tracks` (n,), by `position` and P of all, and places z (m, 2) of noise R that could be re-linked.
-
-    Neither density exceeds that of a distance beyond sqrt(trace(P + R)), at a peak of covariance P.
-    """
-    table, spread, found = state.table.stationarity, R[:, 0, 0] + R[:, 1, 1], []
-    most = log_survival(state)[tracks] + math.log(area(state) / (2 * math.pi)) - least_log_odds(state)
-    for mean, covariance in ((position, P), (table.position, table.P)):
-        mean, covariance = mean[tracks], covariance[tracks]
-        a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-        gate = np.maximum(2 * most - np.log(np.maximum(a * c - b * b, _LEAST)), 0.0) * _ROUNDING
-        i, j = near_pairs(mean, z, np.sqrt(gate * (a + c + spread.max())))
-        near = ((z[j] - mean[i]) ** 2).sum(axis=1) <= gate[i] * ((a + c)[i] + spread[j])
-        found.append(i[near] * len(z) + j[near])
-    i, j = np.divmod(np.unique(np.concatenate(found)), len(z))
-    return i, j
+    still, number = state.table.stationarity, state.class_groups.numbers
+    group, of_place = number(state.table.label), number(label)
+    log_density = np.log(np.bincount(of_place)[of_place] / area(state))
+    objects = position, P, still.position, still.P, still.probability, log_survival(state)
+    return relinking_pairs(tracks, group, *objects, z, R, of_place, log_density, least_log_odds(state), _ROUNDING)
 
 
 def relinkable(state: TrackerState) -> BoolArray:
@@ -135,15 +85,9 @@ def relinkable(state: TrackerState) -> BoolArray:
     if association.relink_above == 1 or len(table) == 0:
         return np.zeros(len(table), dtype=bool)
     still = table.stationarity
-    peaks = _log_peaks(state.kinematics().P, still.P, still.probability, log_survival(state))
+    peaks = log_peaks(state.kinematics().P, still.P, still.probability, log_survival(state))
     within = table.coasting(state.time) <= state.settings.max_coasting
     return np.asarray(within & (peaks >= least_log_odds(state) - math.log(area(state))))
-
-
-@compiled_by(log_peaks)
-def _log_peaks(P: FloatArray, D: FloatArray, stationary: FloatArray, log_survival: FloatArray) -> FloatArray:
-    none, s = np.zeros((len(P), 2)), np.clip(stationary, 0.0, 1 - 1e-9)
-    return np.asarray(log_survival + _mixed(s, _log_density(none, P), _log_density(none, D)))
 
 
 def initiating(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> IntArray:
@@ -172,13 +116,3 @@ def log_survival(state: TrackerState) -> FloatArray:
     table, lifetime = state.table, state.settings.existence.lifetime
     real = np.maximum(table.last_existence, 1e-3)
     return np.asarray(np.log(real) - table.coasting(state.time) / lifetime)
-
-
-def _mixed(s: FloatArray, moving: FloatArray, still: FloatArray) -> FloatArray:
-    """(k,) log densities of tracks from those of moving and, with probability s (k,), of stationary objects (k,)."""
-    return np.asarray(np.logaddexp(np.log1p(-s) + moving, np.log(np.maximum(s, 1e-300)) + still))
-
-
-def _log_density(innovation: FloatArray, S: FloatArray) -> FloatArray:
-    """(k,) log N(innovation; 0, S) in the plane, 1/m^2."""
-    return log_density(innovation, S) - math.log(2 * math.pi)

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.covariances import biased_covariances
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 from saga_fg.tracking.class_belief import ClassGroups
@@ -45,7 +44,7 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     now = state.reported_kinematics(rows)
     yaw, (scale, bias) = table.box.yaw[rows], (table.covariance_scale[rows], table.position_bias[rows])
     centre = np.concatenate([now.position + state.origin, table.box.z[rows, None]], axis=1)
-    P = calibrated_covariance(now.P, yaw, scale, bias)
+    P = biased_covariances(now.P, yaw, scale, bias)
     score = reported_score(table, rows, state.class_groups, coasting > 0, settings.existence)
     if settings.tentative_score_factor < 1:
         score = np.where(table.tentative[rows], settings.tentative_score_factor * score, score)
@@ -92,15 +91,3 @@ def reported_score(
     if len(groups):
         evidence = evidence * groups.certainty(table.class_belief.take(rows, 0))
     return np.asarray(evidence * hit_ratio * np.where(coasting, table.existence[rows], 1.0))
-
-
-@compiled_by(biased_covariances)
-def calibrated_covariance(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:
-    """Reported covariances (n, 2, 2), m^2, of positions.
-
-    P (n, 2, 2), yaw (n,), scale (n,) on the deviations, bias (n,) its deviation, m. Where the heading is unknown,
-    half of the variance of the bias goes to each axis.
-    """
-    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
-    direction = np.where(np.isfinite(yaw)[:, None, None], ahead[:, :, None] * ahead[:, None], np.eye(2) / 2)
-    return np.asarray(scale[:, None, None] ** 2 * P + bias[:, None, None] ** 2 * direction)

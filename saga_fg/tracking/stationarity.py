@@ -29,8 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.compilation import compiled_by
-from saga_fg.kernels.stationarity import Places, predicted_places, reported_moments, updated_places
+from saga_fg.kernels.stationarity import predicted_places, reported_moments, updated_places
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import mahalanobis_of_pairs
 from saga_fg.numerics.columns import Columns
@@ -91,7 +90,9 @@ class Stationarity(Columns):
     def predict(self, dt: float, moving: Kinematics, settings: StationaritySettings) -> None:
         """Predict by `dt` s; `moving` is the joint filter's state before."""
         rates = dt, settings.start_rate, settings.stop_rate, settings.drift, HALTING_SPEED
-        self.probability, self.position, self.P = _predicted(self.probability, self.position, self.P, *moving, *rates)
+        self.probability, self.position, self.P = predicted_places(
+            self.probability, self.position, self.P, *moving, *rates
+        )
 
     def update(
         self, rows: IntArray, z: FloatArray, R: FloatArray, moving: Kinematics, with_velocity: BoolArray
@@ -102,7 +103,7 @@ class Stationarity(Columns):
         """
         if len(rows):
             still = self.probability, self.position, self.P, rows
-            self.probability[rows], self.position[rows], self.P[rows] = _updated(
+            self.probability[rows], self.position[rows], self.P[rows] = updated_places(
                 *still, z, R, *moving, with_velocity, _MOST_LOG_ODDS
             )
 
@@ -115,85 +116,7 @@ class Stationarity(Columns):
 
         moving: the joint filter's state, which has the detected positions
         """
-        return Kinematics(*_reported(self.probability, coasting, *moving, self.position, self.P))
-
-
-@compiled_by(predicted_places)
-def _predicted(
-    s: FloatArray,
-    place: FloatArray,
-    D: FloatArray,
-    position: FloatArray,
-    velocity: FloatArray,
-    P: FloatArray,
-    P_velocity: FloatArray,
-    dt: float,
-    start: float,
-    stop: float,
-    drift: float,
-    halting_speed: float,
-) -> Places:
-    h2 = halting_speed**2  # of slow ones the share is exp(-|v|^2 / (2 h^2)), expected over N(v, P_v)
-    distance, log_det = mahalanobis_of_pairs(velocity, P_velocity + h2 * np.eye(2))
-    halting = stop * (h2 * np.exp(-0.5 * (distance + log_det)))
-    rate = start + halting
-    balance, lost = halting / np.maximum(rate, 1e-12), -np.expm1(-rate * dt)
-    stays, halts = s * (1 - (1 - balance) * lost), (1 - s) * balance * lost
-    later = stays + halts
-    new = (halts / np.maximum(later, 1e-12))[:, None]
-    places, covariance = _mixed(new, place, D, position, P)
-    return later, places, covariance + drift**2 * dt * np.eye(2)
-
-
-@compiled_by(updated_places)
-def _updated(
-    s: FloatArray,
-    place: FloatArray,
-    D: FloatArray,
-    rows: IntArray,
-    z: FloatArray,
-    R: FloatArray,
-    position: FloatArray,
-    velocity: FloatArray,
-    P: FloatArray,
-    P_velocity: FloatArray,
-    with_velocity: BoolArray,
-    most_log_odds: float,
-) -> Places:
-    place, D = place[rows], D[rows]
-    z_p, R_p, z_v, R_v = z[:, :2], R[:, :2, :2], np.where(with_velocity[:, None], z[:, 2:], 0.0), R[:, 2:, 2:]
-    S = D + R_p
-    evidence = log_density(z_p - place, S) - log_density(z_p - position, P + R_p)
-    by_velocity = log_density(z_v, R_v) - log_density(z_v - velocity, P_velocity + R_v)
-    evidence += np.where(with_velocity, by_velocity, 0.0)
-    gain = np.swapaxes(np.linalg.solve(S, D), 1, 2)
-    place = place + (gain @ (z_p - place)[:, :, None])[:, :, 0]
-    return after_evidence(s[rows], evidence, most_log_odds), place, D - gain @ D
-
-
-@compiled_by(reported_moments)
-def _reported(
-    s: FloatArray,
-    unseen: BoolArray,
-    position: FloatArray,
-    velocity: FloatArray,
-    P: FloatArray,
-    P_velocity: FloatArray,
-    place: FloatArray,
-    D: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    velocity, P_velocity = _mixed(s[:, None], velocity, P_velocity, 0.0, 0.0)
-    position, P = _mixed(np.where(unseen, s, 0.0)[:, None], position, P, place, D)
-    return position, velocity, P, P_velocity
-
-
-def _mixed(
-    s: FloatArray, mean: FloatArray, P: FloatArray, other: FloatArray | float, other_P: FloatArray | float
-) -> tuple[FloatArray, FloatArray]:
-    """Moments of mixtures of N(mean, P) and, with probability s (n, 1), N(other, other_P)."""
-    apart = other - mean
-    spread = (s * (1 - s))[..., None] * apart[:, :, None] * apart[:, None]
-    return mean + s * apart, (1 - s)[..., None] * P + s[..., None] * other_P + spread
+        return Kinematics(*reported_moments(self.probability, coasting, *moving, self.position, self.P))
 
 
 def after_evidence(probability: FloatArray, evidence: FloatArray, most_log_odds: float = _MOST_LOG_ODDS) -> FloatArray:

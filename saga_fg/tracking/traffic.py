@@ -11,14 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Self, TypeVar
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.covariances import speeds_ahead
 from saga_fg.kernels.trails import points_by_cell
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
@@ -108,7 +105,7 @@ class Passages(Columns):
         Those of unknown `yaw` head where they go; if they do not move either, they have none. stationary: 0 if not
         given.
         """
-        heading, speed, variance = _ahead(yaw, moves, now.velocity, now.P_velocity)
+        heading, speed, variance = speeds_ahead(yaw, moves, now.velocity, now.P_velocity)
         stationary = np.zeros(len(ids)) if stationary is None else stationary
         found = cls(ids, label, now.position, heading, speed, variance, stationary, np.full(len(ids), time), moves)
         return found if np.isfinite(heading).all() else found.select(np.isfinite(heading))
@@ -176,7 +173,7 @@ P = TypeVar("P", Passages, Marks)
 
 @dataclass(eq=False)
 class Trails:
-    """Points of trails, found by their places: by a tree, or by cells for kernels. What finds them is no part of a
+    """Points of trails, found by their places, by cells. What finds them is no part of a
     state: it is made at need."""
 
     points: TrailPoints
@@ -187,11 +184,6 @@ class Trails:
 
     def __len__(self) -> int:
         return len(self.points)
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        """A tree of the places."""
-        return cKDTree(self.points.position, balanced_tree=False, compact_nodes=False)
 
     def cells(self, size: float) -> tuple[IntArray, IntArray]:
         """The points by cells of this size, m, see `saga_fg.kernels.trails.points_by_cell`."""
@@ -269,16 +261,6 @@ class Traffic:
         if self._trails is None:
             self._trails = Trails(TrailPoints.of(self.left).append(TrailPoints.of(self.latest)))
         return self._trails
-
-
-@compiled_by(speeds_ahead)
-def _ahead(
-    yaw: FloatArray, moves: BoolArray, velocity: FloatArray, P: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    heading = np.where(np.isfinite(yaw) | ~moves, yaw, np.arctan2(velocity[:, 1], velocity[:, 0]))
-    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    variance = np.einsum("ni,nij,nj->n", ahead, P, ahead)
-    return heading, np.einsum("ni,ni->n", ahead, velocity), variance
 
 
 def _since(passages: P, time: float) -> P:

@@ -21,11 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
-from saga_fg.kernels.turning import Turning, known_turning, predicted_turning, updated_turning
+from saga_fg.kernels.turning import known_turning, predicted_turning, updated_turning
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
-from saga_fg.numerics.geometry import wrap_angle
 
 DEVIATION = 0.15  # rad/s, stationary standard deviation of a rate: a bend of 50 m at 7 m/s
 TURNING = 0.3  # rad/s, deviation of their rates: a crossing is a quarter turn in some 5 s
@@ -56,74 +54,14 @@ class TurnRate(Columns):
     def predict(self, dt: float, fading_time: FloatArray) -> None:
         """Predict by `dt` s; fading_time (n,), s, 0 where turns are not modelled."""
         before, scales = (self.heading, self.rate, self.P), (DEVIATION, _LEAST_TIME)
-        self.heading, self.rate, self.P = _predicted(*before, dt, fading_time, *scales)
+        self.heading, self.rate, self.P = predicted_turning(*before, dt, fading_time, *scales)
 
     def update(self, rows: IntArray, yaw: FloatArray, yaw_noise: FloatArray) -> None:
         """Take in one heading each of the tracks `rows` (k,); NaN is none."""
-        now = _updated(self.heading, self.rate, self.P, rows, yaw, yaw_noise, OUTLIER)
+        now = updated_turning(self.heading, self.rate, self.P, rows, yaw, yaw_noise, OUTLIER)
         self.heading[rows], self.rate[rows], self.P[rows] = now
 
     def known(self, rows: IntArray, turning_share: float) -> tuple[FloatArray, FloatArray]:
         """Turn rates of tracks `rows` (k,) to predict with, rad/s, and their variances (k,)."""
         share = min(max(turning_share, 1e-9), 1 - 1e-9)
-        return _known(self.rate, self.P, rows, share, TURNING, STRAIGHT)
-
-
-@compiled_by(predicted_turning)
-def _predicted(
-    heading: FloatArray,
-    rate: FloatArray,
-    P: FloatArray,
-    dt: float,
-    fading_time: FloatArray,
-    deviation: float,
-    least_time: float,
-) -> Turning:
-    tau, variance = np.maximum(fading_time, least_time), deviation**2
-    kept = np.exp(-dt / tau)
-    turned = tau * (1 - kept)
-    F, Q = np.tile(np.eye(2), (len(tau), 1, 1)), np.empty((len(tau), 2, 2))
-    F[:, 0, 1], F[:, 1, 1] = turned, kept
-    Q[:, 0, 0] = variance * tau * (2 * dt - tau * (3 - 4 * kept + kept**2))
-    Q[:, 0, 1] = Q[:, 1, 0] = variance * turned * (1 - kept)
-    Q[:, 1, 1] = variance * (1 - kept**2)
-    return wrap_angle(heading + turned * rate), kept * rate, F @ P @ np.swapaxes(F, 1, 2) + Q
-
-
-@compiled_by(updated_turning)
-def _updated(
-    heading: FloatArray,
-    rate: FloatArray,
-    P: FloatArray,
-    rows: IntArray,
-    yaw: FloatArray,
-    yaw_noise: FloatArray,
-    outlier: float,
-) -> Turning:
-    heading, rate, P, variance = heading[rows], rate[rows], P[rows], yaw_noise**2
-    measured = np.isfinite(yaw)
-    new = measured & ~np.isfinite(heading)
-    heading[new], P[new, 0, 0] = yaw[new], variance[new]
-    P[new, 0, 1] = P[new, 1, 0] = 0.0
-    old = np.flatnonzero(measured & ~new)
-    innovation, before = wrap_angle(2 * (yaw[old] - heading[old])) / 2, P[old]
-    S = np.maximum(before[:, 0, 0] + variance[old], (innovation / outlier) ** 2)
-    gain = before[:, :, 0] / S[:, None]
-    heading[old] = wrap_angle(heading[old] + gain[:, 0] * innovation)
-    rate[old] += gain[:, 1] * innovation
-    P[old] = before - gain[:, :, None] * before[:, None, 0]
-    return heading, rate, P
-
-
-@compiled_by(known_turning)
-def _known(
-    rate: FloatArray, P: FloatArray, rows: IntArray, share: float, turning: float, straight: float
-) -> tuple[FloatArray, FloatArray]:
-    rate, variance = rate[rows], P[rows, 1, 1]
-    one, other = variance + straight**2, variance + turning**2
-    log_odds = np.log(share / (1 - share)) + 0.5 * np.log(one / other)
-    turns = 1 / (1 + np.exp(np.clip(-log_odds - 0.5 * rate**2 * (1 / one - 1 / other), -50, 50)))
-    if_turning, if_straight = turning**2 / other, straight**2 / one
-    kept = turns * if_turning + (1 - turns) * if_straight
-    between = turns * (1 - turns) * (rate * (if_turning - if_straight)) ** 2
-    return rate * kept, variance * kept + between
+        return known_turning(self.rate, self.P, rows, share, TURNING, STRAIGHT)

@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.kernels.compilation import compiled_by
 from saga_fg.kernels.overlap import paired_overlaps
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.near_pairs import near_pairs
@@ -56,15 +55,9 @@ def iou_3d(a: Boxes, b: Boxes) -> FloatArray:
     return result
 
 
-def _overlaps(a: Boxes, b: Boxes) -> FloatArray:
-    return paired_overlaps(a.position, a.size, a.yaw, b.position, b.size, b.yaw, HAIR)
-
-
-@compiled_by(_overlaps)
 def paired_bev_iou(a: Boxes, b: Boxes) -> FloatArray:
     """(N,) IoU of the footprints of a[n] and b[n]; NaN where a size or heading is unknown."""
-    common = paired_intersection(a, b)
-    return np.asarray(common / (_area(a) + _area(b) - common))
+    return paired_overlaps(a.position, a.size, a.yaw, b.position, b.size, b.yaw, HAIR)
 
 
 def paired_iou_3d(a: Boxes, b: Boxes) -> FloatArray:
