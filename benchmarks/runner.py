@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import wraps
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -34,7 +33,6 @@ from pipelines.cli.options import Verbose
 from pipelines.cli.tables import JsonFile, MarkdownFile, report
 from pipelines.process import one_thread
 from saga_fg.errors import InputError
-from saga_fg.kernels.compilation import compiled_kernels
 from saga_fg.numerics.arrays import FloatArray
 
 T = TypeVar("T")
@@ -183,7 +181,6 @@ def resampled(
 def environment() -> dict[str, str]:
     """Return versions and hardware that the figures depend on."""
     blas = sorted({f"{pool['internal_api']} {pool['version']}" for pool in threadpool_info()})
-    packages = {name: version(name) for name in ("saga-fg", "gtsam", "numpy", "scipy")}
-    packages["numba"] = version("numba") if find_spec("numba") is not None else "none"
+    packages = {name: version(name) for name in ("saga-fg", "gtsam", "numpy", "scipy", "numba")}
     machine = {"python": platform.python_version(), "machine": platform.machine(), "blas": ", ".join(blas)}
-    return {**machine, **packages, "kernels": "compiled" if compiled_kernels() else "none"}
+    return {**machine, **packages}

@@ -184,7 +184,7 @@ def _announce_compilation() -> None:
 
     class Announcement(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:
-            _say_once("compiling kernels that this installation has not run yet: up to twelve seconds")
+            _say_once("compiling kernels that this installation has not run yet: up to twenty seconds")
 
         def on_end(self, event: Any) -> None:
             pass

@@ -65,11 +65,12 @@ def compared_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: Flo
     return row[:k].copy(), column[:k].copy()
 
 
-@kernel("f2 f3 f1 f1 i1 f2 f2 f3 i1 f2")
+@kernel("i1 i1 f2 f3 f1 i1 f2 f2 f3 i1 f2")
 def gated_pairs(
+    row: IntArray,
+    column: IntArray,
     position: FloatArray,
     P: FloatArray,
-    reach: FloatArray,
     gate: FloatArray,
     group: IntArray,
     belief: FloatArray,
@@ -81,55 +82,40 @@ def gated_pairs(
     """Rows of the tracks and of the measurements (k,) of pairs inside the gates, innovation (k, 2), S (k, 2, 2), d2 and
     cost (k,), as `saga_fg.tracking.association` defines them, without overlap.
 
-    Of n tracks: position (n, 2), P (n, 2, 2), reach (n,), gate (n,), group (n,), belief (n, C); of m measurements: z
-    (m, 2), R (m, 2, 2), group_z (m,), likelihood (m, C); C = 0: classes tell nothing more
+        S = P + R,   d2 = (z - x)^T S^-1 (z - x),   cost = d2 + log det S - 2 log(belief . likelihood)
+
+    A pair is inside where cost - log det S < gate. Of E pairs within reach: rows `row`, `column` (E,); of n tracks:
+    position (n, 2), P (n, 2, 2), gate (n,), group (n,), belief (n, C); of m measurements: z (m, 2), R (m, 2, 2),
+    group_z (m,), likelihood (m, C); C = 0: classes tell nothing
     """
-    n, m, classes = len(position), len(z), belief.shape[1]
-    k, room = 0, max(64, 2 * (n + m))
-    found, numbers = np.empty((2, room), dtype=np.int64), np.empty((room, 7))
-    for i in range(n):
-        for j in range(m):
-            if group[i] != group_z[j]:
-                continue
-            x, y = z[j, 0] - position[i, 0], z[j, 1] - position[i, 1]
-            if not x * x + y * y <= reach[i] * reach[i]:
-                continue
-            a, b, c = P[i, 0, 0] + R[j, 0, 0], P[i, 0, 1] + R[j, 0, 1], P[i, 1, 1] + R[j, 1, 1]
-            det = a * c - b * b
-            d2 = (c * x * x - 2 * b * x * y + a * y * y) / det
-            of_class = 0.0
-            if classes > 0:
-                chance = 0.0
-                for q in range(classes):
-                    chance += belief[i, q] * likelihood[j, q]
-                if chance > 0:
-                    of_class = -2 * math.log(chance)
-            if not d2 + of_class < gate[i]:
-                continue
-            if k == room:
-                room = 2 * room
-                more, longer = np.empty((2, room), dtype=np.int64), np.empty((room, 7))
-                for e in range(k):
-                    more[0, e], more[1, e] = found[0, e], found[1, e]
-                    for q in range(7):
-                        longer[e, q] = numbers[e, q]
-                found, numbers = more, longer
-            found[0, k], found[1, k] = i, j
-            numbers[k, 0], numbers[k, 1], numbers[k, 2], numbers[k, 3], numbers[k, 4] = x, y, a, b, c
-            numbers[k, 5], numbers[k, 6] = d2, d2 + np.log(det) + of_class
-            k += 1
-    rows, innovation, S, d2_and_cost = (
-        np.empty((2, k), dtype=np.int64),
-        np.empty((k, 2)),
-        np.empty((k, 2, 2)),
-        np.empty((2, k)),
+    k, E, classes = 0, len(row), belief.shape[1]
+    rows, innovation, S, costs = (
+        np.empty((2, E), dtype=np.int64),
+        np.empty((E, 2)),
+        np.empty((E, 2, 2)),
+        np.empty((2, E)),
     )
-    for p in range(k):
-        rows[0, p], rows[1, p] = found[0, p], found[1, p]
-        innovation[p, 0], innovation[p, 1] = numbers[p, 0], numbers[p, 1]
-        S[p, 0, 0], S[p, 0, 1], S[p, 1, 0], S[p, 1, 1] = numbers[p, 2], numbers[p, 3], numbers[p, 3], numbers[p, 4]
-        d2_and_cost[0, p], d2_and_cost[1, p] = numbers[p, 5], numbers[p, 6]
-    return rows[0], rows[1], innovation, S, d2_and_cost[0], d2_and_cost[1]
+    for e in range(E):
+        i, j = row[e], column[e]
+        if group[i] != group_z[j]:
+            continue
+        x, y = z[j, 0] - position[i, 0], z[j, 1] - position[i, 1]
+        a, b, c = P[i, 0, 0] + R[j, 0, 0], P[i, 0, 1] + R[j, 0, 1], P[i, 1, 1] + R[j, 1, 1]
+        det = a * c - b * b
+        d2 = (c * x * x - 2 * b * x * y + a * y * y) / det
+        of_class = 0.0
+        if classes > 0:
+            chance = 0.0
+            for q in range(classes):
+                chance += belief[i, q] * likelihood[j, q]
+            if chance > 0:
+                of_class = -2 * math.log(chance)
+        if d2 + of_class < gate[i]:
+            rows[0, k], rows[1, k], innovation[k, 0], innovation[k, 1] = i, j, x, y
+            S[k, 0, 0], S[k, 0, 1], S[k, 1, 0], S[k, 1, 1] = a, b, b, c
+            costs[0, k], costs[1, k] = d2, d2 + np.log(det) + of_class
+            k += 1
+    return rows[0, :k], rows[1, :k], innovation[:k], S[:k], costs[0, :k], costs[1, :k]
 
 
 @kernel("i1 i1 f2 f3 f2 f3 f1 f1 f2 f3 i1 f1 f f")

@@ -57,3 +57,10 @@ class Marginals:
     def covariance(self, nodes: ArrayLike) -> FloatArray:
         """(k, D, D) covariances, padded."""
         return np.asarray(self.covariances[np.asarray(nodes)])
+
+    def planar_marginals(self, nodes: ArrayLike, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Positions and velocities (k, 4) with their covariances (k, 4, 4); places (k, 4) in the states, -1: zeros."""
+        rows, known = np.arange(len(places))[:, None], places >= 0
+        mean = np.where(known, self.mean(nodes)[rows, places], 0.0)
+        covariance = self.covariance(nodes)[rows[:, :, None], places[:, :, None], places[:, None, :]]
+        return mean, np.where(known[:, :, None] & known[:, None, :], covariance, 0.0)

@@ -30,6 +30,7 @@ import numpy as np
 from saga_fg.kernels.pairs import gated_pairs
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, distinct
 from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total
+from saga_fg.numerics.near_pairs import near_pairs
 from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs
 from saga_fg.numerics.quadratic_matching import QuadraticMatching
 from saga_fg.tracking.class_belief import ClassEvidence
@@ -169,8 +170,9 @@ def _gated(
     else:
         of_track, of_detection = (evidence.groups.numbers(label) for label in (predicted.label, boxes.label))
         belief, likelihood = evidence.belief, evidence.likelihood
-    tracks = predicted.position[:, :2], P, reach, gates, of_track, belief
-    return CandidatePairs(*gated_pairs(*tracks, boxes.position[:, :2], measurements.R, of_detection, likelihood))
+    x, z = predicted.position[:, :2], boxes.position[:, :2]
+    tracks, detected = (x, P, gates, of_track, belief), (z, measurements.R, of_detection, likelihood)
+    return CandidatePairs(*gated_pairs(*near_pairs(x, z, reach), *tracks, *detected))
 
 
 def _overlap(found: CandidatePairs, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:

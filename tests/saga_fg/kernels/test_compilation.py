@@ -10,13 +10,12 @@ import pytest
 
 import saga_fg
 from saga_fg.kernels import compilation
-from saga_fg.kernels.compilation import compiled_kernels, load_kernels, only_numpy
+from saga_fg.kernels.compilation import load_kernels
 
 ROOT = Path(saga_fg.__file__).parents[1]
 LABELS = (
     "import numpy as np; from saga_fg.numerics.arrays import distinct; print(distinct(np.array(['a', 'b', 'a']))[1])"
 )
-USED = "from saga_fg.kernels.compilation import compiled_kernels; print(compiled_kernels())"
 
 
 def run(code, cwd, **environment):
@@ -26,26 +25,13 @@ def run(code, cwd, **environment):
     return done.stdout.strip(), done.stderr
 
 
-def test_kernels_are_used_here_and_can_be_left_out():
-    assert compiled_kernels()
-    with only_numpy():
-        assert not compiled_kernels()
-    assert compiled_kernels()
+def test_numba_can_be_switched_off_and_kernels_are_plain_python():
+    out, said = run(LABELS + "; import sys; print('numba' in sys.modules)", ROOT, NUMBA_DISABLE_JIT="1")
+    assert (out.split("\n"), said) == (["[0 1 0]", "False"], "")
 
 
-@pytest.mark.parametrize(("disabled", "used"), [("1", "False"), ("0", "True"), ("", "True")])
-def test_numba_can_be_switched_off(disabled, used):
-    assert run(USED, ROOT, NUMBA_DISABLE_JIT=disabled)[0] == used
-
-
-def test_without_numba_there_are_no_kernels():
-    hidden = (
-        "import importlib.util as u; real = u.find_spec\n"
-        "u.find_spec = lambda name, *rest: None if name == 'numba' else real(name, *rest)\n"
-    )
-    assert run(hidden + USED, ROOT)[0] == "False"
-    out, _ = run(hidden + LABELS + "; import sys; print('numba' in sys.modules)", ROOT)
-    assert out.split("\n") == ["[0 1 0]", "False"]
+def test_numba_is_imported_at_the_first_kernel_alone():
+    assert run("import sys, saga_fg, saga_fg.tracking.tracker; print('numba' in sys.modules)", ROOT)[0] == "False"
 
 
 def test_a_read_only_installation_keeps_its_kernels_in_the_cache_of_the_user(tmp_path):
@@ -64,12 +50,27 @@ def test_a_read_only_installation_keeps_its_kernels_in_the_cache_of_the_user(tmp
     assert "compiling" not in said
 
 
-def test_a_numba_that_cannot_be_imported_is_told_once_and_numpy_is_used(tmp_path):
-    (tmp_path / "numba.py").write_text("raise ImportError('Numba needs NumPy 2.2 or less')")
-    out, said = run(f"{USED}; {LABELS}", ROOT, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
-    assert out.split("\n") == ["False", "[0 1 0]"]
-    assert said.count("Numba needs NumPy 2.2 or less") == 1
+def in_one_line(code, **environment):
+    """The message of a `KernelError`, which is one line."""
+    caught = f"from saga_fg.errors import SagaError\ntry:\n    {code}\nexcept SagaError as error:\n    print(error)"
+    out, said = run(caught, ROOT, **environment)
+    assert "\n" not in out
     assert "Traceback" not in said
+    return out
+
+
+def test_a_numba_that_cannot_be_imported_is_one_clear_line(tmp_path):
+    (tmp_path / "numba.py").write_text("raise ImportError('Numba needs NumPy 2.2 or less')")
+    out = in_one_line(LABELS, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
+    assert out.startswith("Numba cannot be imported: Numba needs NumPy 2.2 or less")
+    assert "pip install" in out
+
+
+def test_a_kernel_that_does_not_compile_is_one_clear_line(tmp_path):
+    code = "from saga_fg.kernels.compilation import kernel; kernel('f')(lambda x: x.nothing)(1.0)"
+    out = in_one_line(code, NUMBA_CACHE_DIR=str(tmp_path))
+    assert out.startswith("kernel <lambda>: Numba ")
+    assert "does not compile it" in out
 
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])

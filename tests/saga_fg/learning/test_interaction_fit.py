@@ -9,7 +9,6 @@ import pytest
 from saga_fg import InputError
 from saga_fg.learning import GapSettings, HiddenObjects, fit_interactions, hidden_objects, negative_log_likelihood
 from saga_fg.learning.interaction_fit import RuleParameters
-from saga_fg.model.edge_features import EdgeFeatures
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
@@ -36,8 +35,8 @@ def last_error(sample, rules):
 
 def test_the_known_rate_is_found_again_and_lowers_errors_on_other_recordings():
     fitted = fit_interactions(gaps_of(1), SETTINGS, (FOLLOW,), iterations=10, prior=0.02)
-    behind = EdgeFeatures(*(np.array([v]) for v in (GAP, 0.0, 0.0, GAP, 0.0, 8.0, 8.0, 1.0, 1.0)))
-    assert fitted.rules[0].strength(behind)[0] == pytest.approx(RATE, rel=0.5)
+    rule = fitted.rules[0]
+    assert rule.rate * math.exp(-GAP / rule.gap_scale) == pytest.approx(RATE, rel=0.5)
     other = gaps_of(2)
     assert last_error(other, fitted.rules) < 0.9 * last_error(other, ())
 

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from saga_fg.model.edge_pairs import pairs_ahead
+from saga_fg.kernels.lanes import pairs_ahead
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.paths import SHARP, Paths
+from saga_fg.numerics.polyline import Polylines
 from tests.saga_fg.model.drawn_traffic import bend, edges, leaders, random_traffic, table, with_path
 
 
@@ -72,7 +73,7 @@ def test_no_place_beside_a_path_is_left_out(seed):
     none = np.zeros((1, len(places)))
     paths = Paths(np.array([0]), places[None], heading[None], none, none, *np.zeros((2, 1)))
     others = rng.uniform(-70, 70, (2000, 2))
-    at = paths.lines.feet(np.zeros(2000, dtype=np.int64), others)
+    at = Polylines.of(list(paths.position)).feet(np.zeros(2000, dtype=np.int64), others)
     beside = (at.s > 0) & (np.abs(at.e) < 3.6)
     path, able = np.full(2001, -1), np.ones(2001, dtype=bool)
     path[0], follows, every = 0, ~able, np.concatenate([places[:1], others])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
 from saga_fg.tracking.class_belief import ClassGroups
-from saga_fg.tracking.existence import after_hit, after_miss
+from saga_fg.tracking.existence import _existence
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import TrackTable
 from tests.saga_fg.traffic_frames import frame
@@ -26,6 +26,16 @@ def score(probability, hits, opportunities, coasting=False, existence=0.9, setti
     best = np.maximum(probability, best)
     table = replace(TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, **counts)
     return reported_score(table, np.arange(n), ClassGroups(()), np.full(n, coasting), settings)
+
+
+def after_miss(r, p_detect, elapsed, settings):
+    none = np.empty(0, dtype=np.int64), np.empty(0)
+    return _existence(r, np.ones(len(r), dtype=bool), p_detect, *none, elapsed, settings)
+
+
+def after_hit(r, probability, settings):
+    missed, every = np.zeros(len(r), dtype=bool), np.arange(len(r))
+    return _existence(r, missed, np.zeros(len(r)), every, probability, 1.0, settings)
 
 
 def test_a_miss_is_the_likelier_the_less_the_track_exists():

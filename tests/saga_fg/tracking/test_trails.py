@@ -215,11 +215,12 @@ def test_a_corrected_lane_replaces_the_one_of_its_name():
 def test_lanes_are_indexed_once_and_what_finds_them_is_no_part_of_a_state():
     traffic = of_map(BEND)
     path(traffic)
-    found, tree = traffic.lanes, traffic.lanes.tree
+    found, cells = traffic.lanes, traffic.lanes._cells
+    assert cells is not None
     traffic.update(passing([(0.0, 0.0)], 0.0), 0.0)
     twin = traffic.copied()
     assert twin.lanes is traffic.lanes is found
-    assert twin.lanes.tree is tree
+    assert twin.lanes._cells is cells
     assert len(pickle.dumps(traffic.lanes)) == len(pickle.dumps(of_map(BEND).lanes))
     assert path(pickle.loads(pickle.dumps(twin))).position == pytest.approx(path(traffic).position, abs=0)
 
