@@ -46,7 +46,11 @@ def measured_covariances(
 
 @kernel("f3 f1 f1 f1")
 def biased_covariances(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:
-    """Reported covariances (n, 2, 2), see `saga_fg.tracking.reporting.calibrated_covariance`."""
+    """Reported covariances (n, 2, 2), m^2, of positions: scale^2 P + bias^2 u u^T, u the direction of the heading.
+
+    P (n, 2, 2), yaw (n,), scale (n,) on the deviations, bias (n,) its deviation, m. Where the heading is unknown, half of
+    the variance of the bias goes to each axis.
+    """
     n = len(yaw)
     result = np.empty((n, 2, 2))
     for k in range(n):
@@ -110,6 +114,8 @@ def existences(
     neutral: float,
 ) -> FloatArray:
     """Existence (n,) of tracks after a frame, see `saga_fg.tracking.existence`.
+
+        missed: r (1 - c) / (1 - r c) survival,   detected: odds of r times p (1 - neutral) / ((1 - p) neutral)
 
     missed (n,) ones, by the chance (n,) to detect them; detections of a probability (k,) of the tracks `rows` (k,)
     """

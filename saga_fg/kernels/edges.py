@@ -58,7 +58,12 @@ def leader_rates(
     steepest: float,
     least: float,
 ) -> Led:
-    """The pairs (k,) whose sources lead, with their rates.
+    """The pairs (k,) whose sources lead, with their rates
+
+        share rate exp(-ahead / gap_scale - ((turn / heading_scale)^2 + (lateral / lateral_scale)^2) / 2) gain none_before
+
+    ahead and lateral along the path of the target, on an arc aside by ahead tan(turn / 2) where none is predicted;
+    none_before: the probability that no vehicle before the source exists. Left out are sources beyond three scales.
 
     Of n nodes: position (n, 2), heading, length, moved, exists, variance of the velocity (n,); leaders: 0 any, 1 those
     that have moved, 2 others; spread: that of the information gain, below 0 without it; steepest: largest turn of an
@@ -130,7 +135,11 @@ def neighbour_rates(
     degree: int,
     spread: float,
 ) -> Led:
-    """At most `degree` pairs (k,) into each node, the strongest first, with their rates.
+    """At most `degree` pairs (k,) into each node, the strongest first, with their rates
+
+        rate exp(-((distance / distance_scale)^2 + (turn / heading_scale)^2 + (faster / speed_scale)^2) / 2) gain
+
+    faster: size of the difference of velocities; for `parked` ones squares of both speeds are added to its square.
 
     Of n nodes: position, velocity (n, 2), heading, moved, variance of the velocity (n,); spread as above
     """

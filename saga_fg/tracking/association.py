@@ -172,7 +172,8 @@ def _gated(
         belief, likelihood = evidence.belief, evidence.likelihood
     x, z = predicted.position[:, :2], boxes.position[:, :2]
     tracks, detected = (x, P, gates, of_track, belief), (z, measurements.R, of_detection, likelihood)
-    return CandidatePairs(*gated_pairs(*near_pairs(x, z, reach), *tracks, *detected))
+    row, column = near_pairs(x, z, reach)
+    return CandidatePairs(*gated_pairs(row, column, *tracks, *detected))
 
 
 def _overlap(found: CandidatePairs, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:

@@ -173,8 +173,7 @@ P = TypeVar("P", Passages, Marks)
 
 @dataclass(eq=False)
 class Trails:
-    """Points of trails, found by their places, by cells. What finds them is no part of a
-    state: it is made at need."""
+    """Points of trails, found by cells. These are no part of a state: they are made at need."""
 
     points: TrailPoints
     _cells: tuple[float, IntArray, IntArray] | None = field(default=None, init=False, repr=False)
