@@ -48,8 +48,8 @@ def measured_covariances(
 def biased_covariances(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:
     """Reported covariances (n, 2, 2), m^2, of positions: scale^2 P + bias^2 u u^T, u the direction of the heading.
 
-    P (n, 2, 2), yaw (n,), scale (n,) on the deviations, bias (n,) its deviation, m. Where the heading is unknown, half of
-    the variance of the bias goes to each axis.
+    P (n, 2, 2), yaw (n,), scale (n,) on the deviations, bias (n,) its deviation, m. Where the heading is unknown, half
+    of the variance of the bias goes to each axis.
     """
     n = len(yaw)
     result = np.empty((n, 2, 2))
