@@ -60,7 +60,8 @@ def leader_rates(
 ) -> Led:
     """The pairs (k,) whose sources lead, with their rates
 
-        share rate gain none_before exp(-ahead / gap_scale - (turn^2 / heading_scale^2 + lateral^2 / lateral_scale^2) / 2)
+        share rate gain none_before e^-d
+        d = ahead / gap_scale + (turn / heading_scale)^2 / 2 + (lateral / lateral_scale)^2 / 2
 
     ahead and lateral along the path of the target, on an arc aside by ahead tan(turn / 2) where none is predicted;
     none_before: the probability that no vehicle before the source exists. Left out are sources beyond three scales.
