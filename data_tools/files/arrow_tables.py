@@ -78,13 +78,18 @@ def _read(path: Path, choose: Choose, arrays: bool) -> Iterator[tuple[str, Any, 
 
 
 def _names(path: Path) -> Iterator[list[str]]:
-    from pyarrow import feather, parquet
+    from pyarrow import ArrowInvalid, feather, ipc, parquet
 
     with open_bytes(path) as file:
         if path.suffix.lower() == ".parquet":
-            yield list(parquet.ParquetFile(file).schema_arrow.names)
+            names = parquet.ParquetFile(file).schema_arrow.names
         else:
-            yield list(feather.read_table(file, memory_map=False).column_names)
+            try:
+                names = ipc.open_file(file).schema.names
+            except ArrowInvalid:  # the first version of Feather, or a file whose fault its reader tells
+                file.seek(0)
+                names = feather.read_table(file, memory_map=False).column_names
+    yield list(names)
 
 
 def _columns(path: Path, names: list[str], arrays: bool) -> Iterator[tuple[str, Any, int]]:
