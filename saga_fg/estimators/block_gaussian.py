@@ -76,7 +76,9 @@ class BlockGaussian:
         """The partition into parts that no correlation above `tolerance` ties."""
         if self.partition.count == len(self.layout):
             return self.partition
-        parts = _uncorrelated(self, tolerance)
+        layout, label, at = self.layout, self.partition.label, self.partition.block_places
+        joined = uncorrelated_labels(self.flat, label, at.start, at.size, at.offset, layout.dims, tolerance)
+        parts = Partition(layout, joined)
         return self.partition if parts.count == self.partition.count else parts
 
     def covariances(self, rows: IntArray) -> FloatArray:
@@ -113,11 +115,6 @@ class BlockGaussian:
         for places, P in zip(self.partition.groups, self.blocks, strict=True):
             variances[places] = np.diagonal(P, axis1=1, axis2=2)
         return variances
-
-
-def _uncorrelated(x: BlockGaussian, tolerance: float) -> Partition:
-    at, layout, label = x.partition.block_places, x.layout, x.partition.label
-    return Partition(layout, uncorrelated_labels(x.flat, label, at.start, at.size, at.offset, layout.dims, tolerance))
 
 
 def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:

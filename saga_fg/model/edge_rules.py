@@ -122,7 +122,14 @@ class Neighbours(Settings):
             able &= nodes.velocity_variance < self.speed_scale**2
             able &= nodes.has_moved == 0 if nodes.has_moved is not None else False
         target, source = pairs_within(nodes.position, _acted(nodes, able), able, self.max_distance)
-        return _neighbours(self, nodes, target, source) if len(target) else NO_PAIRS
+        if len(target) == 0:
+            return NO_PAIRS
+        _, moved, variance, spread = _columns(nodes, self.information_gain)
+        direction = nodes.along(target, source).direction
+        columns = nodes.position, nodes.velocity, nodes.heading, moved, variance
+        scales = self.rate, self.distance_scale, self.heading_scale, self.speed_scale
+        limits = self.max_distance, self.min_speed, self.parked, self.max_degree
+        return Pairs(*neighbour_rates(target, source, direction, *columns, *scales, *limits, spread))
 
 
 @dataclass(frozen=True)
@@ -175,9 +182,18 @@ class Following(Settings):
     )
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        seen = nodes if self.cones is None else replace(nodes, position=anticipated(nodes, self.classes, self.cones))
-        target, source = self._ahead(seen)
-        return _leaders(self, seen, target, source) if len(target) else NO_PAIRS
+        if self.cones is not None:
+            nodes = replace(nodes, position=anticipated(nodes, self.classes, self.cones))
+        target, source = self._ahead(nodes)
+        if len(target) == 0:
+            return NO_PAIRS
+        exists, moved, variance, spread = _columns(nodes, self.information_gain)
+        columns = nodes.position, nodes.heading, nodes.length, moved, exists, variance
+        scales = self.rate, self.max_gap, self.gap_scale, self.lateral_scale, self.heading_scale
+        leaders = ("any", "moving", "stationary").index(self.leaders)
+        leading = self.parked, leaders, self.min_separation
+        ends = target, source, *nodes.along(target, source)
+        return Pairs(*leader_rates(*ends, *columns, *scales, *leading, spread, _STEEPEST, LEAST))
 
     def _ahead(self, nodes: NodeTable) -> tuple[IntArray, IntArray]:
         """All pairs that may be in a lane: target rows, source rows."""
@@ -269,24 +285,3 @@ def _columns(nodes: NodeTable, information: EdgeInformation | None) -> tuple[Flo
     if information is None:
         return exists, moved, ones, -1.0
     return exists, moved, information.variances(nodes), information.spread
-
-
-def _neighbours(rule: Neighbours, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
-    """The strongest of these pairs, with their rates."""
-    _, moved, variance, spread = _columns(nodes, rule.information_gain)
-    direction = nodes.along(target, source).direction
-    columns = nodes.position, nodes.velocity, nodes.heading, moved, variance
-    scales = rule.rate, rule.distance_scale, rule.heading_scale, rule.speed_scale
-    limits = rule.max_distance, rule.min_speed, rule.parked, rule.max_degree
-    return Pairs(*neighbour_rates(target, source, direction, *columns, *scales, *limits, spread))
-
-
-def _leaders(rule: Following, nodes: NodeTable, target: IntArray, source: IntArray) -> Pairs:
-    """Those of these pairs whose sources lead, with their rates."""
-    exists, moved, variance, spread = _columns(nodes, rule.information_gain)
-    columns = nodes.position, nodes.heading, nodes.length, moved, exists, variance
-    scales = rule.rate, rule.max_gap, rule.gap_scale, rule.lateral_scale, rule.heading_scale
-    leaders = ("any", "moving", "stationary").index(rule.leaders)
-    leading = rule.parked, leaders, rule.min_separation
-    ends = target, source, *nodes.along(target, source)
-    return Pairs(*leader_rates(*ends, *columns, *scales, *leading, spread, _STEEPEST, LEAST))

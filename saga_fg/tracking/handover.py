@@ -67,12 +67,7 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     if len(new) == 0:
         return new, new, new
     old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
-    return _returned(state, new, old)
-
-
-def _returned(state: TrackerState, new: IntArray, old: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """The candidates among `new` and `old` tracks."""
-    now, still, table = state.kinematics(), state.table.stationarity, state.table
+    now, still = state.kinematics(), table.stationarity
     group, places = state.class_groups.numbers(table.label), (now.position, now.P, still.position, still.P)
     return returned_pairs(new, old, group, table.initiated, table.last_detected, *places, _FARTHEST)
 
@@ -85,18 +80,11 @@ def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[Fl
     each, of_pair = new[first], first.cumsum() - 1
     place = state.kinematics().position[each] + state.origin
     _, V_0, p = unmeasured_velocity(state, table.label[each], place, table.box.yaw[each], prior)
-    return _evidence(state, new, old, V_0[of_pair], p[of_pair])
-
-
-def _evidence(
-    state: TrackerState, new: IntArray, old: IntArray, V_0: FloatArray, p: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """`_log_evidence` of velocities V_0 (k, 2, 2) that nobody has measured, and prior probabilities p (k,)."""
-    estimator, table, still = state.joint.estimator, state.table, state.table.stationarity
+    estimator, still = state.joint.estimator, table.stationarity
     places, place, D, s = state.joint.places(table.label), still.position, still.P, still.probability
     (x, P), (x_old, P_old) = (estimator.planar_marginals(table.id[k], places[k]) for k in (new, old))
     if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
-    return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0, p, *if_still)
+    return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0[of_pair], p[of_pair], *if_still)
 
 
 def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatArray) -> None:
