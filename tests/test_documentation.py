@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pkgutil
 import re
 import subprocess
@@ -83,18 +84,26 @@ def run_examples(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
 
 
-def test_the_site_has_every_setting() -> None:
+def on_the_site(*pages: tuple[str, str]) -> list[str]:
+    """The Markdown of pages (name, Markdown) as the site has it; skips without MkDocs."""
     pytest.importorskip("mkdocs", reason="the site comes with the extra docs")
     code = (
+        "import json, sys\n"
         "from types import SimpleNamespace as Some\n"
         "from site_hooks import on_page_markdown\n"
-        "print(on_page_markdown('# Configuration', Some(file=Some(src_uri='configuration.md')), None, None))"
+        "pages = json.load(sys.stdin)\n"
+        "print(json.dumps([on_page_markdown(text, Some(file=Some(src_uri=uri)), None, None) for uri, text in pages]))"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT / "docs")
-    assert run.stdout.startswith("# Configuration\n")
-    assert {name.split(".")[-1] for name in all_settings()} - {"*"} <= set(
-        re.findall(r"^\| `(\w+)` \|", run.stdout, re.M)
-    )
+    command, docs = [sys.executable, "-c", code], ROOT / "docs"
+    run = subprocess.run(command, input=json.dumps(pages), capture_output=True, text=True, check=True, cwd=docs)
+    found: list[str] = json.loads(run.stdout)
+    return found
+
+
+def test_the_site_has_every_setting() -> None:
+    (page,) = on_the_site(("configuration.md", "# Configuration"))
+    assert page.startswith("# Configuration\n")
+    assert {name.split(".")[-1] for name in all_settings()} - {"*"} <= set(re.findall(r"^\| `(\w+)` \|", page, re.M))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)
@@ -222,18 +231,12 @@ def test_the_api_reference_names_every_face() -> None:
 
 
 def test_links_to_the_top_of_the_repository_are_links_of_the_site() -> None:
-    pytest.importorskip("mkdocs", reason="the site comes with the extra docs")
-    code = (
-        "from types import SimpleNamespace as Some\n"
-        "from site_hooks import on_page_markdown\n"
-        "def site(uri, text):\n"
-        "    return on_page_markdown(text, Some(file=Some(src_uri=uri)), None, None)\n"
-        "print(site('index.md', '[a](../CONTRIBUTING.md#b) [c](install.md)'))\n"
-        "print(site('guides/slam.md', '[a](../../CHANGELOG.md) [c](../model.md)'))\n"
-        "print(site('CONTRIBUTING.md', '[a](docs/guides/slam.md#b)'))\n"
+    pages = (
+        ("index.md", "[a](../CONTRIBUTING.md#b) [c](install.md)"),
+        ("guides/slam.md", "[a](../../CHANGELOG.md) [c](../model.md)"),
+        ("CONTRIBUTING.md", "[a](docs/guides/slam.md#b)"),
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT / "docs")
-    assert run.stdout.splitlines() == [
+    assert on_the_site(*pages) == [
         "[a](CONTRIBUTING.md#b) [c](install.md)",
         "[a](../CHANGELOG.md) [c](../model.md)",
         "[a](guides/slam.md#b)",
