@@ -212,7 +212,7 @@ def _end_with_parent(handle: int) -> None:
 
 
 class _Network:
-    """What this process may connect to: `hosts` by name and the addresses of these; anything for None."""
+    """Allows this process to connect to `hosts` and their addresses alone; to any host where `hosts` is None."""
 
     def __init__(self) -> None:
         self.hosts: Sequence[str] | None = ()
