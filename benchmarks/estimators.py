@@ -31,9 +31,8 @@ from pipelines.cli.options import counts
 from pipelines.process import one_thread, resident_memory
 from saga_fg.estimators import (
     BatchSmoother,
-    BoundedKalmanFilter,
     Gaussian,
-    IncrementalFilter,
+    GraphFilter,
     IncrementalSmoother,
     JointKalmanFilter,
     kalman_predict,
@@ -109,11 +108,10 @@ def _filters(kind: Kind, n: int, frames: int, seconds: float, seed: int) -> Iter
     filters: dict[str, Filter] = {"textbook": Textbook(scene)} if n <= DENSE else {}
     filters["kalman"] = Ours(JointKalmanFilter(), scene)
     if kind == "connected":
-        filters["kalman, bounded"] = Ours(BoundedKalmanFilter(), scene)
         bounds = tracker.tolerance, tracker.max_component
         filters["kalman, as in the tracker"] = Ours(JointKalmanFilter((), *bounds), scene)
     if kind == "components" or n <= DENSE:
-        filters["isam2"] = Ours(IncrementalFilter(), scene)
+        filters["isam2"] = Ours(GraphFilter(likelihoods=False), scene)
     anees: dict[str, list[float]] = {name: [] for name in filters}
 
     def judged() -> Iterator[FlockFrame]:
@@ -197,7 +195,7 @@ def _running_graph(kind: Kind, n: int, frames: int, seconds: float) -> Iterator[
 
 def _endless(scene: Flock) -> Callable[[int], None]:
     """The linear filter on the same frames over and over."""
-    ours = Ours(IncrementalFilter(), scene)
+    ours = Ours(GraphFilter(likelihoods=False), scene)
     return lambda k: ours.step(scene.frames[k % len(scene.frames)])
 
 

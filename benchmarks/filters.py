@@ -29,7 +29,7 @@ import scipy.sparse
 
 from benchmarks.flocks import DT, Flock, FlockFrame
 from factors import interaction_factors, linear_detection_factors, nonlinear_graph, position, prior_factors
-from saga_fg.estimators import Estimator, FixedLagSmoother, Gaussian, kalman_predict, kalman_update
+from saga_fg.estimators import Estimator, Gaussian, GraphFilter, kalman_predict, kalman_update
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 Step = Callable[[], None]
@@ -69,10 +69,10 @@ class Ours:
 
 
 class OurWindow(Ours):
-    """The fixed-lag smoother; the means of the whole window and the newest covariances are read."""
+    """The running graph over a window; the means of the whole window and the newest covariances are read."""
 
     def __init__(self, lag: int, flock: Flock) -> None:
-        self._smoother = FixedLagSmoother(lag * DT)
+        self._smoother = GraphFilter(lag=lag * DT, likelihoods=False)
         super().__init__(self._smoother, flock)
 
     def step(self, frame: FlockFrame) -> None:

@@ -11,14 +11,16 @@ from factors.camera import Camera, PixelBearing
 from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
 from factors.errors import FactorError, SingularSystemError
 from factors.gaussian import (
+    GaussianFactors,
     check_dimensions,
     gaussian_factor,
     gaussian_factors,
     gaussian_graph,
     nonlinear_graph,
     nonlinear_graph_at,
+    stacked_gaussian_factors,
 )
-from factors.interaction import interaction_factor, interaction_factors
+from factors.interaction import interaction_factor, interaction_factors, stacked_interaction_factors
 from factors.lane import lane_boundary_factors, lane_keeping_factors
 from factors.line import HesseLine, line_factors
 from factors.marginal import marginal_factors, marginal_moments
@@ -29,7 +31,7 @@ from factors.odometry import ERROR_DIM, odometry_factors
 from factors.on_plane import on_plane_factor
 from factors.plane import OrientedPlane, plane, plane_factor
 from factors.polar import Bearing, Radar, Range, RangeBearing, RangeRate
-from factors.prior import joint_prior_factor, prior_factor, prior_factors
+from factors.prior import joint_prior_factor, prior_factor, prior_factors, stacked_prior_factors
 from factors.ranges import bearing_range_factor, calibrated_range_factors, range_factor
 from factors.relative import (
     point_factors,
@@ -49,6 +51,7 @@ __all__ = [
     "Camera",
     "Components",
     "FactorError",
+    "GaussianFactors",
     "HesseLine",
     "ImuBias",
     "Linearisable",
@@ -115,5 +118,8 @@ __all__ = [
     "relative_factors",
     "relative_range_bearing_factors",
     "solve",
+    "stacked_gaussian_factors",
+    "stacked_interaction_factors",
+    "stacked_prior_factors",
     "unwrapped_angles",
 ]

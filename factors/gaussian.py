@@ -10,6 +10,7 @@ three variables at most; a `GaussianConditional` without frontal variables takes
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -56,6 +57,36 @@ def gaussian_factor(
     return native_factor(distinct, dims, np.asfortranarray(augmented))
 
 
+@dataclass(frozen=True, eq=False)
+class GaussianFactors:
+    """n linear factors of one shape, || sum_k A_ik x(rows[i, k]) - b_i ||^2, whitened, as arrays.
+
+    rows: keys (n, k), distinct within a row; dims: of the k variables; augmented (n, sum(dims) + 1, m): each factor's
+    [A_i1 ... A_ik | b_i] transposed, so that it is column-major, as GTSAM wants it
+    """
+
+    rows: KeyArray
+    dims: tuple[int, ...]
+    augmented: FloatArray
+
+    @property
+    def keys(self) -> list[int]:
+        """All keys, with repetitions."""
+        return list(self.rows.ravel().tolist())
+
+    def native(
+        self, origins: FloatArray | None = None, chosen: Sequence[int] | None = None
+    ) -> list[gtsam.JacobianFactor]:
+        """Return them as GTSAM's; on increments from `origins` (n, sum(dims)) of their variables; some, if `chosen`."""
+        augmented = self.augmented
+        if origins is not None:
+            augmented = augmented.copy()
+            augmented[:, -1] -= (origins[:, None] @ augmented[:, :-1])[:, 0]
+        rows, matrices = self.rows.tolist(), augmented.swapaxes(1, 2)
+        which = range(len(rows)) if chosen is None else chosen
+        return [native_factor(rows[i], self.dims, matrices[i]) for i in which]
+
+
 def gaussian_factors(
     keys: ArrayLike, blocks: Sequence[ArrayLike], rhs: ArrayLike, covariances: ArrayLike
 ) -> list[gtsam.JacobianFactor]:
@@ -64,6 +95,13 @@ def gaussian_factors(
     keys: (n, k), distinct within a row; blocks[k]: (n, m, d_k); rhs: (n, m); covariances: (n, m, m) or one (m, m) for
     all. Whitening and checks are done for all at once, which is what makes them cheap. Raises `FactorError`.
     """
+    return stacked_gaussian_factors(keys, blocks, rhs, covariances).native()
+
+
+def stacked_gaussian_factors(
+    keys: ArrayLike, blocks: Sequence[ArrayLike], rhs: ArrayLike, covariances: ArrayLike
+) -> GaussianFactors:
+    """Return the factors of `gaussian_factors` as arrays."""
     b = checked("rhs", rhs, (None, None))
     n, m = b.shape
     names = checked_key_rows("keys", keys, len(blocks))
@@ -72,30 +110,25 @@ def gaussian_factors(
         raise FactorError(f"keys: expected {n} rows, one per factor, got {len(names)}")
     matrices = [checked(f"blocks[{k}]", block, (n, m, None)) for k, block in enumerate(blocks)]
     W = whiteners("covariances", checked_covariances("covariances", covariances, n, m))
-    if not n:
-        return []
     return whitened_factors(names, W, matrices, b)
 
 
-def whitened_factors(
-    keys: KeyArray, W: FloatArray, blocks: Sequence[FloatArray], rhs: FloatArray
-) -> list[gtsam.JacobianFactor]:
-    """Return the factors || W[i] (sum_k blocks[k][i] x(keys[i, k]) - rhs[i]) ||^2 of `gaussian_factors`.
+def whitened_factors(keys: KeyArray, W: FloatArray, blocks: Sequence[FloatArray], rhs: FloatArray) -> GaussianFactors:
+    """Return the factors || W[i] (sum_k blocks[k][i] x(keys[i, k]) - rhs[i]) ||^2 of `stacked_gaussian_factors`.
 
     Unchecked, except for empty blocks: keys distinct within a row, shapes and numbers right.
     """
-    dims = [block.shape[2] for block in blocks]
+    dims = tuple(block.shape[2] for block in blocks)
     n, m = rhs.shape
-    if m == 0 or 0 in dims:
+    if n and (m == 0 or 0 in dims):
         raise FactorError("blocks: expected at least one row, and one column per block")
-    # Stored transposed, so that each factor's matrix is column-major, as GTSAM wants it.
     augmented = np.empty((n, sum(dims) + 1, m))
     column = 0
     for block, dim in zip(blocks, dims, strict=True):
         np.matmul(block.swapaxes(1, 2), W.swapaxes(1, 2), out=augmented[:, column : column + dim])
         column += dim
     np.matmul(W, rhs[:, :, None], out=augmented[:, -1, :, None])
-    return [native_factor(row, dims, matrix.T) for row, matrix in zip(keys.tolist(), augmented, strict=True)]
+    return GaussianFactors(keys, dims, augmented)
 
 
 def native_factor(keys: Sequence[int], dims: Sequence[int], augmented: FloatArray) -> gtsam.JacobianFactor:

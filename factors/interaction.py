@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors.errors import FactorError
-from factors.gaussian import gaussian_factor, whitened_factors
+from factors.gaussian import GaussianFactors, gaussian_factor, whitened_factors
 from factors.validation import check_distinct, checked, checked_key_array, checked_keys, whiteners
 
 
@@ -47,6 +47,15 @@ def interaction_factors(
     Raises `FactorError`, naming the node, when shapes disagree, a key occurs twice in one factor, a number is not
     finite or a Q is singular.
     """
+    stacks = stacked_interaction_factors(next_keys, keys, indptr, F, b, Q)
+    made = {int(factor.keys()[0]): factor for stack in stacks for factor in stack.native()}
+    return [made[key] for key in checked_key_array("next_keys", next_keys).tolist()]
+
+
+def stacked_interaction_factors(
+    next_keys: ArrayLike, keys: ArrayLike, indptr: ArrayLike, F: ArrayLike, b: ArrayLike, Q: ArrayLike
+) -> list[GaussianFactors]:
+    """Return the factors of `interaction_factors` as arrays, those with equally many neighbours together."""
     nexts = checked_key_array("next_keys", next_keys)
     previous = checked_key_array("keys", keys)
     checked_keys("next_keys", nexts.tolist())
@@ -58,17 +67,16 @@ def interaction_factors(
         return []
     W = whiteners("Q", checked("Q", Q, (len(nexts), d, d)))
 
-    result: list[gtsam.JacobianFactor | None] = [None] * len(nexts)
-    for degree in np.unique(degrees).tolist():  # factors of one shape together
-        rows = np.flatnonzero(degrees == degree)
+    stacks, sharpest = [], np.argsort(-np.abs(W).max(axis=(1, 2)), kind="stable")
+    for degree in np.unique(degrees).tolist():  # factors of one shape together, the sharpest first
+        rows = sharpest[degrees[sharpest] == degree]
         entries = starts[rows, None] + np.arange(degree)
         names = np.concatenate([nexts[rows, None], previous[entries]], axis=1)
         check_distinct("keys", names)
         identity = np.broadcast_to(np.eye(d), (len(rows), d, d))
         own = [identity, *(-blocks[column] for column in entries.T)]
-        for row, factor in zip(rows.tolist(), whitened_factors(names, W[rows], own, offsets[rows]), strict=True):
-            result[row] = factor
-    return [factor for factor in result if factor is not None]
+        stacks.append(whitened_factors(names, W[rows], own, offsets[rows]))
+    return stacks
 
 
 def _rows(indptr: ArrayLike, nodes: int, entries: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

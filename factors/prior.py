@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.errors import FactorError
-from factors.gaussian import gaussian_factor, gaussian_factors, native_factor
+from factors.gaussian import GaussianFactors, gaussian_factor, native_factor, stacked_gaussian_factors
 from factors.validation import checked, checked_key_array, checked_keys, whitener
 
 
@@ -27,11 +27,16 @@ def prior_factor(key: int, mean: ArrayLike, covariance: ArrayLike) -> gtsam.Jaco
 
 def prior_factors(keys: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> list[gtsam.JacobianFactor]:
     """Return one prior a key; keys: (n,); means: (n, d); covariances: (n, d, d), or one (d, d) for all."""
+    return stacked_prior_factors(keys, means, covariances).native()
+
+
+def stacked_prior_factors(keys: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> GaussianFactors:
+    """Return the factors of `prior_factors` as arrays."""
     centers = checked("means", means, (None, None))
     names = checked_key_array("keys", keys)
     checked_keys("keys", names.tolist())
     identity = np.broadcast_to(np.eye(centers.shape[1]), (*centers.shape, centers.shape[1]))
-    return gaussian_factors(names[:, None], [identity], centers, covariances)
+    return stacked_gaussian_factors(names[:, None], [identity], centers, covariances)
 
 
 def joint_prior_factor(keys: Iterable[int], means: Sequence[ArrayLike], covariance: ArrayLike) -> gtsam.JacobianFactor:

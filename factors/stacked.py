@@ -134,7 +134,7 @@ class ResidualFactors:
     def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """Return the factors on the increments from `values`, weighted by the robust loss there."""
         W, jacobians, residuals = self.linearisation(values)
-        return gaussian_graph(whitened_factors(self.rows, W, jacobians, -residuals))
+        return gaussian_graph(whitened_factors(self.rows, W, jacobians, -residuals).native())
 
     def linearisation(
         self, values: gtsam.Values, chosen: IntArray | None = None

@@ -85,8 +85,11 @@ def check_distinct(name: str, rows: KeyArray) -> None:
 
 
 def whitener(name: str, covariance: ArrayLike, dim: int) -> FloatArray:
-    """Return W of shape (dim, dim), lower triangular, with W `covariance` W^T = identity.
+    """Return W of shape (dim, dim), upper triangular, with W `covariance` W^T = identity.
 
+    States have positions first, whose noise over an interval is the least. The first row of W is then the sharpest, and
+    QR, which goes from the first column on, keeps five digits more than with a lower triangle (P = 800 m^2 of a track
+    that nobody sees, Q = 2e-5 m^2: 2e-14 of P in place of 2e-9).
     Raises `FactorError` when the covariance is not symmetric and positive definite (or is so only up to rounding).
     """
     only: FloatArray = whiteners(name, checked(name, covariance, (dim, dim))[None])[0]
@@ -105,7 +108,7 @@ def whiteners(name: str, covariances: ArrayLike, dim: int | None = None) -> Floa
     if asymmetric.any():
         raise FactorError(f"{_entry(name, stack, asymmetric)}: expected a symmetric covariance")
     try:
-        factor = np.linalg.cholesky(stack)
+        factor = np.linalg.cholesky(stack[:, ::-1, ::-1])[:, ::-1, ::-1]  # upper: covariance = factor factor^T
     except np.linalg.LinAlgError as error:
         failed = np.linalg.eigvalsh(stack)[:, 0] <= 0
         raise FactorError(_not_definite(_entry(name, stack, failed))) from error
@@ -113,7 +116,7 @@ def whiteners(name: str, covariances: ArrayLike, dim: int | None = None) -> Floa
     singular = (pivots <= 16 * stack.shape[1] * np.finfo(float).eps * variances).any(axis=1)
     if singular.any():
         raise FactorError(_not_definite(_entry(name, stack, singular)))
-    return np.tril(np.linalg.inv(factor))
+    return np.triu(np.linalg.inv(factor))
 
 
 def checked_covariances(name: str, value: ArrayLike, n: int, dim: int | None) -> FloatArray:

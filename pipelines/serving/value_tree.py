@@ -1,11 +1,12 @@
 """Trees of plain values as JSON and raw arrays, and back, without pickle: nothing in them can run code.
 
-A tree is made of None, bool, int, float (infinite and NaN too), str, tuple, list, dict, NumPy arrays and scalars of
-numbers, truth values and texts, and objects of `saga_fg` and `factors`. As JSON it is a list of nodes;
-a node refers to its parts by their places before its own, and the last node is the root. A shared value is one node.
+A tree is made of None, bool, int, float (infinite and NaN too), str, tuple, list, dict, frozenset, NumPy arrays and
+scalars of numbers, truth values and texts, and objects of `saga_fg` and `factors`. As JSON it is a list of nodes; a
+node refers to its parts by their places before its own, and the last node is the root. A shared value is one node.
 
 Objects are dataclasses and named tuples. They are made again by the constructors of their classes, which check their
-arguments; classes that are not loaded are refused.
+arguments; classes that are not loaded are refused. A running graph is made again from its record. Of functions there
+are the methods of `METHODS` of such objects, by which nonlinear factors are evaluated.
 """
 
 from __future__ import annotations
@@ -13,13 +14,16 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import fields, is_dataclass
+from types import MethodType
 from typing import Any, Literal
 
 import numpy as np
 
 from saga_fg.errors import InputError
+from saga_fg.graph.scene_factor_graph import GraphRecord, SceneFactorGraph
 
 PACKAGES = ("saga_fg", "factors")
+METHODS = ("residual", "jacobians", "residual_jacobians")
 KINDS = "biufU"  # of arrays: truth values, integers, floating point numbers, texts
 ALIGNMENT = 8
 
@@ -61,6 +65,12 @@ class TreeWriter:
             return {cls.__name__: [self._add(part) for part in value]}
         if cls is dict:
             return {"dict": [[self._add(key), self._add(part)] for key, part in value.items()]}
+        if cls is frozenset:
+            return {"frozenset": [self._add(part) for part in sorted(value)]}
+        if cls is SceneFactorGraph:
+            return {"graph": self._add(GraphRecord.of(value))}
+        if cls is MethodType and value.__name__ in METHODS:
+            return {"method": [self._add(value.__self__), value.__name__]}
         if isinstance(value, np.generic):
             return {"scalar": self._add(np.asarray(value))}
         if cls is np.ndarray:
@@ -68,7 +78,8 @@ class TreeWriter:
         if cls.__module__.split(".")[0] in PACKAGES and "." not in cls.__qualname__ and _is_record(cls):
             parts = {name: self._add(part) for name, part in _attributes(value).items()}
             return {"object": [cls.__module__, cls.__qualname__], "parts": parts}
-        raise InputError(f"{cls.__module__}.{cls.__qualname__}: expected a value that can be written to a state file")
+        what = getattr(value, "__qualname__", cls.__qualname__)
+        raise InputError(f"{cls.__module__}.{what}: expected a value that can be written to a state file")
 
     def _array(self, value: np.ndarray[Any, Any]) -> list[Any]:
         if value.dtype.kind not in KINDS or not value.dtype.isnative:
@@ -102,6 +113,12 @@ def _value(node: Any, values: list[Any], arrays: bytes) -> Any:
             return [_at(values, place) for place in places]
         case {"dict": list(pairs)}:
             return {_at(values, key): _at(values, place) for key, place in pairs}
+        case {"frozenset": list(places)}:
+            return frozenset(_at(values, place) for place in places)
+        case {"graph": place} if isinstance(record := _at(values, place), GraphRecord):
+            return record.restored()
+        case {"method": [place, str(name)]} if name in METHODS and _is_record(type(owner := _at(values, place))):
+            return getattr(owner, name)
         case {"scalar": place}:
             return _at(values, place)[()]
         case {"array": [str(dtype), list(shape), str(order), bool(writeable), int(start)]}:

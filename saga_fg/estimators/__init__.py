@@ -2,14 +2,11 @@
 
 from saga_fg.estimators.batch import BatchSmoother
 from saga_fg.estimators.batch_solver import BatchSolver
-from saga_fg.estimators.bounded import BoundedKalmanFilter
-from saga_fg.estimators.fixed_lag import FixedLagSmoother
 from saga_fg.estimators.gauss_newton import GaussNewtonSettings
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_filter import GraphFilter
 from saga_fg.estimators.graph_solution import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
-from saga_fg.estimators.isam2 import IncrementalFilter
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.estimators.kalman import JointKalmanFilter
 from saga_fg.estimators.measurements import Observations
@@ -22,16 +19,13 @@ from saga_fg.estimators.windowed import WindowedSmoother, WindowSettings
 __all__ = [
     "BatchSmoother",
     "BatchSolver",
-    "BoundedKalmanFilter",
     "DetectionFactors",
     "Estimator",
-    "FixedLagSmoother",
     "GaussNewtonSettings",
     "Gaussian",
     "GraduatedNonConvexity",
     "GraphFilter",
     "GraphSolution",
-    "IncrementalFilter",
     "IncrementalSmoother",
     "Interactions",
     "JointKalmanFilter",

@@ -88,12 +88,12 @@ class BatchSmoother(RecordedSmoother):
 
     def update(
         self,
-        measurements: Measurements | Observations,
+        measurements: Measurements | Observations | Sequence[Measurements | Observations],
         time: float | None = None,
         robust: Robust | GraduatedNonConvexity | None = None,
     ) -> float:
         """Take in measurements, as `RecordedSmoother.update`; a loss may be reached by graduated non-convexity."""
-        likelihood = self._recording.update(RecordedMeasurements(measurements, robust), time)
+        likelihood = self._take_in(measurements, time, robust)
         self._graduated &= not isinstance(robust, GraduatedNonConvexity)
         self._clear_cache()
         return likelihood

@@ -12,7 +12,7 @@ from saga_fg.estimators.partition import BlockDiagonal, Partition, flattened, re
 from saga_fg.kernels.components import node_blocks, uncorrelated_labels
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
-_UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
+UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +68,13 @@ class BlockGaussian:
         blocks = regrouped(self.blocks, old, partition, kept)
         return BlockGaussian(partition, self.mean[self.layout.places(kept)], blocks)
 
+    def only(self, nodes: IntArray) -> BlockGaussian:
+        """Integrate out all but some nodes."""
+        return self.without(np.flatnonzero(~np.isin(self.layout.nodes, nodes)))
+
     def decoupled(self) -> BlockGaussian:
         """Separate the parts of components that are no longer correlated, long after the last interaction."""
-        return self.over(self.uncorrelated(_UNCORRELATED))
+        return self.over(self.uncorrelated(UNCORRELATED))
 
     def uncorrelated(self, tolerance: float) -> Partition:
         """The partition into parts that no correlation above `tolerance` ties."""

@@ -55,19 +55,13 @@ class Dynamics:
         b[layout.places(rows)] = self.b
         return Dynamics(layout, (*_renamed(self.F, rows), *identity(layout, others)), b, _renamed(self.Q, rows))
 
-    def only(self, rows: IntArray) -> Dynamics:
-        """Keep the dynamics of the nodes at `rows` alone; itself if these are all."""
-        if len(rows) == len(self.layout):
-            return self
-        kept = np.zeros(len(self.layout), dtype=bool)
-        kept[rows] = True
-        return replace(self, F=_where(kept, self.F), Q=_where(kept, self.Q))
-
     def restricted(self, rows: IntArray) -> Dynamics:
         """Restrict to the nodes at `rows`, ascending, on which no others act; itself if these are all."""
         if len(rows) == len(self.layout):
             return self
-        some = self.only(rows)
+        kept = np.zeros(len(self.layout), dtype=bool)
+        kept[rows] = True
+        some = replace(self, F=_where(kept, self.F), Q=_where(kept, self.Q))
         where = np.full(len(self.layout), -1)
         where[rows] = np.arange(len(rows))
         layout = self.layout.select(rows)
@@ -221,17 +215,6 @@ def predict(x: BlockGaussian, dynamics: Dynamics, partition: Partition | None = 
     return BlockGaussian(partition, mean, blocks)
 
 
-def noise_ratio(x: BlockGaussian, dynamics: Dynamics) -> FloatArray:
-    """(n,) size of each node's covariance in the prediction `x` in units of its process noise, the trace of Q^-1 P.
-
-    Infinite where it has none.
-    """
-    ratio = np.full(len(x.layout), np.inf)
-    for Q in dynamics.Q:
-        ratio[Q.target] = _ratio(x.covariances(Q.target), Q.values)
-    return ratio
-
-
 def identity(layout: StateLayout, rows: IntArray) -> tuple[Blocks, ...]:
     """Blocks of the nodes at `rows` that stay as they are."""
     alike = [rows[layout.dims[rows] == d] for d in np.unique(layout.dims[rows])]
@@ -246,8 +229,8 @@ def _symmetric(product: FloatArray) -> FloatArray:
 
 
 def _where(kept: BoolArray, groups: tuple[Blocks, ...]) -> tuple[Blocks, ...]:
-    """The blocks whose targets are kept."""
-    chosen = ((blocks, kept[blocks.target]) for blocks in groups)
+    """The blocks between nodes that are kept."""
+    chosen = ((blocks, kept[blocks.target] & kept[blocks.source]) for blocks in groups)
     return tuple(
         Blocks(blocks.target[mine], blocks.source[mine], blocks.values[mine]) for blocks, mine in chosen if mine.any()
     )
@@ -275,14 +258,14 @@ def _sparse(groups: tuple[Blocks, ...], starts: IntArray, size: int) -> scipy.sp
     return matrix
 
 
-def _ratio(P: FloatArray, Q: FloatArray) -> FloatArray:
-    """(m,) trace of Q^-1 P; infinite where Q is singular."""
+def noise_ratio(P: FloatArray, Q: FloatArray) -> FloatArray:
+    """(m,) size of covariances P (m, d, d) in units of noise Q (m, d, d), the trace of Q^-1 P; infinite without any."""
     try:
         L = np.linalg.cholesky(Q)
     except np.linalg.LinAlgError:
         if len(Q) == 1:
             return np.array([np.inf])
         half = len(Q) // 2
-        return np.concatenate([_ratio(P[:half], Q[:half]), _ratio(P[half:], Q[half:])])
+        return np.concatenate([noise_ratio(P[:half], Q[:half]), noise_ratio(P[half:], Q[half:])])
     half_done = np.linalg.solve(L, P)
     return np.asarray(np.trace(np.linalg.solve(L, np.swapaxes(half_done, 1, 2)), axis1=1, axis2=2))

@@ -1,74 +1,106 @@
-"""The tracker's filter as a running graph, in which factors of users' own take part.
+"""The running graph as an estimator: interaction factors between the states of objects, solved by iSAM2.
 
-The calls of an estimator become providers of an `IncrementalSmoother`: `add` adds new objects, `predict` an epoch
-with its interaction factors, `update` detections. Between them users' providers are asked.
+    predict   an epoch more: variables, and an interaction factor for each node
+    update    detection factors on the newest epoch, or on an earlier one, where they were made late
+    lag       epochs older than this are marginalised; 0 keeps the last interval alone, which is the filter
+
+Each component of the graph is solved by what it needs. Objects that nothing ties to others are eliminated all at once,
+in closed form (`saga_fg.estimators.independent`). Objects that interactions tie, and those with a nonlinear factor, a
+robust one or one of a user's provider, are variables of `gtsam.ISAM2` (`saga_fg.estimators.incremental_smoother`), and
+what is reported of them is read from its tree. An object passes from the one to the other when a first factor ties it,
+and back when no correlation with others is left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import require_type
-from saga_fg.estimators.block_gaussian import BlockGaussian
+from factors import Robust
+from factors.marginal import Elimination
+from saga_fg.errors import InputError, UnknownNodeError, require_type
+from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics
-from saga_fg.estimators.filter_steps import corrected
+from saga_fg.estimators.graph_solution import linear_solution
+from saga_fg.estimators.graph_window import SAME_TIME, GraphWindow, WindowEpoch
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
+from saga_fg.estimators.independent import IndependentObjects
+from saga_fg.estimators.independent_variables import IndependentVariables
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.joint_gaussian import by_covariance, lossy, replace_by_prior
+from saga_fg.estimators.joint_gaussian import by_covariance, lossy, merged, replace_by_prior
 from saga_fg.estimators.layout import StateLayout, checked_prior
-from saga_fg.estimators.measurements import Observations, RecordedMeasurements
-from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
+from saga_fg.estimators.measurements import Observations, RecordedMeasurements, log_likelihood
+from saga_fg.estimators.object_factors import DetectionFactors, Interactions
 from saga_fg.estimators.protocol import LatestMarginals, Measurements
-from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key
+from saga_fg.estimators.recorded_smoother import JointCovariance, SmoothedState
+from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key, node_kind
 from saga_fg.graph.providers import FactorProvider, predictors
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
 from saga_fg.model.transition import Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, shallow_copy
 from saga_fg.types.frame import Frame
+
+_RELEASE_EVERY = 10  # predictions between looks for objects whose correlation with others has decayed
 
 
 @dataclass(frozen=True, eq=False)
 class GraphState:
-    """The filter as a value: the graph; its nodes, in order; their variables, by id; variables beside them that stay
-    until providers are asked again; those of nodes that have left since the epoch began."""
+    """The filter as a value, which can be pickled; see `GraphFilter` for its parts."""
 
     graph: SceneFactorGraph
     layout: StateLayout
     keys: Mapping[int, int]
+    independent: IndependentObjects
+    window: GraphWindow
+    labels: Mapping[int, str]
     auxiliary: tuple[int, ...]
-    left: tuple[int, ...]
+    predictions: int
+    posterior: BlockGaussian | None
 
 
 class GraphFilter(LatestMarginals):
-    """The joint state of all tracks in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
+    """The joint state of all nodes in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
-    providers  asked by `ask_providers`, once a frame
-    lag        s; how long epochs stay in the graph, at least until all providers have been asked at the next one
-    relinearised  keep the epoch before until the next one in any case, so that nonlinear motion is linearised anew
-               where measurements put it; else it is linearised at the prediction, as by the extended Kalman filter
+    providers  of users' factors, asked by `ask_providers` once a frame
+    lag        s; how long epochs stay in the graph. The last interval stays in any case, so that nonlinear motion is
+               linearised where measurements put it
+    likelihoods  False: `update` returns NaN, and saves reading the state before and after it
 
-    Estimates are those of the newest states, at any lag. A node whose state an interval leaves unchanged keeps its
-    variable. States whose noise is so small that factors would lose digits are predicted by covariances.
+    Estimates are those of the newest states, at any lag; `smoothed` has all epochs. A node whose state an interval
+    leaves unchanged keeps its variable. Components whose noise is so small that factors would lose digits are predicted
+    by covariances; their window begins anew there.
     """
 
-    def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, relinearised: bool = False) -> None:
-        self.providers, self._lag = tuple(providers), lag
-        self._relinearised = relinearised or bool(providers)
+    def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, likelihoods: bool = True) -> None:
+        self.providers, self.lag, self._likelihoods = tuple(providers), float(lag), likelihoods
         self._smoother = IncrementalSmoother(lag=lag)
         self._smoother.step(0.0)
         self._layout = StateLayout()
-        self._keys: Mapping[int, int] = {}
+        self._keys: Mapping[int, int] = {}  # of the nodes that are variables of iSAM2
+        self._independent = IndependentObjects.begun(0, 0.0, BlockGaussian.empty())  # the others
+        self._window = GraphWindow((WindowEpoch(0, 0.0, {}),))
+        self._labels: Mapping[int, str] = {}
         self._auxiliary: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
-        self._left: tuple[int, ...] = ()  # variables of nodes that have left since the epoch began
+        self._predictions = 0
         self._posterior: BlockGaussian | None = None  # until the graph changes
+        self._tied: BlockGaussian | None = None  # the part of it that iSAM2 has
+        self._stale: frozenset[int] = frozenset()  # nodes whose components have changed in iSAM2 since
 
     def __copy__(self) -> GraphFilter:
-        twin = GraphFilter(self.providers, self._lag, self._relinearised)
-        twin.__dict__ |= self.__dict__
+        """A filter that goes its own way; it builds an iSAM2 of its own when it needs one."""
+        twin = shallow_copy(self)
+        twin._smoother = self._smoother.detached()
+        return twin
+
+    def handed_over(self) -> GraphFilter:
+        """A filter that goes on with the present iSAM2; this one builds another when it is needed."""
+        twin = shallow_copy(self)
         twin._smoother = self._smoother.handed_over()
         return twin
 
@@ -80,24 +112,35 @@ class GraphFilter(LatestMarginals):
     def time(self) -> float:
         return self._smoother.time
 
+    @property
+    def start(self) -> float:
+        """Time before which measurements are refused, s: the begin of the window, at lag 0 the present."""
+        return self._window.start if self.lag else self.time
+
     def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
         """Set the frame that providers see, and the origin (2,) of the states' positions in the world, m."""
+        self._note("set_frame", frame, origin)
         self._smoother.origin, self._smoother.frame = origin, frame
         graph = self._smoother.graph()
         if graph.epoch == 0 and not graph.variables:
-            self.extend(predictors(self.providers))
+            with self._changing():
+                self._extend(predictors(self.providers))
 
     def ask_providers(self) -> None:
-        """Let the users' providers add their factors, on the nodes that have not left."""
-        smoother = self._smoother_to_change()
-        smoother.marginalise(key for key in self._left if key in smoother.graph().variables)
-        smoother.extend(self.providers)
-        smoother.forget(self._keys.values())
-        self._auxiliary = self._auxiliary_now()
+        """Let the users' providers add their factors."""
+        with self._changing():
+            variables, present = self._smoother.graph().variables, set(self._keys.values())
+            left = [key for key in self._window.newest.keys.values() if key in variables and key not in present]
+            self._smoother.marginalise(left)
+            self._extend(self.providers)
+            self._auxiliary = self._auxiliary_now()
+            self._note("ask_providers")
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Let some providers add their factors at the present epoch."""
-        self._smoother_to_change().extend(providers)
+        with self._changing():
+            self._extend(providers)
+            self._note("extend", providers)
 
     @property
     def others(self) -> list[int]:
@@ -105,96 +148,311 @@ class GraphFilter(LatestMarginals):
         every = self._smoother.graph().variables
         return [key for key, one in every.items() if one.epoch is None or one.kind not in (OBJECT, MAP_NODE)]
 
+    @property
+    def auxiliary(self) -> SceneFactorGraph:
+        """The part of the graph that iSAM2 solves: all variables beside the nodes are in it."""
+        return self._smoother.graph()
+
     def covariance_with(self, keys: Sequence[int], nodes: ArrayLike) -> FloatArray:
         """Joint covariance of other variables and some nodes, in the order given."""
-        mine = [self._keys[node] for node in np.asarray(nodes).tolist()]
-        return self._smoother.joint_covariance([*keys, *mine])
+        ids = np.asarray(nodes)
+        rows, every = self._layout.rows(ids), self._smoother.graph().variables
+        sizes = [*(every[key].dim for key in keys), *self._layout.dims[rows].tolist()]
+        start = np.cumsum([0, *sizes])
+        mine = [*keys, *(self._keys.get(node) for node in ids.tolist())]
+        tied = [k for k, key in enumerate(mine) if key is not None]
+        P = np.zeros((start[-1], start[-1]))
+        at = np.concatenate([np.arange(start[k], start[k + 1]) for k in tied])
+        P[np.ix_(at, at)] = self._smoother.joint_covariance([key for key in mine if key is not None])
+        for k in set(range(len(mine))) - set(tied):
+            span = slice(start[k], start[k + 1])
+            P[span, span] = self.posterior().joint(rows[[k - len(keys)]])
+        return P
 
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
     ) -> None:
         mean, covariance = checked_prior(nodes, means, covariances)
         layout = self._layout.extended(nodes, mean.shape[1])
-        added = layout.nodes[len(self._layout) :]
-        smoother = self._smoother_to_change()
-        keys = {node: node_key(node, smoother.graph().epoch) for node in added.tolist()}
-        back = [key for key in keys.values() if key in smoother.graph().variables]
-        if back:  # removed and added at the same epoch: iSAM2 has to forget them first
-            smoother.marginalise(back)
-            smoother.extend([])
-            self._left = tuple(key for key in self._left if key not in back)
-        smoother.extend([NewObjects(added, mean, covariance, labels or {})])
-        self._layout, self._keys = layout, {**self._keys, **keys}
+        with self._changing():
+            added = layout.nodes[len(self._layout) :]
+            self._layout = layout
+            self._independent = self._independent.added(added, mean, covariance)
+            self._labels = {**self._labels, **(labels or {})}
+            self._note("add", nodes, means, covariances, labels)
 
     def predict(self, transition: Transition) -> None:
         require_type("transition", transition, Transition)
-        interval = IntervalDynamics(transition)
-        interval.check(self._layout)
-        x, nodes = self.posterior(), self._layout.nodes
-        dynamics = interval.linearised(self._layout, x.mean)
+        interval, layout, x = IntervalDynamics(transition), self._layout, self.posterior()
+        dynamics = interval.linearised(layout, x.mean)
         still = dynamics.unchanged
         if transition.dt == 0 and still.all():
             return
-        carried_over, epoch = set(nodes[still].tolist()), self._smoother.graph().epoch + 1
-        keys = {n: key if n in carried_over else node_key(n, epoch) for n, key in self._keys.items()}
-        chosen = lossy(x, dynamics, still, window=self._lag > 0)
-        unused = np.isin(transition.nodes, nodes[still | chosen])
-        change = self._predict_by_covariance(dynamics, chosen, keys) if chosen.any() else None
-        smoother = self._smoother_to_change()
-        smoother.forget({*self._keys.values(), *self._auxiliary})
-        moved = Interactions(_with_noise(transition, unused) if unused.any() else transition, self._keys, carried_over)
-        begun = [moved, *predictors(self.providers)]
-        smoother.begin(self.time + transition.dt, begun, [self._keys[node] for node in carried_over], change)
-        self._keys, self._left = keys, ()
-        self._auxiliary += self._auxiliary_now()
-        if not self._relinearised:  # nobody is to be asked for factors on the epoch before
-            smoother.forget(keys.values())
+        state = replace(self._state(), window=self._window.without_states) if self.lag else None
+        with self._changing():
+            number, time = self._smoother.graph().epoch + 1, self.time + transition.dt
+            time = max(time, float(np.nextafter(self.time, np.inf)))
+            self._predictions += 1
+            coupled = _coupled(interval, dynamics)
+            if self.lag or self.providers:
+                if self._predictions % _RELEASE_EVERY == 0:
+                    self._release_independent()
+            else:
+                x = x.decoupled()
+                label = dynamics.joined(x.partition).label
+                coupled = np.isin(label, label[coupled])
+                widest = np.bincount(label[coupled], weights=layout.dims[coupled]).max(initial=0)
+                self._begin_anew(x, "cholesky" if widest > WIDE else "qr")
+            self._tie(layout.nodes[coupled])
+            self._begin_epoch(x, transition, dynamics, number, time)
+            since = time - self.lag
+            if self.lag:
+                self._window = self._window.left(state, layout, transition)
+            self._window = self._window.begun(WindowEpoch(number, time, dict(self._keys)), since)
+            history = since + SAME_TIME if self.lag or self.providers else None
+            self._independent = self._independent.predicted(dynamics, number, time, history)
 
-    def update(self, *measurements: Measurements | Observations) -> float:
-        """Take in measurements, several kinds of them by one solution."""
-        kinds = [RecordedMeasurements(each) for each in measurements]
+    def update(
+        self,
+        measurements: Measurements | Observations | Sequence[Measurements | Observations],
+        time: float | None = None,
+        robust: Robust | None = None,
+    ) -> float:
+        """Take in measurements, several kinds of them by one solution, made at `time`, s, None for now.
+
+        Those made late are put in their place, and all that came since comes again, providers' factors as well, which
+        are asked for again. Returns the log-likelihood of the measurements given all before.
+        """
+        if robust is not None:
+            require_type("robust", robust, Robust)
+        given = measurements if isinstance(measurements, Sequence) else [measurements]
+        kinds = [RecordedMeasurements(each, robust) for each in given]
         for recorded in kinds:
             recorded.check(self._layout)
+        k = None if time is None else self._window.place(time, self.start)
         kinds = [recorded for recorded in kinds if len(recorded.measured)]
         if not kinds:
             return 0.0
-        x, log_likelihood = self.posterior(), 0.0
-        for recorded in kinds:
-            x, likelihood = corrected(x, recorded.linearised(x.layout, x.mean))
-            log_likelihood += likelihood
-        self._smoother_to_change().extend([DetectionFactors(recorded.measured, self._keys) for recorded in kinds])
-        return log_likelihood
+        late = time is not None and time < self.time - SAME_TIME
+        before = self.posterior() if self._likelihoods and not late else None
+        with self._changing():
+            if time is not None and k is not None and late:
+                return self._update_past(kinds, k, time)
+            likelihood = self._update_now(kinds, before)
+            self._note("update", [one.measured for one in kinds], None, robust, likelihood=likelihood)
+        return likelihood
+
+    def remembered(self, nodes: ArrayLike, time: float) -> BoolArray:
+        """(k,) whether measurements of nodes at `time`, s, can still be put there."""
+        if time < self.start - SAME_TIME:
+            return np.zeros(len(np.asarray(nodes)), dtype=bool)
+        return self._window.there(nodes, self._window.place(min(time, self.time), self.start))
 
     def marginalise(self, nodes: ArrayLike) -> None:
         """Nodes that disappear have no state at the next epoch; their information on their neighbours stays."""
         rows = self._layout.rows(nodes)
-        self._left += tuple(self._keys[node] for node in self._layout.nodes[rows].tolist())
-        self._layout = self._layout.without(rows)
-        self._keys = {node: self._keys[node] for node in self._layout.nodes.tolist()}
-        self._posterior = None
+        if len(set(rows.tolist())) < len(rows):
+            raise InputError("nodes: expected each node once")
+        leaving = self._layout.nodes[rows]
+        with self._changing():
+            alone = np.array([node for node in leaving.tolist() if node not in self._keys], dtype=np.int64)
+            self._layout, self._independent = self._layout.without(rows), self._independent.without(alone)
+            gone = set(leaving.tolist())
+            if self._tied is not None:
+                self._tied_gaussian()
+                known = self._tied.layout.nodes
+                self._tied = self._tied.without(np.flatnonzero(np.isin(known, leaving)))
+            self._keys = {node: key for node, key in self._keys.items() if node not in gone}
+            self._labels = {node: label for node, label in self._labels.items() if node not in gone}
+            self._note("marginalise", nodes)
 
     def posterior(self) -> BlockGaussian:
         """The joint Gaussian of all nodes."""
         if self._posterior is None:
-            self._posterior = self._joint()
+            self._posterior = merged(self._layout, self._independent.x, self._tied_gaussian())
         return self._posterior
 
     def graph(self) -> SceneFactorGraph:
-        """The running graph itself."""
-        return self._smoother.graph()
+        """The running graph, with the variables and factors of the objects that nothing ties to others."""
+        return self._whole()[0]
+
+    def _whole(self) -> tuple[SceneFactorGraph, list[Mapping[int, int]]]:
+        """The graph of all objects, and the keys of their variables by id, for each epoch of the window."""
+        graph, nodes = self._smoother.graph(), self._independent.layout.nodes
+        keys: dict[int, Mapping[int, int]] = {epoch.number: epoch.keys for epoch in self._window.epochs}
+        if len(nodes):
+            graph = graph.copy()
+            old = {
+                node_key(node, epoch.number)
+                for node in nodes.tolist()
+                for epoch in self._independent.epochs[self._independent.since(node) :]
+            }
+            graph.marginalise(old & graph.variables.keys())  # of nodes of the same ids that have left
+            added = self._independent.add_to(graph, nodes, self._labels)
+            graph.moved_to(graph.base.retract(linear_solution(graph).step))
+            for epoch, own in zip(self._independent.epochs, added, strict=True):
+                keys[epoch.number] = {**keys.get(epoch.number, {}), **own}
+        return graph, [keys[epoch.number] for epoch in self._window.epochs]
+
+    def smoothed(self, covariances: bool = True) -> tuple[SmoothedState, ...]:
+        """Every epoch within the lag, oldest first, of the nodes that are there now: given all measurements.
+
+        A node is in those epochs only in which the graph has its variable. Without `covariances` means only.
+        """
+        (graph, every), result = self._whole(), list[SmoothedState]()
+        solution, present = linear_solution(graph) if covariances else None, self._layout.nodes.tolist()
+        for epoch, keys in zip(self._window.epochs, every, strict=True):
+            if epoch.time < self.start - SAME_TIME:
+                continue
+            layout = self._layout.select(np.array([keys.get(node) in graph.variables for node in present], dtype=bool))
+            here = [keys[node] for node in layout.nodes.tolist()]
+            mean = np.concatenate([np.empty(0), *(graph.state(key) for key in here)])
+            joint = None
+            if solution is not None:
+                joint = JointCovariance(layout, solution.covariance(here) if here else np.empty((0, 0)))
+            result.append(SmoothedState(epoch.time, layout, mean, joint))
+        return tuple(result)
 
     def snapshot(self) -> GraphState:
         """The whole state as a value, which can be pickled. iSAM2 begins anew from it: both go on to the same bits."""
-        state = GraphState(self._smoother.snapshot(), self._layout, self._keys, self._auxiliary, self._left)
+        state = self._state()
         self.restore(state)
         return state
 
     def restore(self, state: GraphState) -> None:
         """Continue from a snapshot."""
         require_type("state", state, GraphState)
-        self._smoother_to_change().restore(state.graph)
-        self._layout, self._keys = state.layout, state.keys
-        self._auxiliary, self._left = state.auxiliary, state.left
+        self._smoother.restore(state.graph)
+        self._layout, self._keys, self._independent = state.layout, state.keys, state.independent
+        self._window, self._labels = state.window, state.labels
+        self._auxiliary, self._predictions = state.auxiliary, state.predictions
+        self._posterior, self._tied, self._stale = state.posterior, None, frozenset()
+
+    def _state(self) -> GraphState:
+        return GraphState(
+            self._smoother.graph(),
+            self._layout,
+            self._keys,
+            self._independent,
+            self._window,
+            self._labels,
+            self._auxiliary,
+            self._predictions,
+            self._posterior,
+        )
+
+    def _note(self, method: str, *arguments: Any, likelihood: float = 0.0) -> None:
+        """Note a call, to come again after a late measurement."""
+        if self.lag:
+            self._window = self._window.called(method, *arguments, likelihood=likelihood)
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Change the state, or leave it as it was where that fails."""
+        before, smoother = dict(vars(self)), self._smoother
+        self._smoother, self._posterior = smoother.handed_over(), None
+        try:
+            yield
+        except BaseException:
+            vars(self).update(before)
+            raise
+
+    def _extend(self, providers: Sequence[FactorProvider]) -> None:
+        offered = IndependentVariables(self._independent, self._labels)
+        self._smoother.extend(providers, offered)
+        self._tied = None
+        self._took_over(offered.taken)
+
+    def _tie(self, nodes: IntArray) -> None:
+        """Make variables of iSAM2 of those nodes that are none yet; the next solution takes them in."""
+        new = self._independent.components_of(nodes)
+        if len(new) == 0:
+            return
+        known = self._smoother.graph().variables
+        back = [
+            key
+            for node in new.tolist()
+            for epoch in self._window.epochs
+            if (key := node_key(node, epoch.number)) in known
+        ]
+        if back:  # of nodes that had left at this epoch
+            self._smoother.marginalise(back)
+            self._smoother.extend([])
+        offered = IndependentVariables(self._independent, self._labels)
+        self._smoother.change(lambda graph: offered.tie(graph, new))
+        self._tied = None
+        self._took_over(offered.taken)
+
+    def _took_over(self, taken: Mapping[int, Mapping[int, int]]) -> None:
+        """Note which independent objects have become variables: keys by id, by the number of the epoch."""
+        if not taken:
+            return
+        self._window = self._window.with_keys(taken)
+        now = taken[self._window.newest.number]
+        self._keys = {**self._keys, **now}
+        self._independent = self._independent.without(np.array(list(now), dtype=np.int64))
+
+    def _begin_anew(self, x: BlockGaussian, elimination: Elimination) -> None:
+        """Begin the graph anew from what is known: the filter's posterior is the prior of the next interval."""
+        newest = self._window.newest
+        self._smoother.clear(elimination)
+        self._independent = IndependentObjects.begun(newest.number, newest.time, x)
+        self._keys, self._tied = {}, None
+        self._window = self._window.without(set(x.layout.nodes.tolist()))
+
+    def _release_independent(self) -> None:
+        """Take those objects out of iSAM2 that are no longer correlated with anything there."""
+        if not self._keys:
+            return
+        graph = self._smoother.graph()
+        x = self._joint(key for key in self.others if key in graph.variables)
+        parts = x.uncorrelated(UNCORRELATED).label
+        alone = np.flatnonzero(np.bincount(parts)[parts] == 1)
+        ids = [node for node in x.layout.nodes[alone].tolist() if node in self._keys]
+        own: dict[int, set[int]] = {node: set() for node in ids}
+        named = {node_kind(node): node for node in ids}
+        for key, one in graph.variables.items():
+            if (node := named.get((one.kind, one.id))) is not None:
+                own[node].add(key)
+        free = np.array([node for node in ids if graph.independent(own[node])], dtype=np.int64)
+        if len(free):
+            self._smoother.marginalise(key for node in free.tolist() for key in own[node])
+            self._released(x.only(free).decoupled())
+
+    def _released(self, x: BlockGaussian) -> None:
+        """Go on with objects that have left iSAM2."""
+        gone = set(x.layout.nodes.tolist())
+        self._independent = self._independent.with_released(self._layout, x)
+        self._keys = {node: key for node, key in self._keys.items() if node not in gone}
+        self._window = self._window.without(gone)
+        self._tied = None
+
+    def _begin_epoch(
+        self, x: BlockGaussian, transition: Transition, dynamics: Dynamics, number: int, time: float
+    ) -> None:
+        """Begin the epoch in iSAM2, with the interaction factors of its nodes; x: of all nodes before it."""
+        tied, still = np.array([node in self._keys for node in x.layout.nodes.tolist()], dtype=bool), dynamics.unchanged
+        carried_over = set(x.layout.nodes[still & tied].tolist())
+        keys = {n: key if n in carried_over else node_key(n, number) for n, key in self._keys.items()}
+        unused = tied & still
+        change = None
+        if tied.any():
+            rows = np.flatnonzero(tied)
+            of_tied, x = dynamics.restricted(rows), x.without(np.flatnonzero(~tied))
+            chosen = lossy(x, of_tied, still[rows], self._smoother.graph().elimination)
+            if chosen.any():
+                change = self._predict_by_covariance(x, of_tied, chosen, keys)
+            unused[rows] |= chosen
+            if unused.any():
+                transition = _with_noise(transition, np.isin(transition.nodes, self._layout.nodes[unused]))
+        moved = Interactions(transition, self._keys, carried_over)
+        begun = [moved, *predictors(self.providers)]
+        offered = IndependentVariables(self._independent, self._labels) if self.providers else None
+        since, kept = min(self.time, time - self.lag), {*self._keys.values(), *keys.values(), *self._auxiliary}
+        self._smoother.begin(time, begun, [self._keys[node] for node in carried_over], change, offered)
+        self._smoother.forget(kept, since)  # its tree has just been eliminated in the order of time
+        self._keys, self._tied = keys, None
+        self._auxiliary += self._auxiliary_now()
 
     def _auxiliary_now(self) -> tuple[int, ...]:
         """Variables of the present epoch beside the nodes."""
@@ -202,31 +460,110 @@ class GraphFilter(LatestMarginals):
         return tuple(k for k, one in graph.variables.items() if one.epoch == graph.epoch and k not in nodes)
 
     def _predict_by_covariance(
-        self, dynamics: Dynamics, chosen: BoolArray, keys: Mapping[int, int]
+        self, x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray, keys: Mapping[int, int]
     ) -> Callable[[SceneFactorGraph], None]:
-        """Return the change of the graph that predicts the components of the `chosen` nodes (n,) by covariances."""
+        """Return the change of the graph that predicts the components of the `chosen` nodes (n,) of `x` by covariances.
+
+        The variables beside the nodes are part of their components.
+        """
         every = self._smoother.graph().variables
         auxiliary = {key: key for key, one in every.items() if one.epoch is None or key in self._auxiliary}
-        x = self._joint(auxiliary)
-        others = np.arange(len(self._layout), len(x.layout))
+        if auxiliary:
+            self._smoother.extend([])  # with the nodes that have just become variables
+            x = self._joint(auxiliary)
+        others = np.arange(len(dynamics.layout), len(x.layout))
         moved = by_covariance(x, dynamics.with_static(x.layout, others), chosen)
         earlier, now = ({**auxiliary, **nodes} for nodes in (self._keys, keys))
         return lambda graph: replace_by_prior(graph, moved, earlier, now)
 
+    def _tied_gaussian(self) -> BlockGaussian:
+        """The joint Gaussian of the nodes that are variables of iSAM2; what has not changed is not read again."""
+        known, stale = self._tied, self._stale
+        if known is None:
+            self._tied = self._joint() if self._keys else BlockGaussian.empty()
+        elif stale:
+            label = known.partition.label
+            changed = np.isin(label, label[known.layout.rows(sorted(stale))])
+            layout = known.layout.select(changed)
+            now = self._smoother.joint_gaussian(layout, [self._keys[node] for node in layout.nodes.tolist()])
+            self._tied = merged(known.layout, known.without(np.flatnonzero(changed)), now)
+        self._stale = frozenset()
+        return self._tied or BlockGaussian.empty()
+
     def _joint(self, auxiliary: Iterable[int] = ()) -> BlockGaussian:
-        """The joint Gaussian of all nodes, then of other variables, by increments from the base."""
-        layout, every = self._layout, self._smoother.graph().variables
+        """The joint Gaussian of iSAM2's nodes, then of other variables, by increments from the base."""
+        every = self._smoother.graph().variables
+        layout = self._layout.select(np.array([node in self._keys for node in self._layout.nodes.tolist()], dtype=bool))
         for key in auxiliary:
             layout = layout.extended([key], every[key].dim)
-        keys = {**dict.fromkeys(auxiliary), **self._keys}
-        return self._smoother.joint_gaussian(layout, [keys[node] or node for node in layout.nodes.tolist()])
+        return self._smoother.joint_gaussian(layout, [self._keys.get(node, node) for node in layout.nodes.tolist()])
+
+    def _update_now(self, kinds: Sequence[RecordedMeasurements], before: BlockGaussian | None) -> float:
+        """Take in measurements of the present epoch; returns their log-likelihood given `before`."""
+        likelihood = 0.0
+        self._tie(np.concatenate([one.measured.nodes for one in kinds if not one.linear] or [np.empty(0, int)]))
+        held: list[RecordedMeasurements] = []
+        for recorded in kinds:
+            tied = np.array([node in self._keys for node in recorded.measured.nodes.tolist()])
+            if tied.any():
+                held.append(recorded.only(tied))
+            if not tied.all():
+                own = recorded.only(~tied).measured
+                assert isinstance(own, Measurements)
+                self._independent, more = self._independent.updated(own)
+                likelihood += more
+        return likelihood + self._measure(held, before) if held else likelihood
+
+    def _measure(self, kinds: Sequence[RecordedMeasurements], before: BlockGaussian | None) -> float:
+        """Add detection factors; returns their log-likelihood given `before`."""
+        nodes = np.unique(np.concatenate([one.measured.nodes for one in kinds]))
+        alike = self._tied is not None and not self._smoother.nonlinear
+        self._smoother.extend([DetectionFactors(one, self._keys) for one in kinds])
+        self._tied, self._stale = (self._tied, self._stale | set(nodes.tolist())) if alike else (None, frozenset())
+        if before is None:
+            return math.nan
+        layout = self._layout.select(np.sort(self._layout.rows(nodes)))
+        after = self._smoother.joint_gaussian(layout, [self._keys[node] for node in layout.nodes.tolist()])
+        return log_likelihood(before.only(layout.nodes), after, kinds)
+
+    def _update_past(self, kinds: Sequence[RecordedMeasurements], k: int, time: float) -> float:
+        """Go back to epoch k, take in measurements made at `time`, and go on again; returns their log-likelihood."""
+        epochs, known = self._window.epochs[k:], self._window.there
+        for recorded in kinds:
+            nodes = recorded.measured.nodes
+            if not (there := known(nodes, k)).all():
+                raise UnknownNodeError(f"node {nodes[~there][0]} is not remembered at {time:.6f} s")
+        now, transition = (self._smoother.frame, self._smoother.origin), epochs[0].transition
+        assert transition is not None
+        state = epochs[0].state
+        self.restore(replace(state, window=state.window.with_states(self._window)))
+        if time > epochs[0].time + SAME_TIME:
+            first, rest = IntervalDynamics(transition).split(time - epochs[0].time)
+            self.predict(first.transition)
+            transition = rest.transition
+        likelihood = self.update([one.measured for one in kinds], robust=kinds[0].loss)
+        for epoch in epochs[1:]:
+            assert transition is not None
+            self.predict(transition)
+            for call in epoch.calls:
+                likelihood += (getattr(self, call.method)(*call.arguments) or 0.0) - call.likelihood
+            transition = epoch.transition
+        self._smoother.frame, self._smoother.origin = now
+        return likelihood
 
     def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
         return self.posterior(), self._layout.rows(nodes)
 
-    def _smoother_to_change(self) -> IncrementalSmoother:
-        self._posterior = None
-        return self._smoother
+
+def _coupled(interval: IntervalDynamics, dynamics: Dynamics) -> BoolArray:
+    """(n,) nodes that an interval ties to others, or moves nonlinearly."""
+    tied = np.zeros(len(dynamics.layout), dtype=bool)
+    for F in dynamics.F:
+        across = (F.target != F.source) & F.values.any(axis=(1, 2))
+        tied[F.target[across]] = tied[F.source[across]] = True
+    for _, rows in interval.nonlinear_rows(dynamics.layout):
+        tied[rows] = True
+    return tied
 
 
 def _with_noise(transition: Transition, rows: BoolArray) -> Transition:

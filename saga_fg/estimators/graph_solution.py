@@ -23,6 +23,7 @@ from factors import marginal_moments
 from factors.marginal import Elimination
 from factors.singular import singular_system
 from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray
 
 _WIDE = 400  # dimensions of a clique from which QR takes ten times as long as Cholesky
@@ -76,6 +77,15 @@ class GraphSolution:
             return self._linear.eliminateMultifrontal(order, gtsam.EliminateQR), "qr"
         except RuntimeError as error:
             raise singular_system(self._linear, error) from error
+
+
+def linear_solution(graph: SceneFactorGraph) -> GraphSolution:
+    """The factors of a graph as they are linearised where its variables are; the step counts from their base."""
+    linear, point = gtsam.GaussianFactorGraph(), graph.point()
+    for number in sorted(graph.groups, key=lambda number: graph.groups[number].elimination_order):
+        for factor in graph.linear(number, point):
+            linear.push_back(factor)
+    return GraphSolution(point, linear, True)
 
 
 def tree_covariances(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int]) -> dict[int, FloatArray]:

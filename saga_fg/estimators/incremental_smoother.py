@@ -30,7 +30,7 @@ from saga_fg.estimators.layout import StateLayout
 from saga_fg.graph.condensation import Condensation
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.linearisation_point import LinearisationPoint
-from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
+from saga_fg.graph.providers import FactorProvider, GraphView, OtherVariables, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.frame import Frame
@@ -66,6 +66,7 @@ class IncrementalSmoother:
         self._graph = SceneFactorGraph(elimination)
         self._engine: Engine | None = None
         self._times: list[float] = []
+        self._changed = False  # since it was solved
 
     @property
     def time(self) -> float:
@@ -99,21 +100,25 @@ class IncrementalSmoother:
         providers: Sequence[FactorProvider],
         carried_over: Iterable[int] = (),
         change: Callable[[SceneFactorGraph], None] | None = None,
+        others: OtherVariables | None = None,
     ) -> None:
         """Begin an epoch as `step`, but keep all that is older than the lag.
 
-        carried_over: variables that are those of the new epoch, too; change: of the graph, after the first provider
+        carried_over: variables that are those of the new epoch, too; change: of the graph, after the first provider;
+        others: variables apart from the graph, which providers see
         """
         graph = self._graph.copy()
         graph.advance(time, carried_over)
-        self._ask_and_move(graph, providers, change)
+        self._ask(graph, providers, change, others)
+        self._move_to(graph)
         self._times = [*self._times, graph.time]
 
-    def forget(self, kept: Collection[int] = ()) -> None:
-        """Marginalise what is older than the lag, but for the variables `kept`."""
+    def forget(self, kept: Collection[int] = (), since: float | None = None) -> None:
+        """Marginalise all epochs before the last until `since`, s, by default `lag` ago, but for variables `kept`."""
         if self._lag is None:
             return
-        first = sum(t <= self.time - self._lag for t in self._times[1:])
+        since = self.time - self._lag if since is None else since
+        first = sum(t <= since for t in self._times[1:])
         self.marginalise([key for key in self._graph.older_than(self._times[first]) if key not in kept])
         self._times = self._times[first:]
 
@@ -125,17 +130,49 @@ class IncrementalSmoother:
             self._ask(graph, [*predictors(providers), *providers])
         self._move_to(graph)
 
-    def extend(self, providers: Sequence[FactorProvider], settings: RelinearisationSettings | None = None) -> None:
-        """Ask some more providers at the present epoch, and solve again; settings: of this solution alone."""
+    def extend(
+        self,
+        providers: Sequence[FactorProvider],
+        others: OtherVariables | None = None,
+        settings: RelinearisationSettings | None = None,
+    ) -> None:
+        """Ask some more providers at the present epoch, and solve again.
+
+        others: variables apart from the graph, which they see; settings: of this solution alone
+        """
         graph = self._graph.copy()
-        self._ask(graph, providers)
+        self._ask(graph, providers, others=others)
         self._move_to(graph, settings)
+
+    def change(self, change: Callable[[SceneFactorGraph], None]) -> None:
+        """Change the graph; the next solution has it."""
+        graph = self._graph.copy()
+        change(graph)
+        self._graph, self._changed = graph, True
+
+    def clear(self, elimination: Elimination) -> None:
+        """Take out all variables and factors; the epoch stays. elimination: from now on."""
+        graph = self._graph.copy()
+        graph.elimination = elimination
+        graph.drop(set(graph.variables))
+        self._graph, self._engine, self._changed = graph, None, False
+        self._times = self._times[-1:]
 
     def marginalise(self, keys: Iterable[int], into: Condensation | None = None) -> None:
         """Integrate variables out; their information on others stays, in the factors that `into` makes of it."""
-        graph = self._graph.copy()
-        graph.marginalise(keys, into)
-        self._graph = graph
+        leaving = set(keys)
+        if not leaving:
+            return
+        graph, engine = self._graph.copy(), self._engine
+        self._engine = None  # it is begun anew, should this fail
+        if engine is None or into is not None or not engine.in_time or not engine.marginalised(graph, leaving):
+            graph.marginalise(leaving, into)
+        self._graph, self._engine = graph, engine
+
+    @property
+    def nonlinear(self) -> bool:
+        """Whether some factor is, so that a change anywhere may move the linearisation point of others."""
+        return any(not held.factors.linear for held in self._graph.groups.values())
 
     def state(self, key: int) -> object:
         """Value of a variable: a vector, or a pose."""
@@ -165,8 +202,14 @@ class IncrementalSmoother:
 
     def joint_gaussian(self, layout: StateLayout, keys: Sequence[int]) -> BlockGaussian:
         """The joint Gaussian of variables by components, as `saga_fg.estimators.joint_gaussian` has it."""
-        engine = self._ready()
-        return joint_gaussian(self._graph, engine.covariance, layout, keys)
+        engine, graph = self._ready(), self._graph
+        return joint_gaussian(graph, engine.covariance, layout, keys)
+
+    def detached(self) -> IncrementalSmoother:
+        """Return a smoother of the same graph that builds an iSAM2 of its own when it needs one."""
+        twin = copy.copy(self)
+        twin._times, twin._engine = list(self._times), None
+        return twin
 
     def handed_over(self) -> IncrementalSmoother:
         """Return a smoother that takes over the present iSAM2; this one builds another when it is needed."""
@@ -185,22 +228,14 @@ class IncrementalSmoother:
         times = {one.time for one in graph.variables.values() if one.time is not None}
         self._times = sorted(times | ({graph.time} if graph.epoch >= 0 else set()))
 
-    def _ask_and_move(
-        self,
-        graph: SceneFactorGraph,
-        providers: Sequence[FactorProvider],
-        change: Callable[[SceneFactorGraph], None] | None = None,
-    ) -> None:
-        self._ask(graph, providers, change)
-        self._move_to(graph)
-
     def _ask(
         self,
         graph: SceneFactorGraph,
         providers: Sequence[FactorProvider],
         change: Callable[[SceneFactorGraph], None] | None = None,
+        others: OtherVariables | None = None,
     ) -> None:
-        view = GraphView(graph, self.covariance, self.origin, self.frame)
+        view = GraphView(graph, self.covariance, self.origin, self.frame, others)
         for k, provider in enumerate(providers):
             ask(provider, graph, view)
             if k == 0 and change is not None:
@@ -208,22 +243,21 @@ class IncrementalSmoother:
 
     def _move_to(self, graph: SceneFactorGraph, settings: RelinearisationSettings | None = None) -> None:
         self._engine = self._solve(graph, settings or self._settings)
-        self._graph = graph
+        self._graph, self._changed = graph, False
 
     def _ready(self) -> Engine:
         """iSAM2 with the graph as it is."""
-        if self._engine is None:
-            graph = self._graph.copy()
-            self._engine = self._solve(graph, self._settings)
-            self._graph = graph
+        if self._engine is None or self._changed:
+            self._move_to(self._graph.copy())
+        assert self._engine is not None
         return self._engine
 
     def _solve(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
         """iSAM2 with the graph, which moves to the solution."""
         engine, self._engine = self._engine, None  # it is begun anew, should it fail
         start = graph.point().values
-        if engine is None or engine.elimination != graph.elimination:
-            engine = Engine(graph.elimination, settings.wildfire)
+        if engine is None or engine.elimination != graph.elimination or engine.holds_others(graph):
+            engine = Engine(graph.elimination, settings.wildfire, in_time=self._lag is not None)
         engine.at_root = self.at_root
         try:
             return engine.solved(graph, settings)
@@ -231,4 +265,4 @@ class IncrementalSmoother:
             if graph.elimination == "qr":
                 raise
         graph.moved_to(start)  # Cholesky has half the digits
-        return Engine("qr", settings.wildfire).solved(graph, settings)
+        return Engine("qr", settings.wildfire, in_time=self._lag is not None).solved(graph, settings)

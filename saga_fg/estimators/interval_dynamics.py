@@ -182,16 +182,18 @@ class NonlinearDynamics:
         return ResidualFactors(
             rows=np.column_stack([next_keys, keys]),
             dims=(self.b.shape[1], self.b.shape[1], *(F.shape[2] for F in self.F)),
-            residual=self._residual,
+            residual=self.residual,
             covariances=self.Q,
-            jacobians=self._residual_jacobians,
+            jacobians=self.residual_jacobians,
             name="interactions",
         )
 
-    def _residual(self, later: FloatArray, *states: FloatArray) -> FloatArray:
+    def residual(self, later: FloatArray, *states: FloatArray) -> FloatArray:
+        """States (n, d) after the interval less those that `predict` gives."""
         return later - self.predict(states)
 
-    def _residual_jacobians(self, later: FloatArray, *states: FloatArray) -> list[FloatArray]:
+    def residual_jacobians(self, later: FloatArray, *states: FloatArray) -> list[FloatArray]:
+        """Derivatives of `residual` by each of them."""
         identity = np.broadcast_to(np.eye(later.shape[1]), self.G.shape)
         return [identity, *(-J for J in self.jacobians(states))]
 

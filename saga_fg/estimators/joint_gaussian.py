@@ -8,26 +8,25 @@ its variable.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from factors import FactorError, joint_prior_factor
+from factors.marginal import Elimination
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics, noise_ratio, predict
-from saga_fg.estimators.filter_steps import predicted
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import Partition, zeros
 from saga_fg.graph.messages import solver_error, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
-_SMALL = 64  # size of the largest component that is eliminated by QR
-_LIMIT = 1e8  # variance predicted over process noise, up to which factors keep enough digits
-_LIMIT_WIDE = 1e6  # the same by Cholesky
+LARGEST_RATIO: dict[Elimination, float] = {"qr": 3e11, "cholesky": 1e6}
+"""Variance predicted over process noise, up to which factors keep enough digits."""
 
 
 def joint_gaussian(
@@ -38,11 +37,10 @@ def joint_gaussian(
     Nodes with their states, other variables with increments from their base; covariance: joint one of some variables.
     Raises `GraphError` where they are not determined.
     """
-    part = components(held.factors.rows[row] for held in graph.groups.values() for row in held.rows.tolist())
-    _, own = np.unique([part[key] for key in keys], return_inverse=True)
-    partition = Partition(layout, own.astype(np.int64))
+    part = components(graph)
+    partition = Partition(layout, renumbered(np.array([part[key] for key in keys], dtype=np.int64)))
     members: dict[int, list[int]] = {}
-    for k, label in enumerate(own.tolist()):
+    for k, label in enumerate(partition.label.tolist()):
         members.setdefault(label, []).append(k)
     blocks, group, component = zeros(partition), partition.group.tolist(), partition.row.tolist()
     try:
@@ -50,33 +48,64 @@ def joint_gaussian(
             blocks[group[its[0]]][component[its[0]]] = covariance([keys[k] for k in its])
     except FactorError as error:
         raise solver_error(graph.variables, graph.groups, error) from error
-    base = graph.base
+    point = graph.point()
     mean = [
-        np.asarray(graph.state(key))
-        if node != key
-        else (v := graph.variable(key)).type.local(v.type.read(base, key), graph.state(key))
+        np.asarray(graph.state(key)) if node != key else point.increment(key)
         for node, key in zip(layout.nodes.tolist(), keys, strict=True)
     ]
     return BlockGaussian(partition, np.concatenate([np.empty(0), *mean]), blocks)
 
 
-def components(factors: Iterable[Sequence[int]]) -> dict[int, int]:
-    """The component of every variable, by the keys of factors: what these tie together, directly or through others."""
-    row: dict[int, int] = {}
-    pairs = [(row.setdefault(keys[0], len(row)), row.setdefault(key, len(row))) for keys in factors for key in keys]
-    a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    matrix = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), shape=(len(row), len(row)))
-    return dict(zip(row, connected_components(matrix, directed=False)[1].tolist(), strict=True))
+def merged(layout: StateLayout, *parts: BlockGaussian) -> BlockGaussian:
+    """The joint Gaussian over `layout` of parts that are independent of each other, each in the order of the layout."""
+    parts = tuple(part for part in parts if len(part.layout))
+    if len(parts) == 1:
+        return parts[0]
+    label, mean, count = np.zeros(len(layout), dtype=np.int64), np.empty(layout.size), 0
+    where = [layout.rows(part.layout.nodes) for part in parts]
+    for part, rows in zip(parts, where, strict=True):
+        label[rows] = count + part.partition.label
+        mean[layout.places(rows)] = part.mean
+        count += part.partition.count
+    partition = Partition(layout, renumbered(label))
+    blocks = zeros(partition)
+    for part, rows in zip(parts, where, strict=True):
+        its = np.unique(part.partition.label, return_index=True)[1]  # a node of each component
+        group, row = part.partition.group[its], part.partition.row[its]
+        for number, P in enumerate(part.blocks):
+            mine = group == number
+            there = rows[its[mine]]
+            blocks[partition.group[there[0]]][partition.row[there]] = P[row[mine]]
+    return BlockGaussian(partition, mean, blocks)
 
 
-def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, window: bool) -> BoolArray:
-    """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable.
+def renumbered(label: IntArray) -> IntArray:
+    """Labels (n,) in the order in which they occur, from 0 without gaps."""
+    _, first, label = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[label]
 
-    window: whether there is one to be lost, so that wide components are to keep their factors while that can be.
-    """
-    label, ratio = dynamics.joined(x.partition).label, noise_ratio(predicted(x, dynamics, None, False), dynamics)
-    wide = np.bincount(label, weights=x.layout.dims)[label] > (np.inf if window else _SMALL)
-    return np.isin(label, label[(ratio > np.where(wide, _LIMIT_WIDE, _LIMIT)) & ~still])
+
+def components(graph: SceneFactorGraph) -> dict[int, int]:
+    """The component of every variable that has factors: what these tie together, directly or through others."""
+    ties = np.concatenate([np.empty((0, 2), dtype=np.uint64), *(held.ties for held in graph.groups.values())])
+    keys, row = np.unique(ties, return_inverse=True)
+    a, b = row.reshape(-1, 2).T
+    matrix = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), shape=(len(keys), len(keys)))
+    return dict(zip(keys.tolist(), connected_components(matrix, directed=False)[1].tolist(), strict=True))
+
+
+def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, elimination: Elimination) -> BoolArray:
+    """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable."""
+    label = dynamics.joined(x.partition).label
+    ratio = np.full(len(still), np.inf)
+    own = {d: np.zeros((len(still), d, d)) for d in np.unique(x.layout.dims).tolist()}
+    for F in dynamics.F:
+        if (mine := np.flatnonzero(F.target == F.source)).size:
+            own[F.values.shape[1]][F.target[mine]] = F.values[mine]
+    for Q in dynamics.Q:
+        F_ii = own[Q.values.shape[1]][Q.target]
+        ratio[Q.target] = noise_ratio(F_ii @ x.covariances(Q.target) @ np.swapaxes(F_ii, 1, 2) + Q.values, Q.values)
+    return np.isin(label, label[(ratio > LARGEST_RATIO[elimination]) & ~still])
 
 
 def by_covariance(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> BlockGaussian:
@@ -93,7 +122,7 @@ def replace_by_prior(
 
     Its variables by id, as they were and as they are now. Raises `InputError` where it has become singular.
     """
-    label = components(held.factors.rows[row] for held in graph.groups.values() for row in held.rows.tolist())
+    label = components(graph)
     ids = x.layout.nodes.tolist()
     for number in range(x.partition.count):
         rows = np.flatnonzero(x.partition.label == number)

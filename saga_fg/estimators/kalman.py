@@ -128,14 +128,15 @@ class JointKalmanFilter(LatestMarginals):
         self._predictions += 1
         self._time += transition.dt
 
-    def update(self, measurements: Measurements | Observations) -> float:
-        recorded = RecordedMeasurements(measurements)
-        rows = recorded.check(self._state.layout)
-        if len(rows) == 0:
-            return 0.0
-        seen = recorded.linearised(self._state.layout, self._state.mean, rows)
-        self._state, log_likelihood = corrected(self._state, seen)
-        return log_likelihood
+    def update(self, measurements: Measurements | Observations | Sequence[Measurements | Observations]) -> float:
+        x, total = self._state, 0.0
+        for each in measurements if isinstance(measurements, Sequence) else (measurements,):
+            recorded = RecordedMeasurements(each)
+            if len(rows := recorded.check(x.layout)):
+                x, log_likelihood = corrected(x, recorded.linearised(x.layout, x.mean, rows))
+                total += log_likelihood
+        self._state = x
+        return total
 
     def marginalise(self, nodes: ArrayLike) -> None:
         self._state = self._state.without(self._state.layout.rows(nodes))

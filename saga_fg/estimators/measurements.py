@@ -11,17 +11,22 @@ is what a linear estimator takes in (iteratively reweighted least squares). Angl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from factors import FactorError, MeasurementModel, Robust
 from saga_fg.errors import InputError, require_type
+from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+
+_LOG_2_PI = float(np.log(2 * np.pi))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +109,16 @@ class RecordedMeasurements:
         measured = self.measured
         return int(measured.H.shape[2]) if isinstance(measured, Measurements) else measured.model.state_dim
 
+    def only(self, chosen: BoolArray) -> RecordedMeasurements:
+        """Those of the measurements (m,) that are chosen."""
+        if chosen.all():
+            return self
+        measured, weights = self.measured, None if self.weights is None else self.weights[chosen]
+        nodes, z, R = measured.nodes[chosen], measured.z[chosen], measured.R[chosen]
+        if isinstance(measured, Measurements):
+            return replace(self, measured=Measurements.unchecked(nodes, z, measured.H[chosen], R), weights=weights)
+        return replace(self, measured=replace(measured, nodes=nodes, z=z, R=R), weights=weights)
+
     def check(self, layout: StateLayout) -> IntArray:
         """The rows (m,) of the nodes; `UnknownNodeError` or `InputError` unless they are in `layout` and of the right
         size."""
@@ -158,6 +173,36 @@ class RecordedMeasurements:
         if not (np.isfinite(residual).all() and np.isfinite(H).all()):
             raise InputError(f"{model.name}: the prediction or its Jacobian is not finite")
         return residual, H
+
+
+def log_likelihood(before: BlockGaussian, after: BlockGaussian, kinds: Sequence[RecordedMeasurements]) -> float:
+    """The log-likelihood of measurements of the nodes of a Gaussian, from what was known before them and after.
+
+        2 log p(z) = -k log 2 pi - log |R| - log |P| + log |P'| - || z - H m' ||_R^2 - || m' - m ||_P^2
+
+    for linear measurements; at a minimum of nonlinear ones, Laplace's approximation.
+    """
+    total, layout = 0.0, before.layout
+    measured = np.zeros(len(layout), dtype=bool)
+    for recorded in kinds:
+        distance, R = recorded.distances(layout, after.mean), recorded.measured.R
+        total -= float(distance @ distance + np.linalg.slogdet(R)[1].sum()) + R.shape[0] * R.shape[1] * _LOG_2_PI
+        measured[layout.rows(recorded.measured.nodes)] = True
+    both = before.partition.joined(*_neighbours(after.partition.label))
+    for label in np.unique(both.label[measured]).tolist():
+        rows = np.flatnonzero(both.label == label)
+        at = layout.places(rows)
+        L, moved = np.linalg.cholesky(before.joint(rows)), after.mean[at] - before.mean[at]
+        half = scipy.linalg.solve_triangular(L, moved, lower=True)
+        total += float(np.linalg.slogdet(after.joint(rows))[1] - 2 * np.log(np.diag(L)).sum() - half @ half)
+    return total / 2
+
+
+def _neighbours(label: IntArray) -> tuple[IntArray, IntArray]:
+    """Pairs of nodes that tie together all of those with equal label."""
+    order = np.argsort(label, kind="stable")
+    same = np.flatnonzero(label[order][1:] == label[order][:-1])
+    return order[same], order[same + 1]
 
 
 def _distances(residual: FloatArray, R: FloatArray) -> FloatArray:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import ClassVar
 
 import gtsam
@@ -20,13 +19,14 @@ import numpy as np
 
 from factors import (
     FactorError,
+    GaussianFactors,
     ResidualFactors,
     detection_factors,
-    gaussian_factors,
     interaction_factor,
-    interaction_factors,
     joint_prior_factor,
-    prior_factors,
+    stacked_gaussian_factors,
+    stacked_interaction_factors,
+    stacked_prior_factors,
 )
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
@@ -43,7 +43,7 @@ from saga_fg.model.transition import Blocks, Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 _SINGULAR = 1e-13  # share of the variances of axes below which a direction has none
-Factors = list[gtsam.JacobianFactor | ResidualFactors]
+Factors = list[gtsam.JacobianFactor | GaussianFactors | ResidualFactors]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +99,8 @@ def recording_factors(
             "interactions": moved,
             "prior": _prior_factors(prior, keys) if k == 0 and len(prior.layout) else [],
             "new objects": [
-                factor
+                stacked_prior_factors([keys[n] for n in new.nodes.tolist()], new.means, new.covariances)
                 for new in epoch.new_nodes
-                for factor in prior_factors([keys[n] for n in new.nodes.tolist()], new.means, new.covariances)
             ],
             "detections": [factor for one in epoch.measurements for factor in measurement_factors(keys, one)],
         }
@@ -144,37 +143,47 @@ def measurement_factors(keys: Mapping[int, int], recorded: RecordedMeasurements)
     H = measured.H[kept]
     if recorded.loss is None:
         informative = H.any(axis=(1, 2))
-        return list(gaussian_factors(names[informative, None], [H[informative]], z[informative], R[informative]))
-    residual, jacobian = partial(_linear_residual, H, z), partial(_linear_jacobian, H)
-    dims = (H.shape[2],)
-    return [ResidualFactors(names[:, None], dims, residual, R, jacobian, recorded.loss, name="robust detections")]
+        return [stacked_gaussian_factors(names[informative, None], [H[informative]], z[informative], R[informative])]
+    difference, rows, dims = _LinearDifference(H, z), names[:, None], (H.shape[2],)
+    name = "robust detections"
+    return [ResidualFactors(rows, dims, difference.residual, R, difference.jacobians, recorded.loss, name=name)]
 
 
-def _linear_residual(H: FloatArray, z: FloatArray, x: FloatArray) -> FloatArray:
-    return np.asarray((H @ x[:, :, None])[:, :, 0] - z)
+@dataclass(frozen=True, eq=False)
+class _LinearDifference:
+    """H x - z of n measurements: H (n, m, d), z (n, m)."""
 
+    H: FloatArray
+    z: FloatArray
 
-def _linear_jacobian(H: FloatArray, x: FloatArray) -> list[FloatArray]:
-    return [H]
+    def residual(self, x: FloatArray) -> FloatArray:
+        return np.asarray((self.H @ x[:, :, None])[:, :, 0] - self.z)
+
+    def jacobians(self, x: FloatArray) -> list[FloatArray]:
+        return [self.H]
 
 
 def interval_factors(
     interval: IntervalDynamics | ZeroInterval,
     layout: StateLayout,
     mean: FloatArray,
-    keys: dict[int, int],
-    next_keys: dict[int, int],
-) -> tuple[list[gtsam.JacobianFactor], list[ResidualFactors]]:
-    """Factors of an interval, native ones and those of nodes that move nonlinearly."""
+    keys: Mapping[int, int],
+    next_keys: Mapping[int, int],
+) -> tuple[list[gtsam.JacobianFactor | GaussianFactors], list[ResidualFactors]]:
+    """Factors of an interval, native ones and those of nodes that move nonlinearly.
+
+    mean: joint state to linearise at; keys: of the nodes before and after it. A node without one after it, or with the
+    same one, has no factor.
+    """
     dynamics = interval.linearised(layout, mean)
-    now = np.array([keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
-    then = np.array([next_keys[node] for node in layout.nodes.tolist()], dtype=np.uint64)
+    now = np.array([keys.get(node, 0) for node in layout.nodes.tolist()], dtype=np.uint64)
+    then = np.array([next_keys.get(node, 0) for node in layout.nodes.tolist()], dtype=np.uint64)
     noise: dict[int, FloatArray] = {}
     regular = np.zeros(len(layout), dtype=bool)  # native factors need noise in all directions
     for blocks in dynamics.Q:
         noise.update(zip(blocks.target.tolist(), blocks.values, strict=True))
         regular[blocks.target] = _is_regular(blocks.values)
-    same = now == then  # nodes whose variable stays
+    same = (now == then) | (then == 0)
     block_shapes = np.zeros(len(layout), dtype=np.int64)  # numbers of state sizes among the sources of a node
     for blocks in dynamics.F:
         block_shapes[np.unique(blocks.target)] += 1
@@ -184,20 +193,20 @@ def interval_factors(
         moves_nonlinearly[rows[:, 0]] = True
         nonlinear.append(group.factors(then[rows[:, 0]], now[rows]))
     together = regular & (block_shapes == 1) & ~moves_nonlinearly
-    native: list[gtsam.JacobianFactor] = []
+    native: list[gtsam.JacobianFactor | GaussianFactors] = []
     for blocks in dynamics.F:
-        mine = np.flatnonzero(together[blocks.target])
+        mine = np.flatnonzero(together[blocks.target] & (now[blocks.source] > 0))
         mine = mine[np.argsort(blocks.target[mine], kind="stable")]
         rows, first = np.unique(blocks.target[mine], return_index=True)
         if len(rows):
             b = dynamics.b[layout.spans(rows)]
             Q = np.stack([noise[row] for row in rows.tolist()])
             names, indptr = now[blocks.source[mine]], np.append(first, len(mine))
-            native += interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
+            native += stacked_interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
     for row in np.flatnonzero(~together & ~moves_nonlinearly).tolist():
         d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
-        sources = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row)]
+        sources = [(int(now[j]), F) for G in dynamics.F for j, F in _of_row(G, row) if now[j]]
         b = dynamics.b[layout.offsets[row] : layout.offsets[row + 1]]
         if not _is_regular(Q):
             raise FactorError(
@@ -240,14 +249,16 @@ class NewObjects:
             NewVariable(*node_kind(i), mean, label=self.labels.get(i, ""))
             for i, mean in zip(ids, self.means, strict=True)
         ]
-        return Additions(new, prior_factors([node_key(i, view.epoch) for i in ids], self.means, self.covariances))
+        keys = [node_key(i, view.epoch) for i in ids]
+        return Additions(new, [stacked_prior_factors(keys, self.means, self.covariances)])
 
 
 @dataclass(frozen=True, eq=False)
 class Interactions:
     """Objects move by a transition over those that stay.
 
-    earlier    by id, the keys of their variables, by default those of the epoch before
+    earlier    by id, the keys of their variables, by default those of the epoch before; nodes of the transition that
+               are not among them are no objects of the graph
     carried_over   ids of those whose variables stay as they are
     """
 
@@ -258,38 +269,40 @@ class Interactions:
     internal: ClassVar[bool] = True
 
     def factors(self, view: GraphView) -> Additions:
-        transition = self.transition
-        nodes = transition.nodes.tolist()
-        if not nodes:
+        interval = IntervalDynamics(self.transition)
+        nodes = self.transition.nodes.tolist()
+        earlier = {node: node_key(node, view.epoch - 1) for node in nodes} if self.earlier is None else self.earlier
+        if not earlier:
             return Additions()
-        earlier = self.earlier or {node: node_key(node, view.epoch - 1) for node in nodes}
-        now = {node: node_key(node, view.epoch) for node in nodes}
-        layout = StateLayout(nodes, transition.graph.dims)
-        mean = np.concatenate([view.state(earlier[node]) for node in nodes])
-        interval = IntervalDynamics(transition)
+        layout = StateLayout(nodes, self.transition.graph.dims)
+        at, mean = layout.offsets.tolist(), np.zeros(layout.size)
+        mine = [row for row, node in enumerate(nodes) if node in earlier]
+        for row in mine:
+            mean[at[row] : at[row + 1]] = view.state(earlier[nodes[row]])
         dynamics = interval.linearised(layout, mean)
         moved = dynamics.times(mean) + dynamics.b
-        states = np.split(moved, transition.offsets[1:-1])
+        moving = [row for row in mine if nodes[row] not in self.carried_over]
+        known = view.variables
         new = [
-            NewVariable(*node_kind(n), x, label=view.variables[earlier[n]].label)
-            for n, x in zip(nodes, states, strict=True)
-            if n not in self.carried_over
+            NewVariable(*node_kind(n), moved[at[row] : at[row + 1]], label=known[earlier[n]].label)
+            for row, n in zip(moving, (nodes[row] for row in moving), strict=True)
         ]
-        native, nonlinear = interval_factors(interval, layout, mean, dict(earlier), now)
-        still = {now[node] for node in self.carried_over}
-        return Additions(new, [*(one for one in native if one.keys()[0] not in still), *nonlinear])
+        then = {nodes[row]: node_key(nodes[row], view.epoch) for row in moving}
+        native, nonlinear = interval_factors(interval, layout, mean, earlier, then)
+        return Additions(new, named={(view.epoch,): [*native, *nonlinear]})
 
 
 @dataclass(frozen=True, eq=False)
 class DetectionFactors:
     """Measurements of objects; keys: of their variables by id, by default those of this epoch."""
 
-    measurements: Measurements | Observations
+    measurements: Measurements | Observations | RecordedMeasurements
     keys: Mapping[int, int] | None = None
     name: str = "detections"
     internal: ClassVar[bool] = True
 
     def factors(self, view: GraphView) -> Additions:
-        m = self.measurements
-        now = self.keys or {node: node_key(node, view.epoch) for node in m.nodes.tolist()}
-        return Additions(factors=measurement_factors(now, RecordedMeasurements(m)))
+        given = self.measurements
+        recorded = given if isinstance(given, RecordedMeasurements) else RecordedMeasurements(given)
+        now = self.keys or {node: node_key(node, view.epoch) for node in recorded.measured.nodes.tolist()}
+        return Additions(factors=measurement_factors(now, recorded))

@@ -8,8 +8,10 @@ Every estimator agrees with `saga_fg.estimators.reference` (see docs/model.md fo
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -87,8 +89,8 @@ class Estimator(Protocol):
         """Move all nodes by a transition over exactly the present nodes, in any order."""
         ...
 
-    def update(self, measurements: Measurements) -> float:
-        """Take in measurements; returns the log-likelihood of their innovation."""
+    def update(self, measurements: Measurements | Sequence[Measurements]) -> float:
+        """Take in measurements, several kinds at once if need be; returns the log-likelihood of their innovation."""
         ...
 
     def marginalise(self, nodes: ArrayLike) -> None:
@@ -130,6 +132,10 @@ class Estimator(Protocol):
 
 class LatestMarginals:
     """Marginals of the nodes that are there now. See `saga_fg.estimators.protocol.Estimator` for the methods."""
+
+    def handed_over(self) -> Self:
+        """A copy that goes on in the place of this one."""
+        return copy.copy(self)
 
     def mean(self, nodes: ArrayLike) -> FloatArray:
         x, rows = self._at(nodes)

@@ -12,6 +12,7 @@ from factors import Robust
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.backward import MarginalCovariances, SmoothedCovariance
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
@@ -19,6 +20,24 @@ from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows
 from saga_fg.estimators.recording import Recording
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class JointCovariance:
+    """Joint covariance (D, D) of all nodes of a layout."""
+
+    layout: StateLayout
+    matrix: FloatArray
+
+    def joint(self, rows: IntArray) -> FloatArray:
+        """Of the nodes at `rows`, in this order."""
+        at = self.layout.places(rows)
+        return np.asarray(self.matrix[np.ix_(at, at)])
+
+    def blocks(self, rows: IntArray) -> FloatArray:
+        """(k, d, d) of the nodes at `rows`, whose states have equal size d."""
+        at = self.layout.spans(rows)
+        return np.asarray(self.matrix[at[:, :, None], at[:, None, :]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +51,7 @@ class SmoothedState:
     time: float
     layout: StateLayout
     state: FloatArray
-    P: SmoothedCovariance | MarginalCovariances | None = None
+    P: SmoothedCovariance | MarginalCovariances | JointCovariance | None = None
 
     @property
     def nodes(self) -> IntArray:
@@ -57,7 +76,7 @@ class SmoothedState:
         """Joint covariance of some nodes, in the order given, of any sizes."""
         return self._covariance().joint(self.layout.rows(nodes))
 
-    def _covariance(self) -> SmoothedCovariance | MarginalCovariances:
+    def _covariance(self) -> SmoothedCovariance | MarginalCovariances | JointCovariance:
         if self.P is None:
             raise InputError("covariances: only means were smoothed; ask for covariances")
         return self.P
@@ -90,9 +109,12 @@ class RecordedSmoother(LatestMarginals):
         self._recording.predict(IntervalDynamics(transition, self._most))
 
     def update(
-        self, measurements: Measurements | Observations, time: float | None = None, robust: Robust | None = None
+        self,
+        measurements: Measurements | Observations | Sequence[Measurements | Observations],
+        time: float | None = None,
+        robust: Robust | None = None,
     ) -> float:
-        """Take in measurements made at `time` (s, on the smoother's clock), None for now.
+        """Take in measurements, of several kinds if need be, made at `time` (s, on the smoother's clock), None for now.
 
         An interval that contains `time` is split: its recorded graph is discretised anew over both parts, its edges
         kept. Returns the log-likelihood of the measurements given all taken in before; with nonlinear or robust parts,
@@ -101,7 +123,22 @@ class RecordedSmoother(LatestMarginals):
         """
         if robust is not None:
             require_type("robust", robust, Robust)
-        return self._recording.update(RecordedMeasurements(measurements, robust), time)
+        return self._take_in(measurements, time, robust)
+
+    def _take_in(
+        self,
+        measurements: Measurements | Observations | Sequence[Measurements | Observations],
+        time: float | None,
+        robust: Robust | GraduatedNonConvexity | None,
+    ) -> float:
+        """Take in all, or none where one can't be taken."""
+        before = self._recording.snapshot()
+        given = measurements if isinstance(measurements, Sequence) else (measurements,)
+        try:
+            return sum(self._recording.update(RecordedMeasurements(each, robust), time) for each in given)
+        except BaseException:
+            self._recording.restore(before)
+            raise
 
     def marginalise(self, nodes: ArrayLike) -> None:
         self._recording.marginalise(nodes)

@@ -187,13 +187,6 @@ class Recording:
         self._epochs[-1] = replace(epoch, leaving=(*epoch.leaving, *self.layout.nodes[rows].tolist()))
         self._layout = None
 
-    def drop_before(self, time: float) -> None:
-        """Drop the epochs before the last one that is not after `time`; their posterior becomes the prior."""
-        k = 0
-        while k + 1 < len(self._epochs) and self._epochs[k + 1].time <= time + _SAME_TIME:
-            k += 1
-        self.drop(k)
-
     def drop(self, k: int) -> None:
         """Drop the first k epochs; their posterior becomes the prior."""
         if k == 0:

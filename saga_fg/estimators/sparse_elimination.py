@@ -26,7 +26,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from factors import Linearisable, linearised, nonlinear_graph
+from factors import GaussianFactors, Linearisable, ResidualFactors, linearised, nonlinear_graph
 from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.epoch import Epoch
@@ -72,8 +72,10 @@ class SparseSolution:
             start.insert(key, state)
             dims[key] = len(state)
         factors = [factor for one in recorded for kind in one.factors.values() for factor in kind]
-        linear = nonlinear_graph([factor for factor in factors if isinstance(factor, gtsam.JacobianFactor)], dims)
-        others = [factor for factor in factors if not isinstance(factor, gtsam.JacobianFactor)]
+        native = [factor for factor in factors if isinstance(factor, gtsam.JacobianFactor)]
+        stacks = [factor for factor in factors if isinstance(factor, GaussianFactors)]
+        linear = nonlinear_graph([*native, *(one for stack in stacks for one in stack.native())], dims)
+        others = [factor for factor in factors if isinstance(factor, ResidualFactors)]
         values, tree = solved_tree(linear, others, start, order, max_iterations)
         keys = [one.keys for one in recorded]
         solved = [np.concatenate([np.empty(0), *(values.atVector(key) for key in own.values())]) for own in keys]

@@ -3,6 +3,7 @@
 | given | becomes |
 |---|---|
 | `gtsam.JacobianFactor`, linear, on vectors themselves | a row of the `LinearGroup` of all that come with it |
+| `factors.GaussianFactors` | a `GaussianGroup` |
 | `factors.ResidualFactors` | a `StackedGroup` |
 | anything else with `keys`, `error` and `linearise` (`factors.Linearisable`) | a `SingleGroup` |
 | `gtsam.CustomFactor` | a `CustomGroup` |
@@ -14,6 +15,7 @@ that least squares cannot take, and takes a `LinearContainerFactor` without a li
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -21,6 +23,7 @@ import gtsam
 import numpy as np
 
 from factors import (
+    GaussianFactors,
     Linearisable,
     OrientedPlane,
     PlanarPose,
@@ -34,10 +37,12 @@ from saga_fg.graph.errors import GraphError
 from saga_fg.graph.factor_groups import (
     CustomGroup,
     FactorGroup,
+    GaussianGroup,
     LinearGroup,
     NativeGroup,
     SingleGroup,
     StackedGroup,
+    WhitenedRows,
     first_residual,
     members,
 )
@@ -45,7 +50,7 @@ from saga_fg.graph.keys import described
 from saga_fg.graph.linearisation_point import LARGEST
 from saga_fg.graph.variables import GraphVariable
 
-Factor = gtsam.JacobianFactor | gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph | Linearisable
+Factor = gtsam.JacobianFactor | GaussianFactors | gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph | Linearisable
 _EXPECTED = "expected a gtsam.JacobianFactor, a GTSAM nonlinear factor, or a factor with keys, error and linearise"
 
 
@@ -60,11 +65,25 @@ def grouped(provider: str, factors: Any, variables: Mapping[int, GraphVariable])
             linear.append(factor)
         else:
             groups.append(_group(provider, factor))
+    for factor in linear:
+        _check_linear(provider, factor, variables)
     if linear:
-        groups.append(LinearGroup(tuple(linear), tuple(tuple(factor.keys()) for factor in linear)))
+        groups.append(LinearGroup.of(linear, variables))
     for group in groups:
-        _check_variables(provider, group, variables)
+        check_variables(provider, group, range(len(group.rows)), variables)
     return [group for group in groups if group.rows]
+
+
+def mentioned_keys(factors: Any) -> set[int]:
+    """Return the keys of all factors that a provider gave, as far as they are such; `grouped` has the checks."""
+    if isinstance(factors, str | bytes) or not isinstance(factors, Iterable | gtsam.NonlinearFactorGraph):
+        return set()
+    keys = set[int]()
+    for factor in _flat(factors):
+        given = getattr(factor, "keys", ())
+        with contextlib.suppress(Exception):  # a user's object: anything
+            keys.update(given() if callable(given) else given)
+    return keys
 
 
 def _flat(factors: Any) -> Iterable[Any]:
@@ -83,8 +102,10 @@ def _members(factors: Any) -> Iterable[Any]:
 
 def _group(provider: str, factor: Any) -> FactorGroup:
     kind = type(factor).__name__
+    if isinstance(factor, GaussianFactors):
+        return GaussianGroup(factor)
     if isinstance(factor, ResidualFactors):
-        return StackedGroup(factor, tuple(map(tuple, factor.rows.tolist())))
+        return StackedGroup(factor)
     if isinstance(factor, gtsam.LinearContainerFactor):
         raise GraphError(f"provider {provider}: {kind}: expected the linear factor itself, a gtsam.JacobianFactor")
     if isinstance(factor, gtsam.NonlinearFactor):
@@ -113,22 +134,47 @@ def _given_keys(provider: str, factor: Any) -> tuple[int, ...]:
     return keys
 
 
-def _check_variables(provider: str, group: FactorGroup, variables: Mapping[int, GraphVariable]) -> None:
-    """Each variable is there, of the type and dimension that its factor expects."""
-    for row, keys in enumerate(group.rows):
-        unknown = [key for key in keys if key not in variables]
-        if unknown:
-            raise GraphError(
-                f"provider {provider}: {group.name}: expected variables of the graph, "
-                f"{described(unknown[0])} is none: never added, or marginalised"
-            )
-        if len(set(keys)) != len(keys):
-            raise GraphError(f"provider {provider}: {group.name}: {variables[keys[0]]}: one variable occurs twice")
-        mine = [variables[key] for key in keys]
-        wrong = _misfit(group, row, mine)
-        if wrong:
-            names = ", ".join(map(str, mine))
-            raise GraphError(f"provider {provider}: {group.name} on {names}: {wrong}")
+def check_variables(
+    provider: str, group: FactorGroup, rows: Sequence[int], variables: Mapping[int, GraphVariable]
+) -> None:
+    """Raise `GraphError` unless each variable of some rows is there, of the type and dimension that they expect."""
+    if isinstance(group, GaussianGroup) and len(rows) == len(group.rows) and _fits(group.factors, variables):
+        return
+    for row in rows:
+        mine = _present(provider, group.name, group.rows[row], variables)
+        _check_fit(provider, group.name, mine, _misfit(group, row, mine))
+
+
+def _check_linear(provider: str, factor: gtsam.JacobianFactor, variables: Mapping[int, GraphVariable]) -> None:
+    """Each variable of a factor of GTSAM's is there, and has its number of columns."""
+    mine = _present(provider, "linear factor", tuple(factor.keys()), variables)
+    total, wrong = sum(variable.dim for variable in mine), ""
+    if factor.cols() - 1 != total:
+        wrong = f"expected {total} columns, as the variables have dimensions, got {factor.cols() - 1}"
+    elif factor.isConstrained():
+        wrong = "expected noise with variances, no hard constraint"
+    elif not (np.abs(factor.augmentedJacobian()) <= LARGEST).all():
+        wrong = f"expected finite numbers, at most {LARGEST:g} standard deviations"
+    _check_fit(provider, "linear factor", mine, wrong)
+
+
+def _present(
+    provider: str, name: str, keys: Sequence[int], variables: Mapping[int, GraphVariable]
+) -> list[GraphVariable]:
+    unknown = [key for key in keys if key not in variables]
+    if unknown:
+        raise GraphError(
+            f"provider {provider}: {name}: expected variables of the graph, "
+            f"{described(unknown[0])} is none: never added, or marginalised"
+        )
+    if len(set(keys)) != len(keys):
+        raise GraphError(f"provider {provider}: {name}: {variables[keys[0]]}: one variable occurs twice")
+    return [variables[key] for key in keys]
+
+
+def _check_fit(provider: str, name: str, variables: Sequence[GraphVariable], wrong: str) -> None:
+    if wrong:
+        raise GraphError(f"provider {provider}: {name} on {', '.join(map(str, variables))}: {wrong}")
 
 
 def check_angles(
@@ -147,16 +193,15 @@ def check_angles(
 def _misfit(group: FactorGroup, row: int, variables: Sequence[GraphVariable]) -> str:
     """Describe what does not fit together; "" if everything does."""
     types = [variable.type for variable in variables]
-    total = sum(variable.dim for variable in variables)
-    if isinstance(group, LinearGroup):
-        factor = group.factors[row]
-        if not all(isinstance(kind, Vector) for kind in types):
-            return "expected vectors: a linear factor speaks of the variables themselves"
-        if factor.cols() - 1 != total:
-            return f"expected {total} columns, as the variables have dimensions, got {factor.cols() - 1}"
-        if factor.isConstrained():
-            return "expected noise with variances, no hard constraint"
-        if not (np.abs(factor.augmentedJacobian()) <= LARGEST).all():
+    if isinstance(group, LinearGroup) and not all(isinstance(kind, Vector) for kind in types):
+        return "expected vectors: a linear factor speaks of the variables themselves"
+    if isinstance(group, WhitenedRows):
+        if tuple(variable.dim for variable in variables) != group.dims[row]:
+            return f"expected variables of dimensions {group.dims[row]}"
+    elif isinstance(group, GaussianGroup):
+        if not all(kind == Vector(dim) for kind, dim in zip(types, group.factors.dims, strict=True)):
+            return f"expected vectors of {group.factors.dims} entries, got {', '.join(map(str, types))}"
+        if not (np.abs(group.factors.augmented[row]) <= LARGEST).all():
             return f"expected finite numbers, at most {LARGEST:g} standard deviations"
     elif isinstance(group, StackedGroup):
         expected = [Vector(dim) if isinstance(dim, int | np.integer) else dim for dim in group.factors.dims]
@@ -171,6 +216,15 @@ def _misfit(group: FactorGroup, row: int, variables: Sequence[GraphVariable]) ->
         if lengths is not None and any(kind != Vector(lengths) for kind in types):
             return f"expected vectors of {lengths} entries, got {', '.join(map(str, types))}"
     return ""
+
+
+def _fits(factors: GaussianFactors, variables: Mapping[int, GraphVariable]) -> bool:
+    """Whether all variables of linear factors are vectors of the right dimensions, and all numbers finite."""
+    for column, dim in zip(factors.rows.T.tolist(), factors.dims, strict=True):
+        vector = Vector(dim)
+        if any((one := variables.get(key)) is None or one.type != vector for key in column):
+            return False
+    return bool((np.abs(factors.augmented) <= LARGEST).all())
 
 
 def _types(expected: Sequence[Any], got: Sequence[Any]) -> str:

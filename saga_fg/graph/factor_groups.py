@@ -7,16 +7,27 @@ differentiated numerically: GTSAM crashes where its function leaves out a Jacobi
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import cached_property
+from typing import Any, Protocol, Self
 
 import gtsam
 import numpy as np
 
-from factors import FactorError, Linearisable, ResidualFactor, ResidualFactors, nonlinear_graph, nonlinear_graph_at
+from factors import (
+    FactorError,
+    GaussianFactors,
+    Linearisable,
+    ResidualFactor,
+    ResidualFactors,
+    nonlinear_graph,
+    nonlinear_graph_at,
+)
 from factors.differences import central_differences
 from factors.gaussian import gaussian_graph, native_factor, whitened_factors
+from factors.validation import KeyArray
+from saga_fg.graph.errors import GraphError
 from saga_fg.graph.linearisation_point import LARGEST, LinearisationPoint
 from saga_fg.graph.variables import GraphVariable
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -54,37 +65,97 @@ def members(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
 
 
 @dataclass(frozen=True, eq=False)
-class LinearGroup:
-    """Linear factors on the variables themselves, which are vectors."""
+class WhitenedRows:
+    """Linear factors as arrays; dims: of the variables in `rows`; augmented: [A | b] (m, sum(dims) + 1) of each row.
 
-    factors: tuple[gtsam.JacobianFactor, ...]
+    Raises `GraphError` where they don't fit together, and for numbers that are not finite.
+    """
+
     rows: Rows
+    dims: Rows
+    augmented: tuple[FloatArray, ...]
     name: str = "linear factor"
     linear: bool = True
+
+    def __post_init__(self) -> None:
+        for keys, dims, augmented in zip(self.rows, self.dims, self.augmented, strict=True):
+            if len(set(keys)) != len(keys) or len(dims) != len(keys) or min(dims, default=0) < 1:
+                raise GraphError(f"{self.name}: expected distinct keys with their dimensions, got {keys} with {dims}")
+            if augmented.dtype != np.float64 or augmented.ndim != 2 or augmented.shape[1] != sum(dims) + 1:
+                raise GraphError(f"{self.name}: expected {sum(dims) + 1} columns, got shape {augmented.shape}")
+            if not (np.abs(augmented) <= LARGEST).all():
+                raise GraphError(f"{self.name}: expected finite numbers, at most {LARGEST:g} standard deviations")
+
+    @classmethod
+    def of(cls, factors: Sequence[gtsam.JacobianFactor], variables: Mapping[int, GraphVariable]) -> Self:
+        """The arrays of GTSAM's factors on some variables."""
+        rows = tuple(tuple(factor.keys()) for factor in factors)
+        dims = tuple(tuple(variables[key].dim for key in keys) for keys in rows)
+        return cls(rows, dims, tuple(factor.augmentedJacobian() for factor in factors))
+
+    def factor(self, row: int, augmented: FloatArray) -> gtsam.JacobianFactor:
+        """A row's factor, of other numbers."""
+        return native_factor(self.rows[row], self.dims[row], augmented)
+
+    @cached_property
+    def factors(self) -> tuple[gtsam.JacobianFactor, ...]:
+        """Every row as GTSAM's factor."""
+        return tuple(self.factor(row, np.asfortranarray(augmented)) for row, augmented in enumerate(self.augmented))
+
+
+@dataclass(frozen=True, eq=False)
+class LinearGroup(WhitenedRows):
+    """Linear factors on the variables themselves, which are vectors."""
 
     def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         result = []
         for row in chosen.tolist():
-            keys, augmented = self.rows[row], np.array(self.factors[row].augmentedJacobian(), order="F")
-            base = np.concatenate([point.base.atVector(key) for key in keys])
+            augmented = np.array(self.augmented[row], order="F")
+            base = np.concatenate([point.base.atVector(key) for key in self.rows[row]])
             augmented[:, -1] -= augmented[:, :-1] @ base
-            result.append(native_factor(keys, point.dims(keys), augmented))
+            result.append(self.factor(row, augmented))
         return result
 
     def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
-        keys = {key for row in chosen.tolist() for key in self.rows[row]}
-        dims = dict(zip(keys, point.dims(list(keys)), strict=True))
+        dims = {k: d for row in chosen.tolist() for k, d in zip(self.rows[row], self.dims[row], strict=True)}
         return members(nonlinear_graph([self.factors[row] for row in chosen.tolist()], dims))
 
 
 @dataclass(frozen=True, eq=False)
-class PriorGroup:
+class GaussianGroup:
+    """Linear factors of one shape on the variables themselves, which are vectors, as arrays."""
+
+    factors: GaussianFactors
+    name: str = "linear factor"
+    linear: bool = True
+
+    def __post_init__(self) -> None:
+        keys, dims, augmented = self.factors.rows, self.factors.dims, self.factors.augmented
+        shape = (len(keys), sum(dims) + 1)
+        if keys.shape != (len(keys), len(dims)) or augmented.shape[:2] != shape or augmented.dtype != np.float64:
+            raise GraphError(f"{self.name}: expected arrays of {shape}, got {keys.shape} and {augmented.shape}")
+
+    @cached_property
+    def rows(self) -> Rows:
+        return tuple(map(tuple, self.factors.rows.tolist()))
+
+    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
+        origins = np.zeros((len(self.rows), sum(self.factors.dims)))
+        for row in chosen.tolist():
+            origins[row] = np.concatenate([point.base_vector(key) for key in self.rows[row]])
+        return self.factors.native(origins, chosen.tolist())
+
+    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
+        keys = {key for row in chosen.tolist() for key in self.rows[row]}
+        dims = dict(zip(keys, point.dims(list(keys)), strict=True))
+        return members(nonlinear_graph(self.factors.native(chosen=chosen.tolist()), dims))
+
+
+@dataclass(frozen=True, eq=False)
+class PriorGroup(WhitenedRows):
     """Priors left by marginalised variables: linear factors on increments from the base."""
 
-    factors: tuple[gtsam.JacobianFactor, ...]
-    rows: Rows
     name: str = "marginal"
-    linear: bool = True
 
     def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         return [self.factors[row] for row in chosen.tolist()]
@@ -93,14 +164,13 @@ class PriorGroup:
         """Factors on increments from the linearisation point."""
         result = []
         for row in chosen.tolist():
-            keys, augmented = self.rows[row], np.array(self.factors[row].augmentedJacobian(), order="F")
+            keys, dims, augmented = self.rows[row], self.dims[row], np.array(self.augmented[row], order="F")
             augmented[:, -1] -= augmented[:, :-1] @ np.concatenate([point.increment(key) for key in keys])
-            dims = point.dims(keys)
-            for key, end in zip(keys, np.cumsum(dims).tolist(), strict=True):
-                columns, D = slice(end - point.variables[key].dim, end), point.transport(key)
+            for key, end, dim in zip(keys, np.cumsum(dims).tolist(), dims, strict=True):
+                columns, D = slice(end - dim, end), point.transport(key)
                 if D is not None:
                     augmented[:, columns] = augmented[:, columns] @ np.linalg.inv(D)
-            result.append(native_factor(keys, dims, augmented))
+            result.append(self.factor(row, augmented))
         return result
 
     def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
@@ -115,8 +185,11 @@ class StackedGroup:
     """Nonlinear factors of one shape, linearised together."""
 
     factors: ResidualFactors
-    rows: Rows
     linear: bool = False
+
+    @cached_property
+    def rows(self) -> Rows:
+        return tuple(map(tuple, self.factors.rows.tolist()))
 
     @property
     def name(self) -> str:
@@ -126,7 +199,7 @@ class StackedGroup:
         W, jacobians, residuals = self.factors.linearisation(point.values, chosen)
         keys, rhs, blocks = self.factors.rows[chosen], -residuals, []
         if point.base is point.values:
-            return whitened_factors(keys, W, jacobians, rhs)
+            return whitened_factors(keys, W, jacobians, rhs).native()
         states, origins = self.factors.states(point.values, chosen), self.factors.states(point.base, chosen)
         for k, J in enumerate(jacobians):
             column = keys[:, k].tolist()
@@ -141,7 +214,7 @@ class StackedGroup:
         largest = np.abs(W).max(initial=0.0) * max(np.abs(numbers).max(initial=0.0) for numbers in (rhs, *blocks))
         if not largest <= LARGEST:
             raise FactorError(f"expected a residual and Jacobians of at most {LARGEST:g} standard deviations")
-        return whitened_factors(keys, W, blocks, rhs)
+        return whitened_factors(keys, W, blocks, rhs).native()
 
     def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
         return float(self.factors.errors(point.values, chosen).sum())
@@ -294,14 +367,22 @@ class HeldGroup:
         """Numbers of the active rows."""
         return np.flatnonzero(self.active)
 
-    @property
-    def elimination_order(self) -> tuple[bool, int]:
+    @cached_property
+    def ties(self) -> KeyArray:
+        """(p, 2) the first key of each active row, with each of its keys."""
+        rows = (self.factors.rows[row] for row in self.rows.tolist())
+        return np.array([(keys[0], key) for keys in rows for key in keys], dtype=np.uint64).reshape(-1, 2)
+
+    @cached_property
+    def elimination_order(self) -> tuple[bool, bool, float]:
         """Sort key for elimination: groups that are likely to have the least noise come first.
 
         Householder's QR loses digits of rows of small numbers where rows of large ones come after them: with intervals
         of a millisecond, whose interactions have next to no noise, three to five digits.
         """
-        return isinstance(self.factors, PriorGroup), -max(map(len, self.factors.rows))
+        group, most = self.factors, max(map(len, self.factors.rows))
+        sharpest = float(np.abs(group.factors.augmented[:, :-1]).max()) if isinstance(group, GaussianGroup) else most
+        return isinstance(group, PriorGroup), most == 1, -sharpest
 
 
 def first_residual(group: FactorGroup) -> ResidualFactor | None:

@@ -23,13 +23,13 @@ class FactorIndex:
         self._named: dict[tuple[str, Hashable], tuple[int, ...]] = {}  # by provider and name
         self._touching: dict[int, tuple[int, ...]] = {}  # groups with a factor on a variable, now or before
         self._factor_counts: dict[int, int] = {}  # number of factors on each variable
-        self._count = 0
+        self.count = 0  # of groups that have been
 
     def copy(self) -> FactorIndex:
         """An index of its own with the same groups, which are shared."""
         other = FactorIndex()
         other.__dict__ |= {name: dict(held) for name, held in vars(self).items() if isinstance(held, dict)}
-        other._count = self._count
+        other.count = self.count
         return other
 
     def add_variables(self, keys: Iterable[int]) -> None:
@@ -44,14 +44,18 @@ class FactorIndex:
 
     def add(self, held: HeldGroup) -> int:
         """Add a group; returns its number."""
-        number, self._count = self._count, self._count + 1
-        self.groups[number] = held
+        self.put(self.count, held)
+        return self.count - 1
+
+    def put(self, number: int, held: HeldGroup) -> None:
+        """Add a group under a number above all others."""
+        self.groups[number], self.count = held, number + 1
         for key in {key for row in held.factors.rows for key in row}:
-            self._touching[key] += (number,)
+            if key in self._touching:
+                self._touching[key] += (number,)
         self._count_rows(held.factors, held.rows.tolist(), 1)
         if held.name is not None:
             self._named[held.provider, held.name] = (*self.named(held.provider, held.name), number)
-        return number
 
     def remove(self, number: int) -> None:
         """Remove a group."""
@@ -93,7 +97,7 @@ class FactorIndex:
         """Rows of groups on any of some variables, by the number of the group, the sharpest first."""
         numbers = {number for key in keys for number in self._touching[key]}
         result = {}
-        for number in sorted(numbers, key=lambda number: self.groups[number].elimination_order):
+        for number in sorted(sorted(numbers), key=lambda number: self.groups[number].elimination_order):
             held = self.groups[number]
             mine = [row for row in held.rows.tolist() if any(key in keys for key in held.factors.rows[row])]
             if mine:

@@ -54,6 +54,8 @@ class KeyId:
 
 def key_of(kind: VariableKind, id: int, epoch: int | None) -> int:  # noqa: A002 -- GTSAM and the tables call it id
     """Return the key. Raises `GraphError` for an id or epoch that is no whole number from 0 to `LARGEST`."""
+    if type(id) is int and type(epoch) is int and 0 <= id <= LARGEST and 0 <= epoch <= LARGEST:
+        return ord(kind.letter) << 2 * _BITS | id << _BITS | epoch
     for name, number in (("id", id), ("epoch", 0 if epoch is None else epoch)):
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 0 <= number <= LARGEST:
             raise GraphError(f"{kind.name}: expected {name} to be a whole number from 0 to {LARGEST}, got {number!r}")

@@ -29,7 +29,14 @@ class LinearisationPoint:
 
     def __init__(self, variables: Mapping[int, GraphVariable], base: gtsam.Values, values: gtsam.Values) -> None:
         self.variables, self.base, self.values = variables, base, values
+        self._vectors: dict[int, FloatArray] = {}
         self._transports: dict[int, FloatArray | None] = {}
+
+    def base_vector(self, key: int) -> FloatArray:
+        """The base (d,) of a vector."""
+        if key not in self._vectors:
+            self._vectors[key] = self.base.atVector(key)
+        return self._vectors[key]
 
     def increment(self, key: int) -> FloatArray:
         """The increment (d,) of a variable from its base."""

@@ -16,7 +16,7 @@ it is asked when an epoch begins, while the variables of the epoch before are st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -24,7 +24,7 @@ import gtsam
 import numpy as np
 
 from saga_fg.graph.errors import GraphError, ProviderError
-from saga_fg.graph.factor_checks import Factor
+from saga_fg.graph.factor_checks import Factor, mentioned_keys
 from saga_fg.graph.keys import VariableKind, key_of
 from saga_fg.graph.messages import with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -59,6 +59,26 @@ class FactorProvider(Protocol):
         """Return the additions of this epoch."""
 
 
+class OtherVariables(Protocol):
+    """Variables that a back end holds apart from the graph, until a provider's factor is on them."""
+
+    @property
+    def variables(self) -> Mapping[int, GraphVariable]:
+        """All of them by key."""
+
+    def of(self, kind: VariableKind, epoch: int) -> dict[int, GraphVariable]:
+        """Those of a kind and an epoch, by id."""
+
+    def state(self, key: int) -> Any:
+        """Value of one of them."""
+
+    def covariance(self, key: int) -> FloatArray:
+        """Its marginal covariance (d, d)."""
+
+    def add_to(self, graph: SceneFactorGraph, keys: Collection[int]) -> None:
+        """Put those among `keys` into the graph, with their factors."""
+
+
 class GraphView:
     """The graph at the present epoch, to read.
 
@@ -73,8 +93,10 @@ class GraphView:
         covariance: Callable[[int], FloatArray],
         origin: FloatArray,
         frame: Frame | None = None,
+        others: OtherVariables | None = None,
     ) -> None:
         self._graph, self._covariance, self.origin, self.frame = graph, covariance, origin.copy(), frame
+        self._others = others
         self.origin.setflags(write=False)
 
     @property
@@ -95,15 +117,15 @@ class GraphView:
     @property
     def variables(self) -> Mapping[int, GraphVariable]:
         """All variables by key."""
-        return self._graph.variables
+        return self._graph.variables if self._others is None else {**self._others.variables, **self._graph.variables}
 
     def now(self, kind: VariableKind) -> dict[int, GraphVariable]:
         """The variables of a kind at this epoch, by id."""
-        return self._graph.of(kind, self.epoch)
+        return self._of(kind, self.epoch)
 
     def before(self, kind: VariableKind) -> dict[int, GraphVariable]:
         """The variables of a kind at the epoch before, by id."""
-        return self._graph.of(kind, self.epoch - 1)
+        return self._of(kind, self.epoch - 1)
 
     def static(self, kind: VariableKind) -> dict[int, GraphVariable]:
         """The variables of a kind for all time, by id."""
@@ -116,12 +138,27 @@ class GraphView:
 
     def state(self, key: int) -> Any:
         """Value of a variable."""
-        return self._graph.state(key)
+        return (
+            self._graph.state(key) if self._others is None or key in self._graph.variables else self._others.state(key)
+        )
 
     def covariance(self, key: int) -> FloatArray:
         """Marginal covariance (d, d) of a variable, as known before this frame."""
+        if self._others is not None and key not in self._graph.variables:
+            return self._others.covariance(key)
         self._graph.variable(key)
         return self._covariance(key)
+
+    def take_in(self, keys: Collection[int]) -> None:
+        """Have those variables in the graph that a back end holds apart from it; a provider's factors are on `keys`."""
+        if self._others is not None and (apart := set(keys) - self._graph.variables.keys()):
+            self._others.add_to(self._graph, apart)
+
+    def _of(self, kind: VariableKind, epoch: int) -> dict[int, GraphVariable]:
+        mine = self._graph.of(kind, epoch)
+        if self._others is not None:
+            mine |= self._others.of(kind, epoch)
+        return dict(sorted(mine.items()))
 
 
 def ask_all(providers: Iterable[FactorProvider], graph: SceneFactorGraph, frame: Frame | None = None) -> None:
@@ -176,12 +213,20 @@ def _ask(name: str, provider: FactorProvider, graph: SceneFactorGraph, view: Gra
     if not isinstance(additions, Additions):
         raise GraphError(f"provider {name}: expected Additions, got {type(additions).__name__}")
     _checked(name, "variables", additions.variables)
+    known = [one for one in additions.variables if isinstance(one, NewVariable) and isinstance(one.kind, VariableKind)]
+    view.take_in([key_of(one.kind, one.id, None if one.static else view.epoch) for one in known])
     graph.add_variables(name, additions.variables)
-    graph.add_factors(name, additions.factors)
+    _add(name, additions.factors, None, graph, view)
     if not isinstance(additions.named, Mapping):
         raise GraphError(f"provider {name}: named: expected factors by name, got {type(additions.named).__name__}")
     for key, factors in additions.named.items():
-        graph.add_factors(name, factors, key)
+        _add(name, factors, key, graph, view)
+
+
+def _add(provider: str, factors: Any, name: Hashable, graph: SceneFactorGraph, view: GraphView) -> None:
+    given = list(factors) if isinstance(factors, Iterator) else factors
+    view.take_in(mentioned_keys(given))
+    graph.add_factors(provider, given, name)
 
 
 def _name(provider: Any) -> str:

@@ -15,29 +15,41 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, get_args
 
 import gtsam
 import numpy as np
 
-from factors import FactorError, Solution, SolverSettings, marginal_factors, solve
+from factors import FactorError, Solution, SolverSettings, Vector, marginal_factors, solve
 from factors.marginal import Elimination
+from saga_fg.errors import require_type
 from saga_fg.graph.condensation import Condensation
 from saga_fg.graph.errors import GraphError
-from saga_fg.graph.factor_checks import Factor, check_angles, grouped
-from saga_fg.graph.factor_groups import ActiveRows, FactorEntry, HeldGroup, LinearGroup, NativeGroup, PriorGroup
+from saga_fg.graph.factor_checks import Factor, check_angles, check_variables, grouped
+from saga_fg.graph.factor_groups import (
+    ActiveRows,
+    FactorEntry,
+    GaussianGroup,
+    HeldGroup,
+    LinearGroup,
+    NativeGroup,
+    PriorGroup,
+    StackedGroup,
+)
 from saga_fg.graph.factor_index import FactorIndex
 from saga_fg.graph.keys import VariableKind, described, key_of
 from saga_fg.graph.linearisation_point import LinearisationPoint
 from saga_fg.graph.messages import factor_error, solver_error
 from saga_fg.graph.variables import GraphVariable, NewVariable, insert_state, variable_type
-from saga_fg.numerics.arrays import IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _MARGINALS = "marginals"
+_RECORDED = (LinearGroup, PriorGroup, GaussianGroup, StackedGroup)  # groups that are values
 _FEW = 5  # factors of a kind whose angles are checked: a measured angle of 0 tells nothing
-_WIDE = 64  # dimensions that hang together, from which QR takes many times as long as Cholesky
+WIDE = 256  # dimensions that hang together, from which Cholesky, with half the digits, takes half as long as QR
 
 
 class SceneFactorGraph:
@@ -49,10 +61,13 @@ class SceneFactorGraph:
     def __init__(self, elimination: Elimination = "qr") -> None:
         self._variables: dict[int, GraphVariable] = {}
         self._base, self._values = gtsam.Values(), gtsam.Values()
+        self._shared = False  # with a copy, until one of them changes
         self._index = FactorIndex()
         self.elimination: Elimination = elimination
         self._angles_checked: dict[tuple[str, str], int] = {}
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
+        self.births: dict[int, int] = {}  # when each variable was added: one that comes back is another
+        self._added = 0
         self._newest: tuple[int, ...] = ()
         self.carried_over: Mapping[int, int] = {}  # variables of earlier epochs that are those of this one, too
 
@@ -104,12 +119,19 @@ class SceneFactorGraph:
         return self.epoch
 
     @property
+    def static(self) -> list[int]:
+        """Keys of the variables for all time."""
+        return [key for key, one in self._variables.items() if one.epoch is None]
+
+    @property
     def newest(self) -> list[int]:
         """Keys of the variables of this epoch."""
         return [key for key in self._newest if key in self._variables]
 
-    def add_variables(self, provider: str, variables: Iterable[NewVariable]) -> list[int]:
-        """Add variables, of the present epoch where they are not static; returns their keys."""
+    def add_variables(
+        self, provider: str, variables: Iterable[NewVariable], when: tuple[int, float] | None = None
+    ) -> list[int]:
+        """Add variables, of the present epoch or `when` (number, s) where they are not static; returns their keys."""
         added: dict[int, GraphVariable] = {}
         values = gtsam.Values()
         for new in variables:
@@ -119,7 +141,7 @@ class SceneFactorGraph:
                 raise GraphError(f"provider {provider}: expected an epoch before variables: advance(time)")
             if not isinstance(new.kind, VariableKind):
                 raise GraphError(f"provider {provider}: expected a VariableKind, got {type(new.kind).__name__}")
-            epoch, time = (None, None) if new.static else (self.epoch, self.time)
+            epoch, time = (None, None) if new.static else when or (self.epoch, self.time)
             key = key_of(new.kind, new.id, epoch)
             kind = new.type or variable_type(f"provider {provider}: {new.kind.name} {new.id}", new.state)
             variable = GraphVariable(key, new.kind, int(new.id), epoch, time, kind, new.label or new.kind.name)
@@ -133,7 +155,10 @@ class SceneFactorGraph:
                 raise GraphError(f"provider {provider}: {error}") from error
             added[key] = variable
         self._variables |= added
-        self._newest += tuple(key for key, one in added.items() if one.epoch is not None)
+        self._added += 1
+        self.births |= dict.fromkeys(added, self._added)
+        self._newest += tuple(key for key, one in added.items() if one.epoch == self.epoch)
+        self._separate()
         self._values.insert(values)
         self._base.insert(values)
         self._index.add_variables(added)
@@ -181,30 +206,63 @@ class SceneFactorGraph:
             self._replace(rows, [], leaving)
             self.add_factors(into.name, made, into.name)
             return
-        factors = self._eliminated(touched, sorted(leaving.keys() & involved), self.elimination)
-        self._replace(rows, factors, leaving)
+        self.replace_rows(rows, self._eliminated(touched, sorted(leaving.keys() & involved), self.elimination), leaving)
+
+    def drop(self, keys: Set[int]) -> None:
+        """Take out variables with all factors on them, which are on no others: whole components."""
+        self._replace(self._index.rows_on(keys), [], keys)
+
+    def rows_on(self, keys: Collection[int]) -> dict[int, list[int]]:
+        """Rows of groups on any of some variables, by the number of the group, the sharpest first."""
+        return self._index.rows_on(keys)
+
+    def replace_rows(
+        self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
+    ) -> int | None:
+        """Put priors, on increments from the base, in place of rows of groups and of the variables `leaving`.
+
+        They are all rows on these. Returns the number of the priors' group.
+        """
+        number = self._replace(rows, factors, leaving)
         if factors:
             self._choose(max(factor.cols() - 1 for factor in factors))
+        return number
 
     def replace_by_prior(self, leaving: Collection[int], prior: gtsam.JacobianFactor) -> None:
         """Put a prior, on increments from the base, in place of all factors on its variables and those `leaving`."""
-        self._replace(self._index.rows_on({*leaving, *prior.keys()}), [prior], leaving)
-        self._choose(prior.cols() - 1)
+        self.replace_rows(self._index.rows_on({*leaving, *prior.keys()}), [prior], leaving)
 
     def _replace(
         self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
-    ) -> None:
+    ) -> int | None:
         """Take rows of groups out and put priors in, then take out the variables without any factor left."""
+        added = None
         for number, mine in rows.items():
             self._index.deactivate(number, mine)
         if factors:
-            prior = PriorGroup(tuple(factors), tuple(tuple(factor.keys()) for factor in factors))
-            self._index.add(HeldGroup(_MARGINALS, None, prior, np.ones(len(factors), dtype=bool)))
+            prior = PriorGroup.of(factors, self._variables)
+            added = self._index.add(HeldGroup(_MARGINALS, None, prior, np.ones(len(factors), dtype=bool)))
+        self._separate()
         for key in leaving:
-            del self._variables[key]
+            del self._variables[key], self.births[key]
             self._index.remove_variable(key)
             self._values.erase(key)
             self._base.erase(key)
+        return added
+
+    def names(self, provider: str) -> list[Hashable]:
+        """The names under which a provider has factors in the graph."""
+        held = (one for one in self._index.groups.values() if one.provider == provider and one.name is not None)
+        return list(dict.fromkeys(one.name for one in held))
+
+    def independent(self, keys: Set[int]) -> bool:
+        """Whether linear factors alone are on some variables, and none of them on others as well, but for priors."""
+        for number, mine in self._index.rows_on(keys).items():
+            group = self._index.groups[number].factors
+            shared = not isinstance(group, PriorGroup) and any(not keys >= set(group.rows[row]) for row in mine)
+            if shared or not group.linear:
+                return False
+        return True
 
     def touching(self, key: int) -> tuple[int, ...]:
         """Numbers of the groups with a factor on a variable, now or before."""
@@ -261,7 +319,7 @@ class SceneFactorGraph:
         """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
         for held in sorted(self._index.groups.values(), key=lambda held: held.elimination_order):
-            if isinstance(held.factors, LinearGroup | NativeGroup):
+            if isinstance(held.factors, GaussianGroup | LinearGroup | NativeGroup):
                 for factor in held.factors.native(held.rows, point):
                     native.add(factor)
             else:
@@ -283,14 +341,21 @@ class SceneFactorGraph:
         one of the two can go on, this one with `erase_unknown_values`
         """
         other = SceneFactorGraph()
+        if share_values:
+            self._separate()  # from a third
+        self._shared = not share_values
         other.__dict__ |= self.__dict__
-        other._variables, other._index = dict(self._variables), self._index.copy()
-        if not share_values:
-            other._base, other._values = self.base, self.values
+        other._variables, other._index, other.births = dict(self._variables), self._index.copy(), dict(self.births)
         return other
+
+    def _separate(self) -> None:
+        """Go on with values of its own."""
+        if self._shared:
+            self._base, self._values, self._shared = self.base, self.values, False
 
     def erase_unknown_values(self) -> None:
         """Erase values of variables that are not in the graph."""
+        self._separate()
         for values in (self._base, self._values):
             for key in set(values.keys()) - self._variables.keys():
                 values.erase(key)
@@ -309,12 +374,86 @@ class SceneFactorGraph:
 
     def _choose(self, widest: int) -> None:
         """QR where what is left of marginalised variables is on few dimensions together, else Cholesky."""
-        if widest > _WIDE:
+        if widest > WIDE:
             self.elimination = "cholesky"
-        elif widest < _WIDE // 2:
+        elif widest < WIDE // 2:
             self.elimination = "qr"
 
 
 def _jacobians(graph: gtsam.GaussianFactorGraph) -> list[gtsam.JacobianFactor]:
     every = [graph.at(i) for i in range(graph.size()) if graph.at(i).size()]
     return [one if isinstance(one, gtsam.JacobianFactor) else gtsam.JacobianFactor(one) for one in every]
+
+
+@dataclass(frozen=True, eq=False)
+class GraphRecord:
+    """A graph of vectors as plain values, which a file can hold: what it takes to go on from there.
+
+    base, values: of the variables, in their order; groups: by number, of which `count` have been; births: when each
+    variable was added, of `additions`
+    """
+
+    elimination: Elimination
+    epoch: int
+    time: float
+    previous_time: float
+    variables: tuple[GraphVariable, ...]
+    base: tuple[FloatArray, ...]
+    values: tuple[FloatArray, ...]
+    births: tuple[int, ...]
+    additions: int
+    groups: Mapping[int, HeldGroup]
+    count: int
+    newest: tuple[int, ...]
+    carried_over: Mapping[int, int]
+
+    @staticmethod
+    def of(graph: SceneFactorGraph) -> GraphRecord:
+        """The record of a graph. Raises `GraphError` for poses and for factors that are more than arrays."""
+        variables, point, groups = tuple(graph.variables.values()), graph.point(), dict(graph.groups)
+        for one in variables:
+            if not isinstance(one.type, Vector):
+                raise GraphError(f"{one}: expected a vector: poses can't be written to a file")
+        for held in groups.values():
+            if not isinstance(held.factors, _RECORDED):
+                raise GraphError(f"provider {held.provider}: {held.factors.name}: it can't be written to a file")
+        return GraphRecord(
+            graph.elimination,
+            graph.epoch,
+            graph.time,
+            graph.previous_time,
+            variables,
+            tuple(one.type.read(point.base, one.key) for one in variables),
+            tuple(one.type.read(point.values, one.key) for one in variables),
+            tuple(graph.births[one.key] for one in variables),
+            graph._added,
+            groups,
+            graph._index.count,
+            graph._newest,
+            graph.carried_over,
+        )
+
+    def restored(self) -> SceneFactorGraph:
+        """The graph. Raises `GraphError` where the parts don't fit together."""
+        if self.elimination not in get_args(Elimination):
+            raise GraphError(f"elimination: expected one of {get_args(Elimination)}, got {self.elimination!r}")
+        graph = SceneFactorGraph(self.elimination)
+        for one, base, value, born in zip(self.variables, self.base, self.values, self.births, strict=True):
+            if one.key != key_of(one.kind, one.id, one.epoch) or one.key in graph._variables:
+                raise GraphError(f"{one}: expected a key of its own, of its kind, id and epoch")
+            if not isinstance(one.type, Vector):
+                raise GraphError(f"{one}: expected a vector, got {one.type}")
+            insert_state(graph._base, one, base)
+            insert_state(graph._values, one, value)
+            graph._variables[one.key], graph.births[one.key] = one, born
+        graph._index.add_variables(graph._variables)
+        for number, held in sorted(self.groups.items()):
+            require_type("group", held, HeldGroup)
+            if not isinstance(held.factors, _RECORDED) or len(held.active) != len(held.factors.rows):
+                raise GraphError(f"factors of {held.provider}: expected arrays, one truth value a row")
+            check_variables(held.provider, held.factors, held.rows.tolist(), graph._variables)
+            graph._index.put(number, held)
+        graph._index.count = max(self.count, graph._index.count)
+        graph.epoch, graph.time, graph.previous_time = self.epoch, self.time, self.previous_time
+        graph._added, graph._newest, graph.carried_over = self.additions, tuple(self.newest), dict(self.carried_over)
+        return graph

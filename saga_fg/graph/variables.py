@@ -86,6 +86,9 @@ def insert_state(values: gtsam.Values, variable: GraphVariable, state: Any) -> N
             state = np.array(state, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise GraphError(f"{variable}: expected numbers as its state, got {state!r}") from error
+        if state.shape == (variable.dim,) and np.isfinite(state).all():
+            values.insert(variable.key, state)
+            return
     alone = gtsam.Values()
     try:
         numbers = variable.type.array(state)

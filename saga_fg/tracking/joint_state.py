@@ -13,7 +13,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from saga_fg.estimators import FixedLagSmoother, GraphFilter, IncrementalFilter, JointKalmanFilter, Measurements
+from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
 from saga_fg.model.discretisation import discretise, own_motion
 from saga_fg.model.edge_rules import EdgeRule
@@ -31,7 +31,7 @@ from saga_fg.types.frame import Frame
 
 _UNKNOWN_POSITION = 1e5  # standard deviation, m
 
-TrackEstimator = JointKalmanFilter | IncrementalFilter | FixedLagSmoother | GraphFilter
+TrackEstimator = JointKalmanFilter | GraphFilter
 
 
 def new_estimator(
@@ -40,9 +40,7 @@ def new_estimator(
     """A fresh estimator; with `providers`, or nonlinear motion, iSAM2 and the smoother are a running graph."""
     if (name := settings.estimator) == "kalman":
         return JointKalmanFilter(providers, settings.tolerance, settings.max_component)
-    if providers or settings.nonlinear(tuple(rules)):
-        return GraphFilter(providers, settings.lag if name == "fixed-lag" else 0.0, relinearised=True)
-    return FixedLagSmoother(settings.lag) if name == "fixed-lag" else IncrementalFilter()
+    return GraphFilter(providers, settings.lag if name == "fixed-lag" else 0.0, likelihoods=False)
 
 
 class JointTrackState:
@@ -202,9 +200,7 @@ class JointTrackState:
 
     def pose(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
-        if isinstance(self.estimator, JointKalmanFilter):
-            return _local_pose(self.estimator.auxiliary)
-        return _local_pose(self.estimator.graph()) if isinstance(self.estimator, GraphFilter) else None
+        return _local_pose(self.estimator.auxiliary)
 
     def kinematics(self, ids: IntArray, label: StrArray) -> Kinematics:
         """The estimates of all tracks; `ids` must be in the order of the last call until the state changes."""
@@ -242,12 +238,15 @@ class JointTrackState:
     @property
     def window(self) -> float:
         """Age up to which a late measurement is put at its own time, s; 0 where it is moved to the present."""
-        return self.estimator.lag if isinstance(self.estimator, FixedLagSmoother) else 0.0
+        return self.estimator.lag if isinstance(self.estimator, GraphFilter) else 0.0
 
-    def copied(self) -> JointTrackState:
-        """Return a state that changes independently of this one."""
+    def copied(self, taking_over: bool = False) -> JointTrackState:
+        """Return a state that changes independently of this one.
+
+        taking_over: it goes on with the solver that this one has, and this one is rarely needed again
+        """
         twin = shallow_copy(self)
-        twin.estimator = copy.copy(self.estimator)
+        twin.estimator = self.estimator.handed_over() if taking_over else copy.copy(self.estimator)
         twin._initiated, twin._modes = dict(self._initiated), dict(self._modes)
         return twin
 
@@ -268,10 +267,10 @@ class JointTrackState:
         if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
             self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
             R = np.broadcast_to(np.eye(node_type.dim), H.shape)
-        if delay > 0 and isinstance(estimator, FixedLagSmoother):
+        if delay > 0 and isinstance(estimator, GraphFilter) and estimator.lag > 0:
             then = estimator.time - delay
             known = [self._initiated[track] <= then for track in ids.tolist()]
-            there = np.array(known, dtype=np.bool_) & (then >= estimator.start)
+            there = np.array(known, dtype=np.bool_) & estimator.remembered(ids, then)
             if there.any():
                 estimator.update(Measurements.unchecked(ids[there], z[there], H[there], R[there]), time=then)
             ids, z, H, R = ids[~there], z[~there], H[~there], R[~there]
@@ -281,12 +280,7 @@ class JointTrackState:
 
     def _take_in(self, kinds: Sequence[Measurements]) -> None:
         """Correct the estimator, once if it takes several kinds together."""
-        estimator = self._estimator_to_change()
-        if isinstance(estimator, IncrementalFilter | GraphFilter):
-            estimator.update(*kinds)
-        else:
-            for measurements in kinds:
-                estimator.update(measurements)
+        self._estimator_to_change().update(kinds)
 
     def _anchor_modes(self) -> None:
         estimator = self.estimator

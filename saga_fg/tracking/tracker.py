@@ -117,7 +117,7 @@ class Tracker:
         a provider are raised every time.
         """
         require_type("frame", frame, Frame)
-        state = self._state.copied()
+        state = self._state.copied(taking_over=True)
         try:
             reported = self._step(state, frame)
         except BaseException as error:

@@ -189,10 +189,10 @@ class TrackerState:
             self.joint.remove(self.table.id[deleted], kept)
             self.table = self.table.select(kept)
 
-    def copied(self) -> TrackerState:
+    def copied(self, taking_over: bool = False) -> TrackerState:
         """Return a state that changes independently of this one."""
         twin = shallow_copy(self)
-        twin.joint = self.joint.copied()
+        twin.joint = self.joint.copied(taking_over)
         twin._part_from_others()
         return twin
 

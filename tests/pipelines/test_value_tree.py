@@ -8,15 +8,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from factors import PlanarPose, RangeBearing, Robust
 from pipelines.config import load_config
 from pipelines.serving.value_tree import TreeWriter, read_tree
-from saga_fg import Detection, Detections, Frame, InputError
-from saga_fg.model.motion import ConstantVelocity
+from saga_fg import Detection, Detections, Frame, InputError, SceneGraph
+from saga_fg.estimators import GraphFilter, Measurements, Observations
+from saga_fg.graph import OBJECT, GraphError, NewVariable, SceneFactorGraph
+from saga_fg.graph.scene_factor_graph import GraphRecord
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.motion import ConstantVelocity, NodeType
+from saga_fg.model.nonlinear_interactions import SocialForce
+from saga_fg.model.scene_graph import NonlinearEdges
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.speed_prior import SpeedPrior
 
@@ -119,6 +127,9 @@ def test_objects_are_made_again_by_their_constructors():
         [{"array": ["<f8", [1000000000], "C", True, 0]}],
         [{"array": ["<f8", [-1], "C", True, 0]}],
         [{"array": ["<f8", [1], "C", True, -8]}],
+        [1, {"graph": 0}],
+        [1, {"method": [0, "residual"]}],
+        [{"object": ["saga_fg.tracking.settings", "TrackerSettings"], "parts": {}}, {"method": [0, "__init__"]}],
     ],
 )
 def test_what_no_writer_writes_is_refused(nodes: list[Any]):
@@ -134,8 +145,8 @@ def test_what_cannot_be_written_is_refused():
             TreeWriter(value)
 
 
-def frame(k: int) -> Frame:
-    rng = np.random.default_rng(k)
+def frame(k: float) -> Frame:
+    rng = np.random.default_rng(int(2 * k))
     places = np.array([[8.0 * k / 10 + 12 * i, 3.0 * i, 0.0] for i in range(4)]) + rng.normal(0, 0.2, (4, 3))
     return Frame(k / 10, "lidar", Detections.of([Detection("car", (x, y, z)) for x, y, z in places.tolist()]))
 
@@ -149,8 +160,72 @@ def test_a_tracker_goes_on_from_its_written_snapshot_to_the_last_bit(method: Any
     for k in range(12):
         first.step(frame(k))
     second.restore(again(first.snapshot()))
-    for k in range(12, 20):
+    for k in (12, 13, 11.5, 14, 15, 16):  # one of them late
         one, other = first.step(frame(k)), second.step(frame(k))
         np.testing.assert_array_equal(one.id, other.id)
         np.testing.assert_array_equal(one.boxes.position, other.boxes.position)
         np.testing.assert_array_equal(one.position_covariance, other.position_covariance)
+
+
+CAR = NodeType("car", ConstantVelocity(0.5))
+NODES = [1, 2, 3]
+
+
+def drive(estimator: GraphFilter, seeds: range) -> GraphFilter:
+    """Two cars that avoid each other, one who is alone; robust, nonlinear and late measurements."""
+    away = NonlinearEdges(SocialForce(), [0, 1], [1, 0], np.ones(2), np.zeros((2, 1, 4)))
+    graph = SceneGraph(np.array(NODES), (CAR,) * 3, nonlinear=(away,))
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        estimator.predict(discretise(graph, 0.2))
+        z = estimator.mean(NODES)[:, :2] + rng.normal(0, 0.1, (3, 2))
+        estimator.update(Measurements(NODES, z, np.eye(2, 4), 0.01 * np.eye(2)), robust=Robust("huber", 1.0))
+        radar = RangeBearing(4, sensor_pose=(20.0, 0.0, 0.0))
+        estimator.update(Observations([3], radar.predict(estimator.mean([3])), radar, 0.01 * np.eye(2)))
+        late = estimator.time - (0.1 if estimator.lag else 0.0)
+        estimator.update(Measurements([1], z[:1], np.eye(2, 4), np.eye(2)), time=late)
+    return estimator
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.5])
+def test_a_running_graph_goes_on_from_its_written_state(lag: float):
+    first, second = (GraphFilter(lag=lag) for _ in range(2))
+    first.add(NODES, [[0, 0, 1, 0], [2, 0.1, -1, 0], [9, 9, 0, 0]], np.stack([np.eye(4)] * 3))
+    second.restore(again(drive(first, range(4)).snapshot()))
+    for estimator in (first, second):
+        drive(estimator, range(4, 8))
+    np.testing.assert_array_equal(first.joint_mean(NODES), second.joint_mean(NODES))
+    np.testing.assert_array_equal(first.joint_covariance(NODES), second.joint_covariance(NODES))
+
+
+def record() -> GraphRecord:
+    estimator = GraphFilter()
+    estimator.add(NODES, np.zeros((3, 4)), np.stack([np.eye(4)] * 3))
+    return GraphRecord.of(estimator.graph())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"elimination": "lu"}, "elimination"),
+        ({"values": (np.zeros(3), *record().values[1:])}, "expected a state"),
+        ({"values": (np.full(4, np.nan), *record().values[1:])}, "finite"),
+        ({"variables": (record().variables[0],) * 3}, "a key of its own"),
+        ({"variables": (replace(record().variables[0], id=7), *record().variables[1:])}, "a key of its own"),
+        ({"variables": (replace(record().variables[0], type=PlanarPose()), *record().variables[1:])}, "vector"),
+        ({"groups": {0: replace(record().groups[0], active=np.ones(2, dtype=bool))}}, "one truth value a row"),
+        ({"variables": (), "base": (), "values": (), "births": ()}, "never added"),
+    ],
+)
+def test_a_graph_whose_parts_do_not_fit_is_refused(change: dict[str, Any], message: str):
+    with pytest.raises(GraphError, match=message):
+        replace(record(), **change).restored()
+
+
+def test_factors_that_are_more_than_arrays_are_refused_by_name():
+    graph = SceneFactorGraph()
+    graph.advance(0.0)
+    (key,) = graph.add_variables("start", [NewVariable(OBJECT, 1, np.zeros(2))])
+    graph.add_factors("start", [gtsam.PriorFactorVector(key, np.zeros(2), gtsam.noiseModel.Unit.Create(2))])
+    with pytest.raises(GraphError, match="provider start: PriorFactorVector: it can't be written to a file"):
+        TreeWriter(graph)

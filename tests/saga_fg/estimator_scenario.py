@@ -16,6 +16,7 @@ from saga_fg.model.discretisation import discretise
 from tests.saga_fg.random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 EXACT = 1e-9  # standard deviations of means, relative difference of covariances
+INTERVALS = (0.05, 0.1, 0.31, 0.7)  # s
 
 
 def random_covariance(rng, count, dim, scale=1.0):
@@ -38,8 +39,13 @@ class Scenario:
     types: dict = field(default_factory=dict)
 
 
-def random_scenario(rng, frames=8, kinds=(CAR, BUS, TRAM, CONE), late=0.0, density=0.3, first=4):
-    """At most a dozen nodes over `frames` intervals; `late`: share of measurements that are of an earlier time."""
+def random_scenario(
+    rng, frames=8, kinds=(CAR, BUS, TRAM, CONE), late=0.0, density=0.3, first=4, intervals=INTERVALS, grid=0.0
+):
+    """At most a dozen nodes over `frames` intervals; `late`: share of measurements that are of an earlier time.
+
+    grid: those are multiples of it, s; 0: any
+    """
     scenario = Scenario()
     present, next_id, now = [], 100, 0.0
 
@@ -63,6 +69,7 @@ def random_scenario(rng, frames=8, kinds=(CAR, BUS, TRAM, CONE), late=0.0, densi
                     continue
                 measured = random_measurements(rng, seen, dim, rows=1 + sensor)
                 time = now - rng.uniform(0, 0.4) if now > 0.5 and rng.random() < late else None
+                time = grid * round(time / grid) if grid and time is not None else time
                 scenario.calls.append(("update", measured, time))
         if len(present) > 2 and rng.random() < 0.4:
             gone = present.pop(rng.integers(len(present)))
@@ -71,7 +78,7 @@ def random_scenario(rng, frames=8, kinds=(CAR, BUS, TRAM, CONE), late=0.0, densi
             bear(1 + rng.integers(2))
         order = rng.permutation(present)
         graph = random_graph(rng, tuple(scenario.types[i] for i in order), ids=order, density=density)
-        dt = float(rng.choice([0.05, 0.1, 0.31, 0.7]))
+        dt = float(rng.choice(intervals))
         scenario.calls.append(("predict", discretise(graph, dt)))
         now += dt
     return scenario
@@ -116,6 +123,10 @@ class Textbook:
 
     def marginalise(self, nodes):
         self.steps[-1].gone += list(nodes)
+
+    def appearances(self):
+        """Time at which each node appeared, the last time if it has come back, s."""
+        return {node: step.time for step in self.steps for nodes, _, _ in step.new_nodes for node in nodes}
 
     def solve(self):
         """Per step: time, places of each node, filtered and smoothed `Gaussian`; and the log-likelihood of it all."""
@@ -171,7 +182,7 @@ def covariance_error(covariance, reference):
 
 def part(x, places, nodes):
     """The marginal of some nodes."""
-    chosen = np.concatenate([places[int(node)] for node in nodes])
+    chosen = np.concatenate([np.empty(0, dtype=int), *(places[int(node)] for node in nodes)])
     return Gaussian(x.mean[chosen], x.covariance[np.ix_(chosen, chosen)])
 
 
@@ -182,32 +193,65 @@ def tell(estimator, calls):
     return estimator
 
 
-def admissible(textbook, call, start):
-    """True if a late measurement is of a time not before `start` at which its nodes were present."""
+def admissible(textbook, call, estimator):
+    """The call, of late measurements those parts that the estimator takes; None where it takes nothing."""
     name, *arguments = call
     if name != "update" or arguments[1] is None:
-        return True
+        return call
     measured, time = arguments
-    if time < start:
-        return False
-    steps, _ = textbook.solve()
-    k = max(k for k, step in enumerate(textbook.steps) if step.time <= time + 1e-9)
-    there = set(steps[k][1]) - set(textbook.steps[k].gone)
-    return set(measured.nodes.tolist()) <= there
+    nodes = measured.nodes
+    born = textbook.appearances()
+    in_time = np.array([born.get(node, np.inf) <= time + 1e-9 for node in nodes.tolist()])
+    if not hasattr(estimator, "remembered"):
+        return call if in_time.all() else None
+    kept = np.isin(nodes, estimator.nodes)
+    kept[kept] = estimator.remembered(nodes[kept], time)
+    assert in_time[kept].all(), "nothing is remembered from before it appeared"
+    if time < estimator.start:
+        assert not kept.any()
+    if not kept.any():
+        return None
+    return name, Measurements(nodes[kept], measured.z[kept], measured.H[kept], measured.R[kept]), time
 
 
-def assert_smoothed(moments, textbook, joint=True):
-    """These moments, which are the last ones, as the textbook has them; `joint`: their joint covariances, too."""
+def assert_smoothed(estimator, textbook, joint=True, everything=False):
+    """Epochs of the estimator, which are the last ones, as the textbook has them; `joint`: joint covariances, too.
+
+    A window has the nodes that are there now, each of them in all epochs from one on; `everything`: from that on in
+    which it appeared.
+    """
     steps, _ = textbook.solve()
-    assert len(moments) > 0
-    for moment, (time, places, _, reference) in zip(moments[::-1], steps[::-1], strict=False):
-        assert moment.time == pytest.approx(time, abs=1e-12)
-        assert set(moment.nodes.tolist()) == set(places)
-        expected = part(reference, places, moment.nodes)
-        assert mean_error(moment.joint_mean(moment.nodes), expected) < EXACT
+    epochs, born = estimator.smoothed(), textbook.appearances()
+    assert epochs[-1].time == estimator.time
+    window = hasattr(estimator, "remembered")
+    possible = set(estimator.nodes.tolist())
+    for k, (epoch, (time, places, _, reference)) in enumerate(zip(epochs[::-1], steps[::-1], strict=False)):
+        assert epoch.time == pytest.approx(time, abs=1e-12)
+        nodes = set(epoch.nodes.tolist())
+        if not window:
+            assert nodes == set(places)
+        elif everything or k == 0:
+            assert nodes == {node for node in possible if born[node] <= time + 1e-9}
+        else:
+            assert nodes <= possible
+            assert estimator.remembered(epoch.nodes, time).all()
+            possible = nodes
+        expected = part(reference, places, epoch.nodes)
+        assert mean_error(epoch.joint_mean(epoch.nodes), expected) < EXACT
         if joint:
-            assert covariance_error(moment.joint_covariance(moment.nodes), expected.covariance) < EXACT
-        for node in moment.nodes:
+            assert covariance_error(epoch.joint_covariance(epoch.nodes), expected.covariance) < EXACT
+        for node in epoch.nodes:
             own = part(reference, places, [node])
-            assert mean_error(moment.mean([node])[0], own) < EXACT
-            assert covariance_error(moment.covariance([node])[0], own.covariance) < EXACT
+            assert mean_error(epoch.mean([node])[0], own) < EXACT
+            assert covariance_error(epoch.covariance([node])[0], own.covariance) < EXACT
+
+
+def assert_newest(estimator, textbook, tolerance=EXACT):
+    """The newest states and their joint covariance are the textbook's."""
+    (time, places, filtered, _), gone = textbook.solve()[0][-1], textbook.steps[-1].gone
+    nodes = [node for node in places if node not in gone]
+    expected = part(filtered, places, nodes)
+    assert estimator.time == pytest.approx(time, abs=1e-12)
+    assert sorted(estimator.nodes.tolist()) == sorted(nodes)
+    assert mean_error(estimator.joint_mean(nodes), expected) < tolerance
+    assert covariance_error(estimator.joint_covariance(nodes), expected.covariance) < tolerance

@@ -4,13 +4,9 @@ import pytest
 
 ESTIMATORS = [
     pytest.param("saga_fg.estimators:JointKalmanFilter()", id="kalman"),
-    pytest.param("saga_fg.estimators:BoundedKalmanFilter(core=1000)", id="kalman-bounded"),  # by more than there is
-    pytest.param("saga_fg.estimators:IncrementalFilter()", id="isam2"),
-    pytest.param("saga_fg.estimators:FixedLagSmoother(0.0)", id="fixed-lag-0"),
-    pytest.param("saga_fg.estimators:FixedLagSmoother(1.0)", id="fixed-lag"),
+    pytest.param("saga_fg.estimators:GraphFilter()", id="isam2"),
+    pytest.param("saga_fg.estimators:GraphFilter(lag=1.0)", id="fixed-lag"),
     pytest.param("saga_fg.estimators:BatchSmoother()", id="batch"),
-    pytest.param("saga_fg.estimators:GraphFilter()", id="graph"),
-    pytest.param("saga_fg.estimators:GraphFilter(lag=1.0)", id="graph-lag"),
 ]
 
 

@@ -119,7 +119,7 @@ def _stacked(
     marginal: Sequence[gtsam.JacobianFactor], point: LinearisationPoint, first: Sequence[int]
 ) -> tuple[list[int], FloatArray]:
     """Keys, `first` in front, and all rows [J | b] on increments from the point."""
-    group = PriorGroup(tuple(marginal), tuple(tuple(factor.keys()) for factor in marginal))
+    group = PriorGroup.of(marginal, point.variables)
     here = group.here(np.arange(len(marginal)), point)
     found = {key for factor in here for key in factor.keys()}  # noqa: SIM118
     keys = [*(key for key in first if key in found), *sorted(found.difference(first))]

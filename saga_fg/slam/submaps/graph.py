@@ -140,7 +140,7 @@ class SubmapGraph:
         if not loops:
             return
         factors = loop_factors(loops, range(len(self._anchors)), self.settings.robust_loops)
-        self._by_anchors.extend([Given(Additions(factors=factors), "loops")], _AFTER_LOOPS)
+        self._by_anchors.extend([Given(Additions(factors=factors), "loops")], settings=_AFTER_LOOPS)
         self._loops += loops
         self._move_running()
 
@@ -228,7 +228,7 @@ class SubmapGraph:
         state: Any = self._by_anchors.state(number)
         prior = pose_prior_factor(self._closed.successor, state.matrix(), self._by_anchors.covariance(number))
         given = Additions(named={self._closed.name: [prior, *self._closed.others]})
-        self._smoother.extend([Given(given, self._closed.name)], _AFTER_LOOPS)
+        self._smoother.extend([Given(given, self._closed.name)], settings=_AFTER_LOOPS)
         self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
 
     def _associated(

@@ -102,10 +102,14 @@ BAD = {
     ),
     "update: no measurements": (
         lambda e: e.update(([4], [[0.0, 0.0]])),
-        "measurements: expected Measurements.*, got tuple",
+        "measurements: expected Measurements",
     ),
     "restore: no snapshot": (lambda e: e.restore((1, 2, 3.0)), "state: expected .*State, got tuple"),
     "update: unknown node": (lambda e: e.update(measured([4, 99])), "node 99 is not in the estimator"),
+    "update: unknown node in the second kind": (
+        lambda e: e.update([measured([4]), measured([16, 99])]),
+        "node 99 is not in the estimator",
+    ),
     "update: nodes of mixed sizes": (lambda e: e.update(measured([4, 8])), "expected states of equal size"),
     "update: H of another size": (lambda e: e.update(measured([4], d=6)), "H: expected 4 columns"),
     "update: H of another size, mixed": (lambda e: e.update(measured([8], d=4)), "H: expected 6 columns"),

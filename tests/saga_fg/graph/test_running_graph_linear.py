@@ -42,7 +42,7 @@ def test_random_programs_agree_with_the_textbook(seed, lag):
         random_program(np.random.default_rng(seed), moments=7, intervals=USUAL), GraphEstimator(lag)
     )
     assert mean < (2e-9 if lag == 0.0 else 5e-9)  # rounding differs from processor to processor
-    assert joint < 1e-9
+    assert joint < (1e-8 if lag == 0.0 else 1e-9)  # each interval begins from covariances
     assert single < 3e-8  # iSAM2's marginals have one digit less
 
 
@@ -61,20 +61,21 @@ def test_a_long_program_does_not_drift_away():
     assert max(mean, joint, single) < 1e-9
 
 
-def test_many_nodes_that_hang_together():
-    """Eliminated by Cholesky, which keeps half the digits."""
-    rng, ids = np.random.default_rng(5), list(range(25))
+@pytest.mark.parametrize(("n", "elimination", "most"), [(25, "qr", 1e-9), (70, "cholesky", 1e-7)])
+def test_many_nodes_that_hang_together(n, elimination, most):
+    """Very many are eliminated by Cholesky, which keeps half the digits."""
+    rng, ids = np.random.default_rng(5), list(range(n))
     program = [new_nodes(rng, ids, CAR)]
     for _ in range(5):
-        seen = np.array(ids)[rng.random(25) < 0.6]
+        seen = np.array(ids)[rng.random(n) < 0.6]
         measured = Measurements(seen, 10 * rng.normal(size=(len(seen), 2)), np.eye(2, 4), 0.2 * np.eye(2))
-        program += [Predict(discretise(random_graph(rng, (CAR,) * 25, ids, 0.2), 0.3)), Update(measured)]
+        program += [Predict(discretise(random_graph(rng, (CAR,) * n, ids, 0.2), 0.3)), Update(measured)]
     estimator, textbook = GraphEstimator(0.0), TextbookEstimator()
     for operation in program:
         operation.run(textbook)
         operation.run(estimator)
-    assert estimator.smoother.graph().elimination == "cholesky"
+    assert estimator.smoother.graph().elimination == elimination
     P = textbook.joint_covariance(ids)
-    assert np.abs((estimator.joint_mean(ids) - textbook.joint_mean(ids)) / np.sqrt(np.diag(P))).max() < 1e-7
-    assert np.linalg.norm(estimator.joint_covariance(ids) - P) < 1e-7 * np.linalg.norm(P)
-    assert np.linalg.norm(estimator.covariance(7) - textbook.covariance([7])[0]) < 1e-6
+    assert np.abs((estimator.joint_mean(ids) - textbook.joint_mean(ids)) / np.sqrt(np.diag(P))).max() < most
+    assert np.linalg.norm(estimator.joint_covariance(ids) - P) < most * np.linalg.norm(P)
+    assert np.linalg.norm(estimator.covariance(7) - textbook.covariance([7])[0]) < 10 * most

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from saga_fg import ConstantVelocity, Edges, InputError, NodeType, SceneGraph
-from saga_fg.estimators import FixedLagSmoother, JointKalmanFilter, Measurements
+from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.modes import Mixture, ModeTable, Stationary, mode_dynamics
@@ -229,7 +229,7 @@ def test_late_measurements_split_the_interval_of_a_mixture():
     """Both parts are matched anew, the second one with the modes as they are then."""
     node_type, modes = NodeType("n", LINEAR), table(LINEAR, n=1)
     graph = SceneGraph(np.array([0]), (node_type,), modes=(modes,))
-    whole, parted = FixedLagSmoother(5.0), FixedLagSmoother(5.0)
+    whole, parted = GraphFilter(lag=5.0), GraphFilter(lag=5.0)
     for smoother in (whole, parted):
         smoother.add([0], *modes.moments)
     whole.predict(discretise(graph, 0.2))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, InputError, Sensor, Tracker, TrackerSettings
-from saga_fg.estimators import FixedLagSmoother, IncrementalFilter, JointKalmanFilter
+from saga_fg.estimators import GraphFilter, JointKalmanFilter
 from saga_fg.estimators.reference import Gaussian, kalman_predict
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
@@ -57,7 +57,7 @@ def test_a_prediction_is_what_frames_without_detections_would_lead_to(stationary
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"), [("kalman", JointKalmanFilter), ("isam2", IncrementalFilter), ("fixed-lag", FixedLagSmoother)]
+    ("name", "kind"), [("kalman", JointKalmanFilter), ("isam2", GraphFilter), ("fixed-lag", GraphFilter)]
 )
 def test_every_estimator_predicts_as_the_textbook(name, kind, monkeypatch):
     """With the recorded F, b and Q: means to 1e-9 standard deviations, the joint covariance to 1e-9 relative."""

@@ -1,0 +1,116 @@
+"""The epochs of a running graph within a window, with what came at each, so that what comes late goes in its place.
+
+A measurement of the past takes the filter back to the epoch before it: the interval that contains its time is
+discretised anew over both parts, with the edges as they were recorded, and all that came since comes again. That is
+exact wherever the filter is, and asks nothing of a solver but to begin from an earlier state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from saga_fg.errors import InputError
+from saga_fg.estimators.layout import StateLayout
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import BoolArray, checked
+
+SAME_TIME = 1e-9  # s
+LEFT = "marginalise"  # the call by which nodes leave
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """A call that changed the filter: a method with its arguments, and the log-likelihood that it returned."""
+
+    method: str
+    arguments: tuple[Any, ...]
+    likelihood: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class WindowEpoch:
+    """An epoch of the window: its number in the graph, its time, s; keys of the objects' variables there, by id.
+
+    calls        that came at this epoch, in their order
+    state        of the filter after them; with the transition to the next epoch, None for the newest
+    """
+
+    number: int
+    time: float
+    keys: Mapping[int, int]
+    calls: tuple[Call, ...] = ()
+    state: Any = None
+    layout: StateLayout | None = None
+    transition: Transition | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class GraphWindow:
+    """The epochs, oldest first."""
+
+    epochs: tuple[WindowEpoch, ...]
+
+    @property
+    def newest(self) -> WindowEpoch:
+        """The present epoch."""
+        return self.epochs[-1]
+
+    @property
+    def start(self) -> float:
+        """Time of the oldest epoch, s."""
+        return self.epochs[0].time
+
+    def called(self, method: str, *arguments: Any, likelihood: float = 0.0) -> GraphWindow:
+        """Note a call."""
+        newest = self.newest
+        call = Call(method, arguments, likelihood)
+        return GraphWindow((*self.epochs[:-1], replace(newest, calls=(*newest.calls, call))))
+
+    @property
+    def without_states(self) -> GraphWindow:
+        """The epochs without the states in which they were left, each of which would hold all earlier ones."""
+        return GraphWindow(tuple(replace(one, state=None) for one in self.epochs))
+
+    def with_states(self, window: GraphWindow) -> GraphWindow:
+        """The epochs that are in another window, too, with the states that they have there."""
+        states = {one.number: one.state for one in window.epochs}
+        return GraphWindow(tuple(replace(one, state=states[one.number]) for one in self.epochs if one.number in states))
+
+    def left(self, state: Any, layout: StateLayout, transition: Transition) -> GraphWindow:
+        """Note the state in which the newest epoch is left, and the transition from there."""
+        return GraphWindow((*self.epochs[:-1], replace(self.newest, state=state, layout=layout, transition=transition)))
+
+    def begun(self, epoch: WindowEpoch, since: float) -> GraphWindow:
+        """Begin the next epoch; since: what is older is forgotten but for the last, s."""
+        first = max((k for k, one in enumerate(self.epochs) if one.time <= since + SAME_TIME), default=0)
+        return GraphWindow((*self.epochs[first:], epoch))
+
+    def with_keys(self, taken: Mapping[int, Mapping[int, int]]) -> GraphWindow:
+        """Note the variables of objects, by id, by the number of their epoch."""
+        return GraphWindow(tuple(replace(one, keys={**one.keys, **taken.get(one.number, {})}) for one in self.epochs))
+
+    def without(self, nodes: set[int]) -> GraphWindow:
+        """Forget the variables of objects."""
+        epochs = (replace(one, keys={n: key for n, key in one.keys.items() if n not in nodes}) for one in self.epochs)
+        return GraphWindow(tuple(epochs))
+
+    def place(self, time: float, start: float) -> int:
+        """The newest epoch that is not after `time`. Raises `InputError` for one before `start` or after the newest."""
+        time, newest = float(checked("time", time, ())), self.newest.time
+        if time > newest + SAME_TIME:
+            raise InputError(f"time: {time:.6f} s is after the newest epoch, {newest:.6f} s; predict first")
+        if time < start - SAME_TIME:
+            raise InputError(f"time: {time:.6f} s is before what is remembered, which begins at {start:.6f} s")
+        return max(k for k, epoch in enumerate(self.epochs) if epoch.time <= time + SAME_TIME)
+
+    def there(self, nodes: ArrayLike, k: int) -> BoolArray:
+        """(m,) which nodes have been there since the end of epoch k."""
+        ids, layout = np.asarray(nodes), self.epochs[k].layout
+        gone = [call.arguments[0] for epoch in self.epochs[k + 1 :] for call in epoch.calls if call.method == LEFT]
+        found = ~np.isin(ids, np.concatenate([np.empty(0, dtype=np.int64), *map(np.atleast_1d, gone)]))
+        return found if layout is None else found & np.isin(ids, layout.nodes)

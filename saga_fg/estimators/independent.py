@@ -1,0 +1,236 @@
+r"""Objects that nothing ties to others, over the epochs of a window: all of them in one batch, in closed form.
+
+    x_i' = F_ii x_i + b_i + q_i,    z = H x_i + v        P = blockdiag( P_1, ..., P_n )
+
+Eliminating the chain of such an object in the order of time is the Kalman filter, whose kernels do it here for all
+objects at once (`saga_fg.estimators.filter_steps`). What would be their factors are arrays; those of an object that is
+tied to others, or that somebody looks at, are made then, over all of its epochs in the window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from factors import GaussianFactors, joint_prior_factor, stacked_gaussian_factors, stacked_prior_factors
+from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.dynamics import Dynamics, noise_ratio
+from saga_fg.estimators.filter_steps import corrected, predicted
+from saga_fg.estimators.joint_gaussian import LARGEST_RATIO, merged
+from saga_fg.estimators.layout import StateLayout
+from saga_fg.estimators.measurements import LinearisedMeasurements, RecordedMeasurements
+from saga_fg.estimators.object_factors import measurement_factors
+from saga_fg.estimators.protocol import Measurements
+from saga_fg.graph.keys import node_key, node_kind
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.variables import NewVariable
+from saga_fg.model.transition import Blocks
+from saga_fg.numerics.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentEpoch:
+    """An epoch of the window: its number in the graph, its time, s, and the objects' Gaussian after `measurements`.
+
+    new       ids of the objects that begin here
+    dynamics  to the next epoch, of the objects that go on; None for the newest epoch
+    """
+
+    number: int
+    time: float
+    x: BlockGaussian
+    new: frozenset[int] = frozenset()
+    measurements: tuple[Measurements, ...] = ()
+    dynamics: Dynamics | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentObjects:
+    """The window, oldest epoch first. Earlier epochs may have objects that have left, or been tied, since."""
+
+    epochs: tuple[IndependentEpoch, ...]
+
+    @staticmethod
+    def begun(number: int, time: float, x: BlockGaussian) -> IndependentObjects:
+        """Objects at one epoch."""
+        return IndependentObjects((IndependentEpoch(number, time, x, frozenset(x.layout.nodes.tolist())),))
+
+    @property
+    def x(self) -> BlockGaussian:
+        """The Gaussian of the objects at the newest epoch."""
+        return self.epochs[-1].x
+
+    @property
+    def layout(self) -> StateLayout:
+        """The objects at the newest epoch."""
+        return self.epochs[-1].x.layout
+
+    def added(self, nodes: IntArray, means: FloatArray, covariances: FloatArray) -> IndependentObjects:
+        """Add objects behind those that are there."""
+        last = self.epochs[-1]
+        x = last.x.extended(last.x.layout.extended(nodes, means.shape[1]), means, covariances)
+        return self._with_newest(replace(last, x=x, new=last.new | set(nodes.tolist())))
+
+    def with_released(self, layout: StateLayout, x: BlockGaussian) -> IndependentObjects:
+        """Add objects that have been tied to others until now; layout: of all nodes, which has the order."""
+        last, nodes = self.epochs[-1], set(x.layout.nodes.tolist())
+        mine = np.isin(layout.nodes, np.concatenate([last.x.layout.nodes, x.layout.nodes]))
+        joint = merged(layout.select(mine), last.x, x)
+        return self._with_newest(replace(last, x=joint, new=last.new | nodes))
+
+    def components_of(self, nodes: IntArray) -> IntArray:
+        """The objects among `nodes`, and all that are correlated with one of them."""
+        x = self.x
+        label = x.partition.label
+        return x.layout.nodes[np.isin(label, label[np.isin(x.layout.nodes, nodes)])]
+
+    def without(self, nodes: IntArray) -> IndependentObjects:
+        """Objects that leave, or that are tied to others from now on."""
+        last = self.epochs[-1]
+        return self._with_newest(replace(last, x=last.x.without(last.x.layout.rows(nodes))))
+
+    def predicted(self, dynamics: Dynamics, number: int, time: float, since: float | None) -> IndependentObjects:
+        """Begin the next epoch; dynamics: of all nodes; since: time from which epochs are kept, s, None for none."""
+        last = self.epochs[-1]
+        own = _own_motion(dynamics, last.x.layout)
+        newest = IndependentEpoch(number, time, _moved(last.x, own))
+        if since is None:
+            return IndependentObjects((newest,))
+        first = max((k for k, epoch in enumerate(self.epochs) if epoch.time <= since), default=0)
+        return IndependentObjects((*self.epochs[first:-1], replace(last, dynamics=own), newest))
+
+    def updated(self, measured: Measurements) -> tuple[IndependentObjects, float]:
+        """Take in measurements made now; returns also their log-likelihood."""
+        last = self.epochs[-1]
+        x, likelihood = _corrected(last.x, measured)
+        return self._with_newest(replace(last, x=x, measurements=(*last.measurements, measured))), likelihood
+
+    def since(self, node: int) -> int:
+        """The place of the first epoch of the window from which on an object has been there."""
+        return next((k for k in reversed(range(len(self.epochs))) if node in self.epochs[k].new), 0)
+
+    def add_to(self, graph: SceneFactorGraph, nodes: IntArray, labels: Mapping[int, str]) -> list[dict[int, int]]:
+        """Add variables and factors of some objects to a graph, over their epochs in the window.
+
+        Returns the keys of their variables by id, for each epoch. What is known at an object's first epoch is its
+        prior; it is a later one where the noise of an interval is too small for a factor. An object that rests keeps
+        its variable.
+        """
+        newest, label = len(self.epochs) - 1, self.x.partition.label
+        tied = self.layout.nodes[np.bincount(label)[label] > 1] if len(label) else self.layout.nodes
+        first = {node: self.since(node) for node in nodes.tolist()} | dict.fromkeys(
+            np.intersect1d(nodes, tied).tolist(), newest
+        )
+        for k, epoch in enumerate(self.epochs[1:], 1):
+            here = np.array([node for node, begin in first.items() if begin < k], dtype=np.int64)
+            first |= dict.fromkeys(_without_factor(self.epochs[k - 1].dynamics, epoch.x.only(here)), k)
+        every: list[dict[int, int]] = []
+        keys: dict[int, int] = {}
+        for k, epoch in enumerate(self.epochs):
+            earlier, dynamics = keys, self.epochs[k - 1].dynamics if k else None
+            here = np.array([node for node, begin in first.items() if begin <= k], dtype=np.int64)
+            resting = dynamics.layout.nodes[dynamics.unchanged] if dynamics else np.empty(0, dtype=np.int64)
+            kept = {node: earlier[node] for node in resting.tolist() if node in earlier}
+            keys = {node: kept.get(node, node_key(node, epoch.number)) for node in here.tolist()}
+            moved = epoch.x.only(np.setdiff1d(here, list(kept)))
+            new = [
+                NewVariable(*node_kind(node), state, label=labels.get(node, ""))
+                for node, state in zip(
+                    moved.layout.nodes.tolist(), np.split(moved.mean, moved.layout.offsets[1:]), strict=False
+                )
+            ]
+            graph.add_variables("new objects", new, (epoch.number, epoch.time))
+            begun = np.array([node for node in here.tolist() if node not in earlier], dtype=np.int64)
+            graph.add_factors("new objects", list(_prior_factors(epoch.x.only(begun), keys)))
+            if dynamics is not None and earlier:
+                going = np.array(list(earlier), dtype=np.int64)
+                factors = list(_motion_factors(dynamics, np.setdiff1d(going, list(kept)), earlier, keys))
+                graph.add_factors("interactions", factors, (epoch.number, int(going[0])))
+                for one in epoch.measurements:
+                    seen = RecordedMeasurements(_only(one, going))
+                    graph.add_factors("detections", measurement_factors(keys, seen))
+            every.append(keys)
+        number = self.epochs[-1].number
+        here_too = {node_key(node, number): key for node, key in keys.items() if key != node_key(node, number)}
+        graph.carried_over = {**graph.carried_over, **here_too}
+        return every
+
+    def _with_newest(self, epoch: IndependentEpoch) -> IndependentObjects:
+        return IndependentObjects((*self.epochs[:-1], epoch))
+
+
+def _own_motion(dynamics: Dynamics, layout: StateLayout) -> Dynamics:
+    """The dynamics of some nodes, on which nobody acts, in the order of `layout`."""
+    rows = dynamics.layout.rows(layout.nodes)
+    place = np.full(len(dynamics.layout), -1)
+    place[rows] = np.arange(len(rows))
+    F, Q = (
+        tuple(
+            Blocks(place[group.target[mine]], place[group.target[mine]], group.values[mine])
+            for group in groups
+            if (mine := (place[group.target] >= 0) & (group.target == group.source)).any()
+        )
+        for groups in (dynamics.F, dynamics.Q)
+    )
+    return Dynamics(layout, F, dynamics.b[dynamics.layout.places(rows)], Q)
+
+
+def _moved(x: BlockGaussian, own: Dynamics) -> BlockGaussian:
+    return predicted(x, own, None, False) if len(x.layout) else x
+
+
+def _corrected(x: BlockGaussian, measured: Measurements) -> tuple[BlockGaussian, float]:
+    if len(measured) == 0:
+        return x, 0.0
+    return corrected(x, LinearisedMeasurements(x.layout.rows(measured.nodes), measured.z, measured.H, measured.R))
+
+
+def _only(measured: Measurements, nodes: IntArray) -> Measurements:
+    """The measurements of some nodes."""
+    mine = np.isin(measured.nodes, nodes)
+    return Measurements.unchecked(measured.nodes[mine], measured.z[mine], measured.H[mine], measured.R[mine])
+
+
+def _without_factor(dynamics: Dynamics | None, x: BlockGaussian) -> list[int]:
+    """Ids of the nodes of `x` that move in the interval before with too little noise for a factor."""
+    if dynamics is None or len(x.layout) == 0:
+        return []
+    own = _own_motion(dynamics, x.layout)
+    ratio = np.full(len(x.layout), np.inf)
+    for Q in own.Q:
+        ratio[Q.target] = noise_ratio(x.covariances(Q.target), Q.values)
+    none = (ratio > LARGEST_RATIO["qr"]) & ~own.unchanged
+    return list(x.layout.nodes[none].tolist())
+
+
+def _prior_factors(x: BlockGaussian, keys: Mapping[int, int]) -> Iterator[GaussianFactors | gtsam.JacobianFactor]:
+    """One prior a component."""
+    label, ids = x.partition.label, x.layout.nodes
+    alone = np.bincount(label)[label] == 1
+    for d in np.unique(x.layout.dims[alone]).tolist():
+        rows = np.flatnonzero(alone & (x.layout.dims == d))
+        names = [keys[node] for node in ids[rows].tolist()]
+        yield stacked_prior_factors(names, x.mean[x.layout.spans(rows)], x.covariances(rows))
+    for number in np.unique(label[~alone]).tolist():
+        rows = np.flatnonzero(label == number)
+        means = [x.mean[x.layout.offsets[row] : x.layout.offsets[row + 1]] for row in rows.tolist()]
+        yield joint_prior_factor([keys[node] for node in ids[rows].tolist()], means, x.joint(rows))
+
+
+def _motion_factors(
+    dynamics: Dynamics, nodes: IntArray, earlier: Mapping[int, int], keys: Mapping[int, int]
+) -> Iterator[GaussianFactors]:
+    """|| x_i' - F_ii x_i - b_i ||_{Q_i} of some nodes."""
+    own = _own_motion(dynamics, dynamics.layout.select(np.isin(dynamics.layout.nodes, nodes)))
+    for F in own.F:
+        rows, ids = F.target, own.layout.nodes[F.target].tolist()
+        noise = np.zeros((len(own.layout), *F.values.shape[1:]))
+        for Q in own.Q:
+            if Q.values.shape[1:] == noise.shape[1:]:
+                noise[Q.target] = Q.values
+        names = np.array([[keys[node], earlier[node]] for node in ids], dtype=np.uint64)
+        identity = np.broadcast_to(np.eye(F.values.shape[1]), F.values.shape)
+        yield stacked_gaussian_factors(names, [identity, -F.values], own.b[own.layout.spans(rows)], noise[rows])
