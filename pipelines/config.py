@@ -20,7 +20,6 @@ from saga_fg.settings import settings_group
 from saga_fg.tracking import (
     AssociationName,
     ClassSettings,
-    EstimatorName,
     GreedySettings,
     GreedyTracker,
     Observer,
@@ -49,7 +48,7 @@ class TrackConfig:
         lambda: {DEFAULT: Sensor()}, "models of the sensors by name; the entry named default serves all others"
     )
 
-    def with_estimator(self, estimator: EstimatorName | None, lag: float | None) -> TrackConfig:
+    def with_estimator(self, estimator: str | None, lag: float | None) -> TrackConfig:
         """Return a copy with this estimator and window (s); None keeps the present one."""
         tracker = self.tracker
         tracker = replace(tracker, estimator=estimator or tracker.estimator, lag=tracker.lag if lag is None else lag)

@@ -26,6 +26,7 @@ from saga_fg.model.motion import Curvilinear
 from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import TrackerSettings
+from saga_fg.tracking.by_name import estimator_parameters
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
@@ -151,11 +152,12 @@ class Doubts:
 def _without_effect(tracker: TrackerSettings, usual: TrackerSettings) -> Iterator[Doubt]:
     """Settings, other than the shipped ones, that the estimator does not have."""
     name, given = tracker.estimator, []
-    if name != "fixed-lag" and tracker.lag != usual.lag:
+    has = estimator_parameters(name)
+    if "lag" not in has and tracker.lag != usual.lag:
         given.append(f"lag: {tracker.lag:g}")
-    if name != "kalman" and tracker.tolerance not in (0.0, usual.tolerance):
+    if "tolerance" not in has and tracker.tolerance not in (0.0, usual.tolerance):
         given.append(f"tolerance: {tracker.tolerance:g}")
-    if name != "kalman" and tracker.max_component < usual.max_component:
+    if "max_component" not in has and tracker.max_component < usual.max_component:
         given.append(f"max_component: {tracker.max_component}")
     if given:
         what = f"tracker: {', '.join(given)}: without effect with estimator: {name}"

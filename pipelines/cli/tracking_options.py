@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from saga_fg.errors import InputError
-from saga_fg.tracking import AssociationName, EstimatorName
+from saga_fg.tracking import AssociationName
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -25,13 +25,15 @@ MethodOption = Annotated[Literal["saga", "kf", "centerpoint"], _METHOD]
 MethodOrNone = Annotated[Literal["saga", "kf", "centerpoint"] | None, _METHOD]
 
 EstimatorOption = Annotated[
-    EstimatorName | None,
+    str | None,
     typer.Option(
         "--estimator",
         help="kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph of "
-        "the last --lag seconds, which puts late frames where they belong. The bounds of kalman (tracker.tolerance, "
+        "the last --lag seconds, which puts late frames where they belong; MODULE:NAME, which is imported, or the name "
+        "of an installed entry point: your own. The bounds of kalman (tracker.tolerance, "
         "tracker.max_component) move tracks by millimetres, a centimetre at most in our recordings.  "
         "[default: as configured]",
+        metavar="NAME",
     ),
 ]
 LagOption = Annotated[
@@ -78,7 +80,7 @@ def configured(
     family: str | Path,
     config: Path | None,
     method: Method,
-    estimator: EstimatorName | None,
+    estimator: str | None,
     lag: float | None,
     association: AssociationName | None = None,
     interactions: Path | None = None,
@@ -127,9 +129,11 @@ def horizons(predict: str | None, method: Method) -> FloatArray | None:
 
 def _estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:
     """Raise `InputError` where --estimator or --lag would have no effect."""
+    from saga_fg.tracking.by_name import estimator_parameters
+
     if method == "centerpoint" and (estimator is not None or lag is not None):
         raise InputError("--estimator, --lag: the method centerpoint has no estimator")
-    if lag is not None and (estimator or configured) != "fixed-lag":
+    if lag is not None and "lag" not in estimator_parameters(estimator or configured):
         raise InputError(f"--lag {lag:g}: goes with --estimator fixed-lag")
 
 

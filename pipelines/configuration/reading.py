@@ -29,7 +29,7 @@ from pipelines.configuration.schema import (
     settings_of,
 )
 from saga_fg.errors import InputError
-from saga_fg.tracking.provider_names import named
+from saga_fg.tracking.by_name import named
 
 T = TypeVar("T")
 LARGEST = 2**63 - 1  # whole number

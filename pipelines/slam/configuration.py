@@ -16,7 +16,7 @@ from saga_fg.model.landmarks.detector import LandmarkDetector
 from saga_fg.settings import setting, settings_group
 from saga_fg.slam.joint import JointSettings
 from saga_fg.slam.sensors import SensorSettings
-from saga_fg.tracking.provider_names import made_by_name, new_provider
+from saga_fg.tracking.by_name import made_by_name, new_provider
 
 
 @dataclass(frozen=True)

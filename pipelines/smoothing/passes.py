@@ -43,7 +43,7 @@ from saga_fg.smoothing import (
     stitch_tracklets,
 )
 from saga_fg.tracking import TrackerSettings
-from saga_fg.tracking.provider_names import new_provider
+from saga_fg.tracking.by_name import new_provider
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame

@@ -1,7 +1,9 @@
 """Estimators behind one protocol, and the textbook reference they must agree with."""
 
+from saga_fg.estimators.base import EstimatorBase
 from saga_fg.estimators.batch import BatchSmoother
 from saga_fg.estimators.batch_solver import BatchSolver
+from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.gauss_newton import GaussNewtonSettings
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_filter import GraphFilter
@@ -19,8 +21,10 @@ from saga_fg.estimators.windowed import WindowedSmoother, WindowSettings
 __all__ = [
     "BatchSmoother",
     "BatchSolver",
+    "BlockGaussian",
     "DetectionFactors",
     "Estimator",
+    "EstimatorBase",
     "GaussNewtonSettings",
     "Gaussian",
     "GraduatedNonConvexity",

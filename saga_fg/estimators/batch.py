@@ -9,7 +9,7 @@ iteratively reweighted least squares, or by graduated non-convexity, which finds
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -78,8 +78,10 @@ class BatchSmoother(RecordedSmoother):
         self._sparse: SparseSolution | None = None  # its solution, where that is not in the order of time
         self._graduated = True  # whether the weights of graduated non-convexity are those of the whole recording
 
-    def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
-        super().add(nodes, means, covariances)
+    def add(
+        self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
+    ) -> None:
+        super().add(nodes, means, covariances, labels)
         self._clear_cache()
 
     def predict(self, transition: Transition) -> None:

@@ -6,11 +6,12 @@ from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.partition import BlockDiagonal, Partition, flattened, regrouped
 from saga_fg.kernels.components import node_blocks, uncorrelated_labels
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked
 
 UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
 
@@ -27,6 +28,21 @@ class BlockGaussian:
     def empty() -> BlockGaussian:
         """Gaussian of no node."""
         return BlockGaussian(Partition.apart(StateLayout()), np.empty(0), ())
+
+    @staticmethod
+    def from_dense(nodes: ArrayLike, sizes: ArrayLike, mean: ArrayLike, covariance: ArrayLike) -> BlockGaussian:
+        """Gaussian of nodes (n,), whose states have `sizes` (n,), from its mean (D,) and covariance (D, D).
+
+        Nodes are independent where the covariance is zero. Raises `InputError` for wrong shapes and numbers that are
+        not finite.
+        """
+        layout = StateLayout(np.asarray(nodes), np.asarray(sizes))  # which checks them
+        mean = checked("mean", mean, (layout.size,))
+        P = checked("covariance", covariance, (layout.size, layout.size))
+        if len(layout) == 0:
+            return BlockGaussian.empty()
+        together = BlockGaussian(Partition(layout, np.zeros(len(layout), dtype=np.int64)), mean, (P[None],))
+        return together.over(together.uncorrelated(0.0))
 
     @property
     def layout(self) -> StateLayout:

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from factors import Robust
 from factors.marginal import Elimination
 from saga_fg.errors import InputError, UnknownNodeError, require_type
+from saga_fg.estimators.base import EstimatorBase
 from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian
 from saga_fg.estimators.dynamics import Dynamics
 from saga_fg.estimators.graph_solution import linear_solution
@@ -37,7 +38,7 @@ from saga_fg.estimators.joint_gaussian import by_covariance, lossy, merged, repl
 from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, log_likelihood
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
-from saga_fg.estimators.protocol import LatestMarginals, Measurements
+from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recorded_smoother import JointCovariance, SmoothedState
 from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key, node_kind
 from saga_fg.graph.providers import FactorProvider, predictors
@@ -64,7 +65,7 @@ class GraphState:
     posterior: BlockGaussian | None
 
 
-class GraphFilter(LatestMarginals):
+class GraphFilter(EstimatorBase):
     """The joint state of all nodes in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  of users' factors, asked by `ask_providers` once a frame
@@ -550,9 +551,6 @@ class GraphFilter(LatestMarginals):
             transition = epoch.transition
         self._smoother.frame, self._smoother.origin = now
         return likelihood
-
-    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
-        return self.posterior(), self._layout.rows(nodes)
 
 
 def _coupled(interval: IntervalDynamics, dynamics: Dynamics) -> BoolArray:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, require_type
+from saga_fg.estimators.base import EstimatorBase
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.bounds import ComponentBounds
 from saga_fg.estimators.filter_steps import corrected, predicted
@@ -25,7 +26,7 @@ from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
 from saga_fg.estimators.layout import checked_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.object_factors import prior_graph
-from saga_fg.estimators.protocol import LatestMarginals, Measurements
+from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
@@ -48,25 +49,25 @@ class KalmanState:
     auxiliary: AuxiliaryVariables | None
 
 
-class JointKalmanFilter(LatestMarginals):
+class JointKalmanFilter(EstimatorBase):
     """The exact filter on the joint state. See `saga_fg.estimators.protocol.Estimator` for the methods.
 
     providers  asked by `ask_providers`, once a frame, for factors on the newest variables: an extended Kalman filter
     tolerance  correlation up to which nodes are taken for independent, and neighbours for independent inputs; 0: none
-    most       largest number of nodes whose correlations are kept together, the strongest; None: any number
+    max_component  largest number of nodes whose correlations are kept together, the strongest; None: any number
 
     Without bounds, as by default, the filter is exact.
     """
 
     def __init__(
-        self, providers: Sequence[FactorProvider] = (), tolerance: float = 0.0, most: int | None = None
+        self, providers: Sequence[FactorProvider] = (), tolerance: float = 0.0, max_component: int | None = None
     ) -> None:
         if not 0 <= tolerance < 1:
             raise InputError(f"tolerance: expected a number from 0 to below 1, got {tolerance!r}")
-        if most is not None and most < 1:
-            raise InputError(f"most: expected a number of nodes >= 1, got {most!r}")
+        if max_component is not None and max_component < 1:
+            raise InputError(f"max_component: expected a number of nodes >= 1, got {max_component!r}")
         self.providers = tuple(providers)
-        self.bounds = ComponentBounds(tolerance, most or sys.maxsize) if tolerance or most else None
+        self.bounds = ComponentBounds(tolerance, max_component or sys.maxsize) if tolerance or max_component else None
         self._state = BlockGaussian.empty()
         self._predictions = 0
         self._time = 0.0
@@ -89,12 +90,16 @@ class JointKalmanFilter(LatestMarginals):
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
     ) -> None:
-        self.extend(nodes, *checked_prior(nodes, means, covariances), labels)
+        self._add(nodes, *checked_prior(nodes, means, covariances), labels)
 
-    def extend(
-        self, nodes: ArrayLike, mean: FloatArray, covariance: FloatArray, labels: Mapping[int, str] | None = None
+    def add_unchecked(
+        self, nodes: IntArray, means: FloatArray, covariances: FloatArray, labels: Mapping[int, str] | None = None
     ) -> None:
-        """Add nodes as `add` does, without checking the numbers again."""
+        self._add(nodes, means, covariances, labels)
+
+    def _add(
+        self, nodes: ArrayLike, mean: FloatArray, covariance: FloatArray, labels: Mapping[int, str] | None
+    ) -> None:
         self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
         if self.providers:
             self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})
@@ -128,7 +133,14 @@ class JointKalmanFilter(LatestMarginals):
         self._predictions += 1
         self._time += transition.dt
 
-    def update(self, measurements: Measurements | Observations | Sequence[Measurements | Observations]) -> float:
+    def update(
+        self,
+        measurements: Measurements | Observations | Sequence[Measurements | Observations],
+        time: float | None = None,
+    ) -> float:
+        """Take in measurements of the present; `time` can only be None, as nothing of the past is kept."""
+        if time is not None:
+            raise InputError("time: the filter has no past; expected measurements moved to the present")
         x, total = self._state, 0.0
         for each in measurements if isinstance(measurements, Sequence) else (measurements,):
             recorded = RecordedMeasurements(each)
@@ -164,6 +176,3 @@ class JointKalmanFilter(LatestMarginals):
         require_type("state", state, KalmanState)
         self._state, self._predictions, self._time = state.x, state.predictions, state.time
         self._auxiliary = state.auxiliary or AuxiliaryVariables()
-
-    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
-        return self._state, self._state.layout.rows(nodes)

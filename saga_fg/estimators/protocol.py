@@ -4,12 +4,14 @@
     update    z = H x_node + v,  v ~ N(0, R)           measurements of some nodes
 
 Every estimator agrees with `saga_fg.estimators.reference` (see docs/model.md for the figures).
+
+A tracker needs nothing of its estimator but this protocol. An estimator of your own derives from
+`saga_fg.estimators.EstimatorBase`, which has all but `time`, `add`, `predict`, `update`, `marginalise`, `posterior`.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
@@ -17,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.layout import StateLayout
+from saga_fg.graph.providers import FactorProvider
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.kernels.components import planar_marginals
 from saga_fg.model.transition import Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, checked_rows
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_covariances, checked_rows
+from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,32 +71,69 @@ def _one_each(value: ArrayLike, m: int) -> ArrayLike:
 
 
 class Estimator(Protocol):
-    """The joint state of all nodes. Every method raises `InputError` or `UnknownNodeError` and then changes nothing."""
+    """The joint state of all nodes. Every method raises `InputError` or `UnknownNodeError` and then changes nothing.
 
-    @property
-    def nodes(self) -> IntArray:
-        """(n,) ids in the order of the joint state."""
+    `copy.copy` returns an estimator that changes independently of this one. Beside the nodes there may be others, such
+    as the vehicle's poses and landmarks, which factor providers add.
+    """
+
+    lag: float
+    """Age up to which `update` puts measurements at their own time, s; 0: it takes those of the present alone."""
+    providers: Sequence[FactorProvider]
+    """Asked for factors once a frame by `ask_providers`; empty for none."""
+
+    def handed_over(self) -> Self:
+        """A copy that takes over what would be long to build again; this one is rarely needed after it."""
         ...
+
+    # the Gaussian, moved and corrected
 
     @property
     def time(self) -> float:
         """Sum of all intervals since the start, s."""
         ...
 
-    def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
-        """Nodes that appear, independent of all others: ids (k,), means (k, d), covariances (k, d, d)."""
+    @property
+    def nodes(self) -> IntArray:
+        """(n,) ids in the order of the joint state."""
+        ...
+
+    def add(
+        self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
+    ) -> None:
+        """Add nodes independent of all others: ids (k,), means (k, d), covariances (k, d, d); classes by id."""
+        ...
+
+    def add_unchecked(
+        self, nodes: IntArray, means: FloatArray, covariances: FloatArray, labels: Mapping[int, str] | None = None
+    ) -> None:
+        """Add nodes as `add` does, whose numbers were checked where they came in."""
         ...
 
     def predict(self, transition: Transition) -> None:
         """Move all nodes by a transition over exactly the present nodes, in any order."""
         ...
 
-    def update(self, measurements: Measurements | Sequence[Measurements]) -> float:
-        """Take in measurements, several kinds at once if need be; returns the log-likelihood of their innovation."""
+    def update(self, measurements: Measurements | Sequence[Measurements], time: float | None = None) -> float:
+        """Take in measurements, several kinds at once if need be; return the log-likelihood of their innovation.
+
+        time: when they were made, s, on this clock, which `remembered` is true of; None: now. NaN is returned where
+        nothing is computed before it is asked for.
+        """
         ...
 
     def marginalise(self, nodes: ArrayLike) -> None:
-        """Nodes that disappear: integrated out, so that their information on their neighbours stays."""
+        """Integrate out nodes that disappear, so that their information on their neighbours stays."""
+        ...
+
+    def remembered(self, nodes: ArrayLike, time: float) -> BoolArray:
+        """(k,) whether measurements of nodes at `time`, s, can still be put there; asked where `lag` is above 0."""
+        ...
+
+    # what is read
+
+    def posterior(self) -> BlockGaussian:
+        """The joint Gaussian: of the nodes, and perhaps of others."""
         ...
 
     def mean(self, nodes: ArrayLike) -> FloatArray:
@@ -113,6 +152,13 @@ class Estimator(Protocol):
         """Joint covariance of some nodes, in the order given, of any sizes."""
         ...
 
+    def planar_marginals(self, nodes: ArrayLike, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Positions and velocities (k, 4) with their covariances (k, 4, 4), by a kernel.
+
+        places (k, 4): where x, y, vx, vy are in the states, -1 for none, which gives zeros
+        """
+        ...
+
     def graph(self) -> SceneFactorGraph:
         """The equivalent factor graph, its values the solution; `solve()` and GTSAM's own solvers come to the same.
 
@@ -129,48 +175,30 @@ class Estimator(Protocol):
         """Continue from a snapshot of an estimator of the same kind; raises `InputError` for anything else."""
         ...
 
+    # factors of providers, for those that have any
 
-class LatestMarginals:
-    """Marginals of the nodes that are there now. See `saga_fg.estimators.protocol.Estimator` for the methods."""
+    def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
+        """Set the frame that providers see, and the origin (2,) of the states' positions in the world, m."""
+        ...
 
-    def handed_over(self) -> Self:
-        """A copy that goes on in the place of this one."""
-        return copy.copy(self)
+    def ask_providers(self) -> None:
+        """Take in the factors of all providers, once a frame."""
+        ...
 
-    def mean(self, nodes: ArrayLike) -> FloatArray:
-        x, rows = self._at(nodes)
-        mean: FloatArray = x.mean[x.layout.spans(rows)]
-        return mean
+    def extend(self, providers: Sequence[FactorProvider]) -> None:
+        """Take in the factors of some providers at once, at the present epoch."""
+        ...
 
-    def covariance(self, nodes: ArrayLike) -> FloatArray:
-        x, rows = self._at(nodes)
-        x.layout.spans(rows)  # states of equal size, or an error that says so
-        return x.covariances(rows)
+    @property
+    def others(self) -> Sequence[int] | IntArray:
+        """The variables beside the nodes, by numbers of the estimator's own."""
+        ...
 
-    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        x, rows = self._at(nodes)
-        mean: FloatArray = x.mean[x.layout.places(rows)]
-        return mean
+    @property
+    def auxiliary(self) -> SceneFactorGraph:
+        """A graph that has the variables beside the nodes with their values, with or without factors."""
+        ...
 
-    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        x, rows = self._at(nodes)
-        return x.joint(rows)
-
-    def planar_marginals(self, nodes: ArrayLike, places: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Positions and velocities (k, 4) with their covariances (k, 4, 4), by a kernel.
-
-        places (k, 4): where x, y, vx, vy are in the states, -1 for none, which gives zeros
-        """
-        x, rows = self._at(nodes)
-        at = x.partition.block_places
-        return planar_marginals(x.mean, x.flat, x.layout.offsets, at.start, at.size, at.offset, rows, places)
-
-    def _at(self, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
-        """A Gaussian, and which of its rows are these nodes."""
-        raise NotImplementedError
-
-
-def live_rows(x: BlockGaussian, live: StateLayout, nodes: ArrayLike) -> tuple[BlockGaussian, IntArray]:
-    """A Gaussian that may have nodes that have left since, and which of its rows are `nodes`."""
-    rows = live.rows(nodes)
-    return x, rows if len(live) == len(x.layout) else x.layout.rows(live.nodes[rows])
+    def covariance_with(self, keys: Sequence[int], nodes: ArrayLike) -> FloatArray:
+        """Joint covariance of variables of `auxiliary`, by key, and of some nodes, in the order given."""
+        ...

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 from factors import Robust
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.backward import MarginalCovariances, SmoothedCovariance
+from saga_fg.estimators.base import EstimatorBase, live_rows
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
-from saga_fg.estimators.protocol import LatestMarginals, Measurements, live_rows
+from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recording import Recording
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -82,7 +83,7 @@ class SmoothedState:
         return self.P
 
 
-class RecordedSmoother(LatestMarginals):
+class RecordedSmoother(EstimatorBase):
     """A smoother that keeps a recording. See `saga_fg.estimators.protocol.Estimator` for the methods."""
 
     _recording: Recording
@@ -102,7 +103,9 @@ class RecordedSmoother(LatestMarginals):
     def nodes(self) -> IntArray:
         return self._recording.layout.nodes
 
-    def add(self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
+    def add(
+        self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
+    ) -> None:
         self._recording.add(nodes, means, covariances)
 
     def predict(self, transition: Transition) -> None:

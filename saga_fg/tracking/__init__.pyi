@@ -2,7 +2,7 @@ from .clock import ClockSettings, TimeVerdict
 from .clock_offsets import SensorTime
 from .greedy import GreedySettings, GreedyTracker
 from .journal import Journal
-from .names import AssociationName, EstimatorName
+from .names import AssociationName
 from .observer import Observer, Stage, TrackerView
 from .settings import (
     AssociationSettings,
@@ -22,7 +22,6 @@ __all__ = [
     "ClassSettings",
     "ClockSettings",
     "EgoNodeSettings",
-    "EstimatorName",
     "ExistenceSettings",
     "GreedySettings",
     "GreedyTracker",

@@ -16,7 +16,6 @@ import numpy as np
 
 from factors import relative_detection_factors
 from saga_fg.errors import InputError
-from saga_fg.estimators import GraphFilter
 from saga_fg.graph import EGO_POSE, key_of
 from saga_fg.model.interactions import POSITION, NodeTable
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
@@ -114,9 +113,8 @@ class EgoNode:
 def relative_covariances(joint: JointTrackState, ids: IntArray, label: StrArray) -> FloatArray:
     """Covariances (n, 2, 2) of positions relative to the vehicle's estimated pose, in the axes of the world."""
     estimator = joint.estimator
-    assert isinstance(estimator, GraphFilter)
-    key = key_of(EGO_POSE, 0, estimator.graph().epoch)
-    pose = estimator.graph().state(key)
+    key = key_of(EGO_POSE, 0, estimator.auxiliary.epoch)
+    pose = estimator.auxiliary.state(key)
     T, d, result = pose.matrix(), pose.dim(), np.zeros((len(ids), 2, 2))
     n, turn = len(T) - 1, T[:2, :2]
     for node_type, rows in joint.rows_by_type(label):

@@ -13,10 +13,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements
-from saga_fg.graph import EGO_POSE, FactorProvider, SceneFactorGraph, key_of
+from saga_fg.estimators import Estimator, Measurements
+from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
 from saga_fg.model.discretisation import discretise, own_motion
-from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.modes import Mixture, ModeTable
 from saga_fg.model.motion import Motion, NodeType
@@ -26,27 +25,15 @@ from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.providers import RelativeDetections
 from saga_fg.tracking.kinematics import Kinematics, RelativePositions
 from saga_fg.tracking.out_of_sequence import moved_to_present
-from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.types.frame import Frame
 
 _UNKNOWN_POSITION = 1e5  # standard deviation, m
-
-TrackEstimator = JointKalmanFilter | GraphFilter
-
-
-def new_estimator(
-    settings: TrackerSettings, providers: Sequence[FactorProvider], rules: Sequence[EdgeRule]
-) -> TrackEstimator:
-    """A fresh estimator; with `providers`, or nonlinear motion, iSAM2 and the smoother are a running graph."""
-    if (name := settings.estimator) == "kalman":
-        return JointKalmanFilter(providers, settings.tolerance, settings.max_component)
-    return GraphFilter(providers, settings.lag if name == "fixed-lag" else 0.0, likelihoods=False)
 
 
 class JointTrackState:
     """Tracks by id and label over one estimator. `motion` gives the own motion of a class."""
 
-    def __init__(self, estimator: TrackEstimator, motion: Callable[[str], Motion]) -> None:
+    def __init__(self, estimator: Estimator, motion: Callable[[str], Motion]) -> None:
         self.estimator = estimator
         self._motion = motion
         self._types: dict[Motion, NodeType] = {}  # classes that move alike share one
@@ -103,19 +90,14 @@ class JointTrackState:
             if isinstance(node_type.motion, Mixture):
                 new, old = ModeTable.new(node_type.motion, ids[rows], mean, P), self._modes.get(node_type.motion)
                 self._modes[node_type.motion] = new if old is None else old.extended(new)
-            estimator = self._estimator_to_change()
-            if isinstance(estimator, JointKalmanFilter) and not estimator.providers:
-                estimator.extend(ids[rows], mean, P)
-            elif isinstance(estimator, GraphFilter | JointKalmanFilter):
-                estimator.add(ids[rows], mean, P, dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True)))
-            else:
-                estimator.add(ids[rows], mean, P)
+            labels = dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True))
+            self._estimator_to_change().add_unchecked(ids[rows], mean, P, labels)
         self._initiated.update(dict.fromkeys(ids.tolist(), self.estimator.time))
         if relative is not None:
             self._add_relative(ids, label, relative)
         if before is not None:
-            exact = isinstance(self.estimator, JointKalmanFilter) and delay == 0 and (self.places(label) >= 0).all()
-            self._kinematics = before.append(now if exact else self.kinematics_of(ids, label))
+            as_given = delay == 0 and (self.places(label) >= 0).all()
+            self._kinematics = before.append(now if as_given else self.kinematics_of(ids, label))
 
     def remove(self, ids: IntArray, kept: IntArray | None = None) -> None:
         """Marginalise tracks; their information on their neighbours stays, and so do the estimates of all others.
@@ -175,28 +157,24 @@ class JointTrackState:
 
     def _add_relative(self, ids: IntArray, label: StrArray, relative: RelativePositions) -> None:
         estimator = self._estimator_to_change()
-        assert isinstance(estimator, GraphFilter)
         for node_type, rows in self.rows_by_type(label):
             x, y = node_type.index(POSITION).tolist()
             estimator.extend([RelativeDetections(ids[rows], relative.z[rows], relative.R[rows], node_type.dim, (x, y))])
 
     def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
         """Set the frame that providers see from now on; positions are from `origin` (2,)."""
-        if isinstance(self.estimator, GraphFilter | JointKalmanFilter) and self.estimator.providers:
-            self.estimator.set_frame(frame, origin)
-            self._estimator_to_change()
+        if self.estimator.providers:
+            self._estimator_to_change().set_frame(frame, origin)
 
     def ask_providers(self) -> None:
         """Let factor providers add their factors."""
-        if isinstance(self.estimator, GraphFilter | JointKalmanFilter) and self.estimator.providers:
-            self.estimator.ask_providers()
-            self._estimator_to_change()
+        if self.estimator.providers:
+            self._estimator_to_change().ask_providers()
 
     @property
     def empty(self) -> bool:
         """True without any track or other variable."""
-        others = self.estimator.others if isinstance(self.estimator, GraphFilter | JointKalmanFilter) else ()
-        return len(self.estimator.nodes) + len(others) == 0
+        return len(self.estimator.nodes) + len(self.estimator.others) == 0
 
     def pose(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) in the running graph, local; None where there is none."""
@@ -238,7 +216,7 @@ class JointTrackState:
     @property
     def window(self) -> float:
         """Age up to which a late measurement is put at its own time, s; 0 where it is moved to the present."""
-        return self.estimator.lag if isinstance(self.estimator, GraphFilter) else 0.0
+        return self.estimator.lag
 
     def copied(self, taking_over: bool = False) -> JointTrackState:
         """Return a state that changes independently of this one.
@@ -267,7 +245,7 @@ class JointTrackState:
         if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
             self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
             R = np.broadcast_to(np.eye(node_type.dim), H.shape)
-        if delay > 0 and isinstance(estimator, GraphFilter) and estimator.lag > 0:
+        if delay > 0 and estimator.lag > 0:
             then = estimator.time - delay
             known = [self._initiated[track] <= then for track in ids.tolist()]
             there = np.array(known, dtype=np.bool_) & estimator.remembered(ids, then)
@@ -288,7 +266,7 @@ class JointTrackState:
             marginals = estimator.mean(table.ids), estimator.covariance(table.ids)
             self._modes[mixture] = table.anchored(*marginals) if len(table) else table
 
-    def _estimator_to_change(self) -> TrackEstimator:
+    def _estimator_to_change(self) -> Estimator:
         self._kinematics = None
         return self.estimator
 

@@ -31,8 +31,9 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
+from saga_fg.tracking.by_name import require_estimator_name
 from saga_fg.tracking.clock import ClockSettings
-from saga_fg.tracking.names import AssociationName, EstimatorName
+from saga_fg.tracking.names import AssociationName
 from saga_fg.tracking.stationarity import StationaritySettings
 from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types.by_class import DEFAULT, class_settings
@@ -228,10 +229,10 @@ class TrackerSettings(Settings):
     road_map: RoadMap | None = settings_group(
         lambda: None, "lights, stop lines, lanes and walls in world coordinates; null: those that frames bring along"
     )
-    estimator: EstimatorName = setting(
+    estimator: str = setting(
         "kalman",
         "kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph "
-        "of the last `lag` seconds, exact for late frames",
+        "of the last `lag` seconds, exact for late frames; MODULE:NAME or the name of an entry point: your own",
     )
     tolerance: FractionBelowOne = setting(
         0.01,
@@ -297,11 +298,9 @@ class TrackerSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ego is not None and self.ego.estimated:
-            if self.association.method == "graph":
-                raise InputError("ego.estimated: expected association without pairs, got association.method graph")
-            if self.estimator == "kalman":
-                raise InputError("ego.estimated: expected the estimator isam2 or fixed-lag, got kalman")
+        require_estimator_name(self.estimator)
+        if self.ego is not None and self.ego.estimated and self.association.method == "graph":
+            raise InputError("ego.estimated: expected association without pairs, got association.method graph")
         self._require_groups_that_move_alike()
         require_rules("edges", self.edges)
         require_stable(self.edges, self.max_step)

@@ -26,6 +26,7 @@ from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.association import associate
+from saga_fg.tracking.by_name import new_provider
 from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.clock_comparison import compare_clocks, compare_left_out
 from saga_fg.tracking.clock_offsets import SensorTime, sensor_times
@@ -38,7 +39,6 @@ from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.observer import Observer, Stage, TrackerView
 from saga_fg.tracking.prediction import predict
-from saga_fg.tracking.provider_names import new_provider
 from saga_fg.tracking.reporting import report_tracks
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState

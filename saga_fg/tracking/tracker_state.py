@@ -23,11 +23,12 @@ from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.assignment import Assignment
+from saga_fg.tracking.by_name import new_estimator
 from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
 from saga_fg.tracking.ego_node import EgoNode
-from saga_fg.tracking.joint_state import JointTrackState, new_estimator
+from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
@@ -102,7 +103,9 @@ class TrackerState:
     def clear(self) -> None:
         """Remove all tracks, the map and the vehicle; ids go on."""
         settings = self.settings
-        estimator = new_estimator(settings, self.providers, self.rules)
+        values = {field.name: getattr(settings, field.name) for field in fields(settings)}
+        poses = settings.ego is not None and settings.ego.estimated
+        estimator = new_estimator(settings.estimator, values, self.providers, poses)
         self.joint = JointTrackState(estimator, lambda label: motion_of(settings, label))
         self.table = TrackTable.empty(len(self.class_groups))
         read = MAP_CLASSES if self.providers else classes_read(self.rules)

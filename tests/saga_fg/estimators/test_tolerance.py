@@ -80,7 +80,7 @@ def test_a_tolerance_that_is_no_correlation_is_refused(bad):
 
 def test_components_keep_to_their_size_and_the_strongest_ties():
     """Of a chain of six every second tie is weaker: pairs go by the others."""
-    close = JointKalmanFilter(most=2)
+    close = JointKalmanFilter(max_component=2)
     close.add(np.arange(6), np.zeros((6, 4)), np.tile(np.eye(4), (6, 1, 1)))
     close.predict(discretise(chain([2.0, 0.5, 2.0, 0.5, 2.0]), 0.2))
     P = close.joint_covariance(np.arange(6)).reshape(6, 4, 6, 4)
@@ -90,7 +90,7 @@ def test_components_keep_to_their_size_and_the_strongest_ties():
 
 def test_room_for_all_is_exact():
     rng, n = np.random.default_rng(5), 12
-    exact, close = JointKalmanFilter(), JointKalmanFilter(most=n)
+    exact, close = JointKalmanFilter(), JointKalmanFilter(max_component=n)
     for estimator in (exact, close):
         estimator.add(np.arange(n), np.zeros((n, 4)), np.tile(np.eye(4), (n, 1, 1)))
     for _ in range(8):

@@ -232,7 +232,7 @@ def test_copies_go_on_alike_and_looking_ahead_changes_nothing(copied: Callable[[
 
 def test_what_is_refused() -> None:
     with pytest.raises(InputError, match=r"ego\.estimated: expected the estimator isam2 or fixed-lag, got kalman"):
-        TrackerSettings(ego=EgoNodeSettings(estimated=True))
+        Tracker(TrackerSettings(ego=EgoNodeSettings(estimated=True)))
     with pytest.raises(InputError, match=r"ego\.estimated: expected association without pairs"):
         TrackerSettings(ego=EgoNodeSettings(True), estimator="isam2", association=AssociationSettings(method="graph"))
     with pytest.raises(InputError, match="length: expected a finite number > 0"):

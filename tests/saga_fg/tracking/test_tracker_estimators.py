@@ -95,7 +95,8 @@ def test_late_frames_of_objects_born_since(estimator):
 
 
 def test_an_estimator_that_is_none_is_refused():
-    with pytest.raises(InputError, match="estimator: expected one of kalman, isam2, fixed-lag, got 'kallman'"):
+    expected = "estimator: expected one of kalman, isam2, fixed-lag, or MODULE:NAME, got 'kallman'"
+    with pytest.raises(InputError, match=expected):
         TrackerSettings(estimator="kallman")
 
 
