@@ -1,4 +1,7 @@
-"""Every estimator by a recipe: code that makes a fresh one, as text. To test an estimator, add it here."""
+"""Every estimator of the toolkit by a recipe: code that makes a fresh one, as text. To test one of ours, add it here.
+
+Users test theirs by `saga_fg.conformance.check_estimator`, whose programs and textbook are those of the suite.
+"""
 
 import pytest
 

@@ -1,0 +1,230 @@
+"""Programs for estimators: random sequences of what a tracker tells them, and the textbook that runs them densely."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike
+
+from saga_fg.conformance.random_graphs import BUS, CAR, CONE, TRAM, random_graph
+from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update, rts_smooth
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.motion import NodeType
+from saga_fg.model.transition import Transition
+from saga_fg.numerics.arrays import FloatArray, IntArray
+
+E = TypeVar("E")
+Random = np.random.Generator
+
+
+class Operation(Protocol):
+    """One call of an estimator; `run` returns the log-likelihood of an update, else None."""
+
+    def run(self, estimator: Any) -> float | None: ...
+
+
+class Add(NamedTuple):
+    nodes: IntArray
+    means: FloatArray
+    covariances: FloatArray
+
+    def run(self, estimator: Any) -> None:
+        estimator.add(self.nodes, self.means, self.covariances)
+
+
+class Predict(NamedTuple):
+    transition: Transition
+
+    def run(self, estimator: Any) -> None:
+        estimator.predict(self.transition)
+
+
+class Update(NamedTuple):
+    measurements: Measurements
+
+    def run(self, estimator: Any) -> float:
+        return float(estimator.update(self.measurements))
+
+
+class Marginalise(NamedTuple):
+    nodes: IntArray
+
+    def run(self, estimator: Any) -> None:
+        estimator.marginalise(self.nodes)
+
+
+def run(program: Iterable[Operation], estimator: E) -> tuple[E, list[float]]:
+    """The estimator after the program, and the log-likelihoods of its updates."""
+    return estimator, [result for result in (operation.run(estimator) for operation in program) if result is not None]
+
+
+class TextbookEstimator:
+    """`saga_fg.estimators.reference` behind the estimator protocol: dense, plain, and it remembers every moment.
+
+    A moment lasts from one prediction to the next. Nodes marginalised in it stay in its record, so that the smoother
+    can tell where they were last.
+    """
+
+    def __init__(self) -> None:
+        self.x = Gaussian(np.empty(0), np.empty((0, 0)))
+        self.keys: list[int | tuple[int, str]] = []  # of the moment's joint state; (id, "gone") of nodes that have left
+        self.dims: list[int] = []
+        self.filtered: list[Gaussian] = []
+        self.predicted: list[Gaussian] = []
+        self.F: list[FloatArray] = []
+        self.layouts: list[tuple[list[int | tuple[int, str]], list[int]]] = []
+
+    @property
+    def nodes(self) -> IntArray:
+        return np.array([key for key in self.keys if not isinstance(key, tuple)], dtype=np.int64)
+
+    def places(self, keys: Iterable[int]) -> IntArray:
+        offsets = np.concatenate([[0], np.cumsum(self.dims)]).astype(int)
+        rows = [self.keys.index(key) for key in keys]
+        return np.concatenate([np.arange(offsets[r], offsets[r + 1]) for r in rows] or [np.empty(0, dtype=int)])
+
+    def add(self, nodes: Sequence[int] | IntArray, means: FloatArray, covariances: FloatArray) -> None:
+        x = self.x
+        P = scipy.linalg.block_diag(x.covariance, *covariances)
+        self.x = Gaussian(np.concatenate([x.mean, np.ravel(means)]), P[P.shape[0] - len(P) :, : len(P)])
+        self.keys += [int(node) for node in nodes]
+        self.dims += [means.shape[1]] * len(nodes)
+        if self.predicted:  # new nodes belong to the prior of their moment, uncorrelated with the others
+            old = self.predicted[-1]
+            self.predicted[-1] = Gaussian(
+                np.concatenate([old.mean, np.ravel(means)]), scipy.linalg.block_diag(old.covariance, *covariances)
+            )
+            self.F[-1] = np.vstack([self.F[-1], np.zeros((means.size, self.F[-1].shape[1]))])
+
+    def predict(self, transition: Transition) -> None:
+        self.filtered.append(self.x)
+        self.layouts.append((list(self.keys), list(self.dims)))
+        F = np.zeros((len(transition.b), len(self.x.mean)))
+        F[:, self.places(transition.nodes.tolist())] = transition.F_matrix.toarray()
+        self.x = kalman_predict(self.x, F, transition.b, transition.Q_matrix.toarray())
+        self.keys, self.dims = transition.nodes.tolist(), transition.graph.dims.tolist()
+        self.predicted.append(self.x)
+        self.F.append(F)
+
+    def update(self, measurements: Measurements) -> float:
+        m, k, _ = measurements.H.shape
+        H = np.zeros((m * k, len(self.x.mean)))
+        for row, node in enumerate(measurements.nodes.tolist()):
+            H[row * k : (row + 1) * k, self.places([node])] = measurements.H[row]
+        R = scipy.linalg.block_diag(*measurements.R) if m else np.empty((0, 0))
+        self.x, log_likelihood = kalman_update(self.x, measurements.z.ravel(), H, R)
+        return log_likelihood
+
+    def marginalise(self, nodes: Sequence[int] | IntArray) -> None:
+        for node in nodes:
+            row = self.keys.index(int(node))
+            self.keys[row] = (int(node), "gone")
+
+    def joint_mean(self, nodes: ArrayLike) -> FloatArray:
+        return self.x.mean[self.places(np.asarray(nodes).tolist())]
+
+    def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
+        places = self.places(np.asarray(nodes).tolist())
+        return self.x.covariance[np.ix_(places, places)]
+
+    def mean(self, nodes: Sequence[int] | IntArray) -> FloatArray:
+        return np.stack([self.joint_mean([node]) for node in nodes])
+
+    def covariance(self, nodes: Sequence[int] | IntArray) -> FloatArray:
+        return np.stack([self.joint_covariance([node]) for node in nodes])
+
+    def smoothed(self) -> list[dict[int, Gaussian]]:
+        """Rauch-Tung-Striebel: of every moment, the nodes that were still there at its end: {id: Gaussian}."""
+        filtered, layouts = [*self.filtered, self.x], [*self.layouts, (self.keys, self.dims)]
+        result = []
+        for x, (keys, dims) in zip(rts_smooth(filtered, self.predicted, self.F), layouts, strict=True):
+            offsets = np.concatenate([[0], np.cumsum(dims)]).astype(int)
+            spans = {key: slice(offsets[k], offsets[k + 1]) for k, key in enumerate(keys)}
+            result.append(
+                {k: Gaussian(x.mean[s], x.covariance[s, s]) for k, s in spans.items() if not isinstance(k, tuple)}
+            )
+        return result
+
+
+def random_covariance(rng: Random, dim: int, deviation: float) -> FloatArray:
+    """Correlated, every variance about deviation squared."""
+    A = rng.normal(size=(dim, dim))
+    P = A @ A.T + 0.5 * dim * np.eye(dim)
+    scale = deviation * rng.uniform(0.7, 1.4, dim) / np.sqrt(np.diag(P))
+    return P * scale[:, None] * scale
+
+
+def new_nodes(rng: Random, ids: Sequence[int], node_type: NodeType) -> Add:
+    """Priors of new nodes, a few metres and metres per second uncertain."""
+    d = node_type.dim
+    covariances = np.stack([random_covariance(rng, d, 2.0) for _ in ids])
+    return Add(np.array(ids), rng.normal(size=(len(ids), d)) * 10, covariances)
+
+
+def random_updates(rng: Random, estimator: TextbookEstimator, roster: dict[int, NodeType]) -> list[Update]:
+    """Measurements of some nodes by one sensor: positions, velocities too, or odd combinations of components."""
+    updates = []
+    kind = int(rng.integers(0, 3))
+    for d in sorted({t.dim for t in roster.values()}):
+        seen = [node for node, t in roster.items() if t.dim == d and rng.random() < 0.6]  # the others are missed
+        if not seen:
+            continue
+        if kind == 2:
+            k = int(rng.integers(1, d + 1))
+            H = rng.normal(size=(len(seen), k, d))
+        else:
+            k = 2 if kind == 0 or d == 2 else 4
+            H = np.eye(k, d)
+        R = np.stack([random_covariance(rng, k, 0.4) for _ in seen])
+        expected = np.stack(
+            [np.broadcast_to(H, (len(seen), k, d))[i] @ estimator.mean([n])[0] for i, n in enumerate(seen)]
+        )
+        updates.append(Update(Measurements(np.array(seen), expected + rng.normal(size=(len(seen), k)), H, R)))
+    return updates
+
+
+def random_program(
+    rng: Random,
+    moments: int = 6,
+    kinds: Sequence[NodeType] = (CAR, BUS, TRAM, CONE),
+    intervals: Sequence[float] = (0.02, 0.1, 0.37, 0.5, 1.2),
+    max_rate: float = 1.0,
+    density: float = 0.3,
+) -> list[Operation]:
+    """New nodes, predictions with a graph that changes every time, several sensors, misses and leaving nodes.
+
+    Measurements scatter about what a textbook estimator that runs along expects, as those of a real sensor do.
+    """
+    along, next_id = TextbookEstimator(), 10
+    roster: dict[int, NodeType] = {}
+    program: list[Operation] = []
+
+    def do(operation: Operation) -> None:
+        program.append(operation)
+        operation.run(along)
+
+    for moment in range(moments):
+        if moment and roster:
+            nodes = rng.permutation(list(roster))
+            types = tuple(roster[node] for node in nodes.tolist())
+            graph = random_graph(rng, types, nodes, density, max_rate)
+            do(Predict(discretise(graph, float(rng.choice(intervals)))))
+        for node_type in kinds:
+            count = int(rng.integers(0, 3)) if moment % 2 == 0 else int(rng.random() < 0.2)
+            if count:
+                ids = [int(next_id + 3 * k) for k in range(count)]
+                next_id += 3 * count
+                do(new_nodes(rng, ids, node_type))
+                roster.update(dict.fromkeys(ids, node_type))
+        for _ in range(int(rng.integers(0, 3))):
+            for update in random_updates(rng, along, roster):
+                do(update)
+        leaving = [node for node in roster if rng.random() < 0.15]
+        if leaving:
+            do(Marginalise(np.array(leaving)))
+            for node in leaving:
+                del roster[node]
+    return program
