@@ -82,10 +82,6 @@ class Estimator(Protocol):
     providers: Sequence[FactorProvider]
     """Asked for factors once a frame by `ask_providers`; empty for none."""
 
-    def handed_over(self) -> Self:
-        """A copy that takes over what would be long to build again; this one is rarely needed after it."""
-        ...
-
     # the Gaussian, moved and corrected
 
     @property
@@ -173,6 +169,10 @@ class Estimator(Protocol):
 
     def restore(self, state: Any) -> None:
         """Continue from a snapshot of an estimator of the same kind; raises `InputError` for anything else."""
+        ...
+
+    def handed_over(self) -> Self:
+        """A copy that takes over what would be long to build again; this one is rarely needed after it."""
         ...
 
     # factors of providers, for those that have any

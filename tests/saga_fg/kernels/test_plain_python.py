@@ -44,7 +44,7 @@ def track(family, seed):
     tracked(random_frames(seed, frames=8), load_config(family))
 
 
-@given(st.integers(0, 10_000), st.sampled_from([{}, {"tolerance": 0.02, "most": 3}]))
+@given(st.integers(0, 10_000), st.sampled_from([{}, {"tolerance": 0.02, "max_component": 3}]))
 @settings(max_examples=4, deadline=None, derandomize=True)
 def play(seed, bounds):
     estimator, _ = played(random_scenario(np.random.default_rng(seed), frames=4), bounds)
