@@ -7,7 +7,7 @@ from importlib import import_module
 from benchmarks.runner import application
 
 NAMES = (
-    *("estimators", "gaps", "joint", "loops", "metrics", "scaling", "service"),
+    *("estimators", "gaps", "joint", "landmarks", "loops", "metrics", "scaling", "service"),
     *("settling", "slam", "smoothing", "speed", "streaming", "tracking"),
 )
 

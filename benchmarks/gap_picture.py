@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.recordings import RecordingSet
+from benchmarks.recording_sets import RecordingSet
 from data_tools.files.atomic_files import write_bytes
 from data_tools.plots import png
 from data_tools.plots.birds_eye import COLOURS, ellipse

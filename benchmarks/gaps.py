@@ -16,11 +16,11 @@ import numpy as np
 import typer
 
 from benchmarks.gap_picture import write_telling_picture
-from benchmarks.recordings import TRAFFIC_SETS, RecordingSet, chosen_sets
+from benchmarks.recording_sets import TRAFFIC_SETS, RecordingSet, chosen_sets
+from benchmarks.recordings.sensed import ABOVE
 from benchmarks.runner import Data, Row, Rows, chosen
 from benchmarks.variants import contenders
 from data_tools.metrics.bootstrap import difference, relative_change
-from data_tools.simulator.recorded_world import ABOVE
 from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config
 from pipelines.cli.tables import writable_picture

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from benchmarks.recordings import recording_set
+from benchmarks.recording_sets import recording_set
 from benchmarks.runner import Data, Row, Rows, Seed, growth, in_turn
 from benchmarks.service.round_trip import round_trips
 from pipelines.cli.options import counts

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 from benchmarks.gaps import chosen_lengths
-from benchmarks.recordings import RecordingSet, Score, chosen_sets, exact_set
+from benchmarks.recording_sets import RecordingSet, Score, chosen_sets, exact_set
 from benchmarks.runner import Data, Row, Rows, clocked, each, resampled
 from benchmarks.variants import COMPONENTS, SHIPPED, contenders
 from data_tools.metrics import Interval, LabelErrors, calibration, error_summary, errors_by_class, paired_bootstrap

@@ -22,8 +22,6 @@ BUILT_IN = {
     "kitti": "data_tools.datasets.kitti.source:KittiSource",
     "argoverse2": "data_tools.datasets.argoverse2.source:ArgoverseSource",
     "eth_ucy": "data_tools.datasets.eth_ucy:EthUcySource",
-    "ngsim": "data_tools.simulator.recorded_source:NgsimSource",
-    "openacc": "data_tools.simulator.recorded_source:OpenAccSource",
     "mcap": "data_tools.datasets.mcap.source:McapSource",
     "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
     "simulated": "data_tools.simulator.source:SimulatedSource",

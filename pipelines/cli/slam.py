@@ -9,18 +9,14 @@ from pipelines.cli.slam_g2o import g2o
 from pipelines.cli.slam_generate import generate
 from pipelines.cli.slam_kitti import kitti
 from pipelines.cli.slam_laser import laser
-from pipelines.cli.slam_plaza import plaza
 from pipelines.cli.slam_simulated import simulated
-from pipelines.cli.slam_victoria_park import victoria_park
 
 slam_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
 slam_app.command()(g2o)
 slam_app.command()(kitti)
 slam_app.command()(generate)
 slam_app.command()(laser)
-slam_app.command()(plaza)
 slam_app.command()(simulated)
-slam_app.command("victoria-park")(victoria_park)
 
 
 @slam_app.callback()

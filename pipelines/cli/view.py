@@ -66,7 +66,7 @@ def view() -> None:
 
 @view_app.command()
 def slam(
-    result: Annotated[Path, typer.Argument(help="Folder that `saga-fg slam kitti`, `victoria-park` or `plaza` wrote.")],
+    result: Annotated[Path, typer.Argument(help="Folder that `saga-fg slam kitti` wrote.")],
     save: Save = None,
     verbose: options.Verbose = False,
 ) -> None:

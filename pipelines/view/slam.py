@@ -1,4 +1,4 @@
-"""Results of `saga-fg slam kitti`, `victoria-park` or `plaza` as drawings: paths, the map, landmarks with their names.
+"""Results of `saga-fg slam kitti` as drawings: paths, the map, landmarks with their names.
 
     ROOT/trajectory, ROOT/odometry, ROOT/online   paths, those that are there
     ROOT/pose                                     a moving frame along the trajectory; ROOT/pose/body: the vehicle
@@ -48,9 +48,7 @@ class SlamView:
 def read_slam_view(folder: Path) -> SlamView:
     """Read the files of a run of SLAM. Raises `InputError` for a folder without trajectory.tum and for broken files."""
     if not (folder / "trajectory.tum").is_file():
-        raise InputError(
-            f"{folder}: expected trajectory.tum, as `saga-fg slam kitti`, `victoria-park` and `plaza` write"
-        )
+        raise InputError(f"{folder}: expected trajectory.tum, as `saga-fg slam kitti` writes")
     paths = {name: read_tum_poses(file) for name in PATHS if (file := folder / f"{name}.tum").is_file()}
     clouds = {name: file for name in ("map", "landmarks") if (file := folder / f"{name}.ply").is_file()}
     names, places = _named(folder / "landmarks.json")

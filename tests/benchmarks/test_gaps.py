@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from benchmarks import gaps, recordings
+from benchmarks import gaps, recording_sets
 from benchmarks.gap_picture import LIGHTS, gap_picture, telling_gap
 from benchmarks.gaps import rows_of, split_runs, splits_of
-from benchmarks.recordings import simulated_set
+from benchmarks.recording_sets import simulated_set
 from benchmarks.variants import contenders, variants
 from pipelines.config import Family, load_config
 from pipelines.learning.gap_runs import LIFE, GapBenchSettings, judged_run, prepared, run_of, with_life
@@ -35,7 +35,7 @@ SEVEN_SECONDS = replace(SHORT, duration=7.0)
 @pytest.fixture
 def short_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulated scenes that last for seconds."""
-    monkeypatch.setattr(recordings, "simulated_set", lambda scenes: simulated_set(scenes, settings=SEVEN_SECONDS))
+    monkeypatch.setattr(recording_sets, "simulated_set", lambda scenes: simulated_set(scenes, settings=SEVEN_SECONDS))
 
 
 @pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "file"])
@@ -153,7 +153,7 @@ def test_the_command_compares_on_the_same_gaps(bench, tmp_path: Path) -> None:
 
 def test_recordings_without_gaps_are_refused(refused, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = replace(SHORT, duration=1.0)
-    monkeypatch.setattr(recordings, "simulated_set", lambda scenes: simulated_set(scenes, settings=settings))
+    monkeypatch.setattr(recording_sets, "simulated_set", lambda scenes: simulated_set(scenes, settings=settings))
     said = refused("gaps --sets simulated --scenes 1 --passes 1 --contenders kf")
     assert "set simulated: expected recordings with gaps" in said
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.recordings import Score, chosen_sets, simulated_set
+from benchmarks.recording_sets import Score, chosen_sets, simulated_set
 from benchmarks.tracking import changes, set_rows, with_made_gaps
 from benchmarks.variants import COMPONENTS, changed, contenders, variants
 from data_tools.metrics import LabelErrors

@@ -16,17 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.recordings.landmarks import read_landmark_log
+from benchmarks.recordings.ngsim import ngsim_windows
+from benchmarks.recordings.openacc import openacc_platoons
 from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.detection_files import TruthFile, read_detections, read_tracks
 from data_tools.datasets.eth_ucy import EthUcy
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
 from data_tools.datasets.label_table import read_label_table
-from data_tools.datasets.ngsim.windows import NgsimWindows
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
-from data_tools.datasets.openacc import OpenAccPlatoons
-from data_tools.datasets.plaza import read_plaza
-from data_tools.datasets.victoria_park import read_victoria_park
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
@@ -35,8 +34,8 @@ from pipelines.explaining import read_events
 from pipelines.report.run_record import read_run_record
 from pipelines.serving import StreamTracker
 from saga_fg.types.dataset import Dataset, Scene
+from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.kitti_example import write_sequence
-from tests.data_tools.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.nuscenes_example import box, results, write_results, write_tables
 
 PIECES = [
@@ -150,8 +149,8 @@ def targets(folder: Path) -> dict[str, Target]:
         "scan, PLY": one("scan.ply", PLY, read_scan),
         "scan, NumPy": Target((npy,), lambda: read_scan(npy)),
         "configuration": one("config.yaml", CONFIG, lambda path: load_config("file", path)),
-        "Victoria Park": one("park.txt", PARK, read_victoria_park),
-        "Plaza": Target(plaza, lambda: read_plaza(plaza[0])),
+        "Victoria Park": one("park.txt", PARK, read_landmark_log),
+        "Plaza": Target(plaza, lambda: read_landmark_log(plaza[0])),
         "ETH and UCY": one("eth/obsmat.txt", OBSMAT, lambda path: EthUcy(folder).scene("eth")),
         **_traffic(folder),
         **_recordings(folder),
@@ -266,7 +265,7 @@ def _traffic(folder: Path) -> dict[str, Target]:
     windows, maps = folder / "ngsim" / "windows.csv", folder / "ngsim" / "maps.json"
     windows.write_text("\n".join([HEADER, *rows(steps=3)]))
     maps.write_text(json.dumps({"A": crossing()}))
-    found = {"NGSIM": Target((windows, maps), lambda: NgsimWindows(folder / "ngsim").recording("A"))}
+    found = {"NGSIM": Target((windows, maps), lambda: ngsim_windows(folder / "ngsim").read("A"))}
     if importlib.util.find_spec("pyarrow") is None:
         return found
     import pyarrow
@@ -276,7 +275,7 @@ def _traffic(folder: Path) -> dict[str, Target]:
     numbers = {name: [1.0, 1.1] for name in ("speed", "east", "north", "gap_to_next")}
     path = folder / "platoons.parquet"
     parquet.write_table(pyarrow.table(text | {"t": [0.1, 0.2], "veh": [1, 1]} | numbers), path)
-    return {**found, "OpenACC": Target((path,), lambda: OpenAccPlatoons(folder).recording("a-b"))}
+    return {**found, "OpenACC": Target((path,), lambda: openacc_platoons(folder).read("a-b"))}
 
 
 def _recordings(folder: Path) -> dict[str, Target]:

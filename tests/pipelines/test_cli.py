@@ -153,8 +153,6 @@ def test_verbose_adds_the_traceback(tmp_path: Path) -> None:
         ("smooth", "file", "circle.csv", "-o", "out"),
         ("smooth", "file", "in.csv", "-o", "circle.csv"),
         ("slam", "g2o", "circle.csv", "-o", "out"),
-        ("slam", "plaza", "circle.csv", "-o", "out"),
-        ("slam", "victoria-park", "circle.csv", "-o", "out"),
         ("explain", "circle.csv", "--track", "1"),
         ("explain", "in.csv", "--track", "9" * 5000),
         ("report", "file", "circle.csv", "-o", "page.html"),

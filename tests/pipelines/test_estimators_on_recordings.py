@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.recordings import recording_set
+from benchmarks.recording_sets import recording_set
 from pipelines.config import load_config
 from saga_fg.estimators import GraphFilter
 from saga_fg.model.transition import Transition

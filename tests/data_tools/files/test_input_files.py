@@ -12,12 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.recordings.landmarks import read_landmark_log
 from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.label_table import read_label_table
 from data_tools.datasets.nuscenes import read_tracking_results
-from data_tools.datasets.plaza import read_plaza
-from data_tools.datasets.victoria_park import read_victoria_park
 from data_tools.files.input_files import open_bytes, read_text
 from data_tools.files.json_stream import open_json, parsed_json
 from data_tools.files.remote_files import expanded
@@ -35,8 +34,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "results.json": read_tracking_results,
     "0000.txt": read_kitti_labels,
     "a.g2o": read_g2o,
-    "park.txt": read_victoria_park,
-    "P_DR.txt": read_plaza,
+    "park.txt": read_landmark_log,
+    "P_DR.txt": read_landmark_log,
     "poses.txt": read_kitti_poses,
     "a.tum": read_tum_poses,
     "a.bin": read_scan,

@@ -7,14 +7,16 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.recordings import recording_set
+from benchmarks.recording_sets import recording_set
+from benchmarks.recordings.sources import Ngsim
 from data_tools.datasets.parts import scene_digests
-from data_tools.simulator.recorded_source import NgsimSource
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.learning import scenes_to_learn_from
 from pipelines.tracking import track_scene
-from tests.data_tools.ngsim_example import crossing, rows, write_ngsim
+from tests.benchmarks.recordings.ngsim_example import crossing, rows, write_ngsim
+
+NGSIM = "benchmarks.recordings:Ngsim"
 
 
 @pytest.fixture
@@ -26,16 +28,16 @@ def data(tmp_path: Path) -> Path:
 
 def test_track_and_evaluate(data: Path) -> None:
     root, tracks = str(data / "ngsim"), str(data / "tracks.csv")
-    run = CliRunner().invoke(app, ["track", "ngsim", "--dataroot", root, "--output", tracks])
+    run = CliRunner().invoke(app, ["track", NGSIM, "--dataroot", root, "--output", tracks])
     assert run.exit_code == 0, run.output
     assert "1 scene, 20 frames" in run.output
-    run = CliRunner().invoke(app, ["evaluate", "ngsim", tracks, "--dataroot", root])
+    run = CliRunner().invoke(app, ["evaluate", NGSIM, tracks, "--dataroot", root])
     assert run.exit_code == 0, run.output
     assert "MOTA" in run.output
 
 
 def test_scenes_to_learn_from_have_the_carrier_as_well(data: Path) -> None:
-    source = NgsimSource(dataroot=str(data / "ngsim"), viewpoint="1")
+    source = Ngsim(dataroot=str(data / "ngsim"), viewpoint="1")
     scene = scenes_to_learn_from(source, load_config("traffic"), with_truth=True)["A"]
     assert scene.ground_truth is not None
     ids = [name for moment in scene.ground_truth for name in moment.id.tolist()]
@@ -54,7 +56,7 @@ def test_a_set_of_the_benchmarks_is_scored_at_every_moment(data: Path) -> None:
 def test_what_is_given_of_the_road_is_part_of_the_digest(data: Path) -> None:
     digests = []
     for road in ("signals", "map", "none"):
-        source = NgsimSource(dataroot=str(data / "ngsim"), road=road)  # type: ignore[arg-type]
+        source = Ngsim(dataroot=str(data / "ngsim"), road=road)  # type: ignore[arg-type]
         with source.open() as dataset:
             digests.append(scene_digests(dataset.scene("A")))
     assert len({each["moments"] for each in digests}) == 2

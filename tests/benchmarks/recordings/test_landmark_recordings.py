@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.plaza import read_plaza
-from data_tools.datasets.victoria_park import read_victoria_park
+from benchmarks.recordings.landmarks import read_landmark_log
 from saga_fg import InputError
 
 PARK = """\
@@ -38,12 +37,12 @@ def plaza(folder: Path, **texts: str) -> Path:
 
 
 def test_a_drive_past_trees_is_read(tmp_path: Path) -> None:
-    drive = read_victoria_park(park(tmp_path, PARK))
+    drive = read_landmark_log(park(tmp_path, PARK))
     np.testing.assert_allclose(drive.a_T_b[1], [[0, -1, 0.5], [1, 0, 0.25], [0, 0, 1]], atol=1e-15)
     np.testing.assert_array_equal(drive.odometry_covariance[1], [[0.01, 0.001, 0], [0.001, 0.02, 0], [0, 0, 0.03]])
     assert drive.pose.tolist() == [1, 2]
-    assert drive.tree.tolist() == [2, 2]
-    np.testing.assert_array_equal(drive.place, [[4, -1], [5, 6]])
+    assert drive.landmark.tolist() == [2, 2]
+    np.testing.assert_array_equal(drive.value, [[4, -1], [5, 6]])
     np.testing.assert_array_equal(drive.covariance[0], [[0.4, 0.1], [0.1, 0.5]])
 
 
@@ -63,30 +62,32 @@ def test_a_drive_past_trees_is_read(tmp_path: Path) -> None:
 def test_a_broken_drive_is_located(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = park(tmp_path, PARK.replace(old, new, 1))
     with pytest.raises(InputError, match=message) as caught:
-        read_victoria_park(path)
+        read_landmark_log(path)
     assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize("named", ["DR", "TL"])
 def test_ranges_to_beacons_are_read(tmp_path: Path, named: str) -> None:
     plaza(tmp_path)
-    drive = read_plaza(tmp_path / f"P_{named}.txt")
+    drive = read_landmark_log(tmp_path / f"P_{named}.txt")
     np.testing.assert_array_equal(drive.time, [10.0, 10.2])
-    np.testing.assert_array_equal(drive.turn, [0.1, -0.1])
-    assert drive.beacon.tolist() == [7, 3]
-    np.testing.assert_array_equal(drive.range, [30.5, 12.0])
+    np.testing.assert_allclose(np.arctan2(drive.a_T_b[:, 1, 0], drive.a_T_b[:, 0, 0]), [-0.1])
+    np.testing.assert_allclose(np.hypot(*drive.a_T_b[0, :2, 2]), 0.25)
+    assert drive.pose.tolist() == [1, 1]
+    assert drive.landmark.tolist() == [7, 3]
+    np.testing.assert_array_equal(drive.value[:, 0], [30.5, 12.0])
     assert drive.truth is not None
     np.testing.assert_allclose(drive.truth.positions[1], [3, 4, 0])
-    assert {k: v.tolist() for k, v in drive.beacons.items()} == {7: [20, 30], 3: [-1, -2]}
+    assert {k: v.tolist() for k, v in drive.places.items()} == {7: [20, 30], 3: [-1, -2]}
 
 
 def test_the_truth_of_beacons_and_drive_is_optional(tmp_path: Path) -> None:
     path = plaza(tmp_path)
     (tmp_path / "P_GT.txt").unlink()
     (tmp_path / "P_TL.txt").unlink()
-    drive = read_plaza(path)
+    drive = read_landmark_log(path)
     assert drive.truth is None
-    assert drive.beacons == {}
+    assert drive.places == {}
 
 
 @pytest.mark.parametrize(
@@ -99,15 +100,10 @@ def test_the_truth_of_beacons_and_drive_is_optional(tmp_path: Path) -> None:
         ({"DR": "10 1 0\n9 1 0\n"}, "P_DR.txt: line 2: time: expected 10.000000 or later"),
         ({"DR": "10 one 0\n"}, "P_DR.txt: line 1: distance: expected a finite number, got 'one'"),
         ({"GT": ""}, "P_GT.txt: expected records"),
-        ({"TL": "1e300 20 30\n"}, "P_TL.txt: line 1: beacon: expected a whole number"),
+        ({"TL": "1e300 20 30\n"}, "P_TL.txt: line 1: beacon: expected a number within"),
         ({"TL": "7 20\n"}, "P_TL.txt: line 1: expected 3 columns"),
     ],
 )
 def test_broken_ranges_are_located(tmp_path: Path, texts: dict[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        read_plaza(plaza(tmp_path, **texts))
-
-
-def test_another_file_is_no_part_of_a_drive(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected one of the files NAME_DR"):
-        read_plaza(tmp_path / "plaza.txt")
+        read_landmark_log(plaza(tmp_path, **texts))

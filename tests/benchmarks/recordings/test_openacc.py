@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_tools.datasets.openacc import OpenAccPlatoons
+from benchmarks.recordings.openacc import openacc_platoons
+from benchmarks.recordings.traffic import Recordings
 from saga_fg.errors import InputError, MissingExtraError
 
 pa = pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
@@ -35,22 +36,22 @@ def platoon(lengths: tuple[float, ...] = (5.0, 4.2, 5.0)) -> dict[str, Any]:
     return columns
 
 
-def write(root: Path, columns: dict[str, Any]) -> OpenAccPlatoons:
+def write(root: Path, columns: dict[str, Any]) -> Recordings:
     parquet.write_table(pa.table(columns), root / "platoons.parquet")
-    return OpenAccPlatoons(root)
+    return openacc_platoons(root)
 
 
 def test_a_platoon_drives_in_order_with_its_gaps(tmp_path: Path) -> None:
     platoons = write(tmp_path, platoon())
     assert platoons.names == ("short_gap-part1",)
-    traffic = platoons.recording("short_gap-part1")
-    assert traffic.id.tolist() == ["1", "2", "3"]
+    traffic = platoons.read("short_gap-part1")
+    assert traffic.vehicles.id.tolist() == ["1", "2", "3"]
     assert len(traffic) == K
-    np.testing.assert_allclose(traffic.yaw, np.pi / 2)
-    np.testing.assert_allclose(traffic.velocity[5], [[0.0, 10.0]] * 3, atol=1e-9)
-    centres = traffic.position[0, :, 1]
+    np.testing.assert_allclose(traffic.vehicles.yaw, np.pi / 2)
+    np.testing.assert_allclose(traffic.vehicles.velocity[5], [[0.0, 10.0]] * 3, atol=1e-9)
+    centres = traffic.vehicles.position[0, :, 1]
     assert (np.diff(centres) < 0).all()
-    half = (traffic.size[1:, 0] + traffic.size[:-1, 0]) / 2
+    half = (traffic.vehicles.size[1:, 0] + traffic.vehicles.size[:-1, 0]) / 2
     np.testing.assert_allclose(-np.diff(centres) - half, GAP, atol=0.1)
     assert traffic.road_map is None
 
@@ -60,7 +61,7 @@ def test_moments_without_a_position_and_jumps_are_left_out(tmp_path: Path) -> No
     columns["east"][3] = None
     columns["speed"][5] = float("nan")
     columns["east"][20] += 2.0  # there and back
-    present = write(tmp_path, columns).recording("short_gap-part1").present
+    present = write(tmp_path, columns).read("short_gap-part1").vehicles.present
     assert np.flatnonzero(~present[:, 0]).tolist() == [3, 5, 19, 20, 21]
     assert present[:, 1:].all()
 
@@ -70,9 +71,9 @@ def test_a_car_that_stands_keeps_the_heading_that_it_had(tmp_path: Path) -> None
     north = np.array(columns["north"])
     north[20:] = north[20]
     still = [10.0 if k <= 20 else 0.0 for k in range(K)]
-    traffic = write(tmp_path, {**columns, "north": north, "speed": still}).recording("short_gap-part1")
-    np.testing.assert_allclose(traffic.yaw, np.pi / 2)
-    np.testing.assert_allclose(traffic.velocity[30], 0.0)
+    traffic = write(tmp_path, {**columns, "north": north, "speed": still}).read("short_gap-part1")
+    np.testing.assert_allclose(traffic.vehicles.yaw, np.pi / 2)
+    np.testing.assert_allclose(traffic.vehicles.velocity[30], 0.0)
 
 
 @pytest.mark.parametrize(
@@ -92,24 +93,22 @@ def test_a_car_that_stands_keeps_the_heading_that_it_had(tmp_path: Path) -> None
 def test_what_is_wrong_in_the_file_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     columns = {name: column for name, column in (platoon((5.0,)) | changes).items() if column is not None}
     with pytest.raises(InputError, match=message):
-        write(tmp_path, columns).recording("short_gap-part1")
+        write(tmp_path, columns).read("short_gap-part1")
 
 
-def test_no_file_an_empty_one_and_an_unknown_run_are_errors(tmp_path: Path) -> None:
+def test_no_file_and_an_empty_one_are_errors(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"platoons.parquet: cannot be read"):
-        OpenAccPlatoons(tmp_path)
+        openacc_platoons(tmp_path)
     (tmp_path / "platoons.parquet").write_bytes(b"")
     with pytest.raises(InputError, match=r"expected a readable Parquet file"):
-        OpenAccPlatoons(tmp_path)
+        openacc_platoons(tmp_path)
     schema = pa.schema([(n, pa.string() if n in ("setting", "run") else pa.float64()) for n in platoon()])
     parquet.write_table(schema.set(3, pa.field("veh", pa.int64())).empty_table(), tmp_path / "platoons.parquet")
     with pytest.raises(InputError, match=r"expected rows, there are none"):
-        OpenAccPlatoons(tmp_path)
-    with pytest.raises(InputError, match=r"unknown run 'part2'"):
-        write(tmp_path, platoon()).recording("part2")
+        openacc_platoons(tmp_path)
 
 
 def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'saga-fg\[parquet\]'"):
-        OpenAccPlatoons(tmp_path)
+        openacc_platoons(tmp_path)

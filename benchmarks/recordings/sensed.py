@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from data_tools.datasets.recorded_traffic import PERIOD, RecordedTraffic
+from benchmarks.recordings.traffic import PERIOD, RecordedTraffic
 from data_tools.files.error_messages import unknown_name
 from data_tools.simulator.lights import HEIGHT, Signal
 from data_tools.simulator.scene import scene_from_world
@@ -75,68 +75,58 @@ def sensed_scene(traffic: RecordedTraffic, viewpoint: str, settings: SimulatorSe
     Raises `InputError` for a viewpoint that is none of the above.
     """
     settings = settings or default_sensors()
-    row = _carrier(traffic, viewpoint)
+    sensors, row = settings.sensors, _carrier(traffic, viewpoint)
     if row is None:
-        ego, sensors = _stationary(traffic, viewpoint, settings.sensors)
+        ego, sensors = _stationary(traffic.vehicles, viewpoint, sensors)
     else:
-        there = np.flatnonzero(traffic.present[:, row])
+        there = np.flatnonzero(traffic.vehicles.present[:, row])
         traffic = traffic.moments(slice(int(there[0]), int(there[-1]) + 1))
-        ego, sensors = np.column_stack([traffic.position[:, row], traffic.yaw[:, row]]), settings.sensors
-        traffic = traffic.without(row)
-    settings = replace(
-        settings,
-        sensors=sensors,
-        duration=PERIOD * (len(traffic) - 1) + 1e-6,
-        keyframe_rate=1 / PERIOD,
-    )
+        all_of_them = traffic.vehicles
+        ego = np.column_stack([all_of_them.position[:, row], all_of_them.yaw[:, row]])
+        traffic = replace(traffic, vehicles=all_of_them.select(np.delete(np.arange(len(all_of_them)), row)))
+    duration = PERIOD * (len(traffic) - 1) + 1e-6
+    settings = replace(settings, sensors=sensors, duration=duration, keyframe_rate=1 / PERIOD)
     number = int(np.random.SeedSequence([seed, zlib.crc32(traffic.name.encode())]).generate_state(1)[0])
-    world = RecordedWorld(_objects(traffic), ego, traffic.road_map)
+    world = RecordedWorld(traffic.vehicles, ego, traffic.road_map)
     scene = scene_from_world(world, settings, number, traffic.name, epoch=0.0)
     return replace(scene, frames=_with_colours(scene.frames, traffic)) if traffic.colours else scene
 
 
 def true_scene(traffic: RecordedTraffic) -> Scene:
     """Ground truth alone: all vehicles, all visible."""
-    objects, truth = _objects(traffic), []
-    for time in traffic.time.tolist():
-        boxes, present = objects.at(time)
-        truth.append(Annotations(traffic.id[present], boxes.select(present), np.ones(int(present.sum()), dtype=bool)))
+    vehicles, truth = traffic.vehicles, []
+    for time in vehicles.time.tolist():
+        boxes, present = vehicles.at(time)
+        truth.append(Annotations(vehicles.id[present], boxes.select(present), np.ones(int(present.sum()), dtype=bool)))
     poses = np.tile(np.eye(4), (len(traffic), 1, 1))
-    return Scene(traffic.name, np.round(traffic.time, 6), poses, ("",) * len(traffic), (), truth)
-
-
-def _objects(traffic: RecordedTraffic) -> SimulatedTrajectories:
-    return SimulatedTrajectories(
-        *(traffic.id, traffic.label, traffic.size, traffic.time),
-        *(traffic.position, traffic.velocity, traffic.yaw, traffic.present),
-    )
+    return Scene(traffic.name, np.round(vehicles.time, 6), poses, ("",) * len(traffic), (), truth)
 
 
 def _carrier(traffic: RecordedTraffic, viewpoint: str) -> int | None:
     """Row of the vehicle that carries the sensors, None where none does."""
     if viewpoint in (MAST, ABOVE) or "," in viewpoint:
         return None
-    count = traffic.present.sum(axis=0)
+    vehicles, names = traffic.vehicles, tuple(traffic.vehicles.id.tolist())
+    count = vehicles.present.sum(axis=0)
     if viewpoint == VEHICLE:
-        away = np.hypot(*(traffic.position.mean(axis=0) - _middle(traffic)).T)
+        away = np.hypot(*(vehicles.position.mean(axis=0) - _middle(vehicles)).T)
         row = int(np.lexsort((away, -count))[0])
-    else:
-        names = tuple(traffic.id.tolist())
-        if viewpoint not in names:
-            known = (MAST, ABOVE, VEHICLE, "X,Y,Z", *names)
-            raise InputError(f"--viewpoint: {traffic.name}: {unknown_name('viewpoint', viewpoint, known)}")
+    elif viewpoint in names:
         row = names.index(viewpoint)
+    else:
+        known = (MAST, ABOVE, VEHICLE, "X,Y,Z", *names)
+        raise InputError(f"--viewpoint: {traffic.name}: {unknown_name('viewpoint', viewpoint, known)}")
     if count[row] < 2:
         raise InputError(f"--viewpoint {viewpoint}: {traffic.name}: expected a vehicle that is there for some time")
     return row
 
 
 def _stationary(
-    traffic: RecordedTraffic, viewpoint: str, sensors: Mapping[str, SensorSettings]
+    vehicles: SimulatedTrajectories, viewpoint: str, sensors: Mapping[str, SensorSettings]
 ) -> tuple[FloatArray, dict[str, SensorSettings]]:
     """Poses (K, 3) without a vehicle, and the sensors at the height of the viewpoint."""
     if viewpoint == ABOVE:
-        far = {
+        return np.column_stack([vehicles.position.mean(axis=1), np.zeros(len(vehicles.time))]), {
             name: replace(
                 sensor,
                 position=(0.0, 0.0, ABOVE_HEIGHT),
@@ -147,16 +137,14 @@ def _stationary(
             )
             for name, sensor in sensors.items()
         }
-        return np.column_stack([traffic.position.mean(axis=1), np.zeros(len(traffic))]), far
-    x, y, z = (*_middle(traffic), MAST_HEIGHT) if viewpoint == MAST else _place(viewpoint)
-    return np.tile([x, y, 0.0], (len(traffic), 1)), {
-        name: replace(sensor, position=(0.0, 0.0, float(z))) for name, sensor in sensors.items()
-    }
+    x, y, z = (*_middle(vehicles), MAST_HEIGHT) if viewpoint == MAST else _place(viewpoint)
+    at = {name: replace(sensor, position=(0.0, 0.0, float(z))) for name, sensor in sensors.items()}
+    return np.tile([x, y, 0.0], (len(vehicles.time), 1)), at
 
 
-def _middle(traffic: RecordedTraffic) -> FloatArray:
+def _middle(vehicles: SimulatedTrajectories) -> FloatArray:
     """(2,) m, of all recorded positions."""
-    return np.asarray(np.median(traffic.position[traffic.present], axis=0))
+    return np.asarray(np.median(vehicles.position[vehicles.present], axis=0))
 
 
 def _place(text: str) -> tuple[float, float, float]:

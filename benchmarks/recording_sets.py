@@ -9,16 +9,17 @@ from functools import partial
 from math import inf
 from pathlib import Path
 
+from benchmarks.recordings.ngsim import ngsim_windows
+from benchmarks.recordings.openacc import openacc_platoons
+from benchmarks.recordings.sensed import MAST, VEHICLE, sensed_scene
+from benchmarks.recordings.sources import TrafficScenes
+from benchmarks.recordings.traffic import Recordings, overlapping
 from benchmarks.runner import chosen
 from data_tools.datasets.kitti import KittiTracking, write_kitti_results
 from data_tools.datasets.kitti.evaluation import CLASSES, kitti_label_errors
 from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
-from data_tools.datasets.ngsim.windows import NgsimWindows
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.datasets.nuscenes.evaluation import nuscenes_label_errors
-from data_tools.datasets.openacc import OpenAccPlatoons
-from data_tools.datasets.overlapping import overlapping
-from data_tools.datasets.recorded_traffic import Stretches, TrafficRecordings
 from data_tools.datasets.source import ChosenScenes
 from data_tools.evaluation.placed_detections import placed_detections
 from data_tools.metrics import (
@@ -32,8 +33,6 @@ from data_tools.metrics import (
     scene_metrics,
 )
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from data_tools.simulator.recorded_source import SensedRecordings
-from data_tools.simulator.recorded_world import MAST, VEHICLE
 from pipelines.config import Family
 from pipelines.tracking import TrackedScene
 from saga_fg.errors import InputError
@@ -163,7 +162,7 @@ def recording_set(
 ) -> RecordingSet:
     """A set by name; `data` holds a folder for each kind of recordings, `scenes` simulated ones are made.
 
-    viewpoint  of the sensors that see recorded traffic, see `data_tools.simulator.recorded_world`; None: the set's own
+    viewpoint  of the sensors that see recorded traffic, see `benchmarks.recordings.sensed`; None: the set's own
     longest    of recorded traffic, s, from the middle of longer recordings
 
     Raises `InputError` for missing recordings.
@@ -175,9 +174,10 @@ def recording_set(
     if name in SETS:
         return SETS[name](data)
     traffic, usual = TRAFFIC_SETS[name]
-    recordings: TrafficRecordings = Stretches(traffic(data), longest)
-    clusters = overlapping(map(recordings.recording, recordings.names)) if name == "ngsim" else {}
-    return exact_set(name, "traffic", SensedRecordings(recordings, viewpoint or usual, None, seed=0), clusters)
+    recordings = traffic(data / name).middle(longest)
+    clusters = overlapping(map(recordings.read, recordings.names)) if name == "ngsim" else {}
+    sensed = partial(sensed_scene, viewpoint=viewpoint or usual, settings=None, seed=0)
+    return exact_set(name, "traffic", TrafficScenes(recordings, sensed), clusters)
 
 
 def chosen_sets(
@@ -217,8 +217,8 @@ SETS: dict[str, Callable[[Path], RecordingSet]] = {
     "camera": partial(_nuscenes, "camera", "camera", "camera", "fastbev_camera.json"),
     "kitti": _kitti,
 }
-TRAFFIC_SETS: dict[str, tuple[Callable[[Path], TrafficRecordings], str]] = {
-    "ngsim": (lambda data: NgsimWindows(data / "ngsim"), MAST),
-    "openacc": (lambda data: OpenAccPlatoons(data / "openacc"), VEHICLE),
+TRAFFIC_SETS: dict[str, tuple[Callable[[Path], Recordings], str]] = {
+    "ngsim": (ngsim_windows, MAST),
+    "openacc": (openacc_platoons, VEHICLE),
 }
 """Recorded traffic, whose detections are made, and the usual viewpoint; taken only where it is asked for."""

@@ -8,44 +8,48 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.ngsim.windows import NgsimWindows
+from benchmarks.recordings.ngsim import ngsim_windows
+from benchmarks.recordings.sensed import true_scene
+from benchmarks.recordings.sources import TrafficScenes
 from saga_fg.errors import InputError
-from tests.data_tools.ngsim_example import HEADER, crossing, rows, write_ngsim
+from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, rows, write_ngsim
 
 
 def test_rows_become_states_on_a_common_grid(tmp_path: Path) -> None:
-    windows = NgsimWindows(write_ngsim(tmp_path, rows() + rows("B"), {"A": crossing(), "B": crossing()}))
+    windows = ngsim_windows(write_ngsim(tmp_path, rows() + rows("B"), {"A": crossing(), "B": crossing()}))
     assert windows.names == ("A", "B")
-    traffic = windows.recording("A")
-    assert traffic.id.tolist() == ["1", "2", "3"]
-    assert traffic.label.tolist() == ["car", "car", "truck"]  # of its length
-    np.testing.assert_allclose(traffic.time, 0.1 * np.arange(12))
-    np.testing.assert_allclose(traffic.position[7], [[-33.0, 4.0], [-3.0, 0.0], [-26.5, 0.0]])
-    np.testing.assert_allclose(traffic.velocity[7], [[10.0, 0.0], [0.0, 0.0], [5.0, 0.0]])
-    assert traffic.present[:, 2].tolist() == [False] * 5 + [True] * 7
-    np.testing.assert_allclose(traffic.position[0, 2], traffic.position[5, 2])  # of the nearest moment where absent
-    assert (traffic.size[:, 2] > 1).all()
+    traffic = windows.read("A")
+    assert traffic.vehicles.id.tolist() == ["1", "2", "3"]
+    assert traffic.vehicles.label.tolist() == ["car", "car", "truck"]  # of its length
+    np.testing.assert_allclose(traffic.vehicles.time, 0.1 * np.arange(12))
+    np.testing.assert_allclose(traffic.vehicles.position[7], [[-33.0, 4.0], [-3.0, 0.0], [-26.5, 0.0]])
+    np.testing.assert_allclose(traffic.vehicles.velocity[7], [[10.0, 0.0], [0.0, 0.0], [5.0, 0.0]])
+    assert traffic.vehicles.present[:, 2].tolist() == [False] * 5 + [True] * 7
+    np.testing.assert_allclose(
+        traffic.vehicles.position[0, 2], traffic.vehicles.position[5, 2]
+    )  # of the nearest moment where absent
+    assert (traffic.vehicles.size[:, 2] > 1).all()
 
 
 def test_columns_come_in_any_order_and_without_compression(tmp_path: Path) -> None:
     names = HEADER.split(",")
     turned = [",".join(row.split(",")[::-1]) for row in rows()]
     (tmp_path / "windows.csv").write_text("\n".join([",".join(names[::-1]), *turned]))
-    traffic = NgsimWindows(tmp_path, "none").recording("A")
-    np.testing.assert_allclose(traffic.position[3, 0], [-37.0, 4.0])
+    traffic = ngsim_windows(tmp_path, "none").read("A")
+    np.testing.assert_allclose(traffic.vehicles.position[3, 0], [-37.0, 4.0])
     assert traffic.road_map is None
 
 
 def test_steps_that_start_late_keep_the_phase_of_the_lights(tmp_path: Path) -> None:
     late = [row.replace(f",{k},car", f",{k + 10},car") for k in range(12) for row in rows() if f",{k},car" in row]
-    colours = NgsimWindows(write_ngsim(tmp_path, late, {"A": crossing()})).recording("A").colours["light-7"]
+    colours = ngsim_windows(write_ngsim(tmp_path, late, {"A": crossing()})).read("A").colours["light-7"]
     assert colours.tolist() == ["green"] * 3 + ["amber"] * 5 + ["red"] * 4
 
 
 def test_vehicles_that_overlap_stay_as_they_are(tmp_path: Path) -> None:
     inside = [f"X,A,9,{k},car,-3.2,0.1,0,0,,4.5,1.8" for k in range(4, 12)]
-    traffic = NgsimWindows(write_ngsim(tmp_path, rows() + inside, {"A": crossing()})).recording("A")
-    assert traffic.present[:, traffic.id == "9"].sum() == 8
+    traffic = ngsim_windows(write_ngsim(tmp_path, rows() + inside, {"A": crossing()})).read("A")
+    assert traffic.vehicles.present[:, traffic.vehicles.id == "9"].sum() == 8
 
 
 @pytest.mark.parametrize(
@@ -63,42 +67,42 @@ def test_vehicles_that_overlap_stay_as_they_are(tmp_path: Path) -> None:
 def test_what_is_wrong_in_a_row_is_named(tmp_path: Path, line: str, message: str) -> None:
     write_ngsim(tmp_path, [*rows(), line], {"A": crossing()})
     with pytest.raises(InputError, match=message):
-        NgsimWindows(tmp_path).recording("A")
+        ngsim_windows(tmp_path).read("A")
 
 
 def test_wrong_columns_empty_files_and_missing_files_are_errors(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected windows.csv.gz or windows.csv, there is neither"):
-        NgsimWindows(tmp_path)
+        ngsim_windows(tmp_path)
     write_ngsim(tmp_path, rows(), header=HEADER.replace("yaw", "heading"))
     with pytest.raises(InputError, match=r"windows.csv.gz: yaw: expected this column, the file has site, scenario"):
-        NgsimWindows(tmp_path)
+        ngsim_windows(tmp_path)
     write_ngsim(tmp_path, [])
     with pytest.raises(InputError, match=r"windows.csv.gz: expected rows, there are none"):
-        NgsimWindows(tmp_path)
+        ngsim_windows(tmp_path)
     (tmp_path / "windows.csv.gz").write_bytes(gzip.compress(b""))
     with pytest.raises(InputError, match=r"scenario: expected this column, the file has none"):
-        NgsimWindows(tmp_path)
+        ngsim_windows(tmp_path)
     (tmp_path / "windows.csv.gz").write_bytes(b"not compressed")
     with pytest.raises(InputError, match=r"windows.csv.gz: expected text in UTF-8, compressed by gzip"):
-        NgsimWindows(tmp_path)
+        ngsim_windows(tmp_path)
 
 
 def test_a_window_of_one_moment_and_an_unknown_one_are_errors(tmp_path: Path) -> None:
-    windows = NgsimWindows(write_ngsim(tmp_path, rows(steps=1), {"A": crossing()}))
+    windows = ngsim_windows(write_ngsim(tmp_path, rows(steps=1), {"A": crossing()}))
     with pytest.raises(InputError, match=r"windows.csv.gz: A: expected at least two moments, got 1"):
-        windows.recording("A")
-    with pytest.raises(InputError, match=r"unknown window 'B'"):
-        windows.recording("B")
+        windows.read("A")
+    with pytest.raises(InputError, match=r"unknown recording 'B'"):
+        TrafficScenes(windows, true_scene).scene("B")
 
 
 def test_a_window_without_a_map_is_an_error_that_says_how_to_go_without(tmp_path: Path) -> None:
     write_ngsim(tmp_path, rows(), {"B": crossing()})
     with pytest.raises(InputError, match=r"maps.json.gz: A: expected a map, there is none; --road none goes without"):
-        NgsimWindows(tmp_path).recording("A")
-    assert NgsimWindows(tmp_path, "none").recording("A").road_map is None
+        ngsim_windows(tmp_path).read("A")
+    assert ngsim_windows(tmp_path, "none").read("A").road_map is None
     (tmp_path / "maps.json.gz").unlink()
     with pytest.raises(InputError, match=r"expected maps.json.gz or maps.json, there is neither; --road none"):
-        NgsimWindows(tmp_path).recording("A")
+        ngsim_windows(tmp_path).read("A")
     (tmp_path / "maps.json").write_text("{")
     with pytest.raises(InputError, match=r"maps.json: expected JSON"):
-        NgsimWindows(tmp_path).recording("A")
+        ngsim_windows(tmp_path).read("A")

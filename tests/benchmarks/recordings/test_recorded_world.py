@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.ngsim.windows import NgsimWindows
-from data_tools.datasets.recorded_traffic import RecordedTraffic
-from data_tools.simulator.recorded_source import NgsimSource
-from data_tools.simulator.recorded_world import sensed_scene, true_scene
+from benchmarks.recordings.ngsim import ngsim_windows
+from benchmarks.recordings.sensed import sensed_scene, true_scene
+from benchmarks.recordings.sources import Ngsim
+from benchmarks.recordings.traffic import RecordedTraffic
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from pipelines.config import load_config
 from pipelines.tracking import track_scene
@@ -20,7 +20,7 @@ from saga_fg.errors import InputError
 from saga_fg.model.road.lane_keeping import InLane
 from saga_fg.model.road.stopping import RedLight
 from saga_fg.types.dataset import Scene
-from tests.data_tools.ngsim_example import crossing, rows, write_ngsim
+from tests.benchmarks.recordings.ngsim_example import crossing, rows, write_ngsim
 
 PERFECT = SensorSettings(
     detection_probability=1.0, clutter_rate=0.0, reach=1000.0, max_range=500.0, size_noise=0.0, yaw_noise=0.0
@@ -29,7 +29,7 @@ PERFECT = SensorSettings(
 
 @pytest.fixture
 def traffic(tmp_path: Path) -> RecordedTraffic:
-    return NgsimWindows(write_ngsim(tmp_path, rows(), {"A": crossing()})).recording("A")
+    return ngsim_windows(write_ngsim(tmp_path, rows(), {"A": crossing()})).read("A")
 
 
 def perfect() -> SimulatorSettings:
@@ -63,7 +63,13 @@ def test_a_vehicle_behind_another_is_hidden_from_the_road_and_not_from_a_mast(tr
     assert high == {"1": 1.0, "2": 1.0, "3": 1.0}
     assert low["2"] == 1.0  # stands before the truck
     assert low["1"] == 1.0  # in the other lane
-    trailing = replace(traffic, size=np.where(traffic.size[:, :1] > 7, [[4.5, 1.8, 1.5]], traffic.size))
+    trailing = replace(
+        traffic,
+        vehicles=replace(
+            traffic.vehicles,
+            size=np.where(traffic.vehicles.size[:, :1] > 7, [[4.5, 1.8, 1.5]], traffic.vehicles.size),
+        ),
+    )
     assert visible(sensed_scene(trailing, "10,0,1", perfect(), 0))["3"] < 0.5
 
 
@@ -126,7 +132,7 @@ def test_a_tracker_believes_the_colours_and_knows_the_map(traffic: RecordedTraff
 
 def test_a_vehicle_that_appears_inside_another_is_tracked_with_the_rest(tmp_path: Path) -> None:
     inside = [f"X,A,9,{k},car,-3.2,0.1,0,0,,4.5,1.8" for k in range(4, 12)]
-    traffic = NgsimWindows(write_ngsim(tmp_path, rows() + inside, {"A": crossing()})).recording("A")
+    traffic = ngsim_windows(write_ngsim(tmp_path, rows() + inside, {"A": crossing()})).read("A")
     scene = sensed_scene(traffic, "mast", perfect(), seed=0)
     assert scene.ground_truth is not None
     assert len(scene.ground_truth[-1]) == 4
@@ -151,7 +157,7 @@ def test_viewpoints_that_are_none_are_errors(traffic: RecordedTraffic, viewpoint
 
 def test_a_source_opens_chosen_windows(tmp_path: Path) -> None:
     write_ngsim(tmp_path, rows() + rows("B"), {"A": crossing(), "B": crossing()})
-    source = NgsimSource(dataroot=str(tmp_path), scenes="B", road="map")
+    source = Ngsim(dataroot=str(tmp_path), scenes="B", road="map")
     with source.open(truth=True) as dataset, source.ground_truth() as true:
         assert dataset.scenes == true.scenes == ("B",)
         scene = dataset.scene("B")
@@ -161,6 +167,6 @@ def test_a_source_opens_chosen_windows(tmp_path: Path) -> None:
     assert scene.frames[0].road_map is not None
     with (
         pytest.raises(InputError, match=r"--scenes: unknown scene 'C'"),
-        NgsimSource(dataroot=str(tmp_path), scenes="C").open(),
+        Ngsim(dataroot=str(tmp_path), scenes="C").open(),
     ):
         pass

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_tools.datasets.ngsim.road import road_of
+from benchmarks.recordings.lanelets import road_of
 from saga_fg.errors import InputError
-from tests.data_tools.ngsim_example import crossing, lanelet
+from tests.benchmarks.recordings.ngsim_example import crossing, lanelet
+
+STEPS = np.arange(2)
 
 
 def test_lanelets_without_a_branch_are_one_lane_and_lines_side_by_side_one_line() -> None:
-    road, cycles = road_of(crossing(), "map", with_cycles=True)
+    steps = np.array([0, 3, 12, 13, 17, 18, 37, 38, 38 + 35 * 7])
+    road, cycles = road_of(crossing(), "map", steps)
     assert {lane.name: (lane.centre[0], lane.centre[-1]) for lane in road.lanes} == {
         "lane-1": ((-50.0, 4.0), (50.0, 4.0)),
         "lane-2": ((-50.0, 0.0), (0.0, 0.0)),  # ends
@@ -23,21 +26,21 @@ def test_lanelets_without_a_branch_are_one_lane_and_lines_side_by_side_one_line(
     assert (line.left, line.right, line.light) == ((0.0, 6.0), (0.0, -2.0), "light-7")
     assert line.heading == pytest.approx(0.0)
     assert road.lights[0].position == pytest.approx((12.0, 2.0))  # beyond the line, where signal heads are
-    shown = cycles["light-7"](np.array([0, 3, 12, 13, 17, 18, 37, 38, 38 + 35 * 7]))
+    shown = cycles["light-7"]
     assert shown.tolist() == ["red", "green", "green", "amber", "amber", "red", "red", "green", "green"]
 
 
 def test_a_lane_that_ends_at_the_edge_of_the_map_ends_there() -> None:
     entry = crossing()
     entry["lanelets"][2]["successor"] = [99]  # not in the map
-    road, _ = road_of(entry, "map", with_cycles=True)
+    road, _ = road_of(entry, "map", steps=STEPS)
     assert road.lanes[0].centre[-1] == (50.0, 4.0)
 
 
 def test_a_branch_ends_a_lane_and_a_circle_is_one() -> None:
     branch = [lanelet(1, 0.0, (0.0, 9.0), successor=[2, 3]), lanelet(2, 0.0, (9.0, 20.0)), lanelet(3, 1.0, (9.0, 20.0))]
     circle = [lanelet(4, 0.0, (9.0, 20.0), successor=[5]), lanelet(5, 8.0, (20.0, 9.0), successor=[4])]
-    road, _ = road_of({"lanelets": branch + circle, "lights": []}, "map", with_cycles=True)
+    road, _ = road_of({"lanelets": branch + circle, "lights": []}, "map", steps=STEPS)
     assert {lane.name: len(lane.centre) for lane in road.lanes} == {"lane-1": 2, "lane-2": 2, "lane-3": 2, "lane-4": 4}
 
 
@@ -70,9 +73,9 @@ def turning(directions: dict[int, str], successors: list[int], lights: list[int]
 def test_a_line_is_governed_by_the_lights_of_the_movements_possible_from_it(
     directions: dict[int, str], successors: list[int], name: str, shown: str
 ) -> None:
-    road, cycles = road_of(turning(directions, successors, list(directions)), "map", with_cycles=True)
+    road, cycles = road_of(turning(directions, successors, list(directions)), "map", steps=STEPS)
     assert road.stop_lines[0].light == name
-    assert cycles[name](np.arange(2)).tolist() == [shown] * 2
+    assert cycles[name].tolist() == [shown] * 2
     assert road.stop_lines[0].heading == pytest.approx(0.0)  # its ends were given from right to left
 
 
@@ -80,8 +83,8 @@ def test_a_signal_without_a_cycle_is_an_error_that_says_how_to_go_without() -> N
     entry = crossing()
     del entry["lights"][0]["cycle"]
     with pytest.raises(InputError, match=r"map: light 7: cycle: expected \[colour, steps\], .*; --road map leaves"):
-        road_of(entry, "map", with_cycles=True)
-    road, cycles = road_of(entry, "map", with_cycles=False)
+        road_of(entry, "map", steps=STEPS)
+    road, cycles = road_of(entry, "map", steps=None)
     assert len(road.stop_lines) == 1
     assert cycles == {}
 
@@ -108,4 +111,4 @@ def test_what_is_wrong_in_a_map_is_named(change: Any, message: str) -> None:
     entry = crossing()
     change(entry)
     with pytest.raises(InputError, match=message):
-        road_of(entry, "map", with_cycles=True)
+        road_of(entry, "map", steps=STEPS)

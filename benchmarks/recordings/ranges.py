@@ -15,50 +15,34 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Annotated
 
 import numpy as np
 
-from data_tools.datasets.plaza import BeaconRanges
+from benchmarks.recordings.landmarks import LandmarkLog
 from data_tools.trajectories import absolute_errors, matched, rigid_alignment
 from factors import Robust, SolverSettings, calibrated_range_factors, prior_factor
 from pipelines.slam.results import planar_trajectory
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.numerics.planar_poses import transforms
-from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import MeasuredMotion, landmark_key, pose_key
 
-_LEAST_NOISE = 0.005  # least standard deviation of a step, ahead and sideways, m
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)
 _START = 1e-8  # variance of the first pose, m^2 and rad^2
 _RANGES = 10  # at least, to place a beacon by
+_LOSS = Robust("cauchy", 2.0)  # of ranges, standard deviations
+_RADIO = np.diag([0.1, 1.0]) ** 2  # covariance of scale and offset (m) of the radio at the start
+_BEGINNING = 100.0  # m driven before the beacons are placed
+_GROWTH = 1.3  # ratio of the lengths of two successive parts of the drive
 _CALIBRATION = key_of(EGO_ERROR, 0, None)
-
-
-@dataclass(frozen=True)
-class PlazaSettings(Settings):
-    """Noise of odometry and ranges."""
-
-    distance_noise: Positive = setting(0.05, "standard deviation of the distance of a step, as a share of it")
-    turn_noise: Positive = setting(0.01, "standard deviation of the heading change of a step, rad")
-    range_noise: Positive = setting(0.5, "standard deviation of a range, m")
-    robust: Positive = setting(2.0, "residual from which the Cauchy loss discounts a range, standard deviations")
-    scale_noise: Positive = setting(0.1, "standard deviation of the scale of the radio at the start")
-    offset_noise: Positive = setting(1.0, "standard deviation of the offset of the radio at the start, m")
-    beginning: Positive = setting(100.0, "distance driven before the beacons are placed, m")
-    growth: Annotated[float, Range(1.01, 100.0)] = setting(
-        1.3, "ratio of the lengths of two successive parts of the drive"
-    )
 
 
 @dataclass(frozen=True, eq=False)
 class BeaconMap:
-    """world_T_pose (N, 3, 3) at each row of odometry, the first at the origin; beacons (2,) by number, and their
-    covariances (2, 2), m and m^2; scale and offset (m) of the ranges; dead_reckoning (N, 3, 3).
+    """world_T_pose (N, 3, 3), the first at the origin; beacons (2,) by number, and their covariances (2, 2), m and m^2;
+    scale and offset (m) of the ranges; dead_reckoning (N, 3, 3).
     """
 
     world_T_pose: FloatArray
@@ -69,32 +53,29 @@ class BeaconMap:
     dead_reckoning: FloatArray
 
 
-def map_beacons(drive: BeaconRanges, settings: PlazaSettings | None = None) -> BeaconMap:
+def map_beacons(drive: LandmarkLog) -> BeaconMap:
     """Estimate all of a drive. Raises `InputError` for a beacon without ranges enough to place it."""
-    settings = settings or PlazaSettings()
-    steps = _steps(drive.distance, drive.turn)
-    reckoned = np.stack(list(accumulate(steps[1:], np.matmul, initial=np.eye(3))))
-    at = np.clip(np.searchsorted(drive.time, drive.measured), 0, len(drive.time) - 1)
-    end = int(np.searchsorted(np.cumsum(np.abs(drive.distance)), settings.beginning)) + 1
-    graph, numbers = SceneFactorGraph(), np.unique(drive.beacon).tolist()
-    along = np.maximum(settings.distance_noise * np.abs(drive.distance), _LEAST_NOISE)
+    reckoned = np.stack(list(accumulate(drive.a_T_b, np.matmul, initial=np.eye(3))))
+    end = int(np.searchsorted(np.cumsum(np.hypot(*drive.a_T_b[:, :2, 2].T)), _BEGINNING)) + 2
+    graph, numbers = SceneFactorGraph(), np.unique(drive.landmark).tolist()
     while graph.epoch + 1 < len(reckoned):
         for row in range(graph.epoch + 1, min(end, len(reckoned))):
-            noise = np.diag([along[row], _LEAST_NOISE, settings.turn_noise]) ** 2
-            first = MeasuredMotion(np.eye(3), _START * np.eye(3))
+            step = (
+                (drive.a_T_b[row - 1], drive.odometry_covariance[row - 1]) if row else (np.eye(3), _START * np.eye(3))
+            )
             graph.advance(max(drive.time[row], np.nextafter(graph.time, np.inf)))  # rows may have one time
-            ask_all([MeasuredMotion(steps[row], noise) if row else first], graph)
+            ask_all([MeasuredMotion(*step)], graph)
         poses = np.stack([graph.state(pose_key(row)).matrix() for row in range(graph.epoch + 1)])
         places: dict[int, FloatArray] = {}
         for number in numbers:
-            seen = (drive.beacon == number) & (at <= graph.epoch)
+            seen = (drive.landmark == number) & (drive.pose <= graph.epoch)
             if landmark_key(number) not in graph.variables and np.count_nonzero(seen) >= _RANGES:
-                places[number] = trilateration(poses[at[seen], :2, 2], drive.range[seen])
-        ask_all([_Ranges(drive, settings, at, places)], graph)
+                places[number] = trilateration(poses[drive.pose[seen], :2, 2], drive.value[seen, 0])
+        ask_all([_Ranges(drive, places)], graph)
         solver = BatchSolver(graph=graph, settings=_SOLVER)
         solver.solve()
         graph = solver.snapshot()
-        end = max(end + 1, int(settings.growth * end))
+        end = max(end + 1, int(_GROWTH * end))
     beacons = {n: graph.state(landmark_key(n)) for n in numbers if landmark_key(n) in graph.variables}
     missing = set(numbers) - set(beacons)
     if missing:
@@ -107,35 +88,27 @@ def map_beacons(drive: BeaconRanges, settings: PlazaSettings | None = None) -> B
 
 @dataclass(frozen=True, eq=False)
 class _Ranges:
-    """All ranges of beacons in the graph from poses in it, those at new places among them, and the calibration.
+    """All ranges of beacons in the graph from poses in it, those at new places (2,) among them, and the calibration."""
 
-    at: (K,) the row of odometry that each range belongs to; places: (2,) by number
-    """
-
-    drive: BeaconRanges
-    settings: PlazaSettings
-    at: IntArray
+    drive: LandmarkLog
     places: Mapping[int, FloatArray]
     name: str = "ranges"
 
     def factors(self, view: GraphView) -> Additions:
-        drive, s = self.drive, self.settings
+        drive = self.drive
         new = [NewVariable(LANDMARK, n, place, static=True, label="beacon") for n, place in self.places.items()]
         factors = []
         if _CALIBRATION not in view.variables:
             new.append(NewVariable(EGO_ERROR, 0, np.zeros(2), static=True, label="calibration"))
-            factors.append(prior_factor(_CALIBRATION, np.zeros(2), np.diag([s.scale_noise, s.offset_noise]) ** 2))
-        used = (self.at <= view.epoch) & np.isin(drive.beacon, [*view.static(LANDMARK), *self.places])
-        rows = [
-            [pose_key(row), landmark_key(number), _CALIBRATION]
-            for row, number in zip(self.at[used].tolist(), drive.beacon[used].tolist(), strict=True)
-        ]
-        loss = Robust("cauchy", s.robust)
-        ranges = calibrated_range_factors(rows, drive.range[used], s.range_noise**2, loss)
+            factors.append(prior_factor(_CALIBRATION, np.zeros(2), _RADIO))
+        used = (drive.pose <= view.epoch) & np.isin(drive.landmark, [*view.static(LANDMARK), *self.places])
+        pairs = zip(drive.pose[used].tolist(), drive.landmark[used].tolist(), strict=True)
+        rows = [[pose_key(row), landmark_key(number), _CALIBRATION] for row, number in pairs]
+        ranges = calibrated_range_factors(rows, drive.value[used, 0], float(drive.covariance[0, 0, 0]), _LOSS)
         return Additions(new, factors, {"ranges": [ranges]})
 
 
-def compared(drive: BeaconRanges, found: BeaconMap) -> tuple[dict[str, float], dict[str, FloatArray]]:
+def compared(drive: LandmarkLog, found: BeaconMap) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Figures against the truth where there is one, and the true path (n, 3) in the coordinates of the estimate.
 
     The estimate is moved as a whole to lie nearest to the true path; beacons are compared after the same motion. The
@@ -150,11 +123,10 @@ def compared(drive: BeaconRanges, found: BeaconMap) -> tuple[dict[str, float], d
     figures["ATE, m"] = _root_mean_square(absolute_errors(estimate, truth))
     figures["ATE of dead reckoning, m"] = _root_mean_square(absolute_errors(reckoned, truth))
     truth_T_world = rigid_alignment(estimate.positions, truth.positions)
-    known = [number for number in found.beacons if number in drive.beacons]
+    known = [number for number in found.beacons if number in drive.places]
     if known:
         places = np.array([[*found.beacons[number], 0.0] for number in known])
-        true = np.array([drive.beacons[number] for number in known])
-        off = transform_points(truth_T_world, places)[:, :2] - true
+        off = transform_points(truth_T_world, places)[:, :2] - np.array([drive.places[number] for number in known])
         figures["beacons, m"] = _root_mean_square(np.linalg.norm(off, axis=1))
     return figures, {"truth": transform_points(inverse_transform(truth_T_world), truth.positions)}
 
@@ -167,8 +139,3 @@ def trilateration(places: FloatArray, ranges: FloatArray) -> FloatArray:
     """Return the point (2,) at these ranges (K,) from these places (K, 2), m, in the sense of linear least squares."""
     b = (ranges**2).mean() - ranges**2 + (places**2).sum(axis=1) - (places**2).sum(axis=1).mean()
     return np.asarray(np.linalg.lstsq(2 * (places - places.mean(axis=0)), b, rcond=None)[0])
-
-
-def _steps(distance: FloatArray, turn: FloatArray) -> FloatArray:
-    """Return the increment (N, 3, 3) of each row of odometry: half the turn, the distance, the other half."""
-    return transforms(np.column_stack([distance * np.cos(turn / 2), distance * np.sin(turn / 2), turn]))

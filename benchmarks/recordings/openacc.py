@@ -7,9 +7,9 @@
     east, north      m, local
     gap_to_next      m, bumper to bumper to the next number
 
-Headings are those of the way travelled, velocities the recorded speed along them. Lengths follow from the gaps: the
-distance of two centres less the gap is the mean of both lengths. A moment without position or speed, and both ends of
-a step that differs from the speed by more than 5 m/s (a jump of the receiver), are left out.
+Headings are those of the direction travelled, velocities the recorded speed along them. Lengths follow from the gaps:
+the distance of two centres less the gap is the mean of both lengths. A moment without position or speed, and both ends
+of a step that differs from the speed by more than 5 m/s (a jump of the receiver), are left out.
 
 Source: Makridis et al., OpenACC, Transport Research Part C 2021; JRC of the European Commission. Parquet needs pyarrow
 (extra [parquet]).
@@ -19,13 +19,12 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.recorded_traffic import PERIOD, RecordedTraffic, StateRows
+from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
 from data_tools.files.arrow_tables import NUMBERS, WHOLE, all_of, read_arrow_arrays
-from data_tools.files.error_messages import error_context, unknown_name
+from data_tools.files.error_messages import error_context
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
@@ -34,51 +33,34 @@ FILE = "platoons.parquet"
 JUMP = 5.0  # m/s, between a step and the speed
 SIZE = (4.6, 1.85)  # m, of a car of which nothing is known
 LENGTHS = (2.5, 7.0)  # m, within which a car is
+_WEAK = 0.5  # weight of the usual length
 _TEXT = "OUT"  # kinds of NumPy's types
-_COLUMNS = {
-    "setting": _TEXT,
-    "run": _TEXT,
-    "t": NUMBERS,
-    "veh": WHOLE,
-    **dict.fromkeys(("speed", "east", "north"), NUMBERS),
-}
-_GAP = "gap_to_next"
-_TRAVELLED = 0.5  # m, from which a way has a direction
+_KINDS = {"setting": _TEXT, "run": _TEXT, "veh": WHOLE}
+_COLUMNS = ("setting", "run", "t", "veh", "speed", "east", "north", "gap_to_next")
+_TYPES = {_TEXT: np.str_, WHOLE: np.int64, NUMBERS: np.float64}
+_TRAVELLED = 0.5  # m, from which a distance has a direction
 _LATEST = 1e6  # s
 
 
-class OpenAccPlatoons:
+def openacc_platoons(root: Path) -> Recordings:
     """The platoons of a folder with platoons.parquet.
 
     Raises `InputError` for a folder or a file that is not as above, `MissingExtraError` without pyarrow.
     """
+    path = root / FILE
+    found = read_arrow_arrays(path, all_of(path, _COLUMNS), _KINDS, _COLUMNS[:4])
+    columns = {name: column.astype(_TYPES[_KINDS.get(name, NUMBERS)]) for name, column in found.items()}
+    if not len(columns["t"]):
+        raise InputError(f"{path}: expected rows, there are none")
+    run = np.char.replace(np.char.add(np.char.add(columns["setting"], "-"), columns["run"]), " ", "_")
 
-    def __init__(self, root: str | Path) -> None:
-        self._path = Path(root) / FILE
-        self._columns = _columns(self._path)
-        settings, runs = self._columns["setting"], self._columns["run"]
-        if not len(settings):
-            raise InputError(f"{self._path}: expected rows, there are none")
-        names = np.char.replace(np.char.add(np.char.add(settings, "-"), runs), " ", "_")
-        self._rows = {str(name): np.flatnonzero(names == name) for name in np.unique(names)}
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the runs."""
-        return tuple(self._rows)
-
-    def recording(self, name: str) -> RecordedTraffic:
-        """Read a run; raises `InputError` for an unknown name, and for numbers that cannot be."""
-        if name not in self._rows:
-            raise InputError(f"{self._path}: {unknown_name('run', name, self.names)}")
-        row = self._rows[name]
-        row = row[np.lexsort((self._columns["t"][row], self._columns["veh"][row]))]
-        time, vehicle, speed, east, north, gap = (
-            self._columns[key][row] for key in ("t", "veh", "speed", "east", "north", _GAP)
-        )
-        with error_context(f"{self._path}: {name}"):
+    def read(name: str) -> RecordedTraffic:
+        row = np.flatnonzero(run == name)
+        row = row[np.lexsort((columns["t"][row], columns["veh"][row]))]
+        time, vehicle, speed, east, north, gap = (columns[key][row] for key in _COLUMNS[2:])
+        position = np.column_stack([east, north])
+        with error_context(f"{path}: {name}"):
             moment = _moments(time)
-            position = np.column_stack([east, north])
             for column, values, largest in (("east, north", position, MAX_POSITION), ("speed", speed, MAX_SPEED)):
                 if (np.abs(values) > largest).any():  # not of NaN
                     raise InputError(f"{column}: expected numbers within {largest:g}")
@@ -86,14 +68,14 @@ class OpenAccPlatoons:
             kept &= ~_jumps(moment, vehicle, position, speed)
             if not kept.any():
                 raise InputError("expected positions and speeds, there are none")
-            length = _lengths(moment[kept], vehicle[kept], position[kept], gap[kept])
-            moment, vehicle, position, speed = moment[kept], vehicle[kept], position[kept], speed[kept]
-            yaw = _courses(vehicle, position)
+        moment, vehicle, position, speed = moment[kept], vehicle[kept], position[kept], speed[kept]
+        lengths, yaw = _lengths(moment, vehicle, position, gap[kept]), _courses(vehicle, position)
         velocity = np.maximum(speed, 0.0)[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
-        sizes = {str(number): ("car", each, SIZE[1]) for number, each in length.items()}
-        states = StateRows(moment - moment.min(), vehicle.astype(np.str_), position, velocity, yaw)
-        with error_context(str(self._path)):
-            return states.traffic(name, sizes)
+        sizes = {str(number): ("car", length, SIZE[1]) for number, length in lengths.items()}
+        with error_context(str(path)):
+            return on_grid(name, moment - moment.min(), vehicle.astype(np.str_), (position, velocity, yaw), sizes)
+
+    return Recordings(tuple(np.unique(run).tolist()), read)
 
 
 def _moments(time: FloatArray) -> IntArray:
@@ -118,19 +100,17 @@ def _jumps(moment: IntArray, vehicle: IntArray, position: FloatArray, speed: Flo
 def _lengths(moment: IntArray, vehicle: IntArray, position: FloatArray, gap: FloatArray) -> dict[int, float]:
     """Length of each vehicle, m: least squares of half the sums that the gaps give, drawn to a usual one."""
     numbers = np.unique(vehicle).tolist()
+    unit = np.eye(len(numbers))
     rows, sums = [], []
     for k, (one, other) in enumerate(pairwise(numbers)):
-        if other != one + 1:
-            continue
         a, b = np.flatnonzero(vehicle == one), np.flatnonzero(vehicle == other)
         _, ia, ib = np.intersect1d(moment[a], moment[b], return_indices=True)
         between = np.hypot(*(position[a[ia]] - position[b[ib]]).T) - gap[a[ia]]
-        if np.isfinite(between).any():
-            rows.append(np.eye(len(numbers))[[k, k + 1]].mean(axis=0))
+        if other == one + 1 and np.isfinite(between).any():
+            rows.append(unit[[k, k + 1]].mean(axis=0))
             sums.append(float(np.nanmedian(between)))
-    weak = 0.5
-    A = np.concatenate([np.array(rows).reshape(-1, len(numbers)), weak * np.eye(len(numbers))])
-    b = np.append(np.array(sums), np.full(len(numbers), weak * SIZE[0]))
+    A = np.concatenate([np.array(rows).reshape(-1, len(numbers)), _WEAK * unit])
+    b = np.append(np.array(sums), np.full(len(numbers), _WEAK * SIZE[0]))
     length = np.clip(np.linalg.lstsq(A, b, rcond=None)[0], *LENGTHS)
     return dict(zip(numbers, length.tolist(), strict=True))
 
@@ -141,21 +121,12 @@ def _courses(vehicle: IntArray, position: FloatArray) -> FloatArray:
     for number in np.unique(vehicle).tolist():
         row = np.flatnonzero(vehicle == number)
         p = position[row]
-        way = np.append(0.0, np.cumsum(np.hypot(*np.diff(p, axis=0).T)))
-        before = np.maximum(np.searchsorted(way, way - _TRAVELLED, side="right") - 1, 0)
-        after = np.minimum(np.searchsorted(way, way + _TRAVELLED), len(way) - 1)
+        distance = np.append(0.0, np.cumsum(np.hypot(*np.diff(p, axis=0).T)))
+        before = np.maximum(np.searchsorted(distance, distance - _TRAVELLED, side="right") - 1, 0)
+        after = np.minimum(np.searchsorted(distance, distance + _TRAVELLED), len(distance) - 1)
         across = p[after] - p[before]
-        known = np.hypot(*across.T) >= _TRAVELLED
-        if known.any():
-            at = np.flatnonzero(known)
+        at = np.flatnonzero(np.hypot(*across.T) >= _TRAVELLED)
+        if len(at):
             course = np.unwrap(np.arctan2(across[at, 1], across[at, 0]))
             yaw[row] = course[np.clip(np.searchsorted(at, np.arange(len(row)), side="right") - 1, 0, None)]
     return yaw
-
-
-def _columns(path: Path) -> dict[str, Any]:
-    """The columns of the file as arrays; numbers may be NaN where the file has nothing."""
-    filled = ("setting", "run", "t", "veh")
-    columns = read_arrow_arrays(path, all_of(path, (*_COLUMNS, _GAP)), _COLUMNS, filled)
-    types = {_TEXT: np.str_, WHOLE: np.int64, NUMBERS: np.float64}
-    return {name: column.astype(types[_COLUMNS.get(name, NUMBERS)]) for name, column in columns.items()}

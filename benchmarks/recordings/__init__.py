@@ -1,0 +1,21 @@
+"""Recordings of research as datasets of the command: `benchmarks.recordings:Ngsim` and `benchmarks.recordings:OpenAcc`;
+drives past landmarks, `read_landmark_log`."""
+
+from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
+from benchmarks.recordings.sensed import ABOVE, MAST, VEHICLE
+from benchmarks.recordings.sources import Ngsim, OpenAcc, TrafficScenes
+from benchmarks.recordings.traffic import RecordedTraffic, Recordings, overlapping
+
+__all__ = [
+    "ABOVE",
+    "MAST",
+    "VEHICLE",
+    "LandmarkLog",
+    "Ngsim",
+    "OpenAcc",
+    "RecordedTraffic",
+    "Recordings",
+    "TrafficScenes",
+    "overlapping",
+    "read_landmark_log",
+]

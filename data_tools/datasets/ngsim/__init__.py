@@ -1,1 +1,0 @@
-"""Windows of dense traffic of the NGSIM programme, with lanes, stop lines and signal cycles."""
