@@ -1,6 +1,6 @@
 """False loop closures in pose graphs beside GTSAM's graduated non-convexity, and loops by place on simulated drives.
 
-A course of some 2 km passes three stretches again (`data_tools.simulator.course`). Its odometry is the true motion with
+A course of some 2 km passes three stretches again (`benchmarks.course`). Its odometry is the true motion with
 errors sampled from `NOISE`, and `drift` m in a random direction more, growing evenly until the vehicle first comes
 back. The graph holds odometry and loops alone. A loop is false if it is off by more than `FALSE` m; a stretch is found
 if a true loop ends in it.
@@ -17,11 +17,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from benchmarks.course import SimulatedCourse, revisits
 from benchmarks.runner import Row, Rows, clocked, each
 from data_tools.files.error_messages import error_context
 from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o, with_false_loops
-from data_tools.simulator.course import SimulatedCourse, revisits
 from data_tools.trajectories import Trajectory, degraded_odometry, trajectory_errors
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.lidar_slam_types import LidarSlamResult
@@ -154,13 +154,13 @@ def course_row(seed: int, drift: float) -> dict[str, Any]:
     before, after = (trajectory_errors(path, truth, distance=OVER) for path in (result.odometry, result.trajectory))
     right, lost = (_right(course, result.keyframes, found) for found in (result.loops, result.false_loops))
     second = result.keyframes[np.array([loop.second for loop in result.loops], dtype=np.int64)]
-    ends = course.way[second[right]]
-    stretches = [(course.way[a], course.way[b]) for a, b in revisits(course.world_T_ego)]
+    ends = course.distance[second[right]]
+    stretches = [(course.distance[a], course.distance[b]) for a, b in revisits(course.world_T_ego)]
     hits = sum(bool(((ends + SETTINGS.submaps.length >= a) & (ends <= b)).any()) for a, b in stretches)
     about = {
         "seed": seed,
         "drift, m": drift,
-        "m": float(course.way[-1]),
+        "m": float(course.distance[-1]),
         "odometry": before.relative_translation / OVER,
     }
     errors = {"ATE, m: odometry": before.ate, "with loops": after.ate, "ratio": after.ate / before.ate}
@@ -184,6 +184,6 @@ def odometry_of(course: SimulatedCourse, seed: int, drift: float) -> FloatArray:
     exact = OdometryIncrements.of(course.timestamps, course.world_T_ego)
     poses = degraded_odometry(exact, NOISE, rng).path(course.world_T_ego[0])
     angle = rng.uniform(0.0, 2 * np.pi)
-    again = course.way[revisits(course.world_T_ego)[0][0]]
-    poses[:, :2, 3] += drift * (course.way / again)[:, None] * np.array([np.cos(angle), np.sin(angle)])
+    again = course.distance[revisits(course.world_T_ego)[0][0]]
+    poses[:, :2, 3] += drift * (course.distance / again)[:, None] * np.array([np.cos(angle), np.sin(angle)])
     return poses

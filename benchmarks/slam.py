@@ -28,12 +28,12 @@ import numpy as np
 import typer
 from scipy.spatial import cKDTree
 
+from benchmarks.course import SimulatedCourse
 from benchmarks.runner import Row, Rows, Seed, clocked, each, in_turn, timed
 from data_tools.datasets.kitti import KittiScans
 from data_tools.lidar import Scan, constant_velocity, deskewed, scan_to_map_residual
 from data_tools.lidar.scan import ScanSequence
 from data_tools.metrics.pairwise_agreement import pairwise_agreement
-from data_tools.simulator.course import SimulatedCourse
 from data_tools.simulator.scanner import ScannerSettings
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.process import one_thread, peak_memory

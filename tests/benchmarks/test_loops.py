@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.app import app
+from benchmarks.course import SimulatedCourse, revisits
 from benchmarks.loops import odometry_of
 from data_tools.pose_graphs import write_g2o
-from data_tools.simulator.course import SimulatedCourse, revisits
 from saga_fg.slam.pose_graph import PoseGraph, PosePriors
 from tests.saga_fg.loops import loop
 
@@ -71,7 +71,7 @@ def test_odometry_errs_by_one_per_cent_and_the_drift_asked_for() -> None:
         poses, drifted = (odometry_of(course, seed, drift) for drift in (0.0, 30.0))
         first = revisits(course.world_T_ego)[0][0]
         assert np.linalg.norm((drifted - poses)[first, :3, 3]) == pytest.approx(30.0)
-        ends.append(np.linalg.norm((poses - course.world_T_ego)[:, :3, 3], axis=1).max() / course.way[-1])
+        ends.append(np.linalg.norm((poses - course.world_T_ego)[:, :3, 3], axis=1).max() / course.distance[-1])
     assert 0.005 < np.median(ends) < 0.03
 
 

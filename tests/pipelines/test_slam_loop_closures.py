@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.course import SimulatedCourse
 from data_tools.lidar import Submap, voxel_downsample
-from data_tools.simulator.course import SimulatedCourse
 from data_tools.simulator.scanner import StaticWorld, simulate_scan
 from data_tools.simulator.street import SMALL
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
@@ -24,7 +24,7 @@ def drive() -> tuple[list[Submap], FloatArray]:
     starts = [*np.arange(0.0, 180.0, 30.0), *(course.lap + np.arange(5.0, 95.0, 30.0))]
     submaps, frames = [], []
     for number, way in enumerate(starts):
-        rows = np.flatnonzero((course.way >= way) & (course.way < way + 30.0))[::4]
+        rows = np.flatnonzero((course.distance >= way) & (course.distance < way + 30.0))[::4]
         frame = course.world_T_ego[rows[0]]
         points = np.concatenate(
             [transform_points(inverse_transform(frame) @ course.world_T_ego[k], course[int(k)].points) for k in rows]

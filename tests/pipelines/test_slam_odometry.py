@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from data_tools.lidar import Scan
-from data_tools.simulator.featureless import tunnel
 from data_tools.simulator.scanner import ScannerSettings
 from data_tools.simulator.street import drive, scans, street
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
+from tests.data_tools.featureless import tunnel
 
 PERIOD = 0.1
 

@@ -11,7 +11,6 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.sensor_logs import SensorLog
-from data_tools.simulator.featureless import open_field, tunnel
 from data_tools.simulator.scanner import ScannerSettings, StaticWorld
 from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans, drive
 from pipelines.cli import app
@@ -21,6 +20,7 @@ from pipelines.slam.sensor_options import sensor_log
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.ego_measurements import WheelSpeed
+from tests.data_tools.featureless import open_field, tunnel
 
 PERIOD = 0.1
 TIMES = PERIOD * np.arange(10)

@@ -15,10 +15,10 @@ from data_tools.lidar import (
     voxel_downsample,
 )
 from data_tools.lidar.registration import Undetermined
-from data_tools.simulator.featureless import open_field, tunnel
 from data_tools.simulator.scanner import StaticWorld
 from data_tools.simulator.street import drive, scans, street
 from saga_fg.numerics.geometry import yaw_transform
+from tests.data_tools.featureless import open_field, tunnel
 
 
 def registered(world: StaticWorld, start: np.ndarray, undetermined: Undetermined = "hold") -> Registration:

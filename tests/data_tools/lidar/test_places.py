@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.course import SimulatedCourse
 from data_tools.lidar.overlap import Structure
 from data_tools.lidar.places import PlaceImage, PlaceIndex
-from data_tools.simulator.course import SimulatedCourse
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_of, yaw_transform
@@ -15,7 +15,7 @@ from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_o
 
 def submap(course: SimulatedCourse, way: float, length: float = 30.0) -> FloatArray:
     """Points of a piece of the drive, in the frame of its first scan."""
-    rows = np.flatnonzero((course.way >= way) & (course.way < way + length))[::8]
+    rows = np.flatnonzero((course.distance >= way) & (course.distance < way + length))[::8]
     back = inverse_transform(course.world_T_ego[rows[0]])
     return np.concatenate([transform_points(back @ course.world_T_ego[k], course[int(k)].points) for k in rows])
 

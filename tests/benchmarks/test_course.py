@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_tools.simulator.course import SimulatedCourse, revisits
+from benchmarks.course import SimulatedCourse, revisits
 from data_tools.simulator.street import SENSOR_HEIGHT
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_of
@@ -33,7 +33,7 @@ def test_three_stretches_are_passed_again_in_both_directions(seed: int) -> None:
 def test_a_lap_closes_and_scans_repeat() -> None:
     course = SimulatedCourse(3, length=5000.0)
     assert len(course) > 6000
-    one, other = (course.world_T_ego[np.searchsorted(course.way, lap * course.lap + 30.0)] for lap in (0, 1))
+    one, other = (course.world_T_ego[np.searchsorted(course.distance, lap * course.lap + 30.0)] for lap in (0, 1))
     np.testing.assert_allclose(one, other, atol=1.0)
     np.testing.assert_array_equal(course[40].points, SimulatedCourse(3, length=200.0)[40].points)
     assert course[40].points[:, 2].min() == pytest.approx(-SENSOR_HEIGHT, abs=0.15)
