@@ -19,9 +19,15 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.runner import Rows
-from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
+from data_tools.datasets.nuscenes import (
+    NuScenes,
+    read_scored_scenes,
+    split_scenes,
+    write_nuscenes,
+    write_tracking_results,
+)
 from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
-from data_tools.simulator import SimulatedTraffic, write_nuscenes
+from data_tools.simulator import SimulatedTraffic
 from pipelines.config import load_config
 from pipelines.process import one_thread
 from pipelines.tracking import track_dataset
@@ -105,7 +111,8 @@ def official_figures(
 
 def tracked_simulation(dataroot: Path, scenes: int) -> Path:
     """Write simulated scenes to a folder, track them by method kf, and write the result beside; returns its path."""
-    write_nuscenes(dataroot, SimulatedTraffic(scenes=scenes))
+    traffic = SimulatedTraffic(scenes=scenes)
+    write_nuscenes(dataroot, traffic, traffic.mounts)
     dataset = NuScenes(dataroot, VERSION, {"lidar": dataroot / "detections" / "lidar.json"})
     runs = track_dataset(dataset, lambda: load_config("nuscenes").new_tracker("kf"))
     write_tracking_results(dataroot / "tracks.json", ((run.scene, run.tracks) for run in runs), dataset.meta)

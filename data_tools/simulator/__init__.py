@@ -1,6 +1,5 @@
 """A seedable traffic simulator: queues, platoons and merges on roads, seen by several sensors on one of the cars."""
 
-from data_tools.simulator.nuscenes_export import write_nuscenes
 from data_tools.simulator.scene import SimulatedTraffic, simulate_scene
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, camera, lidar, radar
 
@@ -12,5 +11,4 @@ __all__ = [
     "lidar",
     "radar",
     "simulate_scene",
-    "write_nuscenes",
 ]

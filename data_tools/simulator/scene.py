@@ -56,6 +56,11 @@ class SimulatedTraffic:
         """The names of the scenes."""
         return tuple(self._seeds)
 
+    @property
+    def mounts(self) -> dict[str, tuple[float, float, float]]:
+        """Position of each sensor on the vehicle by its name, m."""
+        return {name: sensor.position for name, sensor in self._settings.sensors.items()}
+
     def scene(self, name: str) -> Scene:
         """Simulate one scene; raises `InputError` for an unknown name."""
         if name not in self._seeds:

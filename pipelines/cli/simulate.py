@@ -45,7 +45,8 @@ def simulate(
       saga-fg track file junctions/scene-0001/detections.csv \\
           --config junctions/scene-0001/settings.yaml --output tracks.csv
     """
-    from data_tools.simulator import SimulatedTraffic, SimulatorSettings, write_nuscenes
+    from data_tools.datasets.nuscenes import write_nuscenes
+    from data_tools.simulator import SimulatedTraffic, SimulatorSettings
     from data_tools.simulator.scenarios import scenario_settings
     from pipelines.configuration import load_settings
     from pipelines.simulated_tables import write_simulated_tables
@@ -57,7 +58,7 @@ def simulate(
     traffic = SimulatedTraffic(settings, scenes, seed)
     with working(f"simulating {counted(scenes, 'scene')}"):
         if scenario in MAPLESS:
-            write_nuscenes(output, traffic)
+            write_nuscenes(output, traffic, traffic.mounts)
         else:
             write_simulated_tables(output, traffic)
     if scenario not in MAPLESS:

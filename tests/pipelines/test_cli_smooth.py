@@ -10,7 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.datasets.label_table import read_label_table
-from data_tools.simulator import SimulatedTraffic, SimulatorSettings, write_nuscenes
+from data_tools.datasets.nuscenes import write_nuscenes
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.cli import app
 from pipelines.config import Family
 from pipelines.configuration import read_settings, write_settings
@@ -26,7 +27,8 @@ def test_shipped_settings_survive_the_round_trip(family: Family) -> None:
 
 
 def test_nuscenes_labels_are_complete(tmp_path: Path) -> None:
-    write_nuscenes(tmp_path / "data", SimulatedTraffic(SimulatorSettings(duration=5.0), scenes=1, seed=3))
+    traffic = SimulatedTraffic(SimulatorSettings(duration=5.0), scenes=1, seed=3)
+    write_nuscenes(tmp_path / "data", traffic, traffic.mounts)
     detections = tmp_path / "data" / "detections" / "lidar.json"
     arguments = ["smooth", "nuscenes", "--dataroot", str(tmp_path / "data"), "--split", "all"]
     run = runner.invoke(app, [*arguments, "--detections", f"lidar={detections}", "-o", str(tmp_path / "labels")])

@@ -2,6 +2,7 @@ from .classes import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLA
 from .dataset import NuScenes
 from .result_files import ResultMeta
 from .scans import NuScenesScans, nuscenes_scans
+from .scene_writer import write_nuscenes
 from .scored_scenes import ScoredScene, read_scored_scenes
 from .splits import split_scenes
 from .tracking_results import (
@@ -27,5 +28,6 @@ __all__ = [
     "read_scored_scenes",
     "read_tracking_results",
     "split_scenes",
+    "write_nuscenes",
     "write_tracking_results",
 ]

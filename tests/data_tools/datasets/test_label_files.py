@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.label_table import LABEL_COLUMNS, read_label_table, write_label_table
-from data_tools.datasets.nuscenes import NuScenes
+from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
 from data_tools.datasets.nuscenes.labels import write_nuscenes_labels
-from data_tools.simulator import SimulatedTraffic, SimulatorSettings, write_nuscenes
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from saga_fg.errors import InputError
 from saga_fg.smoothing import Labels
 from saga_fg.types.boxes import Boxes
@@ -75,7 +75,8 @@ def test_labels_of_another_length_or_other_words_are_refused(tmp_path: Path) -> 
 
 
 def test_nuscenes_tables_of_labels_are_read_as_a_dataset(tmp_path: Path) -> None:
-    write_nuscenes(tmp_path / "data", SimulatedTraffic(SimulatorSettings(duration=2.0), scenes=1, seed=1))
+    traffic = SimulatedTraffic(SimulatorSettings(duration=2.0), scenes=1, seed=1)
+    write_nuscenes(tmp_path / "data", traffic, traffic.mounts)
     detections = {"lidar": tmp_path / "data" / "detections" / "lidar.json"}
     dataset = NuScenes(tmp_path / "data", "v1.0-mini", detections)
     scene = dataset.scene("scene-0001")
@@ -105,7 +106,8 @@ def test_nuscenes_tables_of_labels_are_read_as_a_dataset(tmp_path: Path) -> None
 
 
 def test_masks_of_maps_are_copied_to_the_folder_of_maps_alone(tmp_path: Path) -> None:
-    write_nuscenes(tmp_path / "data", SimulatedTraffic(SimulatorSettings(duration=1.0), scenes=1, seed=1))
+    traffic = SimulatedTraffic(SimulatorSettings(duration=1.0), scenes=1, seed=1)
+    write_nuscenes(tmp_path / "data", traffic, traffic.mounts)
     (tmp_path / "out").mkdir()
     (tmp_path / "victim.txt").write_text("theirs")
     (tmp_path / "out" / "victim.txt").write_text("mine")

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_tools.datasets.nuscenes import NuScenes
-from data_tools.simulator import SimulatedTraffic, SimulatorSettings, lidar, write_nuscenes
-from data_tools.simulator.nuscenes_export import BLACK_PIXEL
+from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
+from data_tools.datasets.nuscenes.scene_writer import BLACK_PIXEL
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings, lidar
 from data_tools.simulator.settings import TrafficSettings
 from saga_fg.errors import InputError
 
@@ -24,6 +24,10 @@ TABLES = (
 ORDER = np.array([1, 0, 2])  # width, length, height
 
 
+def write(folder: Path, traffic: SimulatedTraffic, version: str = "v1.0-mini") -> None:
+    write_nuscenes(folder, traffic, traffic.mounts, version)
+
+
 @pytest.fixture(scope="module")
 def dataset() -> SimulatedTraffic:
     return SimulatedTraffic(SHORT, scenes=2, seed=4)
@@ -32,7 +36,7 @@ def dataset() -> SimulatedTraffic:
 @pytest.fixture(scope="module")
 def root(dataset: SimulatedTraffic, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated") / "data"
-    write_nuscenes(folder, dataset)
+    write_nuscenes(folder, dataset, dataset.mounts)
     return folder
 
 
@@ -158,9 +162,9 @@ def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
 
     tiny = SimulatorSettings(duration=1.0, warm_up=0.0, sensors={"front lidar": lidar()})
     with pytest.raises(KeyboardInterrupt):
-        write_nuscenes(tmp_path / "out", Breaks(tiny, scenes=2))
+        write(tmp_path / "out", Breaks(tiny, scenes=2))
     assert list(tmp_path.iterdir()) == []
-    write_nuscenes(tmp_path / "out", SimulatedTraffic(tiny, scenes=1))
+    write(tmp_path / "out", SimulatedTraffic(tiny, scenes=1))
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
     read = NuScenes(tmp_path / "out", "v1.0-mini", {"x": tmp_path / "out" / "detections" / "front lidar.json"})
     assert len(read.scene("scene-0001")) == 2  # without a sensor named lidar the poses are there all the same
@@ -169,15 +173,15 @@ def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="expected the name of a folder"):
-        write_nuscenes(tmp_path / "file", SimulatedTraffic(SHORT, scenes=1))
+        write(tmp_path / "file", SimulatedTraffic(SHORT, scenes=1))
     with pytest.raises(InputError, match="version: expected a plain name"):
-        write_nuscenes(tmp_path / "out", SimulatedTraffic(SHORT, scenes=1), version="../v1.0-mini")
+        write(tmp_path / "out", SimulatedTraffic(SHORT, scenes=1), version="../v1.0-mini")
 
 
 def test_classes_beyond_vehicles_and_pedestrians_have_their_categories(tmp_path: Path) -> None:
     traffic = TrafficSettings(truck_share=0.7, bus_share=0.0, trailer_share=1.0)
     settings = SimulatorSettings(duration=2.0, warm_up=5.0, traffic=traffic)
-    write_nuscenes(tmp_path / "out", SimulatedTraffic(settings, scenes=1))
+    write(tmp_path / "out", SimulatedTraffic(settings, scenes=1))
     folder = tmp_path / "out" / "v1.0-mini"
     categories = {record["token"]: record["name"] for record in json.loads((folder / "category.json").read_text())}
     instances = json.loads((folder / "instance.json").read_text())
