@@ -40,7 +40,7 @@ from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Assignment, assign
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.slam.joint import JointSettings, LaneSettings, Observations, OnlineEstimator, estimate_jointly
+from saga_fg.slam.joint import JointSettings, Observations, OnlineEstimator, estimate_jointly
 from saga_fg.slam.joint.estimate import ObjectStates
 from saga_fg.slam.joint.record import in_ego
 from saga_fg.types.boxes import Boxes
@@ -171,7 +171,7 @@ def batch_run(
         again = run_joint(scene, config, settings, SENSOR, seed, see)
         outcome.add_path("with poles", "ATE with poles", again.errors()["joint"].ate, n)
     if lanes:
-        drawn = run_joint(scene, config, replace(settings, lanes=LaneSettings()), SENSOR, seed)
+        drawn = run_joint(scene, config, replace(settings, lanes=True), SENSOR, seed)
         for one, name in ((run, "in map"), (drawn, "in map with lanes")):
             off = one.paths["joint"].positions - one.truth.positions
             outcome.add_path(name, f"{name}, m", float(np.sqrt((off**2).sum(axis=1).mean())), n)

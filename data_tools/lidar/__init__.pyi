@@ -1,10 +1,10 @@
 from .clusters import ClusterSettings, ObjectSize, detect_clusters
-from .curbs import CurbSettings, Line, LineSettings, extract_curbs, straight_lines
+from .curbs import Line, extract_curbs, straight_lines
 from .degeneracy import Observability, observability
 from .deskew import azimuth_times, constant_velocity, deskewed
-from .ground import Ground, GroundSettings, segment_ground
-from .planes import Plane, PlaneSettings, extract_walls, fit_ground, fit_plane
-from .poles import Pole, PoleSettings, extract_poles
+from .ground import Ground, segment_ground
+from .planes import Plane, extract_walls, fit_ground, fit_plane
+from .poles import Pole, extract_poles
 from .registration import Registration, RegistrationError, RegistrationSettings, register
 from .scan import Scan
 from .scan_files import read_scan, write_cloud
@@ -15,17 +15,12 @@ from .voxels import voxel_downsample, voxel_keys
 
 __all__ = [
     "ClusterSettings",
-    "CurbSettings",
     "Ground",
-    "GroundSettings",
     "Line",
-    "LineSettings",
     "ObjectSize",
     "Observability",
     "Plane",
-    "PlaneSettings",
     "Pole",
-    "PoleSettings",
     "Registration",
     "RegistrationError",
     "RegistrationSettings",

@@ -15,20 +15,13 @@ import numpy as np
 
 from data_tools.lidar.voxels import cell_order_statistics
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.settings import Positive, Settings, setting
 
 _SECTORS = 60  # number of sectors of the polar grid
 _RING_WIDTH = 1.5  # width of a ring, m
 _MAX_SLOPE = 0.15  # steepest rise, m per m
-
-
-@dataclass(frozen=True)
-class GroundSettings(Settings):
-    """Ground segmentation of roads and pavements."""
-
-    max_range: Positive = setting(80.0, "outer radius of the last ring, m")
-    step: Positive = setting(0.1, "change of height between rings allowed beyond the slope, m")
-    clearance: Positive = setting(0.2, "largest distance of a ground point from the ground height, m")
+MAX_RANGE = 80.0  # outer radius of the last ring, m
+MAX_STEP = 0.1  # change of height between rings allowed beyond the slope, m
+CLEARANCE = 0.2  # largest distance of a ground point from the ground height, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,32 +32,31 @@ class Ground:
     height: FloatArray
 
 
-def segment_ground(points: FloatArray, settings: GroundSettings | None = None) -> Ground:
+def segment_ground(points: FloatArray) -> Ground:
     """Find the ground in points (N, 3), m, of a sensor that stands upright (z up) above it."""
-    s = settings or GroundSettings()
     if not len(points):
         return Ground(np.empty(0, dtype=np.bool_), np.empty(0))
     distance = np.hypot(points[:, 0], points[:, 1])
     sector = ((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS
-    rings = int(np.ceil(s.max_range / _RING_WIDTH))
+    rings = int(np.ceil(MAX_RANGE / _RING_WIDTH))
     ring = np.minimum((distance / _RING_WIDTH).astype(np.int64), rings - 1)
     low = cell_order_statistics(points[:, 2], sector * rings + ring, _SECTORS * rings, 10).reshape(_SECTORS, rings)
-    ground = _ground_heights(low, s)
+    ground = _ground_heights(low)
     place = np.clip(distance / _RING_WIDTH - 0.5, 0, rings - 1)
     inner = np.minimum(place.astype(np.int64), rings - 2)
     share = place - inner
     height = points[:, 2] - ((1 - share) * ground[sector, inner] + share * ground[sector, inner + 1])
-    return Ground(np.abs(height) <= s.clearance, height)
+    return Ground(np.abs(height) <= CLEARANCE, height)
 
 
-def _ground_heights(low: FloatArray, s: GroundSettings) -> FloatArray:
+def _ground_heights(low: FloatArray) -> FloatArray:
     """Heights (sectors, rings) of the ground, from the innermost ring on."""
     near = low[:, : max(int(10.0 / _RING_WIDTH), 1)]
     start = float(np.nanmedian(near)) if np.isfinite(near).any() else float(np.nanmin(low))
     height, since = np.full(len(low), start), np.ones(len(low))
     ground = np.empty_like(low)
     for k in range(low.shape[1]):
-        fits = np.abs(low[:, k] - height) <= s.step + _MAX_SLOPE * _RING_WIDTH * since  # False in empty cells
+        fits = np.abs(low[:, k] - height) <= MAX_STEP + _MAX_SLOPE * _RING_WIDTH * since  # False in empty cells
         height = np.where(fits, low[:, k], height)
         since = np.where(fits, 1.0, since + 1.0)
         ground[:, k] = height

@@ -24,24 +24,17 @@ from scipy.spatial import cKDTree
 from data_tools.lidar.surfels import surfels_of
 from data_tools.lidar.voxels import voxel_downsample
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.settings import Positive, Settings, setting
 
 _MIN_COSINE = 0.97  # least cosine between normals of one wall
 _MAX_THICKNESS = 0.15  # largest distance of a surfel from the plane of its wall, m
 _MIN_SURFELS = 8  # fewest surfels of a wall
-
-
-@dataclass(frozen=True)
-class PlaneSettings(Settings):
-    """Detection of walls and of the ground plane."""
-
-    surfel_size: Positive = setting(1.0, "voxel size of the surfels, m")
-    max_range: Positive = setting(50.0, "largest distance from the sensor, m")
-    max_tilt: Positive = setting(0.15, "largest z component of the normal of a wall")
-    max_gap: Positive = setting(3.0, "largest gap within a wall, m")
-    min_length: Positive = setting(3.0, "least length of a wall, m")
-    noise: Positive = setting(0.03, "standard deviation of surfels across their wall, m")
-    ground_noise: Positive = setting(0.02, "standard deviation of surfels of the ground, m")
+SURFEL_SIZE = 1.0  # voxel size of the surfels, m
+MAX_RANGE = 50.0  # largest distance from the sensor, m
+MAX_TILT = 0.15  # largest z component of the normal of a wall
+MAX_GAP = 3.0  # largest gap within a wall, m
+MIN_LENGTH = 3.0  # least length of a wall, m
+WALL_NOISE = 0.03  # standard deviation of surfels across their wall, m
+GROUND_NOISE = 0.02  # standard deviation of surfels of the ground, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,26 +82,24 @@ def near_walls(positions: FloatArray, walls: Sequence[Plane], distance: float) -
     return near
 
 
-def fit_ground(ground: FloatArray, settings: PlaneSettings | None = None, reach: float = 15.0) -> Plane | None:
+def fit_ground(ground: FloatArray, reach: float = 15.0) -> Plane | None:
     """The plane of the ground points (N, 3) within `reach` m; None for too few points."""
-    s = settings or PlaneSettings()
     near = ground[np.hypot(ground[:, 0], ground[:, 1]) <= reach]
-    near = near[voxel_downsample(near, s.surfel_size)]
+    near = near[voxel_downsample(near, SURFEL_SIZE)]
     for _ in range(3):
         if len(near) < 3 * _MIN_SURFELS:
             return None
-        plane = fit_plane(near, s.ground_noise)
+        plane = fit_plane(near, GROUND_NOISE)
         off = np.abs(near @ plane.coefficients[:3] + plane.coefficients[3])
         near = near[off <= max(2.5 * float(np.median(off)), 0.01)]
     return plane
 
 
-def extract_walls(points: FloatArray, settings: PlaneSettings | None = None) -> list[Plane]:
+def extract_walls(points: FloatArray) -> list[Plane]:
     """The walls among points (N, 3), m, of a scan without its ground, the largest first."""
-    s = settings or PlaneSettings()
-    points = points[np.hypot(points[:, 0], points[:, 1]) <= s.max_range]
-    surfels = surfels_of(points, s.surfel_size)
-    surfels = surfels.select(surfels.flat & (np.abs(surfels.normal[:, 2]) <= s.max_tilt))
+    points = points[np.hypot(points[:, 0], points[:, 1]) <= MAX_RANGE]
+    surfels = surfels_of(points, SURFEL_SIZE)
+    surfels = surfels.select(surfels.flat & (np.abs(surfels.normal[:, 2]) <= MAX_TILT))
     mean, normal = surfels.mean, surfels.normal
     coplanar = np.abs(normal @ normal.T) >= _MIN_COSINE
     across = np.abs(normal @ mean.T - np.einsum("ni,ni->n", normal, mean)[:, None])
@@ -120,12 +111,12 @@ def extract_walls(points: FloatArray, settings: PlaneSettings | None = None) -> 
         best = int(support.argmax())
         if support[best] < _MIN_SURFELS:
             break
-        rows = _connected(mean, np.flatnonzero(coplanar[best] & left), best, s.max_gap)
+        rows = _connected(mean, np.flatnonzero(coplanar[best] & left), best, MAX_GAP)
         left[rows] = left[best] = False
         if len(rows) < _MIN_SURFELS:
             continue
-        wall = fit_plane(mean[rows], s.noise)
-        if np.hypot(*(wall.extent[1] - wall.extent[0])[:2]) >= s.min_length and abs(wall.coefficients[2]) <= s.max_tilt:
+        wall = fit_plane(mean[rows], WALL_NOISE)
+        if np.hypot(*(wall.extent[1] - wall.extent[0])[:2]) >= MIN_LENGTH and abs(wall.coefficients[2]) <= MAX_TILT:
             walls.append(wall)
     return walls
 

@@ -17,28 +17,19 @@ from scipy.spatial import cKDTree
 from data_tools.lidar.planes import Plane, near_walls
 from data_tools.lidar.voxels import clusters_from_above
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 _MIN_FILLED = 0.5  # least share of half-metre steps of the height that contain points
 _CLEAR_RADIUS = 0.6  # radius around the axis without other objects, m
 _DEPTH_NOISE = 0.1  # standard deviation along the line of sight, from the unknown radius, m
-
-
-@dataclass(frozen=True)
-class PoleSettings(Settings):
-    """Detection of poles."""
-
-    cell: Positive = setting(0.2, "cell of the clustering grid, m")
-    max_range: Positive = setting(40.0, "largest distance from the sensor, m")
-    min_height: Positive = setting(0.3, "lowest height above the ground of clustered points, m")
-    min_length: Positive = setting(1.2, "least height from the lowest to the highest point, m")
-    max_width: Positive = setting(0.6, "largest horizontal extent, m")
-    min_points: PositiveInt = setting(8, "fewest points")
-    clear_share: Positive = setting(
-        0.1, "the same radius as a share of the range, against columns of walls at grazing angles"
-    )
-    noise: Positive = setting(0.05, "standard deviation of the axis, m")
-    bearing_noise: Positive = setting(0.006, "standard deviation across the line of sight, rad")
+CELL = 0.2  # cell of the clustering grid, m
+MAX_RANGE = 40.0  # largest distance from the sensor, m
+MIN_HEIGHT = 0.3  # lowest height above the ground of clustered points, m
+MIN_LENGTH = 1.2  # least height from the lowest to the highest point, m
+MAX_WIDTH = 0.6  # largest horizontal extent, m
+MIN_POINTS = 8  # fewest points
+CLEAR_SHARE = 0.1  # the same radius as a share of the range, against columns of walls at grazing angles
+NOISE = 0.05  # standard deviation of the axis, m
+BEARING_NOISE = 0.006  # standard deviation across the line of sight, rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,23 +48,20 @@ class Pole:
     covariance: FloatArray
 
 
-def extract_poles(
-    points: FloatArray, height: FloatArray, walls: Sequence[Plane] = (), settings: PoleSettings | None = None
-) -> list[Pole]:
+def extract_poles(points: FloatArray, height: FloatArray, walls: Sequence[Plane] = ()) -> list[Pole]:
     """The poles among points (N, 3), m, at `height` (N,) above the ground, m, except near `walls`."""
-    s = settings or PoleSettings()
-    points = points[(height >= s.min_height) & (np.hypot(points[:, 0], points[:, 1]) <= s.max_range)]
+    points = points[(height >= MIN_HEIGHT) & (np.hypot(points[:, 0], points[:, 1]) <= MAX_RANGE)]
     everything = points
-    points = points[~near_walls(points, walls, s.cell)]
-    slender = [points[rows] for rows in _slender(points, clusters_from_above(points, s.cell), s)]
+    points = points[~near_walls(points, walls, CELL)]
+    slender = [points[rows] for rows in _slender(points, clusters_from_above(points, CELL))]
     if not slender:
         return []
     tree = cKDTree(everything[:, :2], balanced_tree=False, compact_nodes=False)
     poles = []
     for candidate in slender:
-        pole = _pole(candidate, s)
+        pole = _pole(candidate)
         around = everything[
-            tree.query_ball_point(pole.foot[:2], max(_CLEAR_RADIUS, s.clear_share * float(np.hypot(*pole.foot[:2]))))
+            tree.query_ball_point(pole.foot[:2], max(_CLEAR_RADIUS, CLEAR_SHARE * float(np.hypot(*pole.foot[:2]))))
         ]
         level = (around[:, 2] >= pole.foot[2]) & (around[:, 2] <= pole.top)
         if level.sum() <= 1.2 * len(candidate):
@@ -81,7 +69,7 @@ def extract_poles(
     return poles
 
 
-def _slender(points: FloatArray, clusters: Sequence[IntArray], s: PoleSettings) -> list[IntArray]:
+def _slender(points: FloatArray, clusters: Sequence[IntArray]) -> list[IntArray]:
     """The clusters that are thin, tall and filled."""
     if not clusters:
         return []
@@ -89,7 +77,7 @@ def _slender(points: FloatArray, clusters: Sequence[IntArray], s: PoleSettings) 
     grouped, start = points[np.concatenate(clusters)], np.cumsum(count) - count
     low, high = np.minimum.reduceat(grouped, start), np.maximum.reduceat(grouped, start)
     size = high - low
-    thin = (count >= s.min_points) & (size[:, :2].max(axis=1) <= s.max_width) & (size[:, 2] >= s.min_length)
+    thin = (count >= MIN_POINTS) & (size[:, :2].max(axis=1) <= MAX_WIDTH) & (size[:, 2] >= MIN_LENGTH)
     return [clusters[k] for k in np.flatnonzero(thin).tolist() if _filled(points[clusters[k], 2])]
 
 
@@ -98,14 +86,14 @@ def _filled(height: FloatArray) -> bool:
     return bool(len(np.unique(steps)) >= _MIN_FILLED * np.ceil(np.ptp(height) / 0.5))
 
 
-def _pole(points: FloatArray, s: PoleSettings) -> Pole:
+def _pole(points: FloatArray) -> Pole:
     mean = points[:, :2].mean(axis=0)
     sight = mean / max(float(np.hypot(*mean)), 1e-9)
     aside = np.array([-sight[1], sight[0]])
     across = points[:, :2] @ aside
     radius = float(np.ptp(across)) / 2
     axis = mean + np.pi / 4 * radius * sight
-    covariance = np.cov(points[:, :2].T) / len(points) + s.noise**2 * np.eye(2)
-    covariance += (s.bearing_noise * float(np.hypot(*mean))) ** 2 * np.outer(aside, aside)
+    covariance = np.cov(points[:, :2].T) / len(points) + NOISE**2 * np.eye(2)
+    covariance += (BEARING_NOISE * float(np.hypot(*mean))) ** 2 * np.outer(aside, aside)
     covariance += _DEPTH_NOISE**2 * np.outer(sight, sight)
     return Pole(np.append(axis, points[:, 2].min()), float(points[:, 2].max()), radius, covariance)

@@ -33,7 +33,7 @@ from data_tools.lidar.surfels import SurfelMap, Surfels
 from saga_fg.errors import SagaError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import transform_points
-from saga_fg.settings import PositiveInt, Settings, setting
+from saga_fg.settings import Settings, setting
 
 _TRANSLATION_TOLERANCE = 1e-3  # largest translation of the last step, m
 _ROTATION_TOLERANCE = 1e-4  # largest rotation of the last step, rad
@@ -42,6 +42,7 @@ UNCONSTRAINED = 1e-3  # least ratio of the smallest to the largest eigenvalue of
 
 
 Undetermined = Literal["refuse", "hold", "follow"]
+MAX_ITERATIONS = 30  # largest number of iterations
 
 
 class RegistrationError(SagaError):
@@ -55,7 +56,6 @@ class RegistrationSettings(Settings):
     method: Literal["gauss-newton", "open3d"] = setting(
         "gauss-newton", "our own iterations, or Open3D's tensor ICP on the same surfels; loops are registered by ours"
     )
-    max_iterations: PositiveInt = setting(30, "largest number of iterations")
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +136,11 @@ def _refined(
 ) -> Registration:
     """The registration among the motions free (6, k)."""
     if settings.method == "open3d" and free.shape[1] == 6 and len(points) >= LEAST_PAIRS and len(surfels.flat):
-        return _by_open3d(points, surfels, map_T_scan, farthest, scale, settings)
+        return _by_open3d(points, surfels, map_T_scan, farthest, scale)
     T = _rigid(map_T_scan)
     span = float(np.sqrt(np.mean(np.square(points)) * 3)) if len(points) else 1.0
     converged, step = False, 0
-    while not converged and step < settings.max_iterations:
+    while not converged and step < MAX_ITERATIONS:
         step += 1
         rows, paired = surfels.nearest(transform_points(T, points), farthest)
         J, r, w = _linearised(points[rows], paired, T, scale)
@@ -158,11 +158,10 @@ def _by_open3d(
     map_T_scan: FloatArray,
     farthest: float,
     scale: float,
-    settings: RegistrationSettings,
 ) -> Registration:
     from data_tools.lidar.open3d_registration import icp  # which imports Open3D
 
-    T, iterations, converged = icp(points, surfels, map_T_scan, farthest, scale, settings.max_iterations)
+    T, iterations, converged = icp(points, surfels, map_T_scan, farthest, scale, MAX_ITERATIONS)
     T = _rigid(T)
     rows, paired = surfels.nearest(transform_points(T, points), farthest)
     return _assessed(points[rows], paired, T, scale, np.eye(6), iterations, converged)

@@ -14,6 +14,8 @@ from data_tools.simulator.settings import SimulatorSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.types.dataset import Annotations
 
+VISIBLE_SHARE = 0.25  # least share of an object that a sensor must see for it to count as visible
+
 
 def annotate(
     world: SensedWorld, time: FloatArray, world_T_ego: FloatArray, settings: SimulatorSettings
@@ -27,7 +29,7 @@ def annotate(
         for sensor in settings.sensors.values():
             _, reached, share = world.visible_from(sensor_position(sensor, pose), t, sensor.max_range)
             seen = np.zeros(len(boxes), dtype=np.bool_)
-            seen[reached] = share >= settings.visible_share
+            seen[reached] = share >= VISIBLE_SHARE
             visible[k] |= seen & in_view(sensor, pose, boxes.position)
     visible &= near
     annotated = near & recently_visible(time, visible, settings.memory)

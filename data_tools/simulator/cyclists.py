@@ -15,6 +15,9 @@ from saga_fg.numerics.arrays import FloatArray
 
 BICYCLE = (1.75, 0.6, 1.1)  # length, width, height, m
 SLOWEST = 1.0  # m/s
+CYCLIST_SPEED = (3.5, 6.5)  # preferred speed of a cyclist, m/s
+SPEED_SPREAD = 1.0  # standard deviation of a cyclist's speed about the preferred one, m/s
+CHANGE_TIME = 2.5  # correlation time of a cyclist's speed, s
 SWAY, SWAY_PERIOD = 0.08, 1.2  # amplitude, m, and period, s, of the rider's body
 
 
@@ -28,14 +31,14 @@ def simulate_cyclists(
 ) -> SimulatedTrajectories:
     """Bicycles, then their riders, that start at road s within `window`, m, inside the outer borders (d, m)."""
     h = float(time[1] - time[0])
-    decay = float(np.exp(-h / settings.change_time))
+    decay = float(np.exp(-h / CHANGE_TIME))
     parts = []
     for sense, lateral in ((1.0, borders[0] + 0.7), (-1.0, borders[1] - 0.7)):
         n = int(rng.integers(settings.count[0], settings.count[1] + 1))
-        preferred = rng.uniform(*settings.speed, n)
-        noise = settings.spread * np.sqrt(1 - decay**2) * rng.standard_normal((len(time), n))
+        preferred = rng.uniform(*CYCLIST_SPEED, n)
+        noise = SPEED_SPREAD * np.sqrt(1 - decay**2) * rng.standard_normal((len(time), n))
         deviation = np.zeros((len(time), n))
-        deviation[0] = settings.spread * rng.standard_normal(n)
+        deviation[0] = SPEED_SPREAD * rng.standard_normal(n)
         for k in range(1, len(time)):
             deviation[k] = decay * deviation[k - 1] + noise[k]
         speed = np.maximum(preferred + deviation, SLOWEST)

@@ -24,11 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.simulator.lanes import LaneOrder
-from data_tools.simulator.settings import DriverSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 
 HARDEST_BRAKING = 9.0  # m/s^2, limit of tyres on a dry road
+POLITENESS = 0.3  # p of MOBIL, Kesting, Treiber and Helbing 2007: 0.2 to 0.5
+CHANGE_THRESHOLD = 0.3  # a_th of MOBIL, m/s^2: least gain for which a driver changes lanes
+SAFE_DECELERATION = 3.0  # b_safe of MOBIL, m/s^2: largest deceleration a lane change may cause
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +78,6 @@ def lane_change_gain(
     target: IntArray,
     must: BoolArray,
     order: LaneOrder,
-    settings: DriverSettings,
 ) -> FloatArray:
     """Gain (N,), m/s^2, of each driver in lane `target` (N,; -1: none); -inf where the change is not allowed.
 
@@ -90,10 +91,10 @@ def lane_change_gain(
     others = drivers.select(follower)
     theirs = free_acceleration(speed[follower], others) + following_acceleration(speed[follower], rear, speed, others)
     loss = np.where(follower >= 0, np.maximum(acceleration[follower] - theirs, 0.0), 0.0)
-    safe = (mine > -settings.safe_deceleration) & ((theirs > -settings.safe_deceleration) | (follower < 0))
+    safe = (mine > -SAFE_DECELERATION) & ((theirs > -SAFE_DECELERATION) | (follower < 0))
     room = (front > drivers.minimum_gap / 2) & (rear > drivers.minimum_gap / 2)
-    gain = mine - acceleration - settings.politeness * loss
-    worth = must | (gain > settings.change_threshold)
+    gain = mine - acceleration - POLITENESS * loss
+    worth = must | (gain > CHANGE_THRESHOLD)
     return np.where((target >= 0) & safe & room & worth, gain + np.where(must, 100.0, 0.0), -np.inf)
 
 

@@ -7,8 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_tools.simulator.driver_models import Drivers
-from data_tools.simulator.settings import DriverSettings, TrafficSettings
+from data_tools.simulator.settings import VAN_SHARE, TrafficSettings
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+
+TIME_HEADWAY = 1.2  # desired time headway T, s: IDM, Treiber et al. 2000, for city traffic
+MINIMUM_GAP = 2.0  # gap s0 kept at standstill, m: IDM, Treiber et al. 2000
+MAX_ACCELERATION = 1.5  # a, m/s^2: IDM, Treiber and Kesting 2013, table 11.2, within 0.5
+COMFORTABLE_DECELERATION = 2.0  # b, m/s^2: IDM, Treiber et al. 2000, within 0.4
+DRIVER_SPREAD = 0.15  # relative standard deviation of the parameters over drivers (log-normal)
 
 
 @dataclass(frozen=True)
@@ -64,19 +70,17 @@ def sample_sizes(kind: IntArray, rng: np.random.Generator) -> FloatArray:
 
 def sample_kinds(count: int, settings: TrafficSettings, rng: np.random.Generator) -> IntArray:
     """Random kinds (count,) of moving vehicles."""
-    shares = np.array([settings.van_share, settings.truck_share, settings.bus_share])
+    shares = np.array([VAN_SHARE, settings.truck_share, settings.bus_share])
     return rng.choice(len(KINDS), size=count, p=[1 - shares.sum(), *shares])
 
 
-def sample_fleet(
-    count: int, desired_speed: float, drivers: DriverSettings, traffic: TrafficSettings, rng: np.random.Generator
-) -> Fleet:
+def sample_fleet(count: int, desired_speed: float, traffic: TrafficSettings, rng: np.random.Generator) -> Fleet:
     """`count` random vehicles; `desired_speed`, m/s, is the mean over the drivers of cars."""
     kind = sample_kinds(count, traffic, rng)
 
     def spread(mean: float, factor: FloatArray | float = 1.0) -> FloatArray:
         deviation = np.clip(rng.standard_normal(count), -2.5, 2.5)
-        return np.asarray(mean * factor * np.exp(drivers.spread * deviation))
+        return np.asarray(mean * factor * np.exp(DRIVER_SPREAD * deviation))
 
     speed, headway, acceleration = (
         np.array([getattr(k, name) for k in KINDS])[kind] for name in ("speed", "headway", "acceleration")
@@ -86,10 +90,10 @@ def sample_fleet(
         sample_sizes(kind, rng),
         Drivers(
             spread(desired_speed, speed),
-            spread(drivers.time_headway, headway),
-            spread(drivers.minimum_gap),
-            spread(drivers.max_acceleration, acceleration),
-            spread(drivers.comfortable_deceleration),
+            spread(TIME_HEADWAY, headway),
+            spread(MINIMUM_GAP),
+            spread(MAX_ACCELERATION, acceleration),
+            spread(COMFORTABLE_DECELERATION),
         ),
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 from data_tools.simulator.disturbances import ClosingLine
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.sensors import position_errors, sensor_position
-from data_tools.simulator.settings import LightSettings, SensorSettings
+from data_tools.simulator.settings import SensorSettings
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import wrap_angle, yaw_of
 from saga_fg.types import road_map
@@ -26,6 +26,9 @@ HEIGHT = 5.0  # m of a light over the ground
 HOUSING = (0.3, 0.4, 1.0)  # m
 MAPPED = (-200.0, 150.0)  # m along the road from the focus: extent of the map
 SPACING = 8.0  # m between the points of a mapped lane
+AMBER_DURATION = 3.0  # duration of amber, the first part of the red phase, s
+MAP_NOISE = 0.2  # standard deviation of positions in the map, m
+VISIBLE_RANGE = 80.0  # largest distance at which the colour of a light is visible, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +49,7 @@ class Signal:
         return "amber" if time < self.red[now[0], 0] + self.amber_duration else "red"
 
 
-def signals_of(lanes: Lanes, lines: tuple[ClosingLine, ...], settings: LightSettings) -> tuple[Signal, ...]:
+def signals_of(lanes: Lanes, lines: tuple[ClosingLine, ...]) -> tuple[Signal, ...]:
     """The lights of the stop lines."""
     signals: list[Signal] = []
     done: set[int] = set()
@@ -57,9 +60,7 @@ def signals_of(lanes: Lanes, lines: tuple[ClosingLine, ...], settings: LightSett
         lane = line.lanes[:1]
         middle = np.array([lanes.offset[line.lanes].mean()])
         position, heading = lanes.pose(lane, np.array([line.s + BEYOND]), middle, np.zeros(1))
-        signals.append(
-            Signal(f"light-{len(signals)}", position[0], float(heading[0]), line.red, settings.amber_duration)
-        )
+        signals.append(Signal(f"light-{len(signals)}", position[0], float(heading[0]), line.red, AMBER_DURATION))
     return tuple(signals)
 
 
@@ -68,7 +69,6 @@ def sample_map(
     focus: float,
     lines: tuple[ClosingLine, ...],
     signals: tuple[Signal, ...],
-    settings: LightSettings,
     rng: np.random.Generator,
 ) -> road_map.RoadMap:
     """Map of the lights, stop lines and lanes around `focus` (m along the road), with random errors."""
@@ -77,7 +77,7 @@ def sample_map(
         return float(position[0]), float(position[1])
 
     def error() -> FloatArray:
-        return np.asarray(settings.map_noise * rng.standard_normal(2))
+        return np.asarray(MAP_NOISE * rng.standard_normal(2))
 
     lights = tuple(road_map.TrafficLight(signal.name, point(signal.position + error())) for signal in signals)
     half = abs(lanes.offset[1] - lanes.offset[0]) / 2
@@ -101,7 +101,7 @@ def sample_map(
         centre, _ = lanes.pose(same, s, d, slope)
         moved = centre + error()
         found.append(road_map.Lane(f"lane-{lane}", tuple(map(point, moved)), 2 * float(half)))
-    return road_map.RoadMap(lights, tuple(mapped), tuple(found), max(settings.map_noise, 1e-3))
+    return road_map.RoadMap(lights, tuple(mapped), tuple(found), max(MAP_NOISE, 1e-3))
 
 
 def detect_lights(
@@ -109,7 +109,6 @@ def detect_lights(
     world_T_ego: FloatArray,
     signals: tuple[Signal, ...],
     time: float,
-    settings: LightSettings,
     rng: np.random.Generator,
 ) -> Detections:
     """Detections of the lights, in world coordinates, by a sensor that classifies colours."""
@@ -119,7 +118,7 @@ def detect_lights(
     offset = true_position - sensor_position(sensor, world_T_ego)[:2]
     distance, bearing = np.hypot(*offset.T), np.arctan2(offset[:, 1], offset[:, 0])
     faces = np.cos(bearing - np.array([signal.heading for signal in signals])) > 0.5
-    within = (distance <= settings.visible_range) & (
+    within = (distance <= VISIBLE_RANGE) & (
         np.abs(wrap_angle(bearing - yaw_of(world_T_ego))) <= sensor.field_of_view / 2
     )
     seen = np.flatnonzero(faces & within & (rng.random(len(signals)) < sensor.detection_probability))

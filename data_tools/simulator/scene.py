@@ -84,7 +84,7 @@ def scene_from_world(
             pose = world.ego_pose(time)
             boxes, near, share = world.visible_from(sensor_position(sensor, pose), time, sensor.max_range)
             detections = detect(sensor, pose, boxes.select(near), share, rng, drift[near])
-            lights = detect_lights(sensor, pose, world.signals, time, settings.lights, rng)
+            lights = detect_lights(sensor, pose, world.signals, time, rng)
             if len(lights):
                 detections = Detections.concatenate([detections, lights])
             frames.append(Frame(round(date + time, 6), sensor_name, detections, pose, road_map=world.road_map))

@@ -16,6 +16,20 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 
 JUNCTION = 10.0  # m between the stop lines of the two directions
 FOCUS = 0.55  # share of the road's length
+ROAD_LENGTH = 1000.0  # length of the simulated road, m: ego drives through its middle
+LANE_WIDTH = 3.5  # m, of US highways (AASHTO, 12 ft) within 0.2 m
+CURVE_PROBABILITY = 0.5  # share of scenes on a curved road
+CURVE_RADIUS = (100.0, 300.0)  # smallest radius of a curve's centre line, m
+MEDIAN_PROBABILITY = 0.5  # share of scenes with a hedge between the directions
+MEDIAN_WIDTH = 3.0  # width of the strip that carries the hedge, m
+DESIRED_SPEED = (10.0, 16.0)  # mean desired speed of a scene's drivers, m/s: 36 to 58 km/h, as in towns
+RED_DURATION = (8.0, 18.0)  # duration of a red phase, s
+GREEN_DURATION = (8.0, 16.0)  # duration of a green phase, s
+LANE_WISE_PROBABILITY = 0.5  # share of scenes with lights or slow zones of each lane
+SLOW_SPEED = (1.0, 4.0)  # speed in a slow zone while it is active, m/s
+SLOW_DURATION = (5.0, 12.0)  # duration of the active and of the inactive phases of a slow zone, s
+TAPER = (30.0, 45.0)  # length of the taper, m
+NOTICE = (60.0, 110.0)  # distance before the taper at which drivers begin to merge, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +64,10 @@ class SceneLayout:
 def sample_layout(settings: SimulatorSettings, rng: np.random.Generator) -> SceneLayout:
     """A random layout."""
     lanes, hedge = _sample_lanes(settings.road, settings.roadworks, rng)
-    focus = FOCUS * settings.road.length
+    focus = FOCUS * ROAD_LENGTH
     until = settings.warm_up + settings.duration
     stop_lines, slow_zones = _sample_disturbances(lanes, focus, until, settings.traffic, rng)
-    desired_speed = float(rng.uniform(*settings.drivers.desired_speed))
+    desired_speed = float(rng.uniform(*DESIRED_SPEED))
     fleet, trailer, lane, s = _sample_vehicles(lanes, desired_speed, settings, rng)
     speed = np.full(len(fleet), _start_speed(desired_speed))
     return SceneLayout(lanes, focus, hedge, fleet, lane, s, speed, stop_lines, slow_zones, trailer)
@@ -67,19 +81,19 @@ def _sample_lanes(
     settings: RoadSettings, roadworks: RoadworkSettings, rng: np.random.Generator
 ) -> tuple[Lanes, float | None]:
     """Lanes, and the offset of the hedge between the directions, m, or None."""
-    focus = FOCUS * settings.length
+    focus = FOCUS * ROAD_LENGTH
     bends = []
-    if rng.random() < settings.curve_probability:
+    if rng.random() < CURVE_PROBABILITY:
         turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.2)
-        extent = 2 * abs(turn) * rng.uniform(*settings.curve_radius)
+        extent = 2 * abs(turn) * rng.uniform(*CURVE_RADIUS)
         bends.append((focus + rng.uniform(-60.0, 100.0), turn, extent))
-    road = curved_road(settings.length, bends, rng.uniform(300.0, 2500.0, 2), rng.uniform(-np.pi, np.pi))
+    road = curved_road(ROAD_LENGTH, bends, rng.uniform(300.0, 2500.0, 2), rng.uniform(-np.pi, np.pi))
     merge = rng.random() < settings.merge_probability
-    hedge = rng.random() < settings.median_probability
+    hedge = rng.random() < MEDIAN_PROBABILITY
     forward = int(rng.integers(settings.lanes[0], settings.lanes[1] + 1))
     oncoming = int(rng.integers(settings.oncoming_lanes[0], settings.oncoming_lanes[1] + 1))
-    half = settings.median_width / 2 if hedge else 0.25
-    width = settings.lane_width
+    half = MEDIAN_WIDTH / 2 if hedge else 0.25
+    width = LANE_WIDTH
     right = -(half + width * (np.arange(forward + merge) + 0.5))
     left = half + width * (np.arange(oncoming) + 0.5)
     lanes = Lanes(
@@ -92,8 +106,8 @@ def _sample_lanes(
         approach=float(rng.choice([0.0, 25.0])) if merge else 0.0,
     )
     if merge and roadworks.probability > 0 and rng.random() < roadworks.probability:
-        taper = float(rng.uniform(*roadworks.taper))
-        opening = focus - taper - float(rng.uniform(*roadworks.notice))
+        taper = float(rng.uniform(*TAPER))
+        opening = focus - taper - float(rng.uniform(*NOTICE))
         lanes = replace(lanes, taper=taper, opening=opening, approach=0.0)
     return lanes, 0.0 if hedge else None
 
@@ -103,18 +117,18 @@ def _sample_disturbances(
 ) -> tuple[tuple[ClosingLine, ...], tuple[SlowZone, ...]]:
     opposite = lanes.road.length - (focus + JUNCTION)
     light = lanes.ending < 0 and rng.random() < settings.signal_probability
-    lane_wise = rng.random() < settings.lane_wise_probability
+    lane_wise = rng.random() < LANE_WISE_PROBABILITY
     stop_lines, zones = [], []
-    shared = sample_intervals(settings.red_duration, settings.green_duration, until, rng)
+    shared = sample_intervals(RED_DURATION, GREEN_DURATION, until, rng)
     for mine, place in ((lanes.forward, focus), (lanes.oncoming, opposite)):
         if light:
             turning = mine[:1] if lane_wise and len(mine) > 1 else mine[:0]  # the innermost lane turns off
-            own = sample_intervals(settings.red_duration, settings.green_duration, until, rng)
+            own = sample_intervals(RED_DURATION, GREEN_DURATION, until, rng)
             stop_lines += [ClosingLine(np.setdiff1d(mine, turning), place, shared), ClosingLine(turning, place, own)]
         elif lanes.taper == 0:  # cones are disturbance enough
             for group in mine[:, None] if lane_wise else [mine]:
-                speed = float(rng.uniform(*settings.slow_speed))
-                active = sample_intervals(settings.slow_duration, settings.slow_duration, until, rng)
+                speed = float(rng.uniform(*SLOW_SPEED))
+                active = sample_intervals(SLOW_DURATION, SLOW_DURATION, until, rng)
                 zones.append(SlowZone(group, place + 20.0, place + 80.0, speed, active))
     return tuple(stop_lines), tuple(zones)
 
@@ -128,7 +142,7 @@ def _sample_vehicles(
     """
     length = lanes.road.length
     most = int(length / 6.0) * len(lanes.offset)
-    fleet = sample_fleet(most, desired_speed, settings.drivers, settings.traffic, rng)
+    fleet = sample_fleet(most, desired_speed, settings.traffic, rng)
     fleet, trailer = attach_trailers(fleet, settings.traffic.trailer_share, rng)
     gaps = equilibrium_gap(_start_speed(desired_speed), fleet.drivers)
     rows, lane, s, row = [], [], [], 0

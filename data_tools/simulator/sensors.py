@@ -17,7 +17,7 @@ import numpy as np
 
 from data_tools.simulator.fleet import KINDS
 from data_tools.simulator.pedestrians import BODY
-from data_tools.simulator.settings import SensorSettings
+from data_tools.simulator.settings import CLEAR_SHARE, HIDDEN_SHARE, SensorSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.numerics.geometry import transform_points, wrap_angle, yaw_of
 from saga_fg.types.boxes import Boxes
@@ -25,6 +25,7 @@ from saga_fg.types.frame import Detections
 
 CLUTTER = (("pedestrian", BODY), *((kind.label, kind.size) for kind in KINDS))
 CLUTTER_SHARES = (0.4, 0.4, 0.1, 0.07, 0.03)
+FADING = 6.0  # width of the fall of the probability of detection around the reach, m
 
 
 def sensor_position(sensor: SensorSettings, world_T_ego: FloatArray) -> FloatArray:
@@ -42,12 +43,12 @@ def in_view(sensor: SensorSettings, world_T_ego: FloatArray, points: FloatArray)
 
 def detection_probability(sensor: SensorSettings, origin: FloatArray, boxes: Boxes, share: FloatArray) -> FloatArray:
     """Detection probability (N,) of `boxes` seen from `origin` (3,), of which a `share` (N,) is visible."""
-    ramp = np.clip((share - sensor.hidden_share) / (sensor.clear_share - sensor.hidden_share), 0.0, 1.0)
+    ramp = np.clip((share - HIDDEN_SHARE) / (CLEAR_SHARE - HIDDEN_SHARE), 0.0, 1.0)
     if sensor.resolution is not None:
         n = points_on(sensor.resolution, origin, boxes, share)
         return np.asarray(sensor.detection_probability * ramp * n**2 / (n**2 + sensor.enough_points**2))
     distance = np.linalg.norm((boxes.position - origin)[:, :2], axis=1)
-    return np.asarray(sensor.detection_probability * ramp / (1 + np.exp((distance - sensor.reach) / sensor.fading)))
+    return np.asarray(sensor.detection_probability * ramp / (1 + np.exp((distance - sensor.reach) / FADING)))
 
 
 def points_on(resolution: tuple[float, float], origin: FloatArray, boxes: Boxes, share: FloatArray) -> FloatArray:

@@ -23,63 +23,42 @@ PositiveSpan = Annotated[tuple[float, float], Range(0, above=True, ascending=Tru
 NonNegativeSpan = Annotated[tuple[float, float], Range(0, ascending=True)]
 Count = Annotated[tuple[int, int], Range(0, ascending=True)]  # fewest and most
 PositiveCount = Annotated[tuple[int, int], Range(0, above=True, ascending=True)]
+VAN_SHARE = 0.25  # of the vehicles; vans are labelled car and high enough to hide cars
+HIDDEN_SHARE = 0.15  # visible share up to which an object is never detected
+CLEAR_SHARE = 0.35  # visible share from which occlusion has no effect
 
 
 @dataclass(frozen=True)
 class RoadSettings(Settings):
     """Shape of the road, in m; traffic keeps to the right."""
 
-    length: Annotated[float, Range(800)] = setting(1000.0, "length of the simulated road, m")
-    lane_width: Positive = setting(3.5, "width of a lane, m")
     lanes: PositiveCount = setting((2, 4), "fewest and most lanes in the ego vehicle's direction")
     oncoming_lanes: PositiveCount = setting((1, 3), "fewest and most lanes in the other direction")
-    curve_probability: Fraction = setting(0.5, "share of scenes on a curved road")
-    curve_radius: PositiveSpan = setting((100.0, 300.0), "smallest radius of a curve's centre line, m")
     merge_probability: Fraction = setting(0.3, "share of scenes with a lane that ends (an on-ramp or a lane drop)")
-    median_probability: Fraction = setting(0.5, "share of scenes with a hedge between the directions")
-    median_width: Positive = setting(3.0, "width of the strip that carries the hedge, m")
 
 
 @dataclass(frozen=True)
 class DriverSettings(Settings):
     """Intelligent Driver Model: means over the drivers of cars, and the spread between drivers."""
 
-    desired_speed: PositiveSpan = setting((10.0, 16.0), "mean desired speed of a scene's drivers, m/s")
-    time_headway: Positive = setting(1.2, "desired time headway T, s")
-    minimum_gap: Positive = setting(2.0, "gap s0 kept at standstill, m")
-    max_acceleration: Positive = setting(1.5, "maximum acceleration a, m/s^2")
-    comfortable_deceleration: Positive = setting(2.0, "comfortable deceleration b, m/s^2")
-    spread: NonNegative = setting(0.15, "relative standard deviation of these parameters over drivers (log-normal)")
     reaction_time: NonNegative = setting(0.3, "delay between a change in traffic and the driver's response, s")
     acceleration_noise: NonNegative = setting(0.2, "standard deviation of random acceleration, m/s^2")
-    noise_time: Positive = setting(3.0, "correlation time of the random acceleration, s")
-    politeness: NonNegative = setting(0.3, "weight of the new follower's loss in the decision to change lanes")
-    change_threshold: NonNegative = setting(0.3, "lowest gain in acceleration for which a driver changes lanes, m/s^2")
-    safe_deceleration: NonNegative = setting(3.0, "largest deceleration that a lane change may cause, m/s^2")
 
 
 @dataclass(frozen=True)
 class TrafficSettings(Settings):
     """Vehicles: kinds, platoons, and disturbances of the traffic flow."""
 
-    van_share: Fraction = setting(0.25, "share of vans, which are labelled car and high enough to hide cars")
     truck_share: Fraction = setting(0.18, "share of trucks")
     bus_share: Fraction = setting(0.08, "share of buses")
     trailer_share: Fraction = setting(0.0, "share of the trucks that tow a trailer")
     platoon_size: PositiveCount = setting((3, 9), "fewest and most vehicles in a platoon")
     platoon_gap: NonNegativeSpan = setting((10.0, 60.0), "extra distance between platoons, m")
     signal_probability: Fraction = setting(0.7, "share of scenes with a traffic light; the others have a slow zone")
-    red_duration: PositiveSpan = setting((8.0, 18.0), "duration of a red phase, s")
-    green_duration: PositiveSpan = setting((8.0, 16.0), "duration of a green phase, s")
-    lane_wise_probability: Fraction = setting(0.5, "share of scenes with separate lights or slow zones for each lane")
-    slow_speed: PositiveSpan = setting((1.0, 4.0), "speed in a slow zone while it is active, m/s")
-    slow_duration: PositiveSpan = setting(
-        (5.0, 12.0), "duration of the active and of the inactive phases of a slow zone, s"
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.van_share + self.truck_share + self.bus_share <= 1:
+        if not VAN_SHARE + self.truck_share + self.bus_share <= 1:
             raise InputError("van_share: expected the shares of vans, trucks and buses to be at most 1 together")
 
 
@@ -100,9 +79,6 @@ class CyclistSettings(Settings):
     """Cyclists at the outer borders of the road."""
 
     count: Count = setting((0, 0), "fewest and most cyclists in each direction")
-    speed: PositiveSpan = setting((3.5, 6.5), "preferred speed of a cyclist, m/s")
-    spread: NonNegative = setting(1.0, "standard deviation of a cyclist's speed about the preferred one, m/s")
-    change_time: Positive = setting(2.5, "correlation time of a cyclist's speed, s")
 
 
 @dataclass(frozen=True)
@@ -110,23 +86,13 @@ class RoadworkSettings(Settings):
     """A right lane closed by cones: a taper that moves its traffic into the adjacent lane, then a row along it."""
 
     probability: Fraction = setting(0.0, "share of the scenes with a lane that ends whose lane is closed by cones")
-    taper: PositiveSpan = setting((30.0, 45.0), "length of the taper, m")
-    row: PositiveSpan = setting((25.0, 50.0), "length of the row of cones behind it, m")
-    spacing: Positive = setting(4.0, "distance between cones, m")
-    notice: PositiveSpan = setting((60.0, 110.0), "distance before the taper at which drivers begin to merge, m")
-    early: NonNegative = setting(
-        10.0, "distance between the earliest and the latest positions at which drivers leave the lane, m"
-    )
 
 
 @dataclass(frozen=True)
 class LightSettings(Settings):
     """Traffic lights: phases, map, and visibility."""
 
-    amber_duration: NonNegative = setting(3.0, "duration of amber, as the first part of the red phase, s")
     mapped: bool = setting(False, "give frames a map of lights, stop lines and lanes")
-    map_noise: NonNegative = setting(0.2, "standard deviation of positions in the map, m")
-    visible_range: NonNegative = setting(80.0, "largest distance at which the colour of a light is visible, m")
 
 
 @dataclass(frozen=True)
@@ -134,15 +100,14 @@ class SurroundingSettings(Settings):
     """Static objects beside the road, which hide moving ones."""
 
     parking_probability: Fraction = setting(0.35, "share of roadsides with a strip of parked cars")
-    parking_occupancy: Fraction = setting(0.5, "share of parking places taken")
 
 
 @dataclass(frozen=True)
 class SensorSettings(Settings):
     """One sensor with its detector. Noise is independent between frames and between the range and bearing axes.
 
-    The probability of detection is detection_probability * ramp(visible share) / (1 + exp((range - reach) / fading)),
-    the ramp rising from 0 at `hidden_share` to 1 at `clear_share`. With a `resolution` the last factor is
+    The probability of detection is detection_probability * ramp(visible share) / (1 + exp((range - reach) / FADING)),
+    the ramp rising from 0 at HIDDEN_SHARE to 1 at CLEAR_SHARE. With a `resolution` the last factor is
     n^2 / (n^2 + enough_points^2), n the points or pixels on the visible part of the object.
     """
 
@@ -176,10 +141,7 @@ class SensorSettings(Settings):
         None, "probability that the colour of a traffic light is reported correctly; null: lights are not detected"
     )
     detection_probability: Fraction = setting(0.97, "probability of detection of a fully visible object at close range")
-    hidden_share: Finite = setting(0.15, "visible share up to which an object is never detected")
-    clear_share: Finite = setting(0.35, "visible share from which occlusion has no effect")
     reach: Positive = setting(60.0, "range at which the probability of detection has halved, m")
-    fading: Positive = setting(6.0, "width of the fall of the probability of detection around `reach`, m")
     resolution: Annotated[tuple[float, float], Range(0, above=True)] | None = setting(
         None,
         "horizontal and vertical angle between points or pixels, rad; null: an object's size does not matter",
@@ -195,13 +157,6 @@ class SensorSettings(Settings):
     true_logit: Finite = setting(2.0, "mean logit of the score of a fully visible object at close range")
     clutter_logit: Finite = setting(-1.5, "mean logit of the score of a false detection")
     logit_noise: NonNegative = setting(0.8, "standard deviation of the logit of the score")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.hidden_share < self.clear_share:
-            raise InputError(
-                f"clear_share: expected more than hidden_share {self.hidden_share}, got {self.clear_share}"
-            )
 
 
 def lidar() -> SensorSettings:
@@ -225,7 +180,6 @@ def camera() -> SensorSettings:
         velocity_noise=1.0,
         detection_probability=0.88,
         reach=45.0,
-        fading=6.0,
         clutter_rate=3.0,
         true_logit=1.2,
         clutter_logit=-1.2,
@@ -284,13 +238,9 @@ class SimulatorSettings(Settings):
 
     duration: Positive = setting(20.0, "length of a scene, s")
     keyframe_rate: Positive = setting(10.0, "rate of ground truth and of track output, 1/s")
-    step: Positive = setting(0.05, "integration step, s")
     warm_up: NonNegative = setting(15.0, "time simulated before the scene starts, s")
     annotation_range: PositiveOrInf = setting(
         60.0, "distance from the ego vehicle within which objects are annotated, m"
-    )
-    visible_share: Fraction = setting(
-        0.25, "least share of an object that a sensor must see for it to count as visible"
     )
     shortest_view: NonNegative = setting(1.0, "shortest view that counts as visible, s")
     memory: Annotated[float, Range(0, infinite=True)] = setting(

@@ -10,7 +10,7 @@ from data_tools.simulator.fleet import CAR, KINDS, TRUCK, VAN, sample_sizes
 from data_tools.simulator.lanes import Lanes
 from data_tools.simulator.road import Road
 from data_tools.simulator.scene_layout import SceneLayout
-from data_tools.simulator.settings import RoadworkSettings, SurroundingSettings
+from data_tools.simulator.settings import SurroundingSettings
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 
@@ -24,6 +24,9 @@ PAVEMENT_WIDTH = 3.5  # m
 SEGMENT = 8.0  # m, longest straight segment of a hedge
 CONE = (0.45, 0.45, 0.75)  # length, width, height, m
 CONE_DEVIATION = 0.1  # standard deviation of a cone's position, m
+CONE_ROW = (25.0, 50.0)  # length of the row of cones behind the taper, m
+CONE_SPACING = 4.0  # distance between cones, m
+PARKING_OCCUPANCY = 0.5  # share of parking places taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +47,7 @@ def sample_surroundings(
         border = abs(offset) + 0.3
         if side > 0 or layout.lanes.ending < 0:
             if rng.random() < settings.parking_probability:
-                parked.append(_parked(road, side * (border + PARKING_WIDTH / 2), side, window, settings, rng))
+                parked.append(_parked(road, side * (border + PARKING_WIDTH / 2), side, window, rng))
                 border += PARKING_WIDTH
             inner, outer = side * (border + 0.9), side * (border + PAVEMENT_WIDTH - 0.9)
             pavements.append((min(inner, outer), max(inner, outer)))
@@ -65,14 +68,14 @@ def sample_surroundings(
     return Surroundings(Boxes.concatenate(parked), Boxes.concatenate(occluders), pavements)
 
 
-def sample_cones(lanes: Lanes, settings: RoadworkSettings, rng: np.random.Generator) -> Boxes:
+def sample_cones(lanes: Lanes, rng: np.random.Generator) -> Boxes:
     """Cones that close the ending lane: a taper to its inner border, then a row along it; none for an open lane."""
     if lanes.taper == 0:
         return Boxes.empty()
     inner = (lanes.offset[lanes.ending] + lanes.offset[lanes.adjacent]) / 2
     outer = 2 * lanes.offset[lanes.ending] - inner
-    end = lanes.end + rng.uniform(*settings.row)
-    s = np.arange(lanes.end - lanes.taper, end, settings.spacing)
+    end = lanes.end + rng.uniform(*CONE_ROW)
+    s = np.arange(lanes.end - lanes.taper, end, CONE_SPACING)
     d = np.interp(s, [lanes.end - lanes.taper, lanes.end], [outer, inner])
     n = len(s)
     horizontal = lanes.road.position(s, d) + CONE_DEVIATION * rng.standard_normal((n, 2))
@@ -107,11 +110,10 @@ def _parked(
     d: float,
     side: float,
     window: tuple[float, float],
-    settings: SurroundingSettings,
     rng: np.random.Generator,
 ) -> Boxes:
     place = np.arange(window[0], window[1], 6.5)
-    place = place[rng.random(len(place)) < settings.parking_occupancy]
+    place = place[rng.random(len(place)) < PARKING_OCCUPANCY]
     kind = rng.choice([CAR, VAN, TRUCK], size=len(place), p=[0.74, 0.2, 0.06])
     size = sample_sizes(kind, rng)
     trucks = np.flatnonzero(kind == TRUCK)

@@ -30,6 +30,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 CHANGE_INTERVAL = 0.5  # s between two decisions to change lanes
 SLOWEST_CHANGE = 2.0  # m/s, lowest speed at which a voluntary lane change starts
+NOISE_TIME = 3.0  # correlation time of the random acceleration, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +120,7 @@ class Traffic:
             self._start_changes(desired, order)
         self._pending.append(desired)
         acceleration = self._pending.pop(0)
-        decay = np.exp(-h / self._settings.noise_time)
+        decay = np.exp(-h / NOISE_TIME)
         kick = self._settings.acceleration_noise * np.sqrt(1 - decay**2)
         self._noise = decay * self._noise + kick * self._rng.standard_normal(len(self.s))
         noise = self._noise * np.clip(self.speed / 3.0, 0.0, 1.0)
@@ -197,9 +198,7 @@ class Traffic:
             target = self._lanes.neighbour(self.lane, side)
             target = np.where(free & self._lanes.may_change(self.lane, target, self.s), target, -1)
             drivers, length = self._fleet.drivers, self._fleet.length
-            gains.append(
-                lane_change_gain(drivers, length, self.s, self.speed, desired, target, ending, order, self._settings)
-            )
+            gains.append(lane_change_gain(drivers, length, self.s, self.speed, desired, target, ending, order))
             targets.append(target)
         better = gains[1] > gains[0]
         gain, target = np.where(better, gains[1], gains[0]), np.where(better, targets[1], targets[0])

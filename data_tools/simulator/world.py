@@ -26,6 +26,8 @@ SURROUNDED = (-300.0, 400.0)  # m along the road from the focus: extent of build
 POPULATED = (-150.0, 100.0)  # m along the road from the focus: start positions of pedestrians and cyclists
 UPSTREAM = (15.0, 140.0)  # m before the focus: start positions of the ego vehicle
 OCCLUDER_MARGIN = 20.0  # m, half the length of the largest occluder and more
+EARLY_MERGE = 10.0  # distance between the earliest and the latest positions of leaving the lane, m
+STEP = 0.05  # integration step, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +89,12 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     riders = simulate_cyclists(
         layout.lanes.road, layout.borders, populated, history.time, settings.cyclists, streams[5]
     )
-    boxes = sample_cones(layout.lanes, settings.roadworks, streams[6])
+    boxes = sample_cones(layout.lanes, streams[6])
     cones = static_objects(_ids("cone", len(boxes)), boxes, history.time)
-    signals = signals_of(layout.lanes, layout.stop_lines, settings.lights)
+    signals = signals_of(layout.lanes, layout.stop_lines)
     road_map = None
     if settings.lights.mapped:
-        road_map = sample_map(layout.lanes, layout.focus, layout.stop_lines, signals, settings.lights, streams[7])
+        road_map = sample_map(layout.lanes, layout.focus, layout.stop_lines, signals, streams[7])
     return World(
         concatenated([others, trailers, people, parked, riders, cones]),
         around.occluders,
@@ -106,11 +108,11 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
 
 def simulate_traffic(layout: SceneLayout, settings: SimulatorSettings, rng: np.random.Generator) -> TrafficHistory:
     """Run the warm-up, then record slightly more than the scene's duration."""
-    early = settings.roadworks.early if layout.lanes.taper > 0 else 0.0
-    traffic = Traffic(layout, settings.drivers, rng, settings.step, early)
-    for _ in range(round(settings.warm_up / settings.step)):
+    early = EARLY_MERGE if layout.lanes.taper > 0 else 0.0
+    traffic = Traffic(layout, settings.drivers, rng, STEP, early)
+    for _ in range(round(settings.warm_up / STEP)):
         traffic.step()
-    return record_traffic(traffic, int(np.ceil(settings.duration / settings.step)) + 2)
+    return record_traffic(traffic, int(np.ceil(settings.duration / STEP)) + 2)
 
 
 def vehicle_trajectories(layout: SceneLayout, history: TrafficHistory) -> SimulatedTrajectories:

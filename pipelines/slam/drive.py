@@ -170,7 +170,7 @@ class RecordedOdometry:
         if k == len(self._times) or timestamp != self._times[k]:
             raise InputError(f"timestamp: expected that of scan {k} of the recording, got {timestamp:.6f} s")
         moved = inverse_transform(self._poses[self._keyframe]) @ self._poses[k]
-        keyframe = k == 0 or moved_on(moved, s)
+        keyframe = k == 0 or moved_on(moved)
         self._row, self._keyframe = k, k if keyframe else self._keyframe
         scan = deskewed_in_range(scan, k, self._poses, self._times, s)
         placed = inverse_transform(self._poses[0]) @ self._poses[k]

@@ -27,6 +27,7 @@ from saga_fg.slam.joint import (
     estimate_jointly,
     estimate_online,
 )
+from saga_fg.slam.joint.settings import KEYFRAME_PERIOD
 from saga_fg.tracking import Tracker
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
@@ -105,7 +106,7 @@ def degraded_drive(
 
     Raises `InputError` where the sensor has no frames, or frames without poses to make the odometry of.
     """
-    frames = keyframes([frame for frame in scene.frames if frame.sensor == sensor], settings.keyframe_period)
+    frames = keyframes([frame for frame in scene.frames if frame.sensor == sensor], KEYFRAME_PERIOD)
     if not frames:
         raise InputError(f"scene {scene.name}: expected frames of {sensor}, there are those of {scene.sensors}")
     poses = [frame.world_T_ego for frame in frames if frame.world_T_ego is not None]

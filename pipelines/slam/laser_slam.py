@@ -37,6 +37,12 @@ _POOR = 0.8  # share of a scan that lies on the local map, below which the pose 
 _REACHES = (0.6, 0.3)  # m, of registrations with other passes, in turn
 _DOUBT = 0.2  # share of a difference between wheels and registration that counts as standard deviation: one errs
 _TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
+KEYFRAME_STEP = 0.5  # distance between keyframes, m
+KEYFRAME_TURN = 0.5  # turn between keyframes, rad
+LOCAL_MAP = 10.0  # m of way whose keyframes scans are registered with
+SUBMAP = 10.0  # m of way in a submap in which loops are searched
+ODOMETRY_DRIFT = 0.15  # error of the wheels, share of the way: standard deviation
+ODOMETRY_TURN = 0.1  # error of the wheels' heading, rad for each rad turned and for each 2 m driven: standard deviation
 
 
 @dataclass(frozen=True)
@@ -46,14 +52,6 @@ class LaserSettings(Settings):
     largest_range: Positive = setting(30.0, "m: readings beyond are left out; raise for halls and yards")
     largest_speed: Positive = setting(
         3.0, "m/s: steps of the wheels that are faster, and 1 m longer, count as standing still; raise for vehicles"
-    )
-    keyframe_step: Positive = setting(0.5, "m between keyframes, 0.2 to 2; smaller costs time")
-    keyframe_turn: Positive = setting(0.5, "rad between keyframes")
-    local_map: Positive = setting(10.0, "m of way whose keyframes scans are registered with")
-    submap: Positive = setting(10.0, "m of way in a submap in which loops are searched")
-    odometry_drift: Positive = setting(0.15, "error of the wheels, share of the way: standard deviation")
-    odometry_turn: Positive = setting(
-        0.1, "error of the wheels' heading, rad for each rad turned and for each 2 m driven: standard deviation"
     )
     loop_score: Annotated[float, Range(0, 1)] = setting(0.6, "least mean score of a loop; raised: fewer, surer loops")
     loop_drift: Positive = setting(0.04, "half width of the search, share of the way since; raised: slower, finds more")
@@ -124,10 +122,7 @@ class LaserSlam:
         self.scale.update(step, np.linalg.inv(before) @ self._at, covariance_of(self._seen, self._at))
         self._matched.append(self._at)
         since = np.linalg.inv(self._keyframes[-1].matched) @ self._at
-        if (
-            np.hypot(since[0, 2], since[1, 2]) > self.settings.keyframe_step
-            or abs(heading(since)) > self.settings.keyframe_turn
-        ):
+        if np.hypot(since[0, 2], since[1, 2]) > KEYFRAME_STEP or abs(heading(since)) > KEYFRAME_TURN:
             self._add_keyframe(points, self._at, since)
         return self._now(self._at)
 
@@ -144,9 +139,7 @@ class LaserSlam:
         rejected = int((~agreed.kept).sum())
         graph = agreed.graph
         for turn, reach in enumerate(_REACHES):
-            again = registered_passes(
-                self._keyframes, graph.world_T_pose, reach, self.settings.local_map, self.settings.loop_score
-            )
+            again = registered_passes(self._keyframes, graph.world_T_pose, reach, LOCAL_MAP, self.settings.loop_score)
             if progress is not None:
                 progress("registering passes", turn + 1, len(_REACHES))
             if again:
@@ -163,8 +156,7 @@ class LaserSlam:
     def _registered(self, points: FloatArray, predicted: FloatArray, way: float, turn: float) -> FloatArray:
         """The pose in the local map, where odometry and the scan agree on it."""
         assert self._map is not None
-        s = self.settings
-        sigma = np.array([0.02 + s.odometry_drift * way] * 2 + [0.01 + s.odometry_turn * (turn + way / 2)])
+        sigma = np.array([0.02 + ODOMETRY_DRIFT * way] * 2 + [0.01 + ODOMETRY_TURN * (turn + way / 2)])
         prior = np.diag(sigma**-2.0)
         scan = thinned(points, 0.05)
         fit = self._map.fit(scan, vector(predicted), prior, reach=min(1.0, 0.3 + way))
@@ -192,12 +184,12 @@ class LaserSlam:
             doubt = _DOUBT * np.array([np.hypot(off[0], off[1])] * 2 + [abs(off[2])]) + [0.0, 0.0, _TURNING * turn]
             self._graph.append(since, covariance_of(self._information, matched) + np.diag(doubt**2))
         self._wheels = self._odometry
-        recent = [frame for frame in frames if frame.way > way - s.local_map]
+        recent = [frame for frame in frames if frame.way > way - LOCAL_MAP]
         self._map = LineMap.of(np.concatenate([moved(frame.points, frame.matched) for frame in recent]))
         self._grid = None
         if not self.loops:
             return
-        self._search = self._search or LoopSearch(frames, self._graph, s.submap, s.loop_drift, s.loop_score)
+        self._search = self._search or LoopSearch(frames, self._graph, SUBMAP, s.loop_drift, s.loop_score)
         self._search.extend()
         if len(frames) % 2 == 0:
             loops = self._search.loops(len(frames) - 1)

@@ -29,7 +29,7 @@ from factors import Robust
 from pipelines.slam.drive import OdometryPath, moved_pose
 from pipelines.slam.map_places import MapPlaces
 from pipelines.slam.map_registration import MapRegistration, MeasuredPose
-from pipelines.slam.odometry import LidarOdometry, OdometrySettings
+from pipelines.slam.odometry import LOST_TRANSLATION, LidarOdometry, OdometrySettings
 from pipelines.slam.slam_map import SlamMap
 from pipelines.slam.vehicle_sensors import VehicleSensors
 from saga_fg.errors import InputError, require_type
@@ -37,7 +37,7 @@ from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, FactorProvider
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
-from saga_fg.settings import Fraction, NonNegative, Positive, Settings, setting, settings_group
+from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import MeasuredMotion
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings
 from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
@@ -45,6 +45,10 @@ from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, 
 _LOG = logging.getLogger(__name__)
 _GUESSED = np.diag([0.02, 0.02, 0.1, 1.0, 1.0, 0.5]) ** 2  # of a pose that was given or recognised
 _ACCURACY = np.diag([1e-3] * 3 + [0.03] * 3) ** 2  # of the map, rad and m
+MIN_OVERLAP = 0.5  # least share of what stands above the ground that scans and map have in common
+RADIUS = 80.0  # distance of the submaps that scans are registered with, m
+SCAN_SPACING = 1.5  # spacing of the points of a scan that is registered, m
+ROBUST_SCALE = 3.0  # residual from which the Cauchy loss discounts a measured pose, deviations
 _COMPARED, _WINDOW = 5.0, 10.0  # m of way between comparisons of the structure, and of the scans compared
 _FIX_AGE = 60.0  # s, from which a fix says nothing of where the vehicle is; it is nearer than the way since, too
 
@@ -57,14 +61,8 @@ class LocaliserSettings(Settings):
     search_way: Positive = setting(
         15.0, "way whose points are looked for in the map, m; higher: surer, and later; usual 10 to 30"
     )
-    min_overlap: Fraction = setting(
-        0.5, "share of what stands above the ground that scans and map have in common, else lost; higher: surer"
-    )
-    radius: Positive = setting(80.0, "distance of the submaps that scans are registered with, m; higher: slower")
-    scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
     lag: NonNegative = setting(2.0, "time over which keyframes are smoothed, s; 0: a filter")
     lost_after: Positive = setting(50.0, "way without a scan that fits after which the place is looked for again, m")
-    robust_scale: Positive = setting(3.0, "residual from which the Cauchy loss discounts a measured pose, deviations")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +104,8 @@ class Localiser:
         self._sensors = VehicleSensors(sensors, sensor_settings, ego_T_lidar)
         self._measured, self._of_sensors = self._sensors.since_keyframe, self._sensors.new_providers()
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
-        self._places = MapPlaces(slam_map, s.radius, s.min_overlap, s.scan_spacing, s.odometry.registration)
-        self._map = MapRegistration(self._places, s.scan_spacing)
+        self._places = MapPlaces(slam_map, RADIUS, MIN_OVERLAP, SCAN_SPACING, s.odometry.registration)
+        self._map = MapRegistration(self._places, SCAN_SPACING)
         self._path = OdometryPath()
         # of keyframes as estimated when they came: map_T_lidar, and the covariance of its tangent
         self._found: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -247,7 +245,7 @@ class Localiser:
         if self._fix is None:
             return None
         time, way, place = self._fix
-        return place if self._time - time <= _FIX_AGE and self.way - way <= self.settings.radius / 2 else None
+        return place if self._time - time <= _FIX_AGE and self.way - way <= RADIUS / 2 else None
 
     def _seen(self) -> tuple[FloatArray, FloatArray]:
         """Points (N, 3) of the last keyframes, level, and their frame (4, 4) by odometry."""
@@ -270,7 +268,7 @@ class Localiser:
             return
         share = self._map.agreement(query, self._pose @ inverse_transform(self._path.poses[self._last]) @ frame)
         self._proved = self.way
-        if share is not None and share < self.settings.min_overlap:
+        if share is not None and share < MIN_OVERLAP:
             self._give_up(f"{100 * share:.0f} % of what stands above the ground is as in the map")
         elif share is not None:
             self._unproved = []
@@ -300,8 +298,8 @@ class Localiser:
         given: list[FactorProvider] = [measured]
         if found is not None:
             lost = found.observed.lost / found.observed.scale
-            covariance = found.covariance + _ACCURACY + s.odometry.lost_translation**2 * lost.T @ lost
-            given.append(MeasuredPose(found.map_T_scan, covariance, Robust("cauchy", s.robust_scale)))
+            covariance = found.covariance + _ACCURACY + LOST_TRANSLATION**2 * lost.T @ lost
+            given.append(MeasuredPose(found.map_T_scan, covariance, Robust("cauchy", ROBUST_SCALE)))
             self._fitted = self.way
             self._fits.add(row)
         self._smoother.step(time, [*given, *self._of_sensors], self._measured.frame(time, None))

@@ -48,6 +48,10 @@ _SPEED_OFF = 2.0  # m/s that a speed by other sensors may differ from that of th
 _ACCELERATION = 10.0  # m/s^2 that a vehicle reaches
 _FASTEST = 70.0  # m/s, of a vehicle whose speed nobody knows yet
 _OUT_OF_RANGE = 5  # scans in a row
+KEYFRAME_DISTANCE = 0.5  # distance from the last keyframe that makes a scan the next one, m; lower: a denser graph
+KEYFRAME_ROTATION = 0.05  # rotation from the last keyframe that makes a scan the next one, rad
+LOST_TRANSLATION = 1.0  # standard deviation of a motion along what points leave open, m
+LOST_ROTATION = 0.05  # standard deviation of a rotation that was only predicted, rad
 _CLEARLY, _SKEWED = 0.9, 3  # of the residual; rounds that take the skew out of the first two scans
 
 
@@ -60,18 +64,6 @@ class OdometrySettings(Settings):
     surfel_size: Positive = setting(1.0, "voxel size of the surfels, m; usual 0.5 to 1")
     map_spacing: Positive = setting(0.25, "spacing of the points that enter the map, m")
     scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
-    keyframe_distance: Positive = setting(
-        0.5, "distance from the last keyframe that makes a scan the next one, m; lower: a denser graph"
-    )
-    keyframe_rotation: Positive = setting(0.05, "rotation from the last keyframe that makes a scan the next one, rad")
-    lost_translation: Positive = setting(
-        1.0,
-        "standard deviation of a motion that was only predicted, m, for want of points, or along a direction that they "
-        "leave open; higher: the graph relies more on other sensors there",
-    )
-    lost_rotation: Positive = setting(
-        0.05, "standard deviation of a rotation that was only predicted for want of points, rad"
-    )
     registration: RegistrationSettings = settings_group(RegistrationSettings, "registration of a scan in the map")
 
 
@@ -249,13 +241,13 @@ class LidarOdometry:
             found = self._registered_scan(points, predicted, self._velocity_known)
         except RegistrationError as error:
             _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, error)
-            covariance = np.diag([s.lost_rotation] * 3 + [s.lost_translation] * 3) ** 2
+            covariance = np.diag([LOST_ROTATION] * 3 + [LOST_TRANSLATION] * 3) ** 2
             return OdometryStep(timestamp, predicted, covariance, scan, False, None)
         self._adapt(inverse_transform(predicted) @ found.map_T_scan, points)
         before = self._registered or last
         since_then = inverse_transform(before.map_T_lidar) @ found.map_T_scan
         self._velocity = constant_velocity(since_then, timestamp - before.timestamp)
-        keyframe = moved_on(inverse_transform(self._keyframe) @ found.map_T_scan, s)
+        keyframe = moved_on(inverse_transform(self._keyframe) @ found.map_T_scan)
         names = found.observed.names(self._velocity[3:] if np.linalg.norm(self._velocity[3:]) > _STANDING else None)
         covariance = found.covariance
         self._velocity_known |= not names
@@ -263,7 +255,7 @@ class LidarOdometry:
             self._confirmed = timestamp
         else:
             open_motions = found.observed.lost / found.observed.scale
-            covariance = covariance + s.lost_translation**2 * open_motions.T @ open_motions
+            covariance = covariance + LOST_TRANSLATION**2 * open_motions.T @ open_motions
         if names != self._degenerate:
             _LOG.warning("scan at %.3f s: %s", timestamp, _said(names))
             self._degenerate = names
@@ -280,11 +272,11 @@ def _deskewed(scan: Scan, velocity: FloatArray) -> Scan:
     return scan if scan.time is None else deskewed(scan, velocity)
 
 
-def moved_on(keyframe_T_scan: FloatArray, settings: OdometrySettings) -> bool:
+def moved_on(keyframe_T_scan: FloatArray) -> bool:
     """True if a scan is far enough from the last keyframe, or turned enough, to be the next one."""
     return bool(
-        np.linalg.norm(keyframe_T_scan[:3, 3]) >= settings.keyframe_distance
-        or rotation_angle(keyframe_T_scan[:3, :3]) >= settings.keyframe_rotation
+        np.linalg.norm(keyframe_T_scan[:3, 3]) >= KEYFRAME_DISTANCE
+        or rotation_angle(keyframe_T_scan[:3, :3]) >= KEYFRAME_ROTATION
     )
 
 

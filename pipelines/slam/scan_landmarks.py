@@ -8,11 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.lidar import (
-    CurbSettings,
-    GroundSettings,
-    LineSettings,
-    PlaneSettings,
-    PoleSettings,
     extract_curbs,
     extract_poles,
     extract_walls,
@@ -25,7 +20,7 @@ from saga_fg.model.landmarks.line import LineLandmark
 from saga_fg.model.landmarks.plane import PlaneLandmark
 from saga_fg.model.landmarks.pole import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.settings import setting, settings_group
+from saga_fg.settings import setting
 from saga_fg.types.landmark import Observation
 
 GROUND = PlaneLandmark(name="ground")
@@ -42,11 +37,6 @@ class ScanLandmarkSettings:
     walls: int = setting(6, "largest number of walls of a scan; the largest ones are kept")
     poles: int = setting(12, "largest number of poles of a scan; the nearest ones are kept")
     lines: int = setting(2, "largest number of curb lines of a scan; those with the most points are kept")
-    segmentation: GroundSettings = settings_group(GroundSettings, "ground segmentation")
-    plane: PlaneSettings = settings_group(PlaneSettings, "walls and ground plane")
-    pole: PoleSettings = settings_group(PoleSettings, "poles")
-    curb: CurbSettings = settings_group(CurbSettings, "points on curbs")
-    line: LineSettings = settings_group(LineSettings, "straight lines through points on curbs")
 
 
 def observe_landmarks(
@@ -57,20 +47,20 @@ def observe_landmarks(
     detectors: of further kinds of landmarks
     """
     s = settings or ScanLandmarkSettings()
-    ground = segment_ground(points, s.segmentation)
+    ground = segment_ground(points)
     found: list[Observation] = []
     if s.ground:
-        plane = fit_ground(points[ground.is_ground], s.plane)
+        plane = fit_ground(points[ground.is_ground])
         if plane is not None:
             found.append(Observation(GROUND, plane.coefficients, plane.covariance, plane.extent))
-    walls = extract_walls(points[~ground.is_ground], s.plane)
+    walls = extract_walls(points[~ground.is_ground])
     for wall in walls[: s.walls]:
         found.append(Observation(WALL, wall.coefficients, wall.covariance, wall.extent))
-    poles = extract_poles(points, ground.height, walls, s.pole)
+    poles = extract_poles(points, ground.height, walls)
     for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
         extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
         found.append(Observation(POLE, pole.foot, pole.covariance, extent))
-    curbs = extract_curbs(points, ground.height, s.curb) if s.lines else np.empty((0, 3))
-    for line in straight_lines(curbs, s.lines, s.line):
+    curbs = extract_curbs(points, ground.height) if s.lines else np.empty((0, 3))
+    for line in straight_lines(curbs, s.lines):
         found.append(Observation(LINE, line.ends.ravel(), line.covariance, line.ends))
     return found + [other for detector in detectors for other in detector.observations(points)]

@@ -26,8 +26,10 @@ from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import JointEstimate, OdometryIncrements, estimate_jointly, estimate_online
+from saga_fg.slam.joint.settings import KEYFRAME_PERIOD
 from saga_fg.slam.mapping import LandmarkSettings
 from saga_fg.slam.sensors import SensorBuffer, SensorSettings, sensor_providers
+from saga_fg.slam.submaps.settings import GATE
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
@@ -63,7 +65,7 @@ def with_objects(
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
-    rows = _moments(result.drive.keyframes, scans.timestamps, s.objects.keyframe_period)
+    rows = _moments(result.drive.keyframes, scans.timestamps, KEYFRAME_PERIOD)
     lidar_T_ego = inverse_transform(scans.ego_T_lidar)
 
     def new_tracker() -> Tracker:
@@ -99,7 +101,7 @@ def with_objects(
         observed: list[list[Observation]] = [[] for _ in rows]
         for one in result.observations:
             observed[at[one.pose]].append(one.observation)
-        marks, others = LandmarkSettings(s.submaps.gate, s.submaps.confirm_after), [*of_sensors, *new_providers()]
+        marks, others = LandmarkSettings(GATE, s.submaps.confirm_after), [*of_sensors, *new_providers()]
         online = estimate_online(seen, odometry, new_tracker(), lag, s.objects, start, observed, marks, others)
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
         slam = replace(slam, online=Trajectory(scans.timestamps, placed))

@@ -29,6 +29,7 @@ from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting
 
 _LOG = logging.getLogger(__name__)
+ANTENNA_DEVIATION = 0.5  # standard deviation of that position beforehand, by axis, m
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,6 @@ class Gps(Settings):
         math.inf, "residual from which the Cauchy loss discounts a fix, standard deviations; .inf: never"
     )
     estimate_antenna: bool = setting(False, "true: the antenna's position is a variable of the graph; poses in space")
-    antenna_deviation: Positive = setting(0.5, "standard deviation of that position beforehand, by axis, m")
     name: str = setting("gps", "name in messages")
 
     def __post_init__(self) -> None:
@@ -88,7 +88,7 @@ class Gps(Settings):
         priors = list[Factor]()
         if ANTENNA not in view.static(EGO_CALIBRATION):
             new.append(NewVariable(EGO_CALIBRATION, ANTENNA, place, static=True, label="place of the antenna"))
-            priors.append(prior_factor(key, place, self.antenna_deviation**2 * np.eye(3)))
+            priors.append(prior_factor(key, place, ANTENNA_DEVIATION**2 * np.eye(3)))
         types = (SpatialPose(), Vector(3))
         function = partial(_by_antenna, z, antenna - place)
         return Additions(new, [*priors, ResidualFactor((pose.key, key), types, function, R, robust=robust, name="fix")])

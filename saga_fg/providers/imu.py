@@ -32,6 +32,10 @@ from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_
 from saga_fg.types.ego_measurements import ImuSamples
 
 _LOG = logging.getLogger(__name__)
+INTEGRATION_NOISE = 1e-4  # noise density of integrating the position, m/s/sqrt(Hz)
+UNKNOWN_ACCELERATION = 3.0  # noise density of the acceleration in gaps of the samples, m/s^2/sqrt(Hz)
+UNKNOWN_TURN = 0.3  # noise density of the turn rate in gaps of the samples, rad/s/sqrt(Hz)
+ROTATION_DEVIATION = 0.05  # standard deviation of that rotation beforehand, by axis, rad
 
 
 @dataclass(frozen=True)
@@ -43,22 +47,16 @@ class Imu(Settings):
     start_velocity_deviation: Positive = setting(10.0, "standard deviation of the first velocity, m/s")
     accelerometer_noise: Positive = setting(0.02, "noise density of the accelerometer, m/s^2/sqrt(Hz)")
     gyroscope_noise: Positive = setting(0.002, "noise density of the gyroscope, rad/s/sqrt(Hz)")
-    integration_noise: Positive = setting(1e-4, "noise density of integrating the position, m/s/sqrt(Hz)")
     accelerometer_bias: Positive = setting(0.1, "standard deviation of the first bias of the accelerometer, m/s^2")
     gyroscope_bias: Positive = setting(0.01, "standard deviation of the first bias of the gyroscope, rad/s")
     accelerometer_drift: Positive = setting(1e-3, "random walk of the bias of the accelerometer in one second, m/s^2")
     gyroscope_drift: Positive = setting(1e-4, "random walk of the bias of the gyroscope in one second, rad/s")
-    unknown_acceleration: Positive = setting(
-        3.0, "noise density of the acceleration in gaps of the samples, m/s^2/sqrt(Hz)"
-    )
-    unknown_turn: Positive = setting(0.3, "noise density of the turn rate in gaps of the samples, rad/s/sqrt(Hz)")
     gravity: NonNegative = setting(9.81, "gravity, m/s^2")
     max_gap: Positive = setting(
         0.05, "longest time of an epoch without samples, s; where they lack more, the epoch is bridged as unknown"
     )
     mounted: Mounting = setting(ON_THE_POSE, "x, y, z (m), roll, pitch, yaw (rad) of the sensor in the vehicle's frame")
     estimate_rotation: bool = setting(False, "true: the sensor's rotation on the vehicle is a variable of the graph")
-    rotation_deviation: Positive = setting(0.05, "standard deviation of that rotation beforehand, by axis, rad")
     name: str = setting("imu", "name in messages")
 
     def __post_init__(self) -> None:
@@ -125,7 +123,7 @@ class Imu(Settings):
         if INERTIAL in view.static(EGO_CALIBRATION):
             return key, Additions()
         new = NewVariable(EGO_CALIBRATION, INERTIAL, np.zeros(3), static=True, label="rotation of the imu")
-        return key, Additions([new], [prior_factor(key, np.zeros(3), self.rotation_deviation**2 * np.eye(3))])
+        return key, Additions([new], [prior_factor(key, np.zeros(3), ROTATION_DEVIATION**2 * np.eye(3))])
 
     def _turned(self, keys: tuple[int, ...], measured: gtsam.PreintegratedCombinedMeasurements) -> ResidualFactor:
         types = (SpatialPose(), Vector(3), SpatialPose(), Vector(3), ImuBias(), ImuBias(), Vector(3))
@@ -163,9 +161,9 @@ class Imu(Settings):
             parameters.setBodyPSensor(self._place)
         noises = (self.accelerometer_noise, self.gyroscope_noise)
         for name, deviation in (
-            ("Accelerometer", noises[0] if known else self.unknown_acceleration),
-            ("Gyroscope", noises[1] if known else self.unknown_turn),
-            ("Integration", self.integration_noise),
+            ("Accelerometer", noises[0] if known else UNKNOWN_ACCELERATION),
+            ("Gyroscope", noises[1] if known else UNKNOWN_TURN),
+            ("Integration", INTEGRATION_NOISE),
             ("BiasAcc", self.accelerometer_drift),
             ("BiasOmega", self.gyroscope_drift),
         ):

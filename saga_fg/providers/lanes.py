@@ -19,11 +19,12 @@ from saga_fg.graph.variables import NewVariable
 from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.polyline import feet, on_it
-from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
+from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.types.road_map import Lane
 
 _ALONG = 0.9  # cosine of the angle between a course and a lane within which an object goes along it
 _LETS_GO = 3.0  # standard deviations
+MIN_SPEED = 1.0  # ignore vehicles slower than this, m/s
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,6 @@ class LaneKeeping(Settings):
         0.5, "standard deviation of the offset left after one second in the lane, m; lower: stronger"
     )
     map_deviation: Positive = setting(0.3, "standard deviation of the lanes in the map, m")
-    min_speed: NonNegative = setting(1.0, "ignore vehicles slower than this, m/s")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that keep to lanes")
     name: str = setting("lanes", "name in messages")
 
@@ -68,7 +68,7 @@ class LaneKeeping(Settings):
         at = feet(centre, states[:, :2])
         along = np.einsum("ni,ni->n", at.direction, states[:, 2:])
         inside = on_it(centre, at.s) & (np.abs(at.e) < lane.width / 2)
-        mine = np.flatnonzero(inside & (speed >= self.min_speed) & (along >= _ALONG * speed))
+        mine = np.flatnonzero(inside & (speed >= MIN_SPEED) & (along >= _ALONG * speed))
         frames = np.tile(np.eye(4), (len(mine), 1, 1))
         x, y = at.direction[mine].T
         frames[:, :2, 0], frames[:, :2, 1] = np.stack([x, y], axis=1), np.stack([-y, x], axis=1)

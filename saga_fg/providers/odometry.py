@@ -25,6 +25,8 @@ from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.types.ego_measurements import OdometryIncrement
 
 _SAME = 1e-4  # relative difference of two intervals that timestamps make
+UNKNOWN_SPEED = 10.0  # standard deviation of the velocity where there is no increment, m/s
+UNKNOWN_TURN = 0.3  # standard deviation of the turn rate where there is no increment, rad/s
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,6 @@ class Odometry(Settings):
     heading_drift: Positive = setting(
         0.01, "standard deviation of heading, roll and pitch after one second, likewise, rad"
     )
-    unknown_speed: Positive = setting(10.0, "standard deviation of the velocity where there is no increment, m/s")
-    unknown_turn: Positive = setting(0.3, "standard deviation of the turn rate where there is no increment, rad/s")
     name: str = setting("odometry", "name in messages")
 
     def predict(self, view: GraphView) -> Additions:
@@ -62,7 +62,7 @@ class Odometry(Settings):
         ego = None if view.frame is None else view.frame.ego
         if ego is None or ego.odometry is None:
             stationary: Pose = gtsam.Pose2() if planar else gtsam.Pose3()
-            return stationary, self._covariance(self.unknown_speed * view.dt, self.unknown_turn * view.dt, planar)
+            return stationary, self._covariance(UNKNOWN_SPEED * view.dt, UNKNOWN_TURN * view.dt, planar)
         reported = ego.odometry
         motion = _motion_of(reported, planar)
         covariance = reported.covariance

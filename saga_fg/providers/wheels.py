@@ -27,6 +27,8 @@ from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import Fraction, Positive, Settings, setting
 
 _OFF = 0.5  # share of an epoch that the wheels must have measured
+SIDEWAYS = 0.1  # standard deviation of the velocity to the side and upwards, m/s
+SCALE_DEVIATION = 0.05  # standard deviation of that scale beforehand, as a share
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,6 @@ class Wheels(Settings):
         0.1, "standard deviation of a speed without one of its own, m/s; higher: trusted less"
     )
     share: Fraction = setting(0.01, "standard deviation of a speed as a share of it: radius of the wheels, slip")
-    sideways: Positive = setting(0.1, "standard deviation of the velocity to the side and upwards, m/s")
     outlier_scale: Positive = setting(
         3.0, "residual from which the Cauchy loss discounts a speed, as of spinning wheels, standard deviations"
     )
@@ -45,7 +46,6 @@ class Wheels(Settings):
         ON_THE_POSE, "x, y, z (m), roll, pitch, yaw (rad) of the axle that does not steer, in the vehicle's frame"
     )
     estimate_scale: bool = setting(False, "true: the scale of the speed is a variable of the graph")
-    scale_deviation: Positive = setting(0.05, "standard deviation of that scale beforehand, as a share")
     name: str = setting("wheels", "name in messages")
 
     def __post_init__(self) -> None:
@@ -66,7 +66,7 @@ class Wheels(Settings):
         if now.dim != 6:
             raise InputError("wheels: expected the vehicle's pose in space, got one in the plane")
         ahead = np.hypot(self.deviation if wheels.deviation is None else wheels.deviation, self.share * wheels.speed)
-        R = np.diag(np.square([ahead, self.sideways, self.sideways]))
+        R = np.diag(np.square([ahead, SIDEWAYS, SIDEWAYS]))
         keys, types = [before.key, now.key], list[Variable]([SpatialPose(), SpatialPose()])
         new, priors = list[NewVariable](), list[Factor]()
         if self.estimate_scale:
@@ -74,7 +74,7 @@ class Wheels(Settings):
             keys, types = [*keys, scale], [*types, Vector(1)]
             if WHEELS not in view.static(EGO_CALIBRATION):
                 new.append(NewVariable(EGO_CALIBRATION, WHEELS, np.ones(1), static=True, label="scale of the wheels"))
-                priors.append(prior_factor(scale, np.ones(1), [[self.scale_deviation**2]]))
+                priors.append(prior_factor(scale, np.ones(1), [[SCALE_DEVIATION**2]]))
         residual = partial(_residual, self._place, view.dt, wheels.speed)
         robust = Robust("cauchy", self.outlier_scale)
         factor = ResidualFactor(tuple(keys), tuple(types), residual, R, robust=robust, name="speed of the wheels")

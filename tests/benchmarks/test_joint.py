@@ -23,7 +23,7 @@ CONFIG = load_config("simulated")
 
 def test_recordings_are_pooled_and_the_same_odometry_is_compared() -> None:
     scenes = [simulate_scene(SHORT, seed, f"street {seed}") for seed in (1, 2)]
-    settings = JointSettings(passes=1, keyframe_period=0.15)
+    settings = JointSettings(passes=1)
     rows = list(joint_rows(scenes, [0], partial(batch_run, config=CONFIG, settings=settings, poles=True)))
     paths = [row for title, row in rows if "path, m" in row]
     assert [row["recording"] for row in paths] == ["street 1", "street 2"]

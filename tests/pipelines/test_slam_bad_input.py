@@ -238,7 +238,7 @@ def test_what_is_no_scan_or_time_is_said(scans: SimulatedScans) -> None:
 
 def test_a_turn_on_the_spot_makes_keyframes_of_recorded_poses_too() -> None:
     scans = SimulatedScans(0, world_T_lidar=np.array([yaw_transform(0, 0, 1.7, 0.02 * k) for k in range(7)]))
-    recorded = RecordedOdometry(scans, 1e-3, 0.03, OdometrySettings(keyframe_rotation=0.05))
+    recorded = RecordedOdometry(scans, 1e-3, 0.03, OdometrySettings())
     keyframes = [recorded.step(scans[k], time).keyframe for k, time in enumerate(scans.timestamps.tolist())]
     assert keyframes == [True, False, False, True, False, False, True]
 

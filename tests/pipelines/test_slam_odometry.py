@@ -11,7 +11,7 @@ from data_tools.lidar import Scan
 from data_tools.simulator.scanner import ScannerSettings
 from data_tools.simulator.street import drive, scans, street
 from data_tools.trajectories import Trajectory, trajectory_errors
-from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
+from pipelines.slam.odometry import LOST_ROTATION, LOST_TRANSLATION, LidarOdometry, OdometrySettings, OdometryStep
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from tests.data_tools.featureless import tunnel
@@ -68,8 +68,7 @@ def test_a_scan_without_points_lies_where_it_was_predicted(caplog: pytest.LogCap
     assert "the motion of the one before goes on" in caplog.text
     assert steps[5].registration is None
     assert not steps[5].keyframe
-    settings = OdometrySettings()
-    deviations = [settings.lost_rotation] * 3 + [settings.lost_translation] * 3
+    deviations = [LOST_ROTATION] * 3 + [LOST_TRANSLATION] * 3
     np.testing.assert_allclose(steps[5].covariance, np.diag(np.square(deviations)))
     assert [step.lost for step in steps] == [0] * 6 + [1, 0]
     estimate = poses[0] @ np.array([step.map_T_lidar for step in steps])

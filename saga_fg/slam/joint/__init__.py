@@ -6,12 +6,11 @@ from saga_fg.slam.joint.landmarks import Observations
 from saga_fg.slam.joint.lanes import lane_key
 from saga_fg.slam.joint.odometry import OdometryIncrements, OdometryNoise
 from saga_fg.slam.joint.online import OnlineEstimate, OnlineEstimator, OnlineStep, estimate_online
-from saga_fg.slam.joint.settings import JointSettings, LaneSettings
+from saga_fg.slam.joint.settings import JointSettings
 
 __all__ = [
     "JointEstimate",
     "JointSettings",
-    "LaneSettings",
     "ObjectStates",
     "Observations",
     "OdometryIncrements",

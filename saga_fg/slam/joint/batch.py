@@ -25,12 +25,13 @@ from saga_fg.slam.joint.lanes import LaneAssociation
 from saga_fg.slam.joint.odometry import OdometryIncrements
 from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects, detections_name
 from saga_fg.slam.joint.record import record_epochs
-from saga_fg.slam.joint.settings import JointSettings
+from saga_fg.slam.joint.settings import MAX_ITERATIONS, JointSettings
 from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 
 TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
+MAX_LANDMARK_DISTANCE = 2.5  # largest distance between two observations of one landmark, m
 
 
 def estimate_jointly(
@@ -63,7 +64,7 @@ def estimate_jointly(
         before, links = links, [now.seen.id.tolist() for now in record]
         if links == before:
             break
-        seen = nearest_landmarks(landmarks, path, settings.max_landmark_distance)
+        seen = nearest_landmarks(landmarks, path, MAX_LANDMARK_DISTANCE)
         clutter = tracker.settings.association.clutter_area
         start_moving = estimate is None
         providers = [seen, *new_providers()]
@@ -104,7 +105,7 @@ def _solve(
     good start; with those stationary that seem so along the path; with identities by the solution; at last with
     vehicles assigned to lanes along the solution before.
     """
-    graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=settings.max_iterations, tolerance=TOLERANCE)
+    graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=MAX_ITERATIONS, tolerance=TOLERANCE)
     epochs = VehicleAndObjects(record, path, settings)
     for now, frame in zip(record, frames, strict=True):
         graph.advance(now.time)
@@ -113,7 +114,7 @@ def _solve(
         graph.solve(solver)
     probabilities = stationary_probabilities(record, path, slow, settings)
     name = StationaryPairs.name
-    graph.add_factors(name, stationary_factors(record, probabilities, settings), name)
+    graph.add_factors(name, stationary_factors(record, probabilities), name)
     estimate = read_estimate(record, graph.solve(solver), probabilities)
     places = [one.position for one in estimate.objects]
     record = with_all_identities(record, estimate.world_T_ego, places, clutter_area)

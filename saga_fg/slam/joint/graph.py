@@ -44,6 +44,8 @@ _START_NOISE = 1e-3  # standard deviation of the first pose, m and rad
 _LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
 _ANY_SPEED = 100.0  # m/s, deviation of an unknown velocity
 Record = Sequence[RecordedEpoch]
+STATIONARY_DRIFT = 0.05  # standard deviation of a stationary object's drift in one second, m
+STATIONARY_SPEED = 0.1  # standard deviation of the velocity of a stationary object, m/s
 
 
 def error_key(epoch: int) -> int:
@@ -121,7 +123,7 @@ def detections(record: Record, settings: JointSettings) -> list[Linearisable]:
     return factors
 
 
-def stationary_factors(record: Record, stationary: Sequence[FloatArray], settings: JointSettings) -> list[Linearisable]:
+def stationary_factors(record: Record, stationary: Sequence[FloatArray]) -> list[Linearisable]:
     """Between two epochs of an object that may be stationary at both; stationary: probabilities (n,) of each."""
     collected: dict[NodeType, list[tuple[int, int, float, float]]] = {}
     for (before, p_before), (now, p_now) in pairwise(zip(record, stationary, strict=True)):
@@ -135,7 +137,7 @@ def stationary_factors(record: Record, stationary: Sequence[FloatArray], setting
     for node_type, rows in collected.items():
         model = _StationaryResidual(node_type.dim, tuple(node_type.index(POSITION)), tuple(node_type.index(VELOCITY)))
         first, second, p, dt = (np.array(column) for column in zip(*rows, strict=True))
-        drift, speed = settings.stationary_drift**2 * dt, np.full(len(dt), settings.stationary_speed**2)
+        drift, speed = STATIONARY_DRIFT**2 * dt, np.full(len(dt), STATIONARY_SPEED**2)
         factors.append(
             ResidualFactors(
                 np.column_stack([first, second]).astype(np.uint64),

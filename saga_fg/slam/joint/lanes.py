@@ -34,6 +34,7 @@ import numpy as np
 from factors import Linearisable, Robust, lane_keeping_factors, prior_factor
 from factors.rotations import cross_matrix
 from saga_fg.graph import MAP_NODE, Additions, GraphView, NewVariable, key_of
+from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.model.interactions import POSITION
 from saga_fg.model.motion import NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
@@ -41,11 +42,16 @@ from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.numerics.polyline import feet, on_it
 from saga_fg.slam.joint.estimate import JointEstimate, ObjectStates
 from saga_fg.slam.joint.graph import Record, by_type, object_key
-from saga_fg.slam.joint.settings import LaneSettings
 from saga_fg.types.road_map import RoadMap
 
 _LIKELY = 0.9  # a vehicle that drives along a lane with less than this probability gets no factor
 _LEAVING = 3.0  # times the spread: scale of the Cauchy loss on the offset from the centre line
+OFFSET_DEVIATION = 0.3  # standard deviation of the offset from the centre line, m
+OFFSET_TIME = 5.0  # correlation time of the offset of one driver, s
+LATERAL_SPEED_SCALE = 0.8  # sigma of the kernel on the speed across the lane, m/s
+OFF_LANE_SHARE = 0.1  # vehicles outside all lanes, as a share of those in one
+LANE_PASSES = 3  # passes of assigning vehicles to lanes along the latest path
+LANE_CLASSES = VEHICLES  # classes of objects that take part
 
 
 def lane_key(number: int) -> int:
@@ -79,8 +85,8 @@ class LaneAssociation:
 
     name = "lanes"
 
-    def __init__(self, settings: LaneSettings | None, maps: Iterable[RoadMap | None]) -> None:
-        self._settings = settings
+    def __init__(self, used: bool, maps: Iterable[RoadMap | None]) -> None:
+        self._used = used
         self._maps: list[RoadMap] = []
         self._lanes: list[KnownLane] = []
         self._record: Record = ()
@@ -91,7 +97,7 @@ class LaneAssociation:
     @property
     def rounds(self) -> int:
         """Number of assignments to make; 0 without lanes."""
-        return 0 if self._settings is None or not self._lanes else self._settings.passes
+        return LANE_PASSES if self._used and self._lanes else 0
 
     def add_maps(self, *maps: RoadMap | None) -> None:
         """Add maps of frames, most of which bring the same one."""
@@ -106,23 +112,23 @@ class LaneAssociation:
         estimate, stationary: of these epochs, and the probabilities (n,) that their objects are stationary
         """
         self._record, self._new, self._first = record, [], record[-len(estimate.objects)].epoch
-        if self.rounds and self._settings is not None:
+        if self.rounds:
             for row in range(-len(estimate.objects), 0):
                 now, pose = record[row], (estimate.world_T_ego[row], estimate.pose_covariances[row])
                 self._new += assign_lanes(
-                    now.epoch, estimate.objects[row], now.seen.id, stationary[row], pose, self._lanes, self._settings
+                    now.epoch, estimate.objects[row], now.seen.id, stationary[row], pose, self._lanes
                 )
         self._all += self._new
         return bool(self._new)
 
     def factors(self, view: GraphView) -> Additions:
         """Lanes that are new to the graph, and the vehicles last assigned."""
-        if self._settings is None:
+        if not self._used:
             return Additions()
         met = {one.lane for one in self._new}
         new = [one for one in self._lanes if one.number in met and lane_key(one.number) not in view.variables]
         lanes = [NewVariable(MAP_NODE, lane.number, np.zeros(1), static=True, label="lane") for lane in new]
-        return Additions(lanes, lane_priors(new), {self._first: lane_factors(self._record, self._new, self._settings)})
+        return Additions(lanes, lane_priors(new), {self._first: lane_factors(self._record, self._new)})
 
     def forget(self, first: int) -> list[int]:
         """Forget assignments before the epoch `first`; returns the keys of lanes that no vehicle is assigned to."""
@@ -150,14 +156,13 @@ def assign_lanes(
     stationary: FloatArray,
     pose: tuple[FloatArray, FloatArray],
     lanes: Sequence[KnownLane],
-    settings: LaneSettings,
 ) -> list[LaneAssignment]:
     """Assign the objects of an epoch to lanes.
 
     seen (m,) ids of detected ones; stationary (n,) probabilities of the objects; pose: (4, 4), and its covariance
     (6, 6) in its own frame.
     """
-    rows = np.flatnonzero(np.isin(objects.id, seen) & of_classes(np.array(objects.label), settings.classes))
+    rows = np.flatnonzero(np.isin(objects.id, seen) & of_classes(np.array(objects.label), LANE_CLASSES))
     if not len(rows) or not lanes:
         return []
     place, velocity = objects.position[rows], objects.velocity[rows]
@@ -167,13 +172,13 @@ def assign_lanes(
     n = np.stack([-t[..., 1], t[..., 0]], axis=-1)
     along, across = np.einsum("jmi,mi->jm", t, velocity), np.einsum("jmi,mi->jm", n, velocity)
     deviation = np.array([lane.deviation for lane in lanes])[:, None]
-    S = settings.offset_deviation**2 + deviation**2 + np.einsum("jmi,mik,jmk->jm", n, _shift(place, world_T_ego, P), n)
+    S = OFFSET_DEVIATION**2 + deviation**2 + np.einsum("jmi,mik,jmk->jm", n, _shift(place, world_T_ego, P), n)
     off = np.stack([one.e for one in at])
     there = np.stack([on_it(lane.centre, one.s) for lane, one in zip(lanes, at, strict=True)]) & (along > 0)
     q = np.where(there, np.exp(-(off**2) / (2 * S)) / np.sqrt(2 * math.pi * S), 0.0)
-    beside = settings.off_lane_share / np.array([lane.width for lane in lanes])[:, None]
+    beside = OFF_LANE_SHARE / np.array([lane.width for lane in lanes])[:, None]
     likely = q / (q.sum(axis=0) + beside)
-    drift = settings.lateral_speed_scale**2 + along**2 * P[2, 2]
+    drift = LATERAL_SPEED_SCALE**2 + along**2 * P[2, 2]
     p = likely * (1 - stationary[rows]) * np.exp(-(across**2) / (2 * drift))
     found = []
     for column, j in enumerate(np.argmax(likely, axis=0).tolist()):
@@ -185,7 +190,7 @@ def assign_lanes(
     return found
 
 
-def lane_factors(record: Record, kept: Sequence[LaneAssignment], settings: LaneSettings) -> list[Linearisable]:
+def lane_factors(record: Record, kept: Sequence[LaneAssignment]) -> list[Linearisable]:
     """The factors of assigned vehicles."""
     times = {now.epoch: now.time for now in record}
     types: dict[tuple[int, int], NodeType] = {
@@ -193,8 +198,8 @@ def lane_factors(record: Record, kept: Sequence[LaneAssignment], settings: LaneS
         for now in record
         for name, node_type in zip(now.objects.id, now.objects.types, strict=True)
     }
-    step = np.median(np.diff(sorted(times.values()))) if len(times) > 1 else settings.offset_time
-    variance = settings.offset_deviation**2 * max(1.0, 2 * settings.offset_time / float(step))
+    step = np.median(np.diff(sorted(times.values()))) if len(times) > 1 else OFFSET_TIME
+    variance = OFFSET_DEVIATION**2 * max(1.0, 2 * OFFSET_TIME / float(step))
     present = [one for one in kept if (one.epoch, one.name) in types and one.probability > 1e-6]
     factors: list[Linearisable] = []
     for node_type, mine in by_type([types[one.epoch, one.name] for one in present]):
@@ -208,7 +213,7 @@ def lane_factors(record: Record, kept: Sequence[LaneAssignment], settings: LaneS
                 1,
                 node_type.dim,
                 (x, y),
-                robust=Robust("cauchy", _LEAVING * settings.offset_deviation / math.sqrt(variance)),
+                robust=Robust("cauchy", _LEAVING * OFFSET_DEVIATION / math.sqrt(variance)),
             )
         )
     return factors

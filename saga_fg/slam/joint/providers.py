@@ -99,8 +99,7 @@ class StationaryPairs:
 
     name = "stationary objects"
 
-    def __init__(self, settings: JointSettings) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._record: Record = ()
         self._now: Sequence[FloatArray] = ()
@@ -120,6 +119,6 @@ class StationaryPairs:
                 given[k] = before
                 continue
             given[k] = pair
-            named[k] = stationary_factors(rows, pair, self._settings)
+            named[k] = stationary_factors(rows, pair)
         self._given = given
         return Additions(named=named)

@@ -40,6 +40,7 @@ _CREEPING = 0.3  # speed of creeping traffic, as a share of the usual one
 _ALIKE = 10.0  # s, time over which traffic keeps its shares
 _PRIOR = 10.0  # detections of each hypothesis that the prior of the shares is worth
 _ROUNDS = 30  # of expectation maximisation
+ONLINE_STATIONARY_SHARE = 0.1  # prior share of stationary objects online: queues look parked
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSet
     S = np.stack([S if online else S + turned, S + turned])
     usual = (seen.speed * T) ** 2
     if online:
-        q = settings.online_stationary_share
+        q = ONLINE_STATIONARY_SHARE
         variances, shares = np.stack([S, S + usual]), np.array([[q], [1 - q]])
         log = _log_likelihoods(variances, d2)
     else:

@@ -20,7 +20,7 @@ from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.slam.joint.graph import error_key
 from saga_fg.slam.joint.providers import Detections, StationaryPairs, VehicleAndObjects
 from saga_fg.slam.joint.record import RecordedEpoch
-from saga_fg.slam.joint.settings import JointSettings
+from saga_fg.slam.joint.settings import MAX_ITERATIONS, JointSettings
 from saga_fg.slam.mapping import pose_key
 from saga_fg.types.frame import Frame
 
@@ -31,9 +31,9 @@ class Window:
     """The epochs of `record` in a running graph; providers: others that are asked at every epoch."""
 
     def __init__(self, settings: JointSettings, providers: Sequence[FactorProvider] = ()) -> None:
-        relinearisation = RelinearisationSettings(_THRESHOLD, settings.max_iterations)
+        relinearisation = RelinearisationSettings(_THRESHOLD, MAX_ITERATIONS)
         self._settings, self._smoother = settings, IncrementalSmoother(providers, None, relinearisation)
-        self._stationary = StationaryPairs(settings)
+        self._stationary = StationaryPairs()
         self.record: list[RecordedEpoch] = []
 
     @property
@@ -68,7 +68,7 @@ class Window:
         try:
             self._smoother.step(now.time, [new, given, *self._smoother.providers], frame)
         except GraphError:
-            self._stationary = StationaryPairs(self._settings)  # whose factors are unknown now
+            self._stationary = StationaryPairs()  # whose factors are unknown now
             raise
         self.record = record
         return self._smoother.solution()

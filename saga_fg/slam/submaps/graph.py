@@ -38,12 +38,13 @@ from saga_fg.slam.submaps.condensing import CondensedSubmap
 from saga_fg.slam.submaps.loop_selection import LoopSelection, Motion, select_loops
 from saga_fg.slam.submaps.loops import LoopClosure, Loops, loop_factors
 from saga_fg.slam.submaps.recording import Given, recorded
-from saga_fg.slam.submaps.settings import SubmapSettings
+from saga_fg.slam.submaps.settings import GATE, SubmapSettings
 from saga_fg.slam.submaps.whole_drive import SolvedDrive, measurement_graph, solve_drive
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
 
 _AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
+MAX_KEYFRAMES = 80  # keyframes after which the next submap begins, on a shorter way
 
 
 class SubmapGraph:
@@ -77,7 +78,7 @@ class SubmapGraph:
         self._by_anchors = self._new_smoother()  # one epoch for each anchor, once a submap was closed
         self._closed: CondensedSubmap | None = None  # the newest one
         self._loops: list[LoopClosure] = []  # between submaps, by their numbers
-        self._landmarks = SubmapLandmarks(self.settings.gate)
+        self._landmarks = SubmapLandmarks(GATE)
         self._numbers, self._way = 0, 0.0
 
     def __len__(self) -> int:
@@ -114,7 +115,7 @@ class SubmapGraph:
             raise InputError("motion: expected one for every keyframe but the first")
         measured = self._motions[0] if motion is None else motion
         way = self._way + (0.0 if motion is None else float(np.linalg.norm(measured[0][:3, 3])))
-        begins = k == 0 or way >= self.settings.length or k - self._anchors[-1] >= self.settings.keyframes
+        begins = k == 0 or way >= self.settings.length or k - self._anchors[-1] >= MAX_KEYFRAMES
         start = measured[0] if k == 0 else self.pose(k - 1) @ measured[0]
         landmarks, numbers = self._associated(begins, motion, start, observations)
         now = list(zip(numbers, observations, strict=True))
@@ -238,7 +239,7 @@ class SubmapGraph:
         start: FloatArray,
         observations: Sequence[Observation],
     ) -> tuple[SubmapLandmarks, list[int]]:
-        landmarks = SubmapLandmarks(self.settings.gate) if begins else self._landmarks.copy()
+        landmarks = SubmapLandmarks(GATE) if begins else self._landmarks.copy()
         if motion is not None and not begins:
             landmarks.move(*motion)
         return landmarks, landmarks.observe(start, observations, self._numbers)

@@ -8,18 +8,14 @@ from typing import Annotated
 from factors import Robust
 from saga_fg.settings import Positive, Range, Settings, setting
 
+GATE = 0.999  # gate probability of association
+
 
 @dataclass(frozen=True)
 class SubmapSettings(Settings):
     """Size of submaps, association and confirmation of landmarks."""
 
     length: Positive = setting(30.0, "way after which the next submap begins, m; usual 20 to 50; higher: slower")
-    keyframes: Annotated[int, Range(2, 1000)] = setting(
-        80, "keyframes after which the next submap begins, on a shorter way; higher: slower"
-    )
-    gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
-        0.999, "gate probability of association; higher: fewer duplicates, more wrong matches"
-    )
     confirm_after: Annotated[int, Range(1, 10**9)] = setting(4, "observations that confirm a landmark")
     relinearise_above: Positive = setting(
         0.5, "linearise factors again when a variable moved by this many standard deviations; higher: faster"

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_tools.lidar import (
-    LineSettings,
     Scan,
     detect_clusters,
     extract_curbs,
@@ -20,10 +19,10 @@ from data_tools.lidar import (
     straight_lines,
 )
 from data_tools.lidar.clusters import l_shape_heading
+from data_tools.lidar.curbs import BIAS
 from data_tools.lidar.voxels import clusters_from_above
 from data_tools.simulator.scanner import ScannerSettings, StaticWorld, simulate_scan
 from data_tools.simulator.street import CURB, SENSOR_HEIGHT, street
-from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes
 
@@ -176,18 +175,15 @@ def test_straight_pieces_are_fitted_and_say_how_surely() -> None:
     squares = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        settings = LineSettings(noise=0.05, bias=0.05, max_offset=0.3)
         points = np.column_stack([np.arange(-8.0, 9.0, 0.5), np.full(34, 4.0), np.full(34, -1.7)])
-        points[:, 1] += rng.normal(0, 0.1, 34) + np.interp(points[:, 0], [-8, 8.5], rng.normal(0, settings.bias, 2))
+        points[:, 1] += rng.normal(0, 0.1, 34) + np.interp(points[:, 0], [-8, 8.5], rng.normal(0, BIAS, 2))
         stray = np.column_stack([rng.uniform(-8, 8, 12), rng.uniform(-10, 0, 12), np.full(12, -1.7)])
         turn = yaw_transform(yaw=rng.uniform(-3, 3))
-        (edge, *_) = straight_lines(transform_points(turn, np.concatenate([points, stray])), 1, settings)
+        (edge, *_) = straight_lines(transform_points(turn, np.concatenate([points, stray])), 1)
         off = transform_points(turn.T, edge.ends)[:, 1] - 4.0
         squares.append(off @ np.linalg.solve(edge.covariance, off) / 2)
     assert 0.5 < np.mean(squares) < 1.5
     assert straight_lines(np.empty((0, 3)), 2) == []
-    with pytest.raises(InputError, match="points"):
-        LineSettings(min_points=2)  # which every line fits
     assert straight_lines(np.random.default_rng(0).uniform(-20, 20, (12, 3)), 2) == []
 
 

@@ -130,7 +130,6 @@ def test_scores_tell_true_from_false_but_not_always(sensor: SensorSettings) -> N
         ({"rate": 0.0}, "rate: expected a finite number > 0"),
         ({"field_of_view": 7.0}, "field_of_view: expected a number above 0 to 6.28"),
         ({"detection_probability": 1.2}, "detection_probability: expected a number from 0 to 1"),
-        ({"hidden_share": 0.6}, "clear_share: expected more than hidden_share"),
     ],
 )
 def test_settings_without_sense_are_refused(change: dict[str, float], text: str) -> None:

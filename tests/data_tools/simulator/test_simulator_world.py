@@ -195,7 +195,6 @@ def test_standing_objects_stand() -> None:
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: RoadSettings(length=100.0), "length: expected a finite number >= 800"),
         (lambda: RoadSettings(lanes=(3, 2)), "lanes: expected ascending numbers"),
         (lambda: PedestrianSettings(groups=(3, 1)), "groups: expected ascending numbers"),
         (lambda: PedestrianSettings(walking_speed=(0.0, 1.0)), "walking_speed: expected a finite number > 0, got 0.0"),

@@ -148,8 +148,6 @@ def test_a_queue_that_creeps_does_not_pass_for_parked():
     assert batch[parked] > 0.9
     assert online[creeps] < 0.5
     assert online[parked] > 0.8
-    with pytest.raises(InputError, match="online_stationary_share: expected a number from"):
-        JointSettings(online_stationary_share=1.0)
 
 
 def test_nothing_is_said_of_an_object_seen_once():

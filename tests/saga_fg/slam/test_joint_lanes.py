@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from saga_fg import Boxes, Detections, Frame, InputError
+from saga_fg import Boxes, Detections, Frame
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.joint import (
     JointEstimate,
     JointSettings,
-    LaneSettings,
     ObjectStates,
     OdometryIncrements,
     OdometryNoise,
@@ -67,15 +66,15 @@ def off(path: FloatArray, poses: FloatArray) -> float:
     return float(np.linalg.norm((path - poses)[:, :2, 3], axis=1).max())
 
 
-def solved(lanes: LaneSettings | None) -> tuple[JointEstimate, FloatArray, float]:
+def solved(lanes: bool) -> tuple[JointEstimate, FloatArray, float]:
     frames, odometry, poses = traffic()
     estimate = estimate_jointly(frames, odometry, new_tracker, replace(SETTINGS, lanes=lanes), poses[0])
     return estimate, poses, off(estimate.world_T_ego, poses)
 
 
 def test_lanes_that_traffic_keeps_hold_the_path() -> None:
-    _, _, without = solved(None)
-    estimate, _, held = solved(LaneSettings())
+    _, _, without = solved(False)
+    estimate, _, held = solved(True)
     assert estimate.converged
     assert held < without / 2
     left, right = (float(estimate.solution.values.atVector(lane_key(number))[0]) for number in (0, 1))
@@ -88,7 +87,7 @@ def test_they_hold_it_frame_by_frame() -> None:
     """In a window, so that vehicles and lanes leave it."""
     frames, odometry, poses = traffic(n=24)
     ends = []
-    for lanes in (None, LaneSettings()):
+    for lanes in (False, True):
         settings = replace(SETTINGS, lanes=lanes)
         ends.append(off(estimate_online(frames, odometry, new_tracker(), 1.5, settings, poses[0]).newest, poses))
     assert ends[1] < ends[0] / 2
@@ -99,7 +98,7 @@ def test_a_map_alone_changes_nothing() -> None:
     bare = [replace(frame, road_map=None) for frame in frames]
     paths = [
         estimate_jointly(some, odometry, new_tracker, settings, poses[0]).world_T_ego
-        for some, settings in ((frames, SETTINGS), (bare, SETTINGS), (bare, replace(SETTINGS, lanes=LaneSettings())))
+        for some, settings in ((frames, SETTINGS), (bare, SETTINGS), (bare, replace(SETTINGS, lanes=True)))
     ]
     np.testing.assert_allclose(paths[1], paths[0], atol=1e-9)
     np.testing.assert_allclose(paths[2], paths[0], atol=1e-9)
@@ -115,7 +114,7 @@ def test_a_vehicle_keeps_the_lane_that_it_surely_drives_along() -> None:
     def found(sideways: float, seen: FloatArray | None = None) -> dict[int, tuple[int, float]]:
         P = np.diag([1e-8, 1e-8, 1e-8, 1e-8, sideways**2, 1e-8])
         which = np.arange(7) if seen is None else seen
-        kept = assign_lanes(4, cars, which, stands, (np.eye(4), P), lanes, LaneSettings())
+        kept = assign_lanes(4, cars, which, stands, (np.eye(4), P), lanes)
         return {one.name: (one.lane, one.probability) for one in kept}
 
     sure = found(0.05)
@@ -128,14 +127,6 @@ def test_a_vehicle_keeps_the_lane_that_it_surely_drives_along() -> None:
     assert set(found(0.05, np.array([2]))) == {2}
 
 
-@pytest.mark.parametrize(
-    ("field", "value"), [("offset_deviation", 0.0), ("offset_time", -1.0), ("passes", 0), ("off_lane_share", 0.0)]
-)
-def test_settings_that_cannot_be_are_refused(field: str, value: float) -> None:
-    with pytest.raises(InputError, match=field):
-        LaneSettings(**{field: value})
-
-
 def test_a_map_that_every_frame_brings_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[int] = []
 
@@ -144,7 +135,7 @@ def test_a_map_that_every_frame_brings_is_read_once(monkeypatch: pytest.MonkeyPa
         return known_lanes(maps)
 
     monkeypatch.setattr("saga_fg.slam.joint.lanes.known_lanes", counted)
-    lanes, same = LaneAssociation(LaneSettings(), []), road()
+    lanes, same = LaneAssociation(True, []), road()
     for _ in range(3):
         lanes.add_maps(same)
     assert read == [1]
