@@ -27,7 +27,7 @@ MIN_HEIGHT = 0.3  # lowest height above the ground of clustered points, m
 MIN_LENGTH = 1.2  # least height from the lowest to the highest point, m
 MAX_WIDTH = 0.6  # largest horizontal extent, m
 MIN_POINTS = 8  # fewest points
-CLEAR_SHARE = 0.1  # the same radius as a share of the range, against columns of walls at grazing angles
+CLEAR_SHARE = 0.1  # _CLEAR_RADIUS as a share of the range, against columns of walls at grazing angles
 NOISE = 0.05  # standard deviation of the axis, m
 BEARING_NOISE = 0.006  # standard deviation across the line of sight, rad
 

@@ -28,7 +28,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.columns import Columns
 
 HARDEST_BRAKING = 9.0  # m/s^2, limit of tyres on a dry road
-POLITENESS = 0.3  # p of MOBIL, Kesting, Treiber and Helbing 2007: 0.2 to 0.5
+POLITENESS = 0.3  # p of MOBIL (Kesting, Treiber and Helbing 2007): weight of the new follower's loss
 CHANGE_THRESHOLD = 0.3  # a_th of MOBIL, m/s^2: least gain for which a driver changes lanes
 SAFE_DECELERATION = 3.0  # b_safe of MOBIL, m/s^2: largest deceleration a lane change may cause
 

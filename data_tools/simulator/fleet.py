@@ -10,10 +10,10 @@ from data_tools.simulator.driver_models import Drivers
 from data_tools.simulator.settings import VAN_SHARE, TrafficSettings
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 
-TIME_HEADWAY = 1.2  # desired time headway T, s: IDM, Treiber et al. 2000, for city traffic
-MINIMUM_GAP = 2.0  # gap s0 kept at standstill, m: IDM, Treiber et al. 2000
-MAX_ACCELERATION = 1.5  # a, m/s^2: IDM, Treiber and Kesting 2013, table 11.2, within 0.5
-COMFORTABLE_DECELERATION = 2.0  # b, m/s^2: IDM, Treiber et al. 2000, within 0.4
+TIME_HEADWAY = 1.2  # T of the IDM (Treiber, Hennecke and Helbing 2000), s: desired time headway
+MINIMUM_GAP = 2.0  # s0 of the IDM, m: gap kept at standstill
+MAX_ACCELERATION = 1.5  # a of the IDM, m/s^2: maximum acceleration
+COMFORTABLE_DECELERATION = 2.0  # b of the IDM, m/s^2: comfortable deceleration
 DRIVER_SPREAD = 0.15  # relative standard deviation of the parameters over drivers (log-normal)
 
 

@@ -16,8 +16,8 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 
 JUNCTION = 10.0  # m between the stop lines of the two directions
 FOCUS = 0.55  # share of the road's length
-ROAD_LENGTH = 1000.0  # length of the simulated road, m: ego drives through its middle
-LANE_WIDTH = 3.5  # m, of US highways (AASHTO, 12 ft) within 0.2 m
+ROAD_LENGTH = 1000.0  # length of the simulated road, m
+LANE_WIDTH = 3.5  # width of a lane, m
 CURVE_PROBABILITY = 0.5  # share of scenes on a curved road
 CURVE_RADIUS = (100.0, 300.0)  # smallest radius of a curve's centre line, m
 MEDIAN_PROBABILITY = 0.5  # share of scenes with a hedge between the directions

@@ -20,7 +20,7 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import Lane, StopLine, TrafficLight
-from saga_fg.types.signal import COLOUR_LABELS, SignalSettings
+from saga_fg.types.signal import COLOUR_LABELS, MAX_LIGHT_DISTANCE
 
 Colours = list[list[int | None]]
 
@@ -64,7 +64,7 @@ def map_data(known: AreaMap, origin: FloatArray) -> dict[str, Any]:
 
 def _colours(lights: FloatArray, detections: Sequence[Boxes]) -> Colours:
     """Return for each moment the colour last reported of each light; lights (L, 2)."""
-    reach = SignalSettings().max_distance
+    reach = MAX_LIGHT_DISTANCE
     now: list[int | None] = [None] * len(lights)
     colours = []
     for boxes in detections:

@@ -37,6 +37,8 @@ from saga_fg.types.predicted_tracks import PredictedTracks, checked_horizons
 from saga_fg.types.track import Tracks
 
 REQUESTS = ("status", "subscribe", "predict", "reset")
+MAX_HORIZON = 10.0  # furthest time of a prediction, s
+MAX_HORIZONS = 20  # largest number of times of a prediction
 
 POSITION, SIZE, VELOCITY = ("x", "y", "z"), ("length", "width", "height"), ("vx", "vy")
 NUMBERS = (*POSITION, *SIZE, "yaw", *VELOCITY, "score")
@@ -99,11 +101,11 @@ def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Reque
 
 def stream_horizons(given: Any, settings: StreamSettings) -> FloatArray:
     """Return horizons (H,), s. Raises `InputError` unless they are increasing numbers within the stream's limits."""
-    if not isinstance(given, list) or len(given) > settings.max_horizons:
-        raise InputError(f"horizons: expected a list of at most {settings.max_horizons} s, got {_short(given)}")
+    if not isinstance(given, list) or len(given) > MAX_HORIZONS:
+        raise InputError(f"horizons: expected a list of at most {MAX_HORIZONS} s, got {_short(given)}")
     horizons = checked_horizons([_number("horizons", {"": each}, "") for each in given])
-    if horizons[-1] > settings.max_horizon:
-        raise InputError(f"horizons: expected at most {settings.max_horizon:g} s, got {horizons[-1]:g}")
+    if horizons[-1] > MAX_HORIZON:
+        raise InputError(f"horizons: expected at most {MAX_HORIZON:g} s, got {horizons[-1]:g}")
     return horizons
 
 

@@ -39,6 +39,7 @@ PIECE = 2**16  # bytes read at once
 LONG = 2**16  # bytes; frames of a few hundred objects have fewer
 LONG_SHARE = 0.1  # of the worker's time for long lines, while short ones wait
 FILES_IN_RESERVE = 192  # that the process may open besides its connections; a backlog of them comes at once
+MAX_UNFINISHED = 64 * 2**20  # size of unread input of all clients, bytes; beyond it the client with most is closed
 
 
 class _Reader(asyncio.StreamReader):
@@ -253,7 +254,7 @@ class SocketServer:
     def _hold(self, client: Client, size: int) -> None:
         """Note how many bytes of a client wait; where all take too much memory the largest client goes."""
         client.size = size
-        limit = self.settings.max_unfinished
+        limit = MAX_UNFINISHED
         if sum(each.size for each in self._clients) > limit:
             largest = max(self._clients, key=lambda each: each.size)
             largest.size = 0

@@ -26,7 +26,6 @@ class StreamSettings(Settings):
     reorder: NonNegative = setting(
         0.0, "hold frames back this long to sort those of several sensors by time, s; 0: never; higher: more delay"
     )
-    max_held: PositiveInt = setting(256, "largest number of frames held back; beyond it the oldest is tracked")
     max_sensors: PositiveInt = setting(
         1000, "largest number of sensors whose frames are numbered; beyond it the longest silent one is forgotten"
     )
@@ -37,16 +36,9 @@ class StreamSettings(Settings):
         500, "largest number of detections of a frame; 500 take up to 0.2 s, for which all clients wait"
     )
     max_message: PositiveInt = setting(4 * MB, "largest size of a message, bytes")
-    max_horizon: Positive = setting(
-        10.0, "furthest time of a prediction, s; higher: such a request takes longer, and all clients wait for it"
-    )
-    max_horizons: PositiveInt = setting(20, "largest number of times of a prediction")
     max_failures: PositiveInt = setting(3, "internal errors in a row after which a fresh tracker starts")
     max_clients: PositiveInt = setting(
         256, "largest number of connections; fewer where the process may open fewer files"
-    )
-    max_unfinished: PositiveInt = setting(
-        64 * MB, "largest size of unread input of all clients, bytes; beyond it the client with most is closed"
     )
     max_outbox: PositiveInt = setting(
         8 * MB, "largest size of unread answers of a client, bytes; beyond it the client is closed"

@@ -44,6 +44,8 @@ COUNTED = (
     *("failures", "restarts"),
 )
 
+MAX_HELD = 256  # largest number of frames held back; beyond it the oldest is tracked
+
 
 class StateSaver(Protocol):
     """Keeper of the stream's state on the disk, `pipelines.serving.state_keeper.StateKeeper`."""
@@ -114,9 +116,7 @@ class StreamTracker(Generic[Client]):
         self.version = 0  # grows whenever there is something new to keep
         self._new_tracker = new_tracker
         self._tracker = new_tracker()
-        self._held: Reordering[_Held[Client]] = Reordering(
-            self.settings.reorder, self.settings.max_held, self._tracker.max_jump
-        )
+        self._held: Reordering[_Held[Client]] = Reordering(self.settings.reorder, MAX_HELD, self._tracker.max_jump)
         self._numbering = Numbering(self.settings.max_sensors)
         self._durable: dict[str, int] = {}
         self._failed_in_a_row = 0

@@ -86,7 +86,7 @@ class LabelSpool:
         times, bounds, sign = (stored.pop(name) for name in ("time", "bounds", "sign"))
         at = np.searchsorted(attributes.id, stored["id"])
         score = attributes.score[at]
-        quality = quality_of(score, stored["position_covariance"], self._settings.quality)
+        quality = quality_of(score, stored["position_covariance"])
         stored["yaw"] = wrap_angle(stored["yaw"] + np.pi * (sign < 0) + attributes.turn[at])
         columns = LabelColumns(**stored, size=attributes.size[at], score=score, quality=quality)
         spans = zip(times.tolist(), pairwise(bounds.tolist()), strict=True)

@@ -115,7 +115,7 @@ def label_states(
         gap,
         score,
         _sources(evidence, objects, wanted),
-        quality_of(score, P, settings.quality),
+        quality_of(score, P),
     )
     return LabelledStates(states, headings, columns)
 

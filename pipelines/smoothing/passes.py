@@ -42,6 +42,8 @@ from saga_fg.smoothing import (
     stationary_states,
     stitch_tracklets,
 )
+from saga_fg.smoothing.labels import MEDIUM_SCORE
+from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME
 from saga_fg.tracking import TrackerSettings
 from saga_fg.tracking.by_name import new_provider
 from saga_fg.tracking.settings import ClassSettings
@@ -53,6 +55,7 @@ _ASSOCIATION_GATE = 0.95  # gate probability of detections without a track; high
 WEAK_SCORE = 0.05  # of a tracklet, below which it is not stitched and takes no detections from others
 MAX_FREE_DISTANCE = 3.0  # between a state and a free detection assigned to it, m
 UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps by other models of the noise
+EXTENSION = 1.5  # time by which the search for detections of an object reaches beyond its first and last one, s
 
 
 def track_evidence(
@@ -126,9 +129,9 @@ def smooth_objects(
     passes = _Passes(evidence, settings, tracker, providers)
     label, moment = evidence.boxes.label, evidence.moment
     everything = lifespans_of(track_of, label, moment)
-    ahead = max(settings.extension, settings.stitching.max_gap)
+    ahead = max(EXTENSION, settings.stitching.max_gap)
     alone = passes.alone(everything, track_of, ahead)
-    score = evidence_scores(evidence, track_of, everything, alone.within(everything), settings.prior_opportunity_time)
+    score = evidence_scores(evidence, track_of, everything, alone.within(everything), PRIOR_OPPORTUNITY_TIME)
     tracklets = everything.select(score >= WEAK_SCORE)
     strong = np.isin(track_of, tracklets.id)
     object_of = np.where(strong, track_of, -1)
@@ -138,15 +141,15 @@ def smooth_objects(
     object_of[strong] = first[tracklets.rows_of(track_of[strong])]
 
     joined = lifespans_of(object_of, label, moment)
-    states = passes.alone(joined, object_of, settings.extension)
-    states = passes.coupled(joined, object_of, settings.extension, states)
+    states = passes.alone(joined, object_of, EXTENSION)
+    states = passes.coupled(joined, object_of, EXTENSION, states)
     object_of = assign_free_detections(evidence, object_of, joined, states, _ASSOCIATION_GATE, MAX_FREE_DISTANCE)
     track_of = np.where(strong | (object_of < 0), track_of, -1)
     object_of = np.where(object_of < 0, track_of, object_of)
     states = states.merged(alone.select(~is_strong))
     lifespans = lifespans_of(object_of, label, moment)
     within = states.within(lifespans)
-    score = evidence_scores(evidence, object_of, lifespans, within, settings.prior_opportunity_time)
+    score = evidence_scores(evidence, object_of, lifespans, within, PRIOR_OPPORTUNITY_TIME)
     kept = score >= settings.min_score
     object_of = np.where(np.isin(object_of, lifespans.id[kept]), object_of, -1)
     stationary = stationary_states(within, lifespans, evidence, object_of, settings.stationary, settings.classes)
@@ -191,14 +194,14 @@ class _Passes:
 
     def alone(self, lifespans: Lifespans, object_of: IntArray, ahead: float) -> StateTable:
         """States without edges of objects that reach beyond their detections, by `ahead` s at their ends."""
-        longer = lifespans.reaching(self.evidence.times, self.settings.extension, ahead)
+        longer = lifespans.reaching(self.evidence.times, EXTENSION, ahead)
         return smooth_states(self.evidence, object_of, longer, self.velocity_prior(longer), self.settings.classes)
 
     def coupled(self, lifespans: Lifespans, object_of: IntArray, ahead: float, states: StateTable) -> StateTable:
         """States as by `alone`, with the edges that follow from given states."""
         if not self.tracker.edges:
             return states
-        longer = lifespans.reaching(self.evidence.times, self.settings.extension, ahead)
+        longer = lifespans.reaching(self.evidence.times, EXTENSION, ahead)
         edges = self._edges(longer, object_of, states)
         prior, classes = self.velocity_prior(longer), self.settings.classes
         return smooth_states(self.evidence, object_of, longer, prior, classes, edges)
@@ -209,7 +212,7 @@ class _Passes:
         distance = np.full(len(lifespans), np.nan)
         distance[lifespans.rows_of(object_of[rows])] = self.evidence.distance[rows]  # the earliest is written last
         settings = self.settings
-        far = (distance > settings.backward_distance) & (score >= settings.quality.medium_score)
+        far = (distance > settings.backward_distance) & (score >= MEDIUM_SCORE)
         back = lifespans.reaching(self.evidence.times, settings.backward_time, 0.0)
         return replace(lifespans, first=np.where(far, back.first, lifespans.first))
 

@@ -40,6 +40,7 @@ from saga_fg.smoothing import (
     opportunities,
     size_weights,
 )
+from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
 
@@ -142,7 +143,7 @@ class _Run:
             self._track(np.inf)
             self._smooth(np.inf)
             self._summaries.close(np.empty(0, dtype=np.int64))
-        self._spool.finish(self._summaries, self._config.smoothing.prior_opportunity_time * self._sums.rate)
+        self._spool.finish(self._summaries, PRIOR_OPPORTUNITY_TIME * self._sums.rate)
         counts = replace(self._sums.counts, objects=len(self._summaries.ids), joined=self._identities.joined)
         return StreamedScene(self._name, counts, frames, cpu + time.perf_counter() - begin, self._spool)
 

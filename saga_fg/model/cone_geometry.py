@@ -21,6 +21,8 @@ from saga_fg.settings import Positive, Settings, setting
 CONES = ("traffic_cone", "barrier")
 MIN_SPEED = 1.0  # m/s; slower vehicles are not pushed
 BESIDE = 3.0  # m behind the middle of a vehicle, up to which a cone is still beside it
+CORRIDOR = 6.0  # cones further aside are ignored, m
+REACH = 45.0  # cones further ahead are ignored, m
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,6 @@ class ConeGeometry(Settings):
     preview: Positive = setting(
         1.5, "time by which drivers look ahead along the line, s; usual 0.5 to 3; higher: vehicles move aside earlier"
     )
-    reach: Positive = setting(45.0, "ignore cones further ahead, m; usual 20 to 60; higher: more cones count")
-    corridor: Positive = setting(6.0, "ignore cones further aside, m; usual 3 to 8; higher: cones of other lanes count")
     classes: tuple[str, ...] = setting(CONES, "classes of objects that form a line")
 
 
@@ -57,7 +57,7 @@ def cones_ahead(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) ->
     offset = nodes.position[cones] - nodes.position[vehicles, None]
     ahead = np.einsum("nmi,ni->nm", offset, u)
     left = u[:, None, 0] * offset[..., 1] - u[:, None, 1] * offset[..., 0]
-    known = (ahead > -BESIDE) & (ahead < geometry.reach) & (np.abs(left) < geometry.corridor)
+    known = (ahead > -BESIDE) & (ahead < REACH) & (np.abs(left) < CORRIDOR)
     order = np.argsort(np.where(known, ahead, np.inf), axis=1)
     ahead, left, known = (np.take_along_axis(x, order, axis=1) for x in (ahead, left, known))
     first = left[:, 0] if len(cones) else np.zeros(len(vehicles))

@@ -50,6 +50,7 @@ from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_
 
 _UNUSED_DEVIATION = 0.3  # standard deviation of a component, in its unit, while its mode does not use it
 _LEAST = 1e-12  # probability of a mode, and share of a variance that a measurement takes away
+STOP_TIME = 0.1  # time constant with which the velocity fades, s
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,6 @@ class Stationary(Settings):
         0.1,
         "standard deviation of a component of the velocity, m/s; usual 0.05 to 0.3; higher: slow objects fit it, too",
     )
-    stop_time: Positive = setting(
-        0.1, "time constant with which the velocity fades, s; usual 0.1 to 1; higher: it comes to rest later"
-    )
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -75,11 +73,11 @@ class Stationary(Settings):
 
     @property
     def generator(self) -> FloatArray:
-        return np.diag([0.0, 0.0, -1.0, -1.0]) / self.stop_time
+        return np.diag([0.0, 0.0, -1.0, -1.0]) / STOP_TIME
 
     @property
     def diffusion(self) -> FloatArray:
-        return np.diag([self.drift**2] * 2 + [2 * self.speed**2 / self.stop_time] * 2)
+        return np.diag([self.drift**2] * 2 + [2 * self.speed**2 / STOP_TIME] * 2)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,9 @@ from saga_fg.settings import NonNegative, Positive, Settings, setting
 
 _TINY = 1e-2  # rad; below, series
 _STRAIGHT = np.diag([1.0, 1.0, 0.0], k=2)  # dp/dt = v
+STEERING_NOISE = 0.02  # spectral density of the random walk of the steering angle, rad^2/s
+INITIAL_STEERING_DEVIATION = 0.1  # standard deviation of the steering angle of a new object, rad
+INITIAL_TURN_RATE_DEVIATION = 0.2  # standard deviation of the turn rate of a new object, rad/s
 
 
 @dataclass(frozen=True)
@@ -39,11 +42,6 @@ class CoordinatedTurn(Settings):
     acceleration_noise: NonNegative = setting(2.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3")
     turn_noise: NonNegative = setting(
         0.05, "spectral density of the random walk of the turn rate, rad^2/s^3; higher: turns are followed faster"
-    )
-    initial_turn_rate_deviation: Positive = setting(
-        0.2,
-        "standard deviation of the turn rate of a new object, rad/s; usual 0.1 to 0.5; higher: first turns "
-        "are followed faster",
     )
 
     @property
@@ -61,7 +59,7 @@ class CoordinatedTurn(Settings):
     @property
     def initial_deviation(self) -> FloatArray:
         """(5,) of a new object, where nothing is measured."""
-        return np.array([1.0, 1.0, 1.0, 1.0, self.initial_turn_rate_deviation])
+        return np.array([1.0, 1.0, 1.0, 1.0, INITIAL_TURN_RATE_DEVIATION])
 
     def flow(self, x: FloatArray, dt: float) -> FloatArray:
         """States (..., 5) after dt seconds; dt may be negative."""
@@ -79,16 +77,8 @@ class Bicycle(Settings):
     """The kinematic bicycle: a vehicle turns as it is steered, and only while it moves; left is positive."""
 
     acceleration_noise: NonNegative = setting(2.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3")
-    steering_noise: NonNegative = setting(
-        0.02, "spectral density of the random walk of the steering angle, rad^2/s; higher: turns are followed faster"
-    )
     wheelbase: Positive = setting(
         2.8, "distance between the axles, m; usual 2.5 to 3; higher: the same steering angle turns less"
-    )
-    initial_steering_deviation: Positive = setting(
-        0.1,
-        "standard deviation of the steering angle of a new object, rad; usual 0.05 to 0.3; higher: first "
-        "turns are followed faster",
     )
 
     @property
@@ -101,12 +91,12 @@ class Bicycle(Settings):
 
     @property
     def diffusion(self) -> FloatArray:
-        return np.diag([0.0, 0.0, self.acceleration_noise, self.acceleration_noise, self.steering_noise])
+        return np.diag([0.0, 0.0, self.acceleration_noise, self.acceleration_noise, STEERING_NOISE])
 
     @property
     def initial_deviation(self) -> FloatArray:
         """(5,) of a new object, where nothing is measured."""
-        return np.array([1.0, 1.0, 1.0, 1.0, self.initial_steering_deviation])
+        return np.array([1.0, 1.0, 1.0, 1.0, INITIAL_STEERING_DEVIATION])
 
     def flow(self, x: FloatArray, dt: float) -> FloatArray:
         """States (..., 5) after dt seconds; dt may be negative."""

@@ -29,7 +29,7 @@ from saga_fg.providers.start import NO_POSE
 from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting
 
 _LOG = logging.getLogger(__name__)
-ANTENNA_DEVIATION = 0.5  # standard deviation of that position beforehand, by axis, m
+ANTENNA_DEVIATION = 0.5  # standard deviation of the antenna's position beforehand, by axis, m
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Gps(Settings):
         math.inf, "residual from which the Cauchy loss discounts a fix, standard deviations; .inf: never"
     )
     estimate_antenna: bool = setting(False, "true: the antenna's position is a variable of the graph; poses in space")
-    name: str = setting("gps", "name in messages")
+    name = "gps"
 
     def __post_init__(self) -> None:
         super().__post_init__()

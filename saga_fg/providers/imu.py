@@ -35,7 +35,7 @@ _LOG = logging.getLogger(__name__)
 INTEGRATION_NOISE = 1e-4  # noise density of integrating the position, m/s/sqrt(Hz)
 UNKNOWN_ACCELERATION = 3.0  # noise density of the acceleration in gaps of the samples, m/s^2/sqrt(Hz)
 UNKNOWN_TURN = 0.3  # noise density of the turn rate in gaps of the samples, rad/s/sqrt(Hz)
-ROTATION_DEVIATION = 0.05  # standard deviation of that rotation beforehand, by axis, rad
+ROTATION_DEVIATION = 0.05  # standard deviation of the sensor's rotation beforehand, by axis, rad
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Imu(Settings):
     )
     mounted: Mounting = setting(ON_THE_POSE, "x, y, z (m), roll, pitch, yaw (rad) of the sensor in the vehicle's frame")
     estimate_rotation: bool = setting(False, "true: the sensor's rotation on the vehicle is a variable of the graph")
-    name: str = setting("imu", "name in messages")
+    name = "imu"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -30,7 +30,7 @@ class Landmarks(Settings):
         (), "labels of detections in the vehicle's frame that are observations of one point each"
     )
     deviation: Positive = setting(0.3, "standard deviation of such an observation, m")
-    name: str = setting("landmarks", "name in messages")
+    name = "landmarks"
 
     def factors(self, view: GraphView) -> Additions:
         pose = view.now(EGO_POSE).get(0)

@@ -37,7 +37,7 @@ class LaneKeeping(Settings):
     )
     map_deviation: Positive = setting(0.3, "standard deviation of the lanes in the map, m")
     classes: tuple[str, ...] = setting(VEHICLES, "classes that keep to lanes")
-    name: str = setting("lanes", "name in messages")
+    name = "lanes"
 
     def factors(self, view: GraphView) -> Additions:
         if not self.lanes:

@@ -40,7 +40,7 @@ class Odometry(Settings):
     heading_drift: Positive = setting(
         0.01, "standard deviation of heading, roll and pitch after one second, likewise, rad"
     )
-    name: str = setting("odometry", "name in messages")
+    name = "odometry"
 
     def predict(self, view: GraphView) -> Additions:
         before = view.before(EGO_POSE)

@@ -24,7 +24,7 @@ class StationaryObjects(Settings):
 
     classes: tuple[str, ...] = setting(("traffic_cone", "barrier"), "classes of stationary objects")
     deviation: Positive = setting(0.1, "standard deviation of the velocity left after one second, m/s; lower: stronger")
-    name: str = setting("stationary", "name in messages")
+    name = "stationary"
 
     def factors(self, view: GraphView) -> Additions:
         dims: dict[int, list[list[int]]] = {}

@@ -28,7 +28,7 @@ from saga_fg.settings import Fraction, Positive, Settings, setting
 
 _OFF = 0.5  # share of an epoch that the wheels must have measured
 SIDEWAYS = 0.1  # standard deviation of the velocity to the side and upwards, m/s
-SCALE_DEVIATION = 0.05  # standard deviation of that scale beforehand, as a share
+SCALE_DEVIATION = 0.05  # standard deviation of the scale of the speed beforehand, as a share
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Wheels(Settings):
         ON_THE_POSE, "x, y, z (m), roll, pitch, yaw (rad) of the axle that does not steer, in the vehicle's frame"
     )
     estimate_scale: bool = setting(False, "true: the scale of the speed is a variable of the graph")
-    name: str = setting("wheels", "name in messages")
+    name = "wheels"
 
     def __post_init__(self) -> None:
         super().__post_init__()

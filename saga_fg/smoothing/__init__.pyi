@@ -22,7 +22,6 @@ from .labels import LabelCounts, Labels, Quality, Source, quality_of
 from .random_walk import scalar_readings, smooth_walks
 from .settings import (
     OfflineClass,
-    QualitySettings,
     SmoothingSettings,
     StationarySettings,
     StitchingSettings,
@@ -39,7 +38,6 @@ __all__ = [
     "Lifespans",
     "OfflineClass",
     "Quality",
-    "QualitySettings",
     "SmoothedEdges",
     "SmoothingSettings",
     "Source",

@@ -31,6 +31,10 @@ from saga_fg.smoothing.evidence import Evidence
 from saga_fg.smoothing.settings import StitchingSettings
 from saga_fg.smoothing.states import Lifespans, StateTable
 
+NEW_OBJECT_DENSITY = 0.005  # density of objects that appear anew, 1/m^2
+MISS_COST = 0.3  # cost of a frame in the gap that should have shown the object, nats
+GATE = 0.999  # share of true links inside the chi-square gate
+
 
 def assign_detections(
     label: StrArray,
@@ -98,15 +102,15 @@ def stitch_tracklets(
     seen: the tracklets, from first to last detection; states: theirs, reaching beyond both ends; velocity_prior
     (n, 2, 2): covariance of the velocity of a new object
     """
-    limit = gate(settings.gate, 4)
+    limit = gate(GATE, 4)
     end, begin, a, b = _meetings(seen, states, evidence.times, settings.max_gap, limit)
     d = states.mean[a] - states.mean[b]
     S = states.covariance[a] + states.covariance[b]
     d2 = np.einsum("ni,ni->n", d, np.linalg.solve(S, d[..., None])[..., 0])
     inside = d2 <= limit
     end, begin, d2, S = end[inside], begin[inside], d2[inside], S[inside]
-    cost = (d2 + _log_det(S)) / 2 + settings.miss_cost * _opportunities_between(evidence, seen, states, end, begin)
-    cost -= _log_det(velocity_prior[begin]) / 2 - np.log(settings.new_object_density)
+    cost = (d2 + _log_det(S)) / 2 + MISS_COST * _opportunities_between(evidence, seen, states, end, begin)
+    cost -= _log_det(velocity_prior[begin]) / 2 - np.log(NEW_OBJECT_DENSITY)
     stitched = least_total(end, begin, cost)
     before = np.arange(len(seen))
     before[begin[stitched]] = end[stitched]

@@ -45,6 +45,7 @@ LEAST_WEIGHT = 1e-4  # of a detection; at zero its noise would be infinite
 
 GraphOf = Callable[[int, IntArray, tuple[NodeType, ...]], SceneGraph]
 """The graph over an interval: called with its first moment, the ids of the objects there, and their node types."""
+NOISE_SCALE = 1e-4  # factor on the process noise while stationary
 
 
 def no_edges(moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGraph:
@@ -109,9 +110,7 @@ def _epochs(
         if k > begin:
             graph = graph_of(k - 1, lifespans.id[present], tuple(types[i] for i in present.tolist()))
             still = stationary.at(k - 1, graph.nodes) & stationary.at(k, graph.nodes)
-            graph = replace(
-                graph, diffusion_scale=np.where(still, stationary.settings.noise_scale, graph.diffusion_scale)
-            )
+            graph = replace(graph, diffusion_scale=np.where(still, NOISE_SCALE, graph.diffusion_scale))
             transition = discretise(graph, float(evidence.times[k] - evidence.times[k - 1]))
         new = np.flatnonzero(lifespans.first == k)
         P = np.zeros((len(new), 4, 4))

@@ -10,13 +10,16 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, StrArray
-from saga_fg.smoothing.settings import QualitySettings
 from saga_fg.types.track import Tracks
 
 Source = Literal["observed", "filled", "extended"]
 """Observed: the object was detected; filled: between detections; extended: before its online track or after it."""
 
 Quality = Literal["high", "medium", "low"]
+MEDIUM_SCORE = 0.2  # least score of a box of medium quality
+HIGH_SCORE = 0.5  # least score of a box of high quality
+HIGH_DEVIATION = 0.3  # largest standard deviation of the position of a box of high quality, m
+MEDIUM_DEVIATION = 0.8  # likewise of a box of medium quality, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +77,9 @@ class LabelCounts:
         return cls(*(sum(getattr(part, name) for part in parts) for name in cls.__dataclass_fields__))
 
 
-def quality_of(score: FloatArray, covariance: FloatArray, settings: QualitySettings) -> StrArray:
+def quality_of(score: FloatArray, covariance: FloatArray) -> StrArray:
     """(N,) the quality of boxes with these scores (N,) and position covariances (N, 2, 2), m^2."""
     deviation = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]) if len(score) else np.empty(0)
-    high = (score >= settings.high_score) & (deviation <= settings.high_deviation)
-    medium = (score >= settings.medium_score) & (deviation <= settings.medium_deviation)
+    high = (score >= HIGH_SCORE) & (deviation <= HIGH_DEVIATION)
+    medium = (score >= MEDIUM_SCORE) & (deviation <= MEDIUM_DEVIATION)
     return np.where(high, "high", np.where(medium, "medium", "low"))

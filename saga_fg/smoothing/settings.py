@@ -13,12 +13,14 @@ from saga_fg.settings import (
     Fraction,
     NonNegative,
     Positive,
-    PositiveOrInf,
     Settings,
     setting,
     settings_group,
 )
 from saga_fg.types.by_class import DEFAULT
+
+LOSS_SCALE = 2.0  # residual from which the loss departs from a square, standard deviations
+PRIOR_OPPORTUNITY_TIME = 1.0  # missed opportunities that each object starts with, as a time, s
 
 
 @dataclass(frozen=True)
@@ -61,14 +63,6 @@ class StitchingSettings(Settings):
     max_gap: NonNegative = setting(
         3.0, "longest gap between two tracklets of one object, s; higher: more links, right and wrong"
     )
-    new_object_density: Positive = setting(0.005, "density of objects that appear anew, 1/m^2; higher: fewer links")
-    miss_cost: NonNegative = setting(
-        0.3, "cost of a frame in the gap that should have shown the object, nats; higher: fewer links"
-    )
-    gate: Fraction = setting(
-        0.999,
-        "gate probability: share of true links inside the chi-square gate; usual 0.99 to 0.9999; higher: more links",
-    )
 
 
 @dataclass(frozen=True)
@@ -82,23 +76,6 @@ class StationarySettings(Settings):
         0.03,
         "standard deviation of the place after one second while stationary, m: by the drift of the vehicle's poses; "
         "usual 0.01 to 0.1; lower: held more firmly",
-    )
-    noise_scale: Positive = setting(1e-4, "factor on the process noise while stationary; lower: held more firmly")
-
-
-@dataclass(frozen=True)
-class QualitySettings(Settings):
-    """Quality of a box: the first class whose conditions it meets, else low."""
-
-    high_score: Fraction = setting(0.5, "least score of a box of high quality; higher: fewer boxes of high quality")
-    high_deviation: PositiveOrInf = setting(
-        0.3,
-        "largest standard deviation of the position of a box of high quality, m; higher: more boxes of high quality",
-    )
-    medium_score: Fraction = setting(0.2, "least score of a box of medium quality; higher: more boxes of low quality")
-    medium_deviation: PositiveOrInf = setting(
-        0.8,
-        "largest standard deviation of the position of a box of medium quality, m; higher: fewer boxes of low quality",
     )
 
 
@@ -114,16 +91,8 @@ class SmoothingSettings(Settings):
     loss: Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"] = setting(
         "huber", "robust loss of the detections"
     )
-    loss_scale: Positive = setting(
-        2.0, "residual from which the loss departs from a square, standard deviations; lower: outliers count less"
-    )
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, for the final states"
-    )
-    extension: NonNegative = setting(
-        1.5,
-        "time by which the search for detections of an object reaches before its first and after its last "
-        "one, s; 0: no search; higher: longer tracks",
     )
     backward_time: NonNegative = setting(
         0.0,
@@ -135,13 +104,9 @@ class SmoothingSettings(Settings):
         "an object came from far away if its first detection is further from the vehicle than this, m; set it a bit "
         "below the range of the detector; higher: fewer objects reach back",
     )
-    prior_opportunity_time: NonNegative = setting(
-        1.0, "missed opportunities that each object starts with, as a time, s; higher: short tracks score less"
-    )
     min_score: Fraction = setting(0.02, "drop objects of a lower score; higher: fewer false objects, more misses")
-    quality: QualitySettings = settings_group(QualitySettings, "quality classes of boxes")
 
     @property
     def robust(self) -> Robust | None:
         """The loss of the detections."""
-        return None if self.loss == "none" else Robust(self.loss, self.loss_scale)
+        return None if self.loss == "none" else Robust(self.loss, LOSS_SCALE)

@@ -30,7 +30,16 @@ from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
 from saga_fg.types.lanes_across import LanesAcross
 from saga_fg.types.road_map import LANE, LIGHT, MAP_CLASSES, STOP_LINE, WALL, Lane, RoadMap, StopLine
-from saga_fg.types.signal import COLOUR_LABELS, COLOURS, STATES, SignalSettings, colour_updated, colours, updated
+from saga_fg.types.signal import (
+    COLOUR_LABELS,
+    COLOURS,
+    MAX_LIGHT_DISTANCE,
+    STATES,
+    SignalSettings,
+    colour_updated,
+    colours,
+    updated,
+)
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:
@@ -167,7 +176,7 @@ class MapNodes:
         z = seen.boxes.position[:, :2] - origin
         d2, log_det = mahalanobis(position, P, z, R)
         apart = np.hypot(*np.moveaxis(z[None] - position[:, None], -1, 0))
-        possible = (d2 < gate(GATE)) & (apart < self.settings.max_distance)
+        possible = (d2 < gate(GATE)) & (apart < MAX_LIGHT_DISTANCE)
         cost = d2 + log_det
         row, column = assign(cost, possible, cost.max(initial=0.0) + 1.0)
         belief = dict(self.beliefs)

@@ -165,9 +165,6 @@ class ExistenceSettings(Settings):
     hit_ratio_weight: NonNegative = setting(
         0.0, "power of the hit ratio (hits / opportunities) in the score of a track; 0: it does not count"
     )
-    occlusion_weight: Fraction = setting(
-        0.0, "share by which full occlusion by another track lowers the detection probability; 0: occlusion is ignored"
-    )
     delete_below: Fraction = setting(
         0.02, "delete an unconfirmed track below this existence probability; higher: false tracks end sooner"
     )
@@ -260,11 +257,6 @@ class TrackerSettings(Settings):
     )
     stationarity: StationaritySettings = settings_group(
         StationaritySettings, "estimation of which objects are stationary"
-    )
-    score_memory: NonNegative = setting(
-        0.15,
-        "time for which the latest detection of each sensor counts in a track's score, s; usual one frame; "
-        "higher: intermittent detections keep their score longer",
     )
     confirming_detections: PositiveInt = setting(
         3,

@@ -24,6 +24,8 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, distinct
 from saga_fg.tracking.traffic import Passages, Traffic
 
 _FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
+HEADING_SCALE = 0.3  # sigma of the kernel on the difference of headings, rad
+SPREAD = 2.0  # standard deviation of the difference between the speeds of neighbours, m/s
 
 
 class SpeedPrior(NamedTuple):
@@ -52,7 +54,7 @@ def speed_prior(
     number: dict[str, int] = {}
     left, latest = (_columns(each, number) for each in sets)
     new = _class_numbers(label, number), position, heading, variance
-    scales = settings.weight, settings.ahead_scale, settings.lateral_scale, settings.heading_scale, settings.spread
+    scales = settings.weight, settings.ahead_scale, settings.lateral_scale, HEADING_SCALE, SPREAD
     limits = settings.max_speed_deviation**2, _FARTHEST
     return SpeedPrior(*prior_of_traffic(*left, *latest, *new, stationary, *scales, *limits))
 

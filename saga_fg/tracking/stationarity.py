@@ -38,6 +38,7 @@ from saga_fg.tracking.kinematics import Kinematics
 
 HALTING_SPEED = 1.0  # m/s, scale of the speeds from which an object comes to rest at once: walking, or the last metre
 _MOST_LOG_ODDS = 12.0  # so that later evidence can still change the probability
+NOISE_SCALE = 0.05  # factor on the process noise of a stationary object
 
 
 @dataclass(frozen=True)
@@ -57,13 +58,10 @@ class StationaritySettings(Settings):
     drift: NonNegative = setting(
         0.02, "standard deviation of the drift of a stationary position in one second, m; usual 0 to 0.1"
     )
-    noise_scale: Fraction = setting(
-        0.05, "factor on the process noise of a surely stationary object; lower: steadier velocities, later departures"
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.prior == 1 or self.noise_scale == 0:
+        if self.prior == 1 or NOISE_SCALE == 0:
             raise InputError(
                 "prior and noise_scale: expected a prior below 1 and a scale above 0, since everything may move"
             )
@@ -109,7 +107,7 @@ class Stationarity(Columns):
 
     def noise_scale(self, settings: StationaritySettings) -> FloatArray:
         """(n,) factor on the process noise, expected over both states."""
-        return np.asarray(1 - self.probability * (1 - settings.noise_scale))
+        return np.asarray(1 - self.probability * (1 - NOISE_SCALE))
 
     def reported(self, moving: Kinematics, coasting: BoolArray) -> Kinematics:
         """Mean and covariance over both cases; positions where `coasting` (n,).

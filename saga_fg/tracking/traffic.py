@@ -39,12 +39,6 @@ class SpeedPriorSettings(Settings):
     lateral_scale: PositiveOrInf = setting(
         2.0, "sigma of the kernel on the distance across the heading, m; usual half a lane; higher: other lanes count"
     )
-    heading_scale: PositiveOrInf = setting(
-        0.3, "sigma of the kernel on the difference of headings, rad; higher: traffic that turns counts"
-    )
-    spread: NonNegative = setting(
-        2.0, "standard deviation of the difference between the speeds of neighbours, m/s; higher: a weaker prior"
-    )
     max_speed_deviation: PositiveOrInf = setting(
         1.5, "use only tracks whose speed has a standard deviation below this, m/s; higher: more, less certain speeds"
     )

@@ -33,6 +33,7 @@ STATES = ("red", "amber", "starting", "green")
 COLOUR_OF_STATE = np.array([0, 1, 2, 2])  # (4,) numbers in COLOURS
 COLOUR_LABELS = tuple(f"traffic_light_{colour}" for colour in COLOURS)  # labels of detections that report a colour
 LEAST_BELIEF = 1e-6  # no state is ever ruled out
+MAX_LIGHT_DISTANCE = 4.0  # a reported light belongs to no known light further away than this, m
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,6 @@ class SignalSettings(Settings):
         0.1,
         "share of drivers who do not drive as the light tells them, as they turn at red or cannot leave at green; "
         "usual 0.05 to 0.3; higher: one vehicle tells less; 1: colours are not inferred from traffic",
-    )
-    max_distance: Positive = setting(
-        4.0,
-        "a reported light belongs to no known light further away than this, m; usual 2 to 6; higher: more "
-        "reports are used, more of them wrongly",
     )
     belief: Literal["mixed", "likeliest"] = setting(
         "mixed", "effect of a stop line: mixed: by the probability that it is closed; likeliest: all or nothing"

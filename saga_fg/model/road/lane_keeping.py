@@ -22,7 +22,6 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.polyline import direction_at, feet, on_it
 from saga_fg.settings import (
     NonNegative,
-    PositiveOrInf,
     Settings,
     setting,
     settings_group,
@@ -30,6 +29,8 @@ from saga_fg.settings import (
 from saga_fg.types.road_map import LANE
 
 PUSHED = 0.5  # m aside, from which cones decide and no longer the lane
+LATERAL_SPEED_SCALE = 0.8  # sigma of the kernel on the speed across the lane, m/s
+OFFSET_TIME = 3.0  # tau: time constant with which an offset from the centre line fades, s
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,6 @@ class KeepLane(Settings):
     """Attraction to the centre line of a lane and to its direction; the source is the lane."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
-    offset_time: PositiveOrInf = setting(
-        3.0, "tau: time constant with which an offset from the centre line fades, s; usual 2 to 5; .inf: never"
-    )
     lag: NonNegative = setting(
         0.5, "time by which vehicles look ahead along the lane, s; usual 0 to 1; 0: where they are"
     )
@@ -55,9 +53,9 @@ class KeepLane(Settings):
             ahead = direction_at(centre, at.s + speed * self.lag)
             across[rows] = n[:, :, None] * n[:, None, :]
             foot = np.einsum("ei,ei->e", at.point - nodes.position[lane], n)
-            sideways = speed * np.einsum("ei,ei->e", ahead, n) + foot / self.offset_time
+            sideways = speed * np.einsum("ei,ei->e", ahead, n) + foot / OFFSET_TIME
             constant[rows] = n * sideways[:, None]
-        pull = across / self.offset_time
+        pull = across / OFFSET_TIME
         return velocity_triples(nodes, target, source, -pull, -across, pull, constant=constant)
 
 
@@ -68,9 +66,6 @@ class InLane(Settings):
     map_classes: ClassVar[tuple[str, ...]] = (LANE,)
     interaction: KeepLane = settings_group(KeepLane, "interaction function of the edges")
     rate: NonNegative = setting(2.0, "strength of an edge, 1/s; higher: vehicles keep their lane more strictly")
-    lateral_speed_scale: PositiveOrInf = setting(
-        0.8, "sigma of the kernel on the speed across the lane, m/s; lower: vehicles that leave it are let go sooner"
-    )
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
     cones: ConeGeometry | None = settings_group(
         lambda: None, "vehicles that these cones push out of the lane do not keep it; null: ignore cones"
@@ -92,7 +87,7 @@ class InLane(Settings):
             mine = vehicles[inside]
             targets.append(mine)
             sources.append(np.full(len(mine), lane, dtype=np.int64))
-            rates.append(self.rate * np.exp(-((drift[inside] / self.lateral_speed_scale) ** 2) / 2))
+            rates.append(self.rate * np.exp(-((drift[inside] / LATERAL_SPEED_SCALE) ** 2) / 2))
         return Pairs(np.concatenate(targets), np.concatenate(sources), np.concatenate(rates))
 
 

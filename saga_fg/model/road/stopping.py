@@ -36,6 +36,7 @@ from saga_fg.types.road_map import LIGHT, STOP_LINE
 
 HALTING_SPEED = 2.0  # m/s; slower vehicles near a closed line come to rest where they are
 HALTING_GAP = 10.0  # m from the front of the vehicle to the line
+MAX_DECELERATION = 4.5  # drivers who would have to brake harder do not stop, m/s^2
 
 
 @dataclass(frozen=True)
@@ -165,14 +166,11 @@ class RedLight(Settings):
     full_deceleration: Positive = setting(
         1.0, "needed deceleration from which they brake fully, m/s^2; usual 0.8 to 2; higher: they brake later"
     )
-    max_deceleration: Positive = setting(
-        4.5, "drivers who would have to brake harder do not stop, m/s^2; usual 3 to 6; higher: more vehicles stop"
-    )
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def able(self, coming: ComingVehicles) -> ComingVehicles:
         """Coming vehicles that can stop before the line, or halt at it."""
-        can = (coming.front > 0) & (coming.speed**2 <= 2 * self.max_deceleration * coming.front)
+        can = (coming.front > 0) & (coming.speed**2 <= 2 * MAX_DECELERATION * coming.front)
         return coming.select(can | halting(coming.speed, coming.front))
 
     def brakes(self, nodes: NodeTable, coming: ComingVehicles) -> tuple[FloatArray, FloatArray]:

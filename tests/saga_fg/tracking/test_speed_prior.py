@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.errors import InputError
-from saga_fg.tracking.speed_prior import speed_prior
+from saga_fg.tracking.speed_prior import SPREAD, speed_prior
 from saga_fg.tracking.traffic import Passages, SpeedPriorSettings, Traffic, TrafficSettings
 from saga_fg.types.track import known_velocities
 from tests.saga_fg.traffic_frames import frame
 
 ON = TrafficSettings(memory=5.0, speed_prior=SpeedPriorSettings(weight=5.0))
-SPREAD = ON.speed_prior.spread
 
 
 def passages(position, heading, speed, variance=0.1, time=0.0, ids=None, label="car", standing=0.0):
