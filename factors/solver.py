@@ -1,4 +1,4 @@
-"""Nonlinear least squares over GTSAM's factors and ours together: Gauss-Newton and Levenberg-Marquardt.
+"""Nonlinear least squares over GTSAM's factors and ours together: Gauss-Newton, damped or not, and Levenberg-Marquardt.
 
     minimise  E(x) = sum_i rho_i( || r_i(x) ||_{R_i} )
 
@@ -11,8 +11,13 @@ Of ours, those that come together (`ResidualFactors`) take one call for all; the
 GTSAM's optimisers took 25 times as long with a hundred nodes.
 
 Levenberg-Marquardt starts at lambda = 0, that is as Gauss-Newton, and damps only steps that fail to lower E
-(Nocedal and Wright, Numerical Optimization, 2nd ed. 2006, section 10.3). Both stop when the next step is short: the
-length of a step in posterior standard deviations is sqrt(delta^T H delta), which knows no units.
+(Nocedal and Wright, Numerical Optimization, 2nd ed. 2006, section 10.3). The line search goes a share a of the
+Gauss-Newton step, halved until it lowers E by what Armijo's rule asks for (the same, section 3.1),
+
+    E(x + a delta) <= E(x) - c a delta^T H delta,     c = 1e-4
+
+which damps a step that overshoots without turning it away from where sharp factors allow it to go. All stop when the
+next step is short: the length of a step in posterior standard deviations is sqrt(delta^T H delta), which knows no units.
 """
 
 from __future__ import annotations
@@ -21,7 +26,7 @@ import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, get_args
 
 import gtsam
 import numpy as np
@@ -38,24 +43,29 @@ _EXACT = 1e-12  # relative agreement of the error with its prediction from which
 _ROUNDING = 1e-9  # relative, of an error, at the most
 _MAX_DAMPING = 1e12
 _PIVOT = 1e-14  # relative to its column
+_ARMIJO = 1e-4  # c of Armijo's rule
+_MIN_SHARE = 2.0**-30  # of a step; where less is needed, it does not lower the error
+
+Method = Literal["levenberg-marquardt", "gauss-newton", "line-search"]
 
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """method: "levenberg-marquardt" or "gauss-newton"; max_iterations: linearisations; tolerance: length of the step,
-    in posterior standard deviations, below which the solution counts as reached; relative_tolerance: decrease of the
-    error by a step, as a share of it, below which it does, too; damping: first lambda tried when a plain step fails.
+    """method: "levenberg-marquardt", "gauss-newton" or "line-search"; max_iterations: linearisations; tolerance: length
+    of the step, in posterior standard deviations, below which the solution counts as reached; relative_tolerance:
+    decrease of the error by a step, as a share of it, below which it does, too; damping: first lambda tried when a plain
+    step fails.
     """
 
-    method: Literal["levenberg-marquardt", "gauss-newton"] = "levenberg-marquardt"
+    method: Method = "levenberg-marquardt"
     max_iterations: int = 100
     tolerance: float = 1e-6
     relative_tolerance: float = 0.0
     damping: float = 1e-4
 
     def __post_init__(self) -> None:
-        if self.method not in ("levenberg-marquardt", "gauss-newton"):
-            raise FactorError(f"method: expected levenberg-marquardt or gauss-newton, got {self.method!r}")
+        if self.method not in (known := get_args(Method)):
+            raise FactorError(f"method: expected one of {', '.join(known)}, got {self.method!r}")
         if self.max_iterations < 1 or not self.tolerance > 0 or not self.damping > 0:
             raise FactorError("settings: expected max_iterations >= 1, tolerance > 0 and damping > 0")
         if not self.relative_tolerance >= 0:
@@ -100,6 +110,11 @@ class Solution:
         return block_covariances(tree, self.values.dims())
 
     @cached_property
+    def step(self) -> gtsam.VectorValues | None:
+        """The next Gauss-Newton step, None where the system is singular."""
+        return _step(self.linear, gtsam.Ordering.ColamdGaussianFactorGraph(self.linear), 0.0)
+
+    @cached_property
     def _tree(self) -> gtsam.GaussianBayesTree:
         return self.linear.eliminateMultifrontal()
 
@@ -130,7 +145,10 @@ def solve(
         linear = _linearised(graph, custom, factors, values)
         if ordering is None:
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
-        move = _move(graph, factors, linear, ordering, values, error, damping, settings)
+        if settings.method == "line-search":
+            move = _searched(graph, factors, linear, ordering, values, error, settings)
+        else:
+            move = _move(graph, factors, linear, ordering, values, error, damping, settings)
         if move is None:  # no damping helps: error and linearisation contradict each other
             return Solution(values, error, iteration, False, graph, factors)
         _LOG.debug("iteration %d: error %.9g, damping %.3g", iteration, move.error, move.damping)
@@ -265,6 +283,30 @@ def _move(
     if undetermined:
         raise singular_system(linear)
     return None
+
+
+def _searched(
+    graph: gtsam.NonlinearFactorGraph,
+    factors: Sequence[Linearisable],
+    linear: gtsam.GaussianFactorGraph,
+    ordering: gtsam.Ordering,
+    values: gtsam.Values,
+    error: float,
+    settings: SolverSettings,
+) -> _Move | None:
+    """Return the largest share of the step, halved, that lowers the error enough; None when none does."""
+    step = _step(linear, ordering, 0.0)
+    if step is None:
+        raise singular_system(linear)
+    length, share = _length(linear, step, 0.0), 1.0
+    while share >= _MIN_SHARE:
+        moved = values.retract(step if share == 1 else step.scale(share))
+        moved_error = _error_or_infinity(graph, factors, moved)
+        if moved_error <= error * (1 + _EXACT) - _ARMIJO * share * length**2:
+            exact = share == 1 and abs(moved_error - linear.error(step)) <= _EXACT * error
+            return _Move(moved, min(moved_error, error), length, 0.0, exact)  # rounding alone makes it larger
+        share /= 2
+    return _Move(values, error, length, 0.0, False) if length <= settings.tolerance else None
 
 
 def _error(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values) -> float:

@@ -45,7 +45,7 @@ def on_vector(residual, key=0, dim=2, m=2, **given):
     return ResidualFactor((key,), (Vector(dim),), residual, np.eye(m), **given)
 
 
-@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt"])
+@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "line-search"])
 def test_linear_problem_takes_one_step(method, covariance):
     rng = np.random.default_rng(0)
     factors = [prior_factor(X[0], rng.normal(size=3), covariance(rng, 3))]
@@ -64,8 +64,10 @@ def test_linear_problem_takes_one_step(method, covariance):
     np.testing.assert_allclose(solution.covariance(X[2:4]), np.linalg.inv(information)[6:12, 6:12], rtol=1e-6)
 
 
-def test_levenberg_marquardt_comes_down_a_curved_valley():
-    solution = solve(EMPTY, [on_vector(rosenbrock)], values_of({0: np.array([-1.2, 1.0])}))
+@pytest.mark.parametrize("method", ["levenberg-marquardt", "line-search"])
+def test_damped_methods_come_down_a_curved_valley(method):
+    start = values_of({0: np.array([-1.2, 1.0])})
+    solution = solve(EMPTY, [on_vector(rosenbrock)], start, SolverSettings(method))
     assert solution.converged
     np.testing.assert_allclose(solution.values.atVector(0), [1.0, 1.0], atol=1e-8)
     assert solution.error == pytest.approx(0.0, abs=1e-15)
@@ -75,9 +77,31 @@ def test_damping_saves_a_step_that_gauss_newton_loses():
     factor = on_vector(lambda x: np.arctan(x), dim=1, m=1)
     start = values_of({0: np.array([3.0])})
     assert not solve(EMPTY, [factor], start, SolverSettings("gauss-newton", max_iterations=3)).converged
-    solution = solve(EMPTY, [factor], start)
-    assert solution.converged
-    assert solution.values.atVector(0)[0] == pytest.approx(0.0, abs=1e-8)
+    for method in ("levenberg-marquardt", "line-search"):
+        solution = solve(EMPTY, [factor], start, SolverSettings(method))
+        assert solution.converged
+        assert solution.values.atVector(0)[0] == pytest.approx(0.0, abs=1e-8)
+
+
+def test_a_line_search_ends_the_to_and_fro_of_gauss_newton():
+    """x^2 = -1 at a prior of 0.3: the minimum is beside the prior, and full steps jump over it for ever."""
+    factors = [on_vector(lambda x: x**2 + 1, dim=1, m=1), on_vector(lambda x: 0.5 * (x - 0.3), dim=1, m=1)]
+    start = values_of({0: np.array([1.0])})
+    plain, searched = (
+        solve(EMPTY, factors, start, SolverSettings(method, 60)) for method in ("gauss-newton", "line-search")
+    )
+    assert not plain.converged
+    assert searched.converged
+    x = searched.values.atVector(0)[0]
+    assert 2 * x * (x**2 + 1) + 0.25 * (x - 0.3) == pytest.approx(0.0, abs=1e-5)
+    assert searched.step.norm() < 1e-5
+
+
+def test_a_line_search_says_so_where_no_share_of_the_step_helps():
+    uphill = on_vector(lambda x: x, dim=1, m=1, jacobians=lambda x: [-np.eye(1)])
+    solution = solve(EMPTY, [uphill], values_of({0: np.array([1.0])}), SolverSettings("line-search"))
+    assert not solution.converged
+    assert solution.values.atVector(0)[0] == 1.0
 
 
 def test_slow_convergence_ends_where_the_error_hardly_falls():
@@ -105,9 +129,11 @@ def test_step_to_where_a_factor_is_undefined_is_shortened():
     def logarithm(x):
         return np.log(x - 1.0) if x[0] > 1 else np.array([np.nan])
 
-    solution = solve(EMPTY, [on_vector(logarithm, dim=1, m=1)], values_of({0: np.array([10.0])}))
-    assert solution.converged
-    assert solution.values.atVector(0)[0] == pytest.approx(2.0, abs=1e-8)
+    for method in ("levenberg-marquardt", "line-search"):
+        start = values_of({0: np.array([10.0])})
+        solution = solve(EMPTY, [on_vector(logarithm, dim=1, m=1)], start, SolverSettings(method))
+        assert solution.converged
+        assert solution.values.atVector(0)[0] == pytest.approx(2.0, abs=1e-8)
 
 
 def test_robust_mean_is_the_weighted_one():
@@ -177,7 +203,7 @@ def test_free_variables_are_named():
     between = gaussian_factor(X[1:3], [np.eye(2), -np.eye(2)], [0.0, 0.0])
     graph = nonlinear_graph([prior_factor(X[0], [0.0, 0.0], np.eye(2)), between], dict.fromkeys(X, 2))
     start = values_of({key: np.ones(2) for key in X[:3]})
-    for method in ("gauss-newton", "levenberg-marquardt"):
+    for method in ("gauss-newton", "levenberg-marquardt", "line-search"):
         with pytest.raises(SingularSystemError, match="does not determine x1, x2") as caught:
             solve(graph, [], start, SolverSettings(method=method))
         assert caught.value.keys == (X[1], X[2])
