@@ -17,7 +17,7 @@ Gauss-Newton step, halved until it lowers E by what Armijo's rule asks for (the 
     E(x + a delta) <= E(x) - c a delta^T H delta,     c = 1e-4
 
 which damps a step that overshoots without turning it away from where sharp factors allow it to go. All stop when the
-next step is short: the length of a step in posterior standard deviations is sqrt(delta^T H delta), which knows no units.
+next step is short: its length in posterior standard deviations is sqrt(delta^T H delta), which knows no units.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Method = Literal["levenberg-marquardt", "gauss-newton", "line-search"]
 class SolverSettings:
     """method: "levenberg-marquardt", "gauss-newton" or "line-search"; max_iterations: linearisations; tolerance: length
     of the step, in posterior standard deviations, below which the solution counts as reached; relative_tolerance:
-    decrease of the error by a step, as a share of it, below which it does, too; damping: first lambda tried when a plain
+    decrease of the error by a step, as a share of it, below which it does, too; damping: first lambda tried when plain
     step fails.
     """
 

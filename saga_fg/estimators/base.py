@@ -88,6 +88,10 @@ class EstimatorBase:
     def remembered(self, nodes: ArrayLike, time: float) -> BoolArray:
         return np.zeros(len(np.asarray(nodes)), dtype=bool)
 
+    @property
+    def unsettled(self) -> IntArray:
+        return np.empty(0, dtype=np.int64)
+
     def mean(self, nodes: ArrayLike) -> FloatArray:
         x, rows = self._at(nodes)
         mean: FloatArray = x.mean[x.layout.spans(rows)]

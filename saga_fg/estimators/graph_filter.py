@@ -27,7 +27,8 @@ from factors.marginal import Elimination
 from saga_fg.errors import InputError, UnknownNodeError, require_type
 from saga_fg.estimators.base import EstimatorBase
 from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian
-from saga_fg.estimators.dynamics import Dynamics
+from saga_fg.estimators.covariance_floor import not_smaller
+from saga_fg.estimators.dynamics import Dynamics, predict
 from saga_fg.estimators.graph_solution import linear_solution
 from saga_fg.estimators.graph_window import SAME_TIME, GraphWindow, WindowEpoch
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
@@ -63,6 +64,7 @@ class GraphState:
     auxiliary: tuple[int, ...]
     predictions: int
     posterior: BlockGaussian | None
+    before: tuple[BlockGaussian, Dynamics] | None = None  # see there; without nodes in iSAM2 not needed
 
 
 class GraphFilter(EstimatorBase):
@@ -76,6 +78,9 @@ class GraphFilter(EstimatorBase):
     Estimates are those of the newest states, at any lag; `smoothed` has all epochs. A node whose state an interval
     leaves unchanged keeps its variable. Components whose noise is so small that factors would lose digits are predicted
     by covariances; their window begins anew there.
+
+    The covariance of nodes that are `unsettled` is not smaller than the one predicted over the last interval, see
+    `saga_fg.estimators.covariance_floor`: what was measured meanwhile counts for their place alone.
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, likelihoods: bool = True) -> None:
@@ -89,6 +94,7 @@ class GraphFilter(EstimatorBase):
         self._labels: Mapping[int, str] = {}
         self._auxiliary: tuple[int, ...] = ()  # variables beside the nodes, of the epoch when providers were last asked
         self._predictions = 0
+        self._before: tuple[BlockGaussian, Dynamics] | None = None  # the state before the last interval, its dynamics
         self._posterior: BlockGaussian | None = None  # until the graph changes
         self._tied: BlockGaussian | None = None  # the part of it that iSAM2 has
         self._stale: frozenset[int] = frozenset()  # nodes whose components have changed in iSAM2 since
@@ -212,6 +218,7 @@ class GraphFilter(EstimatorBase):
             self._window = self._window.begun(WindowEpoch(number, time, dict(self._keys)), since)
             history = since + SAME_TIME if self.lag or self.providers else None
             self._independent = self._independent.predicted(dynamics, number, time, history)
+            self._before = x, dynamics
 
     def update(
         self,
@@ -270,8 +277,19 @@ class GraphFilter(EstimatorBase):
     def posterior(self) -> BlockGaussian:
         """The joint Gaussian of all nodes."""
         if self._posterior is None:
-            self._posterior = merged(self._layout, self._independent.x, self._tied_gaussian())
+            x = merged(self._layout, self._independent.x, self._tied_gaussian())
+            if self._before is not None and len(unsettled := self.unsettled):
+                x = not_smaller(x, predict(*self._before), unsettled)
+            self._posterior = x
         return self._posterior
+
+    @property
+    def unsettled(self) -> IntArray:
+        """Nodes with a variable, of any epoch that is kept, which has not settled."""
+        self._tied_gaussian()  # by the present solution
+        moving, keys = self._smoother.unsettled, (self._keys, *(epoch.keys for epoch in self._window.epochs))
+        every = self._layout.nodes.tolist() if moving else []
+        return np.array([n for n in every if any(of.get(n) in moving for of in keys)], dtype=np.int64)
 
     def graph(self) -> SceneFactorGraph:
         """The running graph, with the variables and factors of the objects that nothing ties to others."""
@@ -326,7 +344,7 @@ class GraphFilter(EstimatorBase):
         self._smoother.restore(state.graph)
         self._layout, self._keys, self._independent = state.layout, state.keys, state.independent
         self._window, self._labels = state.window, state.labels
-        self._auxiliary, self._predictions = state.auxiliary, state.predictions
+        self._auxiliary, self._predictions, self._before = state.auxiliary, state.predictions, state.before
         self._posterior, self._tied, self._stale = state.posterior, None, frozenset()
 
     def _state(self) -> GraphState:
@@ -340,6 +358,7 @@ class GraphFilter(EstimatorBase):
             self._auxiliary,
             self._predictions,
             self._posterior,
+            self._before if self._keys else None,
         )
 
     def _note(self, method: str, *arguments: Any, likelihood: float = 0.0) -> None:

@@ -5,7 +5,8 @@ linearises itself: no callback runs inside it, and a factor that raises does so 
 more than `threshold` of its own standard deviations from where its factors were linearised, these are linearised
 anew, families in NumPy all at once, and exchanged: the old ones out, the new ones in (Kaess et al., "iSAM2", IJRR 31,
 2012). Robust losses are weighted anew with it (iteratively reweighted least squares). Where that does not
-settle, as after a poor start, Levenberg-Marquardt solves the whole graph, and iSAM2 begins anew from there.
+settle, as after a poor start, damped steps solve the graph (`saga_fg.estimators.damped_steps`), and iSAM2 begins anew
+from there.
 
 Epochs older than `lag` are marginalised: their factors go out, the prior that they leave on their neighbours comes in,
 and iSAM2 drops the variables without factors. Between the two they need not be leaves of the Bayes tree, which
@@ -67,11 +68,17 @@ class IncrementalSmoother:
         self._engine: Engine | None = None
         self._times: list[float] = []
         self._changed = False  # since it was solved
+        self._unsettled = frozenset[int]()
 
     @property
     def time(self) -> float:
         """Time of the newest epoch, s."""
         return self._graph.time
+
+    @property
+    def unsettled(self) -> frozenset[int]:
+        """Keys of the variables that had not settled when the graph was last solved; empty where all have."""
+        return self._unsettled & self._graph.variables.keys()
 
     def graph(self) -> SceneFactorGraph:
         """The running graph itself: its variables, factors and values. To be read, not changed."""
@@ -197,7 +204,7 @@ class IncrementalSmoother:
         """The present solution as a value."""
         engine, graph = self._ready(), self._graph
         return GraphSolution(
-            LinearisationPoint(dict(graph.variables), graph.base, graph.values), engine.linear(), engine.converged
+            LinearisationPoint(dict(graph.variables), graph.base, graph.values), engine.linear(), not engine.unsettled
         )
 
     def joint_gaussian(self, layout: StateLayout, keys: Sequence[int]) -> BlockGaussian:
@@ -260,9 +267,11 @@ class IncrementalSmoother:
             engine = Engine(graph.elimination, settings.wildfire, in_time=self._lag is not None)
         engine.at_root = self.at_root
         try:
-            return engine.solved(graph, settings)
+            engine = engine.solved(graph, settings)
         except GraphError:
             if graph.elimination == "qr":
                 raise
-        graph.moved_to(start)  # Cholesky has half the digits
-        return Engine("qr", settings.wildfire, in_time=self._lag is not None).solved(graph, settings)
+            graph.moved_to(start)  # Cholesky has half the digits
+            engine = Engine("qr", settings.wildfire, in_time=self._lag is not None).solved(graph, settings)
+        self._unsettled = engine.unsettled
+        return engine

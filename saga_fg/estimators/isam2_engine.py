@@ -22,10 +22,11 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
-from factors import SingularSystemError, SolverSettings, marginal_moments
+from factors import SingularSystemError, marginal_moments
 from factors.gaussian import native_factor
 from factors.marginal import Elimination
 from factors.singular import singular_system
+from saga_fg.estimators.damped_steps import solve_damped
 from saga_fg.estimators.joint_gaussian import components
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_groups import HeldGroup
@@ -48,7 +49,7 @@ class RelinearisationSettings(Settings):
         0.001, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
     )
     max_iterations: Annotated[int, Range(1, 1000)] = setting(
-        25, "largest number of linearisations in a frame, before Levenberg-Marquardt takes over"
+        25, "largest number of linearisations in a frame, before damped steps take over"
     )
     wildfire: NonNegative = setting(
         0.0,
@@ -74,7 +75,7 @@ class Engine:
         self._delta = gtsam.VectorValues()  # increments from the base, at the last update
         self.slots: dict[int, IntArray] = {}
         self._held: dict[int, HeldGroup] = {}  # groups as they were at the last update
-        self.converged = True
+        self.unsettled = frozenset[int]()  # variables whose last step was longer than the threshold
         self.elimination_order: dict[int, tuple[bool, bool, float]] = {}
         self._rank: dict[int, int] = {}  # of every variable in time, where the whole tree was eliminated in that order
         self._births: dict[int, int] = {}  # of the variables that it has
@@ -84,7 +85,7 @@ class Engine:
 
     def solved(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
         """The engine with everything that has changed in the graph, which moves to the solution."""
-        start, self.converged = graph.point().values, True
+        start, self.unsettled = graph.point().values, frozenset()
         try:
             if not self._synchronised(graph):
                 return self
@@ -98,10 +99,22 @@ class Engine:
             log.info("at %.3f s: %s", graph.time, error)
         graph.moved_to(start)
         restarted = Engine(graph.elimination, settings.wildfire, self.in_time)
-        restarted.converged = graph.solve(SolverSettings(tolerance=settings.threshold / 10)).converged
-        if not restarted.converged:
-            log.warning("at %.3f s the graph has not settled: its factors may contradict each other", graph.time)
+        restarted.at_root = self.at_root
+        found = solve_damped(graph, settings.threshold)
+        restarted.unsettled = found.unsettled
         restarted._synchronised(graph)
+        if found.unsettled:
+            some = ", ".join(str(graph.variables[key]) for key in sorted(found.unsettled)[:3])
+            log.warning(
+                "at %.3f s the graph has not settled, its factors may contradict each other: %d variables "
+                "still move, as %s",
+                graph.time,
+                len(found.unsettled),
+                some,
+            )
+            values = graph.values  # where iSAM2 has taken one step more, which may lead far away
+            values.update(found.values)
+            graph.moved_to(values)
         return restarted
 
     def holds_others(self, graph: SceneFactorGraph) -> bool:

@@ -132,6 +132,11 @@ class Estimator(Protocol):
         """The joint Gaussian: of the nodes, and perhaps of others."""
         ...
 
+    @property
+    def unsettled(self) -> IntArray:
+        """Nodes whose nonlinear solution has not settled; the answer of closed forms always has."""
+        ...
+
     def mean(self, nodes: ArrayLike) -> FloatArray:
         """(k, d) means of nodes of equal size d."""
         ...
