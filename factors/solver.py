@@ -53,8 +53,8 @@ Method = Literal["levenberg-marquardt", "gauss-newton", "line-search"]
 class SolverSettings:
     """method: "levenberg-marquardt", "gauss-newton" or "line-search"; max_iterations: linearisations; tolerance: length
     of the step, in posterior standard deviations, below which the solution counts as reached; relative_tolerance:
-    decrease of the error by a step, as a share of it, below which it does, too; damping: first lambda tried when plain
-    step fails.
+    decrease of the error by a step, as a share of it, below which it does, too; damping: first lambda, tried when a
+    plain step fails.
     """
 
     method: Method = "levenberg-marquardt"

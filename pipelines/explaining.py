@@ -172,7 +172,13 @@ def _story(events: Sequence[Event]) -> list[str]:
     first, last = events[0], events[-1]
     end = "" if last["event"] == "deleted" else ", then the recording ends"
     head = f"track {first['track']} of {first['scene']}, {first['label']}: {last['time'] - first['time']:.1f} s{end}"
-    describe = {"initiated": _initiated, "matched": _matched, "missed": _missed, "deleted": _deleted}
+    describe = {
+        "initiated": _initiated,
+        "matched": _matched,
+        "missed": _missed,
+        "deleted": _deleted,
+        "unsettled": _unsettled,
+    }
     lines = [head]
     for event in events:
         text, *more = describe[event["event"]](event)
@@ -213,6 +219,11 @@ def _missed(event: Event) -> list[str]:
 def _deleted(event: Event) -> list[str]:
     state = f"not detected for {event['coasting']:.2f} s, existence {event['existence']:.2f}"
     return [f"deleted: {event['reason']} ({state})"]
+
+
+def _unsettled(event: Event) -> list[str]:
+    deviation = " and ".join(f"{d:.2f}" for d in event["deviation"])
+    return [f"not settled: the solver found no minimum of the graph; known to {deviation} m, no better than predicted"]
 
 
 def _split(candidates: Sequence[Event]) -> tuple[Event, list[Event]]:

@@ -110,7 +110,10 @@ def stream_horizons(given: Any, settings: StreamSettings) -> FloatArray:
 
 
 def tracks_message(tracks: Tracks) -> dict[str, Any]:
-    """Return the answer to a frame: the tracks in world coordinates, with the columns of track files."""
+    """Return the answer to a frame: the tracks in world coordinates, with the columns of track files.
+
+    `settled` is there where it is false alone.
+    """
     boxes, covariance = tracks.boxes, tracks.position_covariance
     numbers = np.column_stack(
         [
@@ -123,6 +126,8 @@ def tracks_message(tracks: Tracks) -> dict[str, Any]:
         {"id": id_, "label": label, **{name: x for name, x in zip(names, row, strict=True) if math.isfinite(x)}}
         for id_, label, row in zip(tracks.id.tolist(), boxes.label.tolist(), numbers.tolist(), strict=True)
     ]
+    for row in np.flatnonzero(~tracks.settled).tolist():
+        rows[row]["settled"] = False
     return {"type": "tracks", "timestamp": tracks.timestamp, "tracks": rows}
 
 

@@ -41,7 +41,7 @@ Answer = dict[str, Any]
 LATENCIES = 10_000  # latest frames, whose latencies are kept
 COUNTED = (
     *("messages", "frames", "out_of_order", "late", "unconfirmed", "repeats", "refused", "jumps"),
-    *("failures", "restarts"),
+    *("unsettled", "failures", "restarts"),
 )
 
 MAX_HELD = 256  # largest number of frames held back; beyond it the oldest is tracked
@@ -283,6 +283,7 @@ class StreamTracker(Generic[Client]):
             self.counts["late"] += 1
             return late_message(tracks.timestamp) | self._about(message)
         self.counts["frames"] += 1
+        self.counts["unsettled"] += int(not tracks.settled.all())
         if verdict == "accepted":
             self._held.set_clock(max(self._held.newest, frame.timestamp))
             clock = {}

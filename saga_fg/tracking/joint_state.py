@@ -191,6 +191,11 @@ class JointTrackState:
         x, P = self.estimator.planar_marginals(ids, self.places(label))
         return Kinematics(x[:, :2], x[:, 2:], P[:, :2, :2], P[:, 2:, 2:])
 
+    def settled(self, ids: IntArray) -> BoolArray:
+        """(k,) tracks for which the solver has found the minimum of the graph; all where it is linear."""
+        unsettled = self.estimator.unsettled
+        return ~np.isin(ids, unsettled) if len(unsettled) else np.ones(len(ids), dtype=bool)
+
     def places(self, label: StrArray) -> IntArray:
         """(n, 4) where x, y, vx, vy are in the state of each track, -1 for none."""
         classes, index = distinct(label)

@@ -3,6 +3,7 @@
     initiated  detection and its probability, and the nearest tracks that did not take it
     matched    candidates with their squared distances in sigmas, the chosen one, and why the others were not chosen
     missed     candidates, none of which was chosen
+    unsettled  in frames for which the solver found no minimum of the graph, as far as the track is concerned
     deleted    time without a detection, existence, and the limit that was passed
     clocks     offsets of the sensors' clocks, whenever one is corrected anew, or its frames are left out or used again
     graph      running graph of the interval that the frame ended (`saga_fg.tracking.graph_record`), once a frame
@@ -65,6 +66,7 @@ class Journal:
             self._write_initiations(now)
         elif stage == "delete":
             now = view()
+            self._write_unsettled(now)
             self._write_deletions(now)
             self._write_clocks(now)
             self._before = now
@@ -140,6 +142,11 @@ class Journal:
                 }
             )
         return result
+
+    def _write_unsettled(self, now: TrackerView) -> None:
+        for row in np.flatnonzero(~now.settled).tolist():
+            event = self._event("unsettled", now, int(now.table.id[row]), row)
+            self._write(event | {"deviation": _numbers(np.sqrt(np.diagonal(now.P[row])))})
 
     def _write_initiations(self, now: TrackerView) -> None:
         assert self._predicted is not None

@@ -14,7 +14,7 @@ import numpy as np
 from saga_fg.graph import SceneFactorGraph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.tracking.clock import Clock
 from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
@@ -43,6 +43,7 @@ class TrackerView:
     initiated     (b,) rows of the measurements that initiated the last b tracks, at the stage `initiate`
     boxes         of the tracks, in the world
     clock, shared of the sensors, and what their frames have in common, see `clocks`
+    settled       (n,) tracks for which the solver has found the minimum of the graph
     running       the running graph, where factor providers take part; its positions are local
     """
 
@@ -59,6 +60,7 @@ class TrackerView:
     boxes: Boxes
     clock: Clock
     shared: SharedObservations
+    settled: BoolArray
     running: SceneFactorGraph | None
 
     @classmethod
@@ -88,6 +90,7 @@ class TrackerView:
             replace(state.boxes(now.position, now.velocity)),
             state.clock,
             state.shared,
+            state.joint.settled(table.id),
             state.joint.estimator.graph() if state.providers else None,
         )
 

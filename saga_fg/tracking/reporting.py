@@ -51,6 +51,7 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     columns = {"label": table.label[rows], "position": centre, "size": table.box.size.take(rows, 0)}
     boxes = unchecked(Boxes, **_frozen(columns | {"yaw": yaw, "velocity": now.velocity}))
     columns = {"id": table.id[rows], "score": score, "coasting": coasting}
+    columns["settled"] = state.joint.settled(columns["id"])
     covariances = {"position_covariance": P, "velocity_covariance": now.P_velocity}
     return unchecked(Tracks, timestamp=timestamp, boxes=boxes, **_frozen(columns | covariances))
 

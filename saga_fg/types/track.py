@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_ids, upper_triangle
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_ids, upper_triangle
 from saga_fg.numerics.columns import Columns
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.html_table import html_table
@@ -48,6 +49,7 @@ class Track:
     position_covariance: FloatArray
     velocity_covariance: FloatArray
     coasting: float
+    settled: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,8 @@ class Tracks(Columns):
     position_covariance  (N, 2, 2)  of the horizontal position, m^2
     velocity_covariance  (N, 2, 2)  (m/s)^2
     coasting             (N,)       seconds since the last detection, 0 when just updated
+    settled              (N,)       False where the solver found no minimum of a nonlinear graph: the covariance is then
+                                    not smaller than the predicted one; True for all if left out
     """
 
     timestamp: float
@@ -70,6 +74,7 @@ class Tracks(Columns):
     position_covariance: FloatArray
     velocity_covariance: FloatArray
     coasting: FloatArray
+    settled: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
@@ -78,6 +83,10 @@ class Tracks(Columns):
             vars(self)[name] = checked(name, getattr(self, name), (n,))
         for name in ("position_covariance", "velocity_covariance"):
             vars(self)[name] = checked(name, getattr(self, name), (n, 2, 2))
+        settled = np.asarray(self.settled, dtype=bool)
+        if settled.shape not in ((n,), (0,)):
+            raise InputError(f"settled: expected shape ({n},), got {settled.shape}")
+        vars(self)["settled"] = settled if len(settled) else np.ones(n, dtype=bool)
 
     @classmethod
     def empty(cls, timestamp: float) -> Self:
@@ -108,6 +117,7 @@ class Tracks(Columns):
             position_covariance=self.position_covariance[row],
             velocity_covariance=self.velocity_covariance[row],
             coasting=float(self.coasting[row]),
+            settled=bool(self.settled[row]),
         )
 
     def __iter__(self) -> Iterator[Track]:
@@ -133,7 +143,8 @@ class Tracks(Columns):
             (("coasting",), self.coasting[:, None]),
         )
         first = {"timestamp": np.full(len(self), self.timestamp), "id": self.id, "label": self.boxes.label}
-        return first | {name: values[:, k] for names, values in vectors for k, name in enumerate(names)}
+        numbers = {name: values[:, k] for names, values in vectors for k, name in enumerate(names)}
+        return first | numbers | {"settled": self.settled}
 
     def _repr_html_(self) -> str:
         deviation = np.sqrt(np.trace(self.position_covariance, axis1=1, axis2=2) / 2)

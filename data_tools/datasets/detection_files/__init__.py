@@ -50,7 +50,8 @@ Tables of true objects have the columns of tracks, and `visible`: 0 for objects 
 Parquet, Feather and Arrow files have the same columns (extra [parquet]).
 
 Tracks are written with the same columns and, besides, id, cov_xx, cov_xy, cov_yy (covariance of the horizontal
-position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2) and coasting (s since the last detection).
+position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2), coasting (s since the last detection)
+and settled (0 where the solver found no minimum of a nonlinear graph, else 1).
 """
 
 from data_tools.datasets.detection_files.dataset import DetectionFile, read_detections, read_scenes_in_parts

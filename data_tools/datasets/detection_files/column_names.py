@@ -46,7 +46,7 @@ _ALIASES = {
 }
 ALIASES = MappingProxyType({ours: tuple(aliases.split()) for ours, aliases in _ALIASES.items()})
 _SHORTEST_GUESS = 4  # letters of a name that may be a misspelt one
-_OF_TRACKS = {"id", "coasting", "cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy"}
+_OF_TRACKS = {"id", "coasting", "settled", "cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy"}
 _OURS = {alias: ours for ours, aliases in ALIASES.items() for alias in aliases}
 
 

@@ -12,12 +12,12 @@ from data_tools.datasets.detection_files.columns import BOX, COLUMNS, POSE, QUAT
 from data_tools.datasets.detection_files.dataset import DetectionFile
 from data_tools.datasets.detection_files.formats import ROWS, Layout, read_raw_table, sorted_by_time
 from data_tools.datasets.detection_files.table_import import TableImport
-from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS
+from data_tools.datasets.detection_files.tracks import SETTLED, TRACK_COLUMNS
 from data_tools.plausibility import Doubt, Sample, doubts_of
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 
-_ALL = Layout(tuple(dict.fromkeys((*COLUMNS, *TRACK_COLUMNS, "visible"))), REQUIRED, faulty=True)
+_ALL = Layout(tuple(dict.fromkeys((*COLUMNS, *TRACK_COLUMNS, SETTLED, "visible"))), REQUIRED, faulty=True)
 SHOWN = (*REQUIRED, *BOX, *POSE)
 GAP = 3.0  # usual steps, from which a pause counts
 

@@ -11,7 +11,7 @@ from data_tools.datasets.detection_files.columns import QUATERNION, RawTable
 from data_tools.datasets.detection_files.dataset import box_columns
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.datasets.detection_files.table_import import TableImport
-from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS
+from data_tools.datasets.detection_files.tracks import SETTLED, TRACK_COLUMNS
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, from_upper_triangle
 from saga_fg.types.boxes import Boxes
 
@@ -53,7 +53,7 @@ def read_tracks(path: str | Path, how: TableImport | None = None, lenient: bool 
     how      what it takes to understand it, without effect on a table that saga-fg wrote
     lenient  columns that `how` names need not be there
     """
-    layout = Layout((*TRACK_COLUMNS, *QUATERNION), REQUIRED, lenient)
+    layout = Layout((*TRACK_COLUMNS, SETTLED, *QUATERNION), REQUIRED, lenient)
     return track_rows_of(read_raw_table(Path(path), layout, how, own=OWN))
 
 

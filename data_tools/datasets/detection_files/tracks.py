@@ -24,6 +24,7 @@ TRACK_COLUMNS = (
     *("scene", "timestamp", "id", "label", "x", "y", "z", "length", "width", "height", "yaw", "vx", "vy", "score"),
     *("cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy", "coasting"),
 )
+SETTLED = "settled"  # 1 or 0, the last column of results
 
 
 def write_tracks(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> None:
@@ -33,7 +34,7 @@ def write_tracks(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Tracks
     numbers are written in full. Raises `InputError` for another suffix, a path that is not writable, and tracks that
     do not fit the scene.
     """
-    write_rows(path, TRACK_COLUMNS, track_rows(str(path), scenes))
+    write_rows(path, (*TRACK_COLUMNS, SETTLED), _result_rows(str(path), scenes))
 
 
 def write_rows(path: str | Path, columns: tuple[str, ...], rows: Iterable[list[Any]]) -> None:
@@ -82,3 +83,11 @@ def track_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> I
                 tracks.id.tolist(), boxes.label.tolist(), *np.hstack([before, after]).T.tolist(), strict=True
             ):
                 yield [scene.name, timestamp, id_, label, *(None if x != x else x for x in numbers)]
+
+
+def _result_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterator[list[Any]]:
+    """The rows of `track_rows` with the last column of results."""
+    for scene, moments in scenes:
+        settled = np.concatenate([np.empty(0, dtype=bool), *(tracks.settled for tracks in moments)])
+        rows = track_rows(path, [(scene, moments)])
+        yield from ([*row, value] for row, value in zip(rows, settled.astype(int).tolist(), strict=True))

@@ -17,7 +17,7 @@ from data_tools.datasets.detection_files.columns import POSE, QUATERNION, ROTATI
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.track_rows import REQUIRED, TrackRows, track_rows_of
-from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS
+from data_tools.datasets.detection_files.tracks import SETTLED, TRACK_COLUMNS
 from data_tools.files.error_messages import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
@@ -26,7 +26,9 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
 
 LAYOUT = Layout(
-    (*TRACK_COLUMNS, *QUATERNION, "coordinates", *POSE, *ROTATIONS["ego_yaw"], "visible"), REQUIRED, lenient=True
+    (*TRACK_COLUMNS, SETTLED, *QUATERNION, "coordinates", *POSE, *ROTATIONS["ego_yaw"], "visible"),
+    REQUIRED,
+    lenient=True,
 )
 REACH = 0.25  # s to either side, for a velocity
 LONGEST_GAP = 2.5  # steps between rows of an object, for a velocity

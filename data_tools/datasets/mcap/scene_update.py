@@ -80,6 +80,8 @@ def result(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> 
         keys = ("score", "vx", "vy", *_POSITION, *_VELOCITY)
         known = {key: f"{value:.6g}" for key, value in zip(keys, columns[k].tolist(), strict=True) if value == value}
         facts = {"id": str(id_), "class": names.get(label, label), **known}
+        if not tracks.settled[k]:
+            facts["settled"] = "0"
         size = np.where(np.isfinite(boxes.size[k]), boxes.size[k], 0.5)
         above = boxes.position[k] + [0, 0, size[2] / 2 + _TEXT_GAP]
         text = {"pose": ros.pose(above, 0.0), "billboard": True, "font_size": 12.0, "scale_invariant": True}
