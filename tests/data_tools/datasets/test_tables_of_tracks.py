@@ -21,9 +21,8 @@ def tracks(timestamp: float) -> Tracks:
         [[3, 0.1], [np.nan, np.nan]],
     )
     covariance = np.array([[[0.1, 0.01], [0.01, 0.2]], [[1, 0], [0, 1]]])
-    return Tracks(
-        timestamp, np.array([7, 9]), boxes, np.array([0.25, 1 / 3]), covariance, covariance, np.array([0, 0.5])
-    )
+    score, coasting, settled = np.array([0.25, 1 / 3]), np.array([0, 0.5]), np.array([True, False])
+    return Tracks(timestamp, np.array([7, 9]), boxes, score, covariance, covariance, coasting, settled)
 
 
 def scene(name: str = "drive") -> Scene:
@@ -36,9 +35,9 @@ def test_tracks_as_csv(tmp_path: Path) -> None:
     write_tracks(path, [(scene(), [tracks(0.0), Tracks.empty(0.5)])])
     assert path.read_text() == (
         "scene,timestamp,id,label,x,y,z,length,width,height,yaw,vx,vy,score,"
-        "cov_xx,cov_xy,cov_yy,cov_vxvx,cov_vxvy,cov_vyvy,coasting\n"
-        f"drive,0.0,7,car,1.0,2.0,3.0,4.0,2.0,1.5,{yaw},3.0,0.1,0.25,0.1,0.01,0.2,0.1,0.01,0.2,0.0\n"
-        "drive,0.0,9,pedestrian,4.0,5.0,6.0,,,,,,,0.3333333333333333,1.0,0.0,1.0,1.0,0.0,1.0,0.5\n"
+        "cov_xx,cov_xy,cov_yy,cov_vxvx,cov_vxvy,cov_vyvy,coasting,settled\n"
+        f"drive,0.0,7,car,1.0,2.0,3.0,4.0,2.0,1.5,{yaw},3.0,0.1,0.25,0.1,0.01,0.2,0.1,0.01,0.2,0.0,1\n"
+        "drive,0.0,9,pedestrian,4.0,5.0,6.0,,,,,,,0.3333333333333333,1.0,0.0,1.0,1.0,0.0,1.0,0.5,0\n"
     )
 
 
@@ -64,6 +63,7 @@ def test_tracks_as_ndjson(tmp_path: Path) -> None:
         "cov_vxvy": 0,
         "cov_vyvy": 1,
         "coasting": 0.5,
+        "settled": 0,
     }
 
 

@@ -113,7 +113,7 @@ def test_what_has_not_settled_is_not_better_known_than_predicted(lag: float) -> 
     assert np.linalg.eigvalsh((reported - predicted)[:4, :4])[0] > -1e-9
     assert np.linalg.eigvalsh(reported)[0] > 0
     assert reported[4, 4] < 0.8 * predicted[4, 4]  # the other one is measured as ever
-    x, P = estimator.planar_marginals([1], np.array([[0, 1, 2, 3]]))
+    _, P = estimator.planar_marginals([1], np.array([[0, 1, 2, 3]]))
     np.testing.assert_allclose(P[0], reported[:4, :4])
 
 
