@@ -22,6 +22,9 @@ class Marginals:
     wanted  the first so many are predicted, the others stay
     """
 
+    lag = 0.0
+    providers = others = ()
+
     def __init__(self, means: FloatArray, covariances: FloatArray, wanted: int) -> None:
         self.means, self.covariances, self._wanted = means, covariances, wanted
         self.nodes: IntArray = np.arange(len(means))

@@ -24,6 +24,7 @@ class GraphEstimator:
 
     def update(self, measurements):
         self.smoother.extend([DetectionFactors(measurements)])
+        return np.nan
 
     def marginalise(self, nodes):
         """Remove nodes: no variable at the next epoch; the last one leaves with the lag."""
