@@ -20,8 +20,7 @@ import gtsam
 import numpy as np
 
 from factors import FactorError, SingularSystemError, Solution, SolverSettings, solve
-from saga_fg.estimators.joint_gaussian import components
-from saga_fg.graph.factor_groups import ActiveRows, GaussianGroup, HeldGroup, LinearGroup, NativeGroup
+from saga_fg.graph.factor_groups import ActiveRows, HeldGroup
 from saga_fg.graph.messages import solver_error
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
@@ -72,10 +71,8 @@ def unsettled_keys(solution: Solution, threshold: float) -> set[int]:
 
 def _parts(graph: SceneFactorGraph) -> list[Part]:
     """Components of the graph with a nonlinear factor."""
-    groups = sorted(graph.groups.values(), key=lambda held: held.elimination_order)
-    label = components(graph)
-    parts: dict[int, Part] = {}
-    for held in groups:
+    label, parts = graph.components(), dict[int, Part]()
+    for held in graph.sharpest_first():
         rows = held.rows
         of_row = np.array([label[held.factors.rows[row][0]] for row in rows.tolist()], dtype=np.int64)
         for number in np.unique(of_row).tolist():
@@ -84,14 +81,7 @@ def _parts(graph: SceneFactorGraph) -> list[Part]:
 
 
 def _solution(graph: SceneFactorGraph, part: Part, threshold: float) -> Solution:
-    native, ours, start = gtsam.NonlinearFactorGraph(), list[ActiveRows](), gtsam.Values()
-    point = graph.point()
-    for held, rows in part:
-        if isinstance(held.factors, GaussianGroup | LinearGroup | NativeGroup):
-            for factor in held.factors.native(rows, point):
-                native.add(factor)
-        else:
-            ours.append(ActiveRows(held.factors, rows, point))  # type: ignore[arg-type]
+    (native, ours), start = graph.solver_inputs(part), gtsam.Values()
     for key in {key for held, rows in part for row in rows.tolist() for key in held.factors.rows[row]}:
         insert_state(start, graph.variable(key), graph.state(key))
     try:

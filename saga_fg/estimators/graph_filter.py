@@ -214,7 +214,7 @@ class GraphFilter(EstimatorBase):
             self._begin_epoch(x, transition, dynamics, number, time)
             since = time - self.lag
             if self.lag:
-                self._window = self._window.left(state, layout, transition)
+                self._window = self._window.left(state, transition)
             self._window = self._window.begun(WindowEpoch(number, time, dict(self._keys)), since)
             history = since + SAME_TIME if self.lag or self.providers else None
             self._independent = self._independent.predicted(dynamics, number, time, history)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
-from saga_fg.estimators.layout import StateLayout
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import BoolArray, checked
 
@@ -45,7 +44,6 @@ class WindowEpoch:
     keys: Mapping[int, int]
     calls: tuple[Call, ...] = ()
     state: Any = None
-    layout: StateLayout | None = None
     transition: Transition | None = None
 
 
@@ -81,9 +79,9 @@ class GraphWindow:
         states = {one.number: one.state for one in window.epochs}
         return GraphWindow(tuple(replace(one, state=states[one.number]) for one in self.epochs if one.number in states))
 
-    def left(self, state: Any, layout: StateLayout, transition: Transition) -> GraphWindow:
+    def left(self, state: Any, transition: Transition) -> GraphWindow:
         """Note the state in which the newest epoch is left, and the transition from there."""
-        return GraphWindow((*self.epochs[:-1], replace(self.newest, state=state, layout=layout, transition=transition)))
+        return GraphWindow((*self.epochs[:-1], replace(self.newest, state=state, transition=transition)))
 
     def begun(self, epoch: WindowEpoch, since: float) -> GraphWindow:
         """Begin the next epoch; since: what is older is forgotten but for the last, s."""
@@ -110,7 +108,7 @@ class GraphWindow:
 
     def there(self, nodes: ArrayLike, k: int) -> BoolArray:
         """(m,) which nodes have been there since the end of epoch k."""
-        ids, layout = np.asarray(nodes), self.epochs[k].layout
+        ids, state = np.asarray(nodes), self.epochs[k].state
         gone = [call.arguments[0] for epoch in self.epochs[k + 1 :] for call in epoch.calls if call.method == LEFT]
         found = ~np.isin(ids, np.concatenate([np.empty(0, dtype=np.int64), *map(np.atleast_1d, gone)]))
-        return found if layout is None else found & np.isin(ids, layout.nodes)
+        return found if state is None else found & np.isin(ids, state.layout.nodes)

@@ -178,7 +178,7 @@ class IncrementalSmoother:
 
     @property
     def nonlinear(self) -> bool:
-        """Whether some factor is, so that a change anywhere may move the linearisation point of others."""
+        """Whether some factor is nonlinear: then a change may move the linearisation point of any variable."""
         return any(not held.factors.linear for held in self._graph.groups.values())
 
     def state(self, key: int) -> object:

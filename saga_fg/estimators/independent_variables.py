@@ -52,7 +52,7 @@ class IndependentVariables:
         return found
 
     def of(self, kind: VariableKind, epoch: int) -> dict[int, GraphVariable]:
-        """Those of a kind and an epoch, by id."""
+        """The variables of a kind and an epoch, by id."""
         return {one.id: one for one in self.variables.values() if one.kind == kind and one.epoch == epoch}
 
     def state(self, key: int) -> FloatArray:

@@ -27,7 +27,6 @@ from factors.gaussian import native_factor
 from factors.marginal import Elimination
 from factors.singular import singular_system
 from saga_fg.estimators.damped_steps import solve_damped
-from saga_fg.estimators.joint_gaussian import components
 from saga_fg.graph.errors import GraphError, UndeterminedError
 from saga_fg.graph.factor_groups import HeldGroup
 from saga_fg.graph.messages import solver_error
@@ -76,7 +75,6 @@ class Engine:
         self.slots: dict[int, IntArray] = {}
         self._held: dict[int, HeldGroup] = {}  # groups as they were at the last update
         self.unsettled = frozenset[int]()  # variables whose last step was longer than the threshold
-        self.elimination_order: dict[int, tuple[bool, bool, float]] = {}
         self._rank: dict[int, int] = {}  # of every variable in time, where the whole tree was eliminated in that order
         self._births: dict[int, int] = {}  # of the variables that it has
         self._hints: dict[int, frozenset[int]] = {}  # keys of factors without information, by slot; see `_hinted`
@@ -118,7 +116,7 @@ class Engine:
         return restarted
 
     def holds_others(self, graph: SceneFactorGraph) -> bool:
-        """Whether it has variables under keys that are those of others now, which iSAM2 can't exchange."""
+        """Whether a key of the graph now names another variable than the one that iSAM2 has under it."""
         return any(self._births.get(key, born) != born for key, born in graph.births.items())
 
     def root(self, key: int, rough: bool = False) -> FloatArray:
@@ -183,7 +181,7 @@ class Engine:
     def linear(self) -> gtsam.GaussianFactorGraph:
         """All linear factors that it holds, the sharpest first."""
         held, linear = self.isam.getFactorsUnsafe(), gtsam.GaussianFactorGraph()
-        for number in sorted(self.slots, key=self.elimination_order.__getitem__):
+        for number in sorted(self.slots, key=lambda number: self._held[number].elimination_order):
             slots = self.slots[number]
             for slot in slots[slots >= 0].tolist():
                 factor = held.at(slot)
@@ -233,10 +231,9 @@ class Engine:
             if old in groups:
                 self.slots[old] = np.where(groups[old].active, self.slots[old], -1)
             else:
-                del self.slots[old], self.elimination_order[old]
+                del self.slots[old]
         if number is not None:
             self.slots[number] = np.array(added)
-            self.elimination_order[number] = groups[number].elimination_order
         self._held = dict(groups)
         return True
 
@@ -252,7 +249,7 @@ class Engine:
             held = graph.groups[number]
             rows.append((number, held.rows))
             linear += graph.linear(number, point)
-            self.slots[number], self.elimination_order[number] = np.full(len(held.active), -1), held.elimination_order
+            self.slots[number] = np.full(len(held.active), -1)
             if not held.factors.linear:
                 nonlinear |= {key for row in held.rows.tolist() for key in held.factors.rows[row]}
         if alone := graph.without_factors():
@@ -294,7 +291,7 @@ class Engine:
                 continue
             if held is None:
                 removed += slots[slots >= 0].tolist()
-                del self.slots[number], self.elimination_order[number]
+                del self.slots[number]
             elif (out := (slots >= 0) & ~held.active).any():
                 removed += slots[out].tolist()
                 self.slots[number] = np.where(out, -1, slots)
@@ -392,7 +389,7 @@ def _hinted(graph: SceneFactorGraph, rows: Sequence[tuple[int, IntArray]], new: 
     separators are the same: n cliques, with a QR of all n states for each. A factor without information on all of them
     makes it one: a sixth of the time for 30 nodes, a tenth for 60.
     """
-    label, together = components(graph), dict[tuple[int, int], set[int]]()
+    label, together = graph.components(), dict[tuple[int, int], set[int]]()
     epoch = {key: -1 if one.epoch is None else one.epoch for key, one in graph.variables.items()}
     for number, mine in rows:
         keys_of = graph.groups[number].factors.rows

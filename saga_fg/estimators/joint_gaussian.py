@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-import scipy.sparse
-from scipy.sparse.csgraph import connected_components
 
 from factors import FactorError, joint_prior_factor
 from factors.marginal import Elimination
@@ -37,7 +35,7 @@ def joint_gaussian(
     Nodes with their states, other variables with increments from their base; covariance: joint one of some variables.
     Raises `GraphError` where they are not determined.
     """
-    part = components(graph)
+    part = graph.components()
     partition = Partition(layout, renumbered(np.array([part[key] for key in keys], dtype=np.int64)))
     members: dict[int, list[int]] = {}
     for k, label in enumerate(partition.label.tolist()):
@@ -85,15 +83,6 @@ def renumbered(label: IntArray) -> IntArray:
     return np.argsort(np.argsort(first))[label]
 
 
-def components(graph: SceneFactorGraph) -> dict[int, int]:
-    """The component of every variable that has factors: what these tie together, directly or through others."""
-    ties = np.concatenate([np.empty((0, 2), dtype=np.uint64), *(held.ties for held in graph.groups.values())])
-    keys, row = np.unique(ties, return_inverse=True)
-    a, b = row.reshape(-1, 2).T
-    matrix = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), shape=(len(keys), len(keys)))
-    return dict(zip(keys.tolist(), connected_components(matrix, directed=False)[1].tolist(), strict=True))
-
-
 def lossy(x: BlockGaussian, dynamics: Dynamics, still: BoolArray, elimination: Elimination) -> BoolArray:
     """(n,) nodes of components of which interaction factors would lose digits; still (n,): what keeps its variable."""
     label = dynamics.joined(x.partition).label
@@ -122,7 +111,7 @@ def replace_by_prior(
 
     Its variables by id, as they were and as they are now. Raises `InputError` where it has become singular.
     """
-    label = components(graph)
+    label = graph.components()
     ids = x.layout.nodes.tolist()
     for number in range(x.partition.count):
         rows = np.flatnonzero(x.partition.label == number)

@@ -110,7 +110,7 @@ class RecordedMeasurements:
         return int(measured.H.shape[2]) if isinstance(measured, Measurements) else measured.model.state_dim
 
     def only(self, chosen: BoolArray) -> RecordedMeasurements:
-        """Those of the measurements (m,) that are chosen."""
+        """The measurements that are `chosen` (m,)."""
         if chosen.all():
             return self
         measured, weights = self.measured, None if self.weights is None else self.weights[chosen]

@@ -31,7 +31,7 @@ class JointCovariance:
     matrix: FloatArray
 
     def joint(self, rows: IntArray) -> FloatArray:
-        """Of the nodes at `rows`, in this order."""
+        """Joint covariance of the nodes at `rows`, in this order."""
         at = self.layout.places(rows)
         return np.asarray(self.matrix[np.ix_(at, at)])
 

@@ -67,7 +67,7 @@ class OtherVariables(Protocol):
         """All of them by key."""
 
     def of(self, kind: VariableKind, epoch: int) -> dict[int, GraphVariable]:
-        """Those of a kind and an epoch, by id."""
+        """The variables of a kind and an epoch, by id."""
 
     def state(self, key: int) -> Any:
         """Value of one of them."""

@@ -256,7 +256,7 @@ class SceneFactorGraph:
         return list(dict.fromkeys(one.name for one in held))
 
     def independent(self, keys: Set[int]) -> bool:
-        """Whether linear factors alone are on some variables, and none of them on others as well, but for priors."""
+        """Whether all factors on some variables are linear, and priors alone tie them to other variables."""
         for number, mine in self._index.rows_on(keys).items():
             group = self._index.groups[number].factors
             shared = not isinstance(group, PriorGroup) and any(not keys >= set(group.rows[row]) for row in mine)
@@ -315,16 +315,29 @@ class SceneFactorGraph:
         self.moved_to(gtsam.Values(solution.values))
         return solution
 
-    def solver_inputs(self) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:
-        """All factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy."""
+    def solver_inputs(
+        self, part: Iterable[tuple[HeldGroup, IntArray]] | None = None
+    ) -> tuple[gtsam.NonlinearFactorGraph, list[ActiveRows]]:
+        """Factors for `factors.solve`: GTSAM's own, and those that are linearised in NumPy.
+
+        part: groups with their rows, the sharpest first, by default all
+        """
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
-        for held in sorted(self._index.groups.values(), key=lambda held: held.elimination_order):
+        for held, rows in ((held, held.rows) for held in self.sharpest_first()) if part is None else part:
             if isinstance(held.factors, GaussianGroup | LinearGroup | NativeGroup):
-                for factor in held.factors.native(held.rows, point):
+                for factor in held.factors.native(rows, point):
                     native.add(factor)
             else:
-                ours.append(ActiveRows(held.factors, held.rows, point))  # type: ignore[arg-type]
+                ours.append(ActiveRows(held.factors, rows, point))  # type: ignore[arg-type]
         return native, ours
+
+    def sharpest_first(self) -> list[HeldGroup]:
+        """All factors in the order in which elimination loses the fewest digits."""
+        return sorted(self._index.groups.values(), key=lambda held: held.elimination_order)
+
+    def components(self) -> Mapping[int, int]:
+        """The component of every variable that has factors: what these tie together, directly or through others."""
+        return self._index.components()
 
     def native(self) -> gtsam.NonlinearFactorGraph:
         """All factors as GTSAM's own, for its solvers from `values`; ours call back into Python, which is slow."""

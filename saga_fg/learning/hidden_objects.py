@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -182,7 +182,7 @@ class HiddenObjects(Columns):
                 ids = n + np.arange(len(gap))
                 parts.append(_placed(around, ids, shift[rows[gap]], s * step))
             scene = RecordedTracks.concatenate(parts)
-            marginals: Any = Marginals(scene.mean, scene.P, wanted=n)
+            marginals = Marginals(scene.mean, scene.P, wanted=n)
             state.rules = tuple(_Onto(rule, n) for rule in rules)
             state.time, state.table = s * step, scene.table
             state.joint = JointTrackState(marginals, partial(motion_of, settings))

@@ -11,25 +11,24 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from saga_fg.estimators.base import EstimatorBase
 from saga_fg.model.transition import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
-class Marginals:
+class Marginals(EstimatorBase):
     """n nodes with the ids 0 to n - 1 as far as a tracker's prediction needs an estimator.
 
     means (n, D), covariances (n, D, D): padded to the largest state
     wanted  the first so many are predicted, the others stay
     """
 
-    lag = 0.0
-    providers = others = ()
+    time: float = 0.0
+    nodes: IntArray = np.empty(0, dtype=np.int64)
 
     def __init__(self, means: FloatArray, covariances: FloatArray, wanted: int) -> None:
         self.means, self.covariances, self._wanted = means, covariances, wanted
-        self.nodes: IntArray = np.arange(len(means))
-        self.time = 0.0
-        self._dims: IntArray | None = None
+        self.nodes = np.arange(len(means))
 
     def predict(self, transition: Transition) -> None:
         """Move the first nodes on by a transition over all."""
@@ -53,7 +52,7 @@ class Marginals:
         self.means, self.covariances = mean, covariance
         self.time += transition.dt
 
-    def mean(self, nodes: ArrayLike, dim: int | None = None) -> FloatArray:
+    def mean(self, nodes: ArrayLike) -> FloatArray:
         """(k, D) means, padded."""
         return np.asarray(self.means[np.asarray(nodes)])
 

@@ -13,6 +13,7 @@ import pytest
 
 from factors import SolverSettings
 from saga_fg import Edges, SagaError, SceneGraph
+from saga_fg.conformance import TOLERANCE, assert_equal
 from saga_fg.estimators import BatchSolver, JointKalmanFilter, Measurements
 from saga_fg.graph import SceneFactorGraph
 from saga_fg.graph.keys import node_key
@@ -34,9 +35,6 @@ from tests.saga_fg.graph_keys import newest_key
 from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE, TRAM, VAN, random_graph
 from tests.saga_fg.road_scenes import road_program
 
-TOLERANCE = 1e-9
-
-
 SMOOTHERS = [kind for kind in ESTIMATORS if hasattr(maker(kind.values[0])(), "smoothed")]
 
 
@@ -44,26 +42,6 @@ SMOOTHERS = [kind for kind in ESTIMATORS if hasattr(maker(kind.values[0])(), "sm
 def make_smoother(request):
     """Makes fresh estimators of those kinds that tell of earlier moments too."""
     return maker(request.param)
-
-
-def assert_equal(estimator, textbook, tolerance=TOLERANCE):
-    """Means within `tolerance` posterior sigmas, joint covariance within `tolerance` relative."""
-    nodes = textbook.nodes
-    assert sorted(estimator.nodes.tolist()) == sorted(nodes.tolist())
-    if len(nodes) == 0:
-        return
-    P = textbook.joint_covariance(nodes)
-    sigma = np.sqrt(np.diag(P))
-    assert np.abs((estimator.joint_mean(nodes) - textbook.joint_mean(nodes)) / sigma).max() <= tolerance
-    difference = estimator.joint_covariance(nodes) - P
-    assert np.linalg.norm(difference) <= tolerance * np.linalg.norm(P)
-    for node in nodes.tolist():
-        own = textbook.covariance([node])[0]
-        assert np.linalg.norm(estimator.covariance([node])[0] - own) <= tolerance * np.linalg.norm(own)
-        assert (
-            np.abs(estimator.mean([node])[0] - textbook.mean([node])[0]).max()
-            <= tolerance * np.sqrt(np.diag(own)).max()
-        )
 
 
 def in_step(program, estimator, tolerance=TOLERANCE, textbook=None):
