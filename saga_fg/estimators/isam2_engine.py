@@ -12,6 +12,7 @@ units of each variable. R is computed anew whenever a variable gets new factors.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import math
 from collections.abc import Collection, Iterable, KeysView, Mapping, Sequence, Set
@@ -163,20 +164,24 @@ class Engine:
         dims, wanted = self.points.dims(factor.keys()), set(keys)
         if not wanted <= dims.keys() or not isinstance(factor, gtsam.JacobianFactor):
             return None
-        R, others = factor.augmentedJacobian()[:, :-1], [key for key in dims if key not in wanted]
-        kept, order = [key for key in dims if key in wanted], _places(dims)
-        if [*others, *kept] != list(dims) or np.tril(R, -1).any():
-            order = {key: order[key] for key in (*others, *kept)}
-            R = np.asarray(np.linalg.qr(R[:, np.concatenate(list(order.values()))], mode="r"), dtype=np.float64)
-        first = sum(dims[key] for key in others)
+        R, kept = factor.augmentedJacobian()[:, :-1], [key for key in dims if key in wanted]
+        others = [key for key in dims if key not in wanted]
+        if moved := kept != list(dims)[len(others) :]:
+            R = R[:, _columns(dims, [*others, *kept])]
+        if moved or scipy.linalg.bandwidth(R)[0]:
+            R = np.asarray(np.linalg.qr(R, mode="r"), dtype=np.float64)
         if R.shape[0] < R.shape[1]:
             return None
-        upper, singular = scipy.linalg.lapack.dpotri(R[first : R.shape[1], first:])
-        if singular or not np.isfinite(upper).all():
+        first = sum(dims[key] for key in others)
+        P, singular = scipy.linalg.lapack.dpotri(R[first : R.shape[1], first:])  # its upper triangle
+        if singular or not np.isfinite(P).all():
             return None
-        P, place = np.triu(upper) + np.triu(upper, 1).T, _places({key: dims[key] for key in kept})
-        at = np.concatenate([place[key] for key in keys])
-        return np.asarray(P if kept == keys else P[at[:, None], at])
+        P = P + P.T
+        P.flat[:: len(P) + 1] /= 2
+        if kept == keys:
+            return np.asarray(P)
+        at = _columns({key: dims[key] for key in kept}, keys)
+        return np.asarray(P[at[:, None], at])
 
     def linear(self) -> gtsam.GaussianFactorGraph:
         """All linear factors that it holds, the sharpest first."""
@@ -399,10 +404,10 @@ def _hinted(graph: SceneFactorGraph, rows: Sequence[tuple[int, IntArray]], new: 
     return [sorted(keys) for keys in together.values() if len(keys) > _FEW]
 
 
-def _places(dims: Mapping[int, int]) -> dict[int, IntArray]:
-    """The places of variables that stand one after the other."""
-    start = np.cumsum([0, *dims.values()]).tolist()
-    return {key: np.arange(first, first + dim) for (key, dim), first in zip(dims.items(), start, strict=False)}
+def _columns(dims: Mapping[int, int], keys: Iterable[int]) -> IntArray:
+    """The columns of `keys` among those of variables of `dims`, which stand one after the other."""
+    start = dict(zip(dims, itertools.accumulate(dims.values(), initial=0), strict=False))
+    return np.array([column for key in keys for column in range(start[key], start[key] + dims[key])], dtype=np.int64)
 
 
 def _in_time(graph: SceneFactorGraph, last: Set[int]) -> dict[int, int]:
