@@ -80,13 +80,16 @@ def block_covariances(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int]) ->
 
     The separator is part of the clique above, so that nothing but the blocks of the tree is ever computed (Takahashi,
     Fagan, Chin 1973; Kaess and Dellaert, Robotics and Autonomous Systems 2009). Raises `FactorError` for a tree whose
-    variables have other dimensions.
+    variables have other dimensions, and for hard constraints.
     """
     found: dict[int, FloatArray] = {}
     waiting = [(clique, np.empty((0, 0)), dict[int, slice]()) for clique in tree.roots()]
     while waiting:
         clique, above, place = waiting.pop()
         conditional = clique.conditional()
+        noise = conditional.get_model()
+        if noise is not None and noise.isConstrained():
+            raise FactorError("noise: expected variance in all directions, got a hard constraint")
         keys, R = list(conditional.keys()), conditional.R()
         ends = np.cumsum([0, *(dims.get(key, 0) for key in keys)])
         count = int(np.searchsorted(ends, len(R)))

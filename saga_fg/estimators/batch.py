@@ -125,7 +125,7 @@ class BatchSmoother(RecordedSmoother):
             return self._smoothed(covariances, joint)
         try:
             P = sparse.covariances(recording.layouts) if covariances else None
-        except NoSolution as reason:
+        except (NoSolution, FactorError) as reason:
             self._give_up(reason)
             return self._smoothed(covariances, joint)
         return tuple(

@@ -1,26 +1,16 @@
-r"""The solution of a running graph as a value, which stays when the graph goes on, with the marginals of its variables.
-
-Covariances come from the Bayes tree of cliques, R x_F + S x_S = d each, from the roots down: with the separator's own
-covariance from the clique above,
-
-    cov x_F = R^-1 R^-T + G cov(x_S) G^T,    cov(x_F, x_S) = -G cov(x_S),    G = R^-1 S
-
-(Takahashi's recursion on blocks; Kaess and Dellaert, Covariance recovery from a square root information matrix for data
-association, 2009).
-"""
+"""The solution of a running graph as a value, which stays when the graph goes on; the marginals of its variables."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cached_property
 
 import gtsam
 import numpy as np
-import scipy.linalg
 
 from factors import marginal_moments
-from factors.marginal import Elimination
+from factors.marginal import Elimination, block_covariances
 from factors.singular import singular_system
 from saga_fg.graph.linearisation_point import LinearisationPoint
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -63,7 +53,7 @@ class GraphSolution:
     @cached_property
     def _marginals(self) -> dict[int, FloatArray]:
         dims = {key: variable.dim for key, variable in self._point.variables.items()}
-        return tree_covariances(self._eliminated[0], dims)
+        return block_covariances(self._eliminated[0], dims)
 
     @cached_property
     def _eliminated(self) -> tuple[gtsam.GaussianBayesTree, Elimination]:
@@ -88,33 +78,6 @@ def linear_solution(graph: SceneFactorGraph) -> GraphSolution:
     return GraphSolution(point, linear, True)
 
 
-def tree_covariances(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int]) -> dict[int, FloatArray]:
-    """The covariance of every single variable, by key; dims: their sizes. Raises `NoSolution` for hard constraints."""
-    blocks: dict[int, FloatArray] = {}
-    open_cliques: list[tuple[gtsam.GaussianBayesTreeClique, FloatArray]]
-    open_cliques = [(root, np.empty((0, 0))) for root in tree.roots()]
-    while open_cliques:
-        clique, separator = open_cliques.pop()
-        conditional = clique.conditional()
-        model = conditional.get_model()
-        if model is not None and model.isConstrained():
-            raise NoSolution("some noise has no variance in a direction")
-        R = np.array(conditional.R())
-        joint = _joint(R, np.array(conditional.S()), separator)
-        spans, end = {}, 0
-        for key in conditional.keys():  # noqa: SIM118 -- frontal ones first; a conditional is no dict
-            begin, end = end, end + dims[key]
-            spans[key] = np.arange(begin, end)
-            if end <= len(R):
-                blocks[key] = joint[begin:end, begin:end]
-        for k in range(clique.nrChildren()):
-            child = clique[k]
-            at = [spans[key] for key in child.conditional().keys() if key in spans]  # noqa: SIM118
-            shared = np.concatenate(at) if at else np.empty(0, dtype=np.int64)
-            open_cliques.append((child, joint[np.ix_(shared, shared)]))
-    return blocks
-
-
 def width(tree: gtsam.GaussianBayesTree) -> int:
     """Dimensions of the largest clique."""
     widest, below = 0, list(tree.roots())
@@ -123,18 +86,3 @@ def width(tree: gtsam.GaussianBayesTree) -> int:
         widest = max(widest, clique.conditional().cols() - 1)
         below += [clique[k] for k in range(clique.nrChildren())]
     return widest
-
-
-def _joint(R: FloatArray, S: FloatArray, separator: FloatArray) -> FloatArray:
-    """Covariance of a clique's frontal variables and its separator together."""
-    inverse = scipy.linalg.lapack.dtrtri(R)[0]
-    if separator.size == 0:
-        return np.asarray(inverse @ inverse.T)
-    f = len(R)
-    G = inverse @ S
-    joint = np.empty((f + len(separator), f + len(separator)))
-    joint[f:, f:] = separator
-    joint[:f, f:] = -G @ separator
-    joint[f:, :f] = joint[:f, f:].T
-    joint[:f, :f] = inverse @ inverse.T - joint[:f, f:] @ G.T
-    return joint

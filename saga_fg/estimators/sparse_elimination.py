@@ -27,10 +27,11 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from factors import GaussianFactors, Linearisable, ResidualFactors, linearised, nonlinear_graph
+from factors.marginal import block_covariances
 from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.epoch import Epoch
-from saga_fg.estimators.graph_solution import NoSolution, tree_covariances
+from saga_fg.estimators.graph_solution import NoSolution
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.object_factors import recording_factors
@@ -84,7 +85,7 @@ class SparseSolution:
     def covariances(self, layouts: Sequence[StateLayout]) -> list[MarginalCovariances]:
         """Marginals of all nodes, by epoch."""
         if self.known is None:
-            blocks = tree_covariances(self.tree, self.dims)
+            blocks = block_covariances(self.tree, self.dims)
             self.known = [
                 MarginalCovariances.of(layout, partial(_blocks_of, blocks, keys, layout))
                 for keys, layout in zip(self.keys, layouts, strict=True)
