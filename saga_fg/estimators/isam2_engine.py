@@ -15,6 +15,7 @@ import contextlib
 import itertools
 import logging
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, KeysView, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -23,9 +24,9 @@ import gtsam
 import numpy as np
 import scipy.linalg
 
-from factors import SingularSystemError, marginal_moments
+from factors import FactorError, SingularSystemError, marginal_moments
 from factors.gaussian import native_factor
-from factors.marginal import Elimination
+from factors.marginal import Elimination, block_covariances
 from factors.singular import singular_system
 from saga_fg.estimators.damped_steps import solve_damped
 from saga_fg.graph.errors import GraphError, UndeterminedError
@@ -37,6 +38,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
 
 _FEW = 24  # variables that GTSAM eliminates as quickly one after the other
+_MANY = 16  # variables of a component whose marginals cost less together than one by one
 
 log = logging.getLogger(__name__)
 
@@ -266,25 +268,47 @@ class Engine:
         return any(not held.factors.linear for held in graph.groups.values())
 
     def _update_sigmas(self, graph: SceneFactorGraph, keys: set[int]) -> None:
-        """Compute the standard deviations of variables; in large components, of the newest ones at once.
+        """Compute the standard deviations of variables, to half the digits.
 
-        The marginal of a single variable then costs as much as that of all.
+        Where many hang together the marginal of one costs as much as that of all, which are then computed at once: in a
+        window all of them, in a graph without end the newest.
         """
-        if self.elimination == "qr":
-            for key in keys:
+        together: dict[int, FloatArray] = {}
+        if self.in_time:
+            together = self._window_covariances(graph, keys)
+        elif self.elimination == "cholesky":
+            together = self._newest_covariances(graph, keys)
+        for key, P in together.items():
+            self.points.set_root(key, np.linalg.cholesky(np.linalg.inv(P)).T)
+        if self.in_time or self.elimination == "qr":
+            for key in keys - together.keys():
                 self.points.set_root(key, self.root(key, rough=True))
-            return
+
+    def _window_covariances(self, graph: SceneFactorGraph, keys: set[int]) -> dict[int, FloatArray]:
+        """Those of variables in large components, by one elimination of all factors; none where that loses digits."""
+        if len(keys) <= _MANY:
+            return {}
+        label = graph.components()
+        count = Counter(label[key] for key in keys)
+        large = [key for key in keys if count[label[key]] > _MANY]
+        if not large:
+            return {}
+        try:
+            P = block_covariances(self.linear().eliminateMultifrontal(), self.points.dims(self.points.keys))
+            return {key: P[key] for key in large if np.linalg.eigvalsh(P[key])[0] > 0}
+        except (RuntimeError, FactorError, np.linalg.LinAlgError):
+            return {}
+
+    def _newest_covariances(self, graph: SceneFactorGraph, keys: set[int]) -> dict[int, FloatArray]:
+        """Those of variables of this epoch, and of those for all time, at once."""
         newest = [key for key in keys if graph.variable(key).epoch in (graph.epoch, None)]
         if not newest:
-            return
+            return {}
         P = self.joint(newest)
         if P is None:
             P = marginal_moments(self.linear(), newest, "qr")[1]
-        start = 0
-        for key in newest:
-            span = slice(start, start + graph.variable(key).dim)
-            self.points.set_root(key, np.linalg.cholesky(np.linalg.inv(P[span, span])).T)
-            start = span.stop
+        columns = {key: _columns(self.points.dims(newest), [key]) for key in newest}
+        return {key: P[np.ix_(at, at)] for key, at in columns.items()}
 
     def _remove_factors(self, graph: SceneFactorGraph) -> list[int]:
         """Forget factors that have left; returns their indices."""
