@@ -23,12 +23,11 @@ from saga_fg.estimators.bounds import checked_most
 from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.gauss_newton import GaussNewtonSettings
 from saga_fg.estimators.graduated import GraduatedNonConvexity
-from saga_fg.estimators.graph_solution import NoSolution
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
 from saga_fg.estimators.recording import Recording, RecordingState
-from saga_fg.estimators.sparse_elimination import Order, SparseSolution, cheapest_order
+from saga_fg.estimators.sparse_elimination import NoSolution, Order, SparseSolution, cheapest_order
 from saga_fg.graph.errors import GraphError
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.transition import Transition
@@ -125,7 +124,7 @@ class BatchSmoother(RecordedSmoother):
             return self._smoothed(covariances, joint)
         try:
             P = sparse.covariances(recording.layouts) if covariances else None
-        except (NoSolution, FactorError) as reason:
+        except FactorError as reason:
             self._give_up(reason)
             return self._smoothed(covariances, joint)
         return tuple(

@@ -19,10 +19,6 @@ from saga_fg.numerics.arrays import FloatArray
 _WIDE = 400  # dimensions of a clique from which QR takes ten times as long as Cholesky
 
 
-class NoSolution(Exception):  # noqa: N818 -- it is no error of the caller's
-    """Elimination has too few digits for this recording."""
-
-
 class GraphSolution:
     """values: where all variables are; converged: whether the last step was short enough.
 

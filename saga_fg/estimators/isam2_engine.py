@@ -38,7 +38,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
 
 _FEW = 24  # variables that GTSAM eliminates as quickly one after the other
-_MANY = 16  # variables of a component whose marginals cost less together than one by one
+_LARGE = 16  # variables of a component whose marginals cost less together than one by one
 
 log = logging.getLogger(__name__)
 
@@ -268,47 +268,50 @@ class Engine:
         return any(not held.factors.linear for held in graph.groups.values())
 
     def _update_sigmas(self, graph: SceneFactorGraph, keys: set[int]) -> None:
-        """Compute the standard deviations of variables, to half the digits.
+        """Compute R of variables anew, to half the digits.
 
-        Where many hang together the marginal of one costs as much as that of all, which are then computed at once: in a
-        window all of them, in a graph without end the newest.
+        In large components the marginal of one variable costs as much as that of all, which are then computed at once:
+        in a window all of them, in a graph that keeps everything those of this epoch and landmarks.
         """
         together: dict[int, FloatArray] = {}
         if self.in_time:
-            together = self._window_covariances(graph, keys)
+            together = self._window_roots(graph, keys)
         elif self.elimination == "cholesky":
-            together = self._newest_covariances(graph, keys)
-        for key, P in together.items():
-            self.points.set_root(key, np.linalg.cholesky(np.linalg.inv(P)).T)
+            together = self._newest_roots(graph, keys)
+        for key, R in together.items():
+            self.points.set_root(key, R)
         if self.in_time or self.elimination == "qr":
             for key in keys - together.keys():
                 self.points.set_root(key, self.root(key, rough=True))
 
-    def _window_covariances(self, graph: SceneFactorGraph, keys: set[int]) -> dict[int, FloatArray]:
-        """Those of variables in large components, by one elimination of all factors; none where that loses digits."""
-        if len(keys) <= _MANY:
+    def _window_roots(self, graph: SceneFactorGraph, keys: set[int]) -> dict[int, FloatArray]:
+        """R of variables in large components, by one Cholesky elimination of all factors; empty where that fails."""
+        if len(keys) <= _LARGE:
             return {}
         label = graph.components()
         count = Counter(label[key] for key in keys)
-        large = [key for key in keys if count[label[key]] > _MANY]
+        large = [key for key in keys if count[label[key]] > _LARGE]
         if not large:
             return {}
         try:
             P = block_covariances(self.linear().eliminateMultifrontal(), self.points.dims(self.points.keys))
-            return {key: P[key] for key in large if np.linalg.eigvalsh(P[key])[0] > 0}
+            return {key: _square_root_information(P[key]) for key in large}
         except (RuntimeError, FactorError, np.linalg.LinAlgError):
             return {}
 
-    def _newest_covariances(self, graph: SceneFactorGraph, keys: set[int]) -> dict[int, FloatArray]:
-        """Those of variables of this epoch, and of those for all time, at once."""
+    def _newest_roots(self, graph: SceneFactorGraph, keys: set[int]) -> dict[int, FloatArray]:
+        """R of the variables of this epoch and of landmarks, from their joint covariance."""
         newest = [key for key in keys if graph.variable(key).epoch in (graph.epoch, None)]
         if not newest:
             return {}
         P = self.joint(newest)
         if P is None:
             P = marginal_moments(self.linear(), newest, "qr")[1]
-        columns = {key: _columns(self.points.dims(newest), [key]) for key in newest}
-        return {key: P[np.ix_(at, at)] for key, at in columns.items()}
+        roots, start = {}, 0
+        for key, dim in self.points.dims(newest).items():
+            span = slice(start, start + dim)
+            roots[key], start = _square_root_information(P[span, span]), span.stop
+        return roots
 
     def _remove_factors(self, graph: SceneFactorGraph) -> list[int]:
         """Forget factors that have left; returns their indices."""
@@ -426,6 +429,11 @@ def _hinted(graph: SceneFactorGraph, rows: Sequence[tuple[int, IntArray]], new: 
             if not new.isdisjoint(keys := keys_of[row]):
                 together.setdefault((label[keys[0]], max(map(epoch.__getitem__, keys))), set()).update(keys)
     return [sorted(keys) for keys in together.values() if len(keys) > _FEW]
+
+
+def _square_root_information(P: FloatArray) -> FloatArray:
+    """R (d, d), P^-1 = R^T R. Raises `LinAlgError` where P is not positive definite."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(P)))
 
 
 def _columns(dims: Mapping[int, int], keys: Iterable[int]) -> IntArray:

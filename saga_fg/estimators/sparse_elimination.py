@@ -31,7 +31,6 @@ from factors.marginal import block_covariances
 from saga_fg.estimators.anderson import AndersonAcceleration
 from saga_fg.estimators.backward import MarginalCovariances
 from saga_fg.estimators.epoch import Epoch
-from saga_fg.estimators.graph_solution import NoSolution
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.object_factors import recording_factors
@@ -49,6 +48,10 @@ _SWEEP_WORK = 8  # multiplications an epoch over the cube of a component's size,
 _SPARSE_SPEED, _SPARSE_CALLS = 5e9, 1e-4  # multiplications a second; seconds a factor and clique
 _SPARSE_WORK = 3  # over those of the elimination itself: covariances, and once more for the last digits
 _WORTH_A_LOOK = 0.5  # seconds of elimination in time above which the others are looked at
+
+
+class NoSolution(Exception):  # noqa: N818 -- it is no error of the caller's
+    """Elimination has too few digits for this recording."""
 
 
 @dataclass(eq=False)

@@ -78,6 +78,14 @@ def test_block_covariances_are_those_of_the_dense_inverse(seed, options, covaria
         block_covariances(graph.eliminateMultifrontal(), dims | {keys[0]: 7})
 
 
+def test_block_covariances_refuse_a_hard_constraint():
+    hard = gtsam.noiseModel.Constrained.All(2)
+    graph = gtsam.GaussianFactorGraph()
+    graph.push_back(gtsam.JacobianFactor(1, np.eye(2), -np.eye(2)[0], hard))
+    with pytest.raises(FactorError, match="expected variance in all directions, got a hard constraint"):
+        block_covariances(graph.eliminateMultifrontal(function=gtsam.EliminateQR), {1: 2})
+
+
 def _rows(keys, dims, key):
     start = sum(dims[other] for other in keys[: keys.index(key)])
     return np.arange(start, start + dims[key])

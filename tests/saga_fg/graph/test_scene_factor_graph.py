@@ -82,6 +82,21 @@ def test_a_pickled_graph_goes_on_as_the_smoother_itself(lag):
         np.testing.assert_allclose(again.covariance(key), P, rtol=0.02, atol=1e-3 * np.abs(P).max())
 
 
+def test_relinearisation_of_a_large_component_has_the_marginals_that_one_by_one_has(monkeypatch):
+    def informations(large):
+        monkeypatch.setattr("saga_fg.estimators.isam2_engine._LARGE", large)
+        _, smoother = driven(lag=0.3)
+        tables = smoother._engine.points._tables.values()
+        return {key: R.T @ R for table in tables for key, R in zip(table.keys, table.root, strict=False)}
+
+    together, one_by_one = informations(1), informations(10**6)
+    assert together.keys() == one_by_one.keys()
+    assert len(together) > 5
+    for key, information in together.items():
+        assert information.any()
+        np.testing.assert_allclose(information, one_by_one[key], rtol=1e-3, atol=1e-3 * np.abs(information).max())
+
+
 def test_a_snapshot_does_not_change_when_the_smoother_goes_on():
     scene, smoother = driven(0.3)
     snapshot, solution = smoother.snapshot(), smoother.solution()
