@@ -18,7 +18,8 @@ from pipelines.slam.lidar_slam_types import START, LidarSlamResult
 from pipelines.slam.scan_landmarks import POLE
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
-from saga_fg.slam.pose_graph import LandmarkObservations, PointLandmarks, PoseGraph, PosePriors
+from saga_fg.slam.pose_graph import LandmarkObservations as PoseGraphObservations
+from saga_fg.slam.pose_graph import PointLandmarks, PoseGraph, PosePriors
 from saga_fg.types.landmark import Landmark
 
 _HEIGHT = 100.0  # m, standard deviation of the height of an observed pole
@@ -60,7 +61,7 @@ def _poles(result: LidarSlamResult) -> PointLandmarks | None:
     np.add.at(height, row, heights)
     height /= np.bincount(row, minlength=len(numbers))
     places = np.column_stack([np.array([marks[number].state for number in numbers.tolist()]), height])
-    observed = LandmarkObservations("point", pose, row, z, information)
+    observed = PoseGraphObservations("point", pose, row, z, information)
     return PointLandmarks(len(result.keyframes) + numbers, (observed,), places)
 
 
