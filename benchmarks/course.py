@@ -18,11 +18,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_tools.lidar import Scan
-from data_tools.simulator.scanner import ScannerSettings, StaticWorld, simulate_scan
-from data_tools.simulator.street import SENSOR_HEIGHT, SMALL
+from data_tools.simulator.scanner import SENSOR_HEIGHT, SMALL, ScannerSettings, StaticWorld, simulate_scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.planar_poses import transforms
+from saga_fg.numerics.geometry import transforms
 from saga_fg.types.boxes import Boxes
 
 NODES = 5  # crossings of the town in each direction

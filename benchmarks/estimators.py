@@ -28,7 +28,7 @@ from benchmarks.flocks import DT, Flock, FlockFrame, Kind, flock
 from benchmarks.runner import Row, Rows, Seed, each, growth, in_turn, timed
 from factors import gaussian_factors, prior_factors
 from pipelines.cli.options import counts
-from pipelines.process import one_thread, resident_memory
+from pipelines.tracking import one_thread, resident_memory
 from saga_fg.estimators import (
     BatchSmoother,
     Gaussian,

@@ -19,12 +19,10 @@ from benchmarks.recording_sets import RecordingSet
 from data_tools.files.atomic_files import write_bytes
 from data_tools.plots import png
 from data_tools.plots.birds_eye import COLOURS, ellipse
-from pipelines.learning.gap_judging import CAP, JudgedRun
-from pipelines.learning.gap_runs import Contender, Run, judged_run
+from pipelines.learning.gaps import CAP, Contender, JudgedRun, Run, judged_run
 from saga_fg.errors import InputError
-from saga_fg.learning.gaps import Gap
+from saga_fg.learning.gaps import Gap, colours_at
 from saga_fg.learning.labelled_scene import LabelledScene
-from saga_fg.learning.situations import colours_at
 from saga_fg.numerics.arrays import FloatArray
 
 BEFORE, AFTER = 1.5, 1.0  # s

@@ -1,6 +1,6 @@
 """Objects that nobody sees for some seconds, through the whole tracker on detections: identity and place.
 
-Every contender tracks every recording, with all detections and with some taken away (`pipelines.learning.gap_runs`).
+Every contender tracks every recording, with all detections and with some taken away (`pipelines.learning.gaps`).
 Intervals are paired bootstraps over recordings; those that overlap in time count as one.
 """
 
@@ -21,20 +21,26 @@ from benchmarks.recordings.sensed import ABOVE
 from benchmarks.runner import Data, Row, Rows, chosen
 from benchmarks.variants import contenders
 from data_tools.metrics.bootstrap import difference, relative_change
-from pipelines.cli.console import progress_bar
+from pipelines.cli.console import progress_bar, writable_picture
 from pipelines.cli.options import Config
-from pipelines.cli.tables import writable_picture
 from pipelines.config import TrackConfig, load_config
 from pipelines.learning import learned_motions
-from pipelines.learning.gap_judging import GapOutcome
-from pipelines.learning.gap_runs import LIVES, Contender, GapBenchSettings, Run, bench_gaps
+from pipelines.learning.gaps import (
+    LIVES,
+    Contender,
+    GapBenchSettings,
+    GapOutcome,
+    Run,
+    bench_gaps,
+    by_cluster,
+    compared,
+    situation_figures,
+)
 from pipelines.learning.interactions import LEARNED, LearningSettings, learn_interactions
-from pipelines.learning.situation_figures import by_cluster, compared, situation_figures
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import measured_trajectories
-from saga_fg.learning.gaps import LENGTHS, Gap
-from saga_fg.learning.situations import SITUATIONS
+from saga_fg.learning.gaps import LENGTHS, SITUATIONS, Gap
 from saga_fg.numerics.arrays import FloatArray
 
 FITS = ("noise", "edges")

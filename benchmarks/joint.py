@@ -36,12 +36,12 @@ from pipelines.config import TrackConfig, load_config
 from pipelines.slam.joint import degraded_drive, path_tracker, run_joint, street
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, Additions, GraphView
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Assignment, assign
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.slam.joint import JointSettings, Observations, OnlineEstimator, estimate_jointly
-from saga_fg.slam.joint.estimate import ObjectStates
+from saga_fg.slam.joint.graph import ObjectStates
 from saga_fg.slam.joint.record import in_ego
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene

@@ -17,10 +17,10 @@ from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.recordings.ranges import compared, map_beacons
 from benchmarks.runner import Rows, each
 from data_tools.files.atomic_files import check_writable_folder
-from data_tools.metrics.pairwise_agreement import pairwise_agreement
+from data_tools.metrics.matching import pairwise_agreement
 from pipelines.slam.results import landmark_row, landmark_rows, planar_trajectory, write_landmark_map
 from saga_fg.errors import InputError
-from saga_fg.model.landmarks.point import PointLandmark
+from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LandmarkMapper, MapperSettings
 from saga_fg.types.landmark import Observation

@@ -19,12 +19,11 @@ import typer
 
 from benchmarks.course import SimulatedCourse, revisits
 from benchmarks.runner import Row, Rows, clocked, each
-from data_tools.files.error_messages import error_context
+from data_tools.files.input_files import error_context
 from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o, with_false_loops
 from data_tools.trajectories import Trajectory, degraded_odometry, trajectory_errors
-from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
-from pipelines.slam.lidar_slam_types import LidarSlamResult
+from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
 from pipelines.slam.pose_graph_baselines import graduated
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray

@@ -29,8 +29,7 @@ from data_tools.datasets.nuscenes import (
 from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from data_tools.simulator import SimulatedTraffic
 from pipelines.config import load_config
-from pipelines.process import one_thread
-from pipelines.tracking import track_dataset
+from pipelines.tracking import one_thread, track_dataset
 from saga_fg.errors import InputError, SagaError
 
 PYTHON_VARIABLE = "SAGA_FG_DEVKIT_PYTHON"

@@ -26,12 +26,11 @@ from threadpoolctl import threadpool_info
 
 from data_tools.datasets.source import names
 from data_tools.figures import FigureTable
-from data_tools.files.error_messages import unknown_name
+from data_tools.files.input_files import unknown_name
 from data_tools.metrics import Interval
-from pipelines.cli.console import error_console, new_command
+from pipelines.cli.console import JsonFile, MarkdownFile, error_console, new_command, report
 from pipelines.cli.options import Verbose
-from pipelines.cli.tables import JsonFile, MarkdownFile, report
-from pipelines.process import one_thread
+from pipelines.tracking import one_thread
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 

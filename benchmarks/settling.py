@@ -32,7 +32,7 @@ from benchmarks.sampled_traffic import (
     providers,
     sample_traffic,
 )
-from pipelines.process import one_thread
+from pipelines.tracking import one_thread
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.numerics.arrays import FloatArray
 

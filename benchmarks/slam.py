@@ -33,14 +33,14 @@ from benchmarks.runner import Row, Rows, Seed, clocked, each, in_turn, timed
 from data_tools.datasets.kitti import KittiScans
 from data_tools.lidar import Scan, constant_velocity, deskewed, scan_to_map_residual
 from data_tools.lidar.scan import ScanSequence
-from data_tools.metrics.pairwise_agreement import pairwise_agreement
+from data_tools.metrics.matching import pairwise_agreement
 from data_tools.simulator.scanner import ScannerSettings
 from data_tools.trajectories import Trajectory, trajectory_errors
-from pipelines.process import one_thread, peak_memory
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
+from pipelines.tracking import one_thread, peak_memory
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.model.landmarks.point import PointLandmark
+from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.mapping import LandmarkMapper

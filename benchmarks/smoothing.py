@@ -17,8 +17,8 @@ from benchmarks.runner import Rows, Seed, each
 from data_tools.metrics import paired_bootstrap
 from data_tools.simulator import SimulatedTraffic
 from pipelines.cli.options import Config
-from pipelines.process import one_thread
 from pipelines.smoothing import load_smooth_config, smooth_known_objects
+from pipelines.tracking import one_thread
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import Evidence, StateTable, assign_detections, gather_evidence
 from saga_fg.types.dataset import Scene

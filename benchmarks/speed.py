@@ -28,7 +28,7 @@ from benchmarks.runner import Data, Row, Rows, Seed, growth, in_turn
 from benchmarks.service.round_trip import round_trips
 from pipelines.cli.options import counts
 from pipelines.config import Method, TrackConfig, load_config
-from pipelines.observers import StageClock
+from pipelines.tracking import StageClock
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.types.boxes import Boxes

@@ -18,8 +18,8 @@ import typer
 
 from benchmarks.runner import Rows, Seed
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
-from pipelines.process import one_thread, peak_memory, resident_memory
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
+from pipelines.tracking import one_thread, peak_memory, resident_memory
 from saga_fg.smoothing import Labels
 
 PLATOON, GAP = 5, 15.0  # cars, and m between them

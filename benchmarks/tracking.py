@@ -21,7 +21,7 @@ from benchmarks.variants import COMPONENTS, SHIPPED, contenders
 from data_tools.metrics import Interval, LabelErrors, calibration, error_summary, errors_by_class, paired_bootstrap
 from pipelines.cli.options import Config
 from pipelines.config import load_config
-from pipelines.learning.gap_runs import Contender, hidden
+from pipelines.learning.gaps import Contender, hidden
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg.errors import InputError
 from saga_fg.learning.gaps import made_gaps

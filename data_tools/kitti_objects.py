@@ -17,8 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import inverse_transform, wrap_angle
 from saga_fg.types.boxes import Boxes
 

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.kitti.oxts import read_sensors, world_position
-from data_tools.files.text_tables import TextTable, read_lines
+from data_tools.datasets.kitti.dataset import read_sensors, world_position
+from data_tools.files.readers import TextTable, read_lines
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.slam.sensors import SensorBuffer, SensorName

@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from data_tools.simulator.scenarios import scenario_settings
-from data_tools.simulator.scene import scene_from_world
-from data_tools.simulator.world import World, build_world
+from data_tools.simulator.settings import scenario_settings
+from data_tools.simulator.world import World, build_world, scene_from_world
 from pipelines.config import TrackConfig, load_config
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.numerics.arrays import FloatArray, StrArray

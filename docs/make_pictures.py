@@ -16,16 +16,14 @@ from scaling_picture import write_scaling_picture
 from slam_loops_picture import write_loops_picture
 
 from data_tools.simulator import simulate_scene
-from data_tools.simulator.laser_drive import laser_drive
-from data_tools.simulator.street import SimulatedScans
+from data_tools.simulator.scanner import SimulatedScans, laser_drive
 from pipelines.config import load_config
 from pipelines.demo import run_demo
 from pipelines.slam.joint import run_joint, street
-from pipelines.slam.laser_results import write_laser_slam
 from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import lidar_slam
-from pipelines.slam.results import write_joint
+from pipelines.slam.results import write_joint, write_laser_slam
 from saga_fg.slam.joint import JointSettings
 
 HERE = Path(__file__).parent

@@ -16,7 +16,7 @@ from saga_fg import Tracker
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable
 from saga_fg.tracking import Journal
-from saga_fg.tracking.graph_record import GraphRecord
+from saga_fg.tracking.journal import GraphRecord
 
 SEED = 63
 POST = np.array([18.0, 9.0])

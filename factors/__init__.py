@@ -5,45 +5,69 @@ Linear families give native `gtsam.JacobianFactor`s, which no solver needs Pytho
 `ResidualFactors`. One family a file.
 """
 
-from factors.absolute import attitude_factor, position_factor
-from factors.between import Pose, between_factor, noise_model, pose, pose_prior_factor
-from factors.camera import Camera, PixelBearing
-from factors.detection import detection_factor, detection_factors, linear_detection_factor, linear_detection_factors
-from factors.errors import FactorError, SingularSystemError
+from factors.absolute import (
+    attitude_factor,
+    joint_prior_factor,
+    position_factor,
+    prior_factor,
+    prior_factors,
+    stacked_prior_factors,
+)
+from factors.between import ERROR_DIM, Pose, between_factor, noise_model, odometry_factors, pose, pose_prior_factor
+from factors.detection import (
+    Camera,
+    PixelBearing,
+    detection_factor,
+    detection_factors,
+    linear_detection_factor,
+    linear_detection_factors,
+)
 from factors.gaussian import (
     GaussianFactors,
     check_dimensions,
     gaussian_factor,
     gaussian_factors,
     gaussian_graph,
+    marginal_factors,
+    marginal_moments,
     nonlinear_graph,
     nonlinear_graph_at,
     stacked_gaussian_factors,
 )
-from factors.interaction import interaction_factor, interaction_factors, stacked_interaction_factors
-from factors.lane import lane_boundary_factors, lane_keeping_factors
-from factors.line import HesseLine, line_factors
-from factors.marginal import marginal_factors, marginal_moments
-from factors.measurement import Components, MeasurementModel, box, position, position_velocity
-from factors.nonlinear import Linearisable, ResidualFactor
-from factors.nonlinear_interaction import NonlinearInteraction
-from factors.odometry import ERROR_DIM, odometry_factors
-from factors.on_plane import on_plane_factor
-from factors.plane import OrientedPlane, plane, plane_factor
-from factors.polar import Bearing, Radar, Range, RangeBearing, RangeRate
-from factors.prior import joint_prior_factor, prior_factor, prior_factors, stacked_prior_factors
-from factors.ranges import bearing_range_factor, calibrated_range_factors, range_factor
+from factors.interaction import (
+    NonlinearInteraction,
+    interaction_factor,
+    interaction_factors,
+    stacked_interaction_factors,
+)
+from factors.lane import HesseLine, lane_boundary_factors, lane_keeping_factors, line_factors
+from factors.manifolds import ImuBias, PlanarPose, SpatialPose, Variable, Vector
+from factors.measurement import (
+    Bearing,
+    Components,
+    MeasurementModel,
+    Radar,
+    Range,
+    RangeBearing,
+    RangeRate,
+    box,
+    position,
+    position_velocity,
+)
+from factors.nonlinear import Linearisable, ResidualFactor, ResidualFactors, unwrapped_angles
+from factors.plane import OrientedPlane, on_plane_factor, plane, plane_factor
 from factors.relative import (
+    bearing_range_factor,
+    calibrated_range_factors,
     point_factors,
+    range_factor,
     relative_detection_factors,
     relative_factors,
     relative_range_bearing_factors,
 )
 from factors.robust import Mixture, Robust, RobustLoss
 from factors.solver import Solution, SolverSettings, linearised, solve
-from factors.stacked import ResidualFactors
-from factors.variables import ImuBias, PlanarPose, SpatialPose, Variable, Vector
-from factors.wrapping import unwrapped_angles
+from factors.validation import FactorError, SingularSystemError
 
 __all__ = [
     "ERROR_DIM",

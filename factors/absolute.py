@@ -1,4 +1,6 @@
-"""Absolute measurements of a pose: its place from a satellite receiver, its tilt from an accelerometer.
+"""Priors of variables, and absolute measurements of poses: places from satellites, tilt by gravity.
+
+Absolute measurements of a pose: its place from a satellite receiver, its tilt from an accelerometer.
 
     position   r = t + R a - z                                       z in the local frame, a the antenna's place, m
     attitude   r = angle between R u_pose and u_world, two turns     GTSAM's `AttitudeFactorPose3`
@@ -7,11 +9,18 @@ With the pose moved by its tangent to (R Exp(w), t + R v): dr/dv = R, dr/dw = -R
 
 An accelerometer at rest measures "up" in the frame of the pose, u_pose, where the world says u_world = (0, 0, 1); a
 compass does the same with north. Neither measures the turn about its own direction.
+
+Priors of a variable, or of several together.
+
+    phi(x) = || x - m ||_P^2
+
+One variable's prior is the initial state of a track. A joint prior over many keys, P being their full joint
+covariance, is what a filter knows of the past: all of it in one factor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -19,12 +28,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.between import noise_model
-from factors.errors import FactorError
+from factors.gaussian import GaussianFactors, gaussian_factor, native_factor, stacked_gaussian_factors
+from factors.manifolds import PlanarPose, SpatialPose, cross_matrix
+from factors.nonlinear import ResidualFactors, residual_factors
 from factors.robust import RobustLoss
-from factors.rotations import cross_matrix
-from factors.stacked import ResidualFactors, residual_factors
-from factors.validation import FloatArray, checked, checked_keys
-from factors.variables import PlanarPose, SpatialPose
+from factors.validation import FactorError, FloatArray, checked, checked_key_array, checked_keys, whitener
 
 _UP = (0.0, 0.0, 1.0)
 
@@ -90,3 +98,41 @@ class _Place:
             return [np.concatenate([-R @ cross_matrix(self.antenna), R], axis=2)]
         turned = R @ np.array([[-self.antenna[1]], [self.antenna[0]]])
         return [np.concatenate([R, turned], axis=2)]
+
+
+def prior_factor(key: int, mean: ArrayLike, covariance: ArrayLike) -> gtsam.JacobianFactor:
+    """Return the factor || x(key) - mean ||_covariance; mean: (d,), covariance: (d, d), positive definite."""
+    center = checked("mean", mean, (None,))
+    return gaussian_factor([key], [np.eye(len(center))], center, covariance)
+
+
+def prior_factors(keys: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> list[gtsam.JacobianFactor]:
+    """Return one prior a key; keys: (n,); means: (n, d); covariances: (n, d, d), or one (d, d) for all."""
+    return stacked_prior_factors(keys, means, covariances).native()
+
+
+def stacked_prior_factors(keys: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> GaussianFactors:
+    """Return the factors of `prior_factors` as arrays."""
+    centers = checked("means", means, (None, None))
+    names = checked_key_array("keys", keys)
+    checked_keys("keys", names.tolist())
+    identity = np.broadcast_to(np.eye(centers.shape[1]), (*centers.shape, centers.shape[1]))
+    return stacked_gaussian_factors(names[:, None], [identity], centers, covariances)
+
+
+def joint_prior_factor(keys: Iterable[int], means: Sequence[ArrayLike], covariance: ArrayLike) -> gtsam.JacobianFactor:
+    """Return one factor on all `keys` from their joint covariance.
+
+    means: one vector (d_k,) a key; covariance: (D, D) with D = sum_k d_k, in the order of the keys, positive definite.
+    Raises `FactorError` on anything else.
+    """
+    distinct = checked_keys("keys", keys)
+    vectors = [checked("means", mean, (None,)) for mean in means]
+    dims = [len(vector) for vector in vectors]
+    if not distinct or len(vectors) != len(distinct) or 0 in dims:
+        raise FactorError(f"means: expected one vector per key, got {len(vectors)} for {len(distinct)} keys")
+    W = whitener("covariance", covariance, sum(dims))
+    augmented = np.empty((len(W), len(W) + 1), order="F")
+    augmented[:, :-1] = W
+    augmented[:, -1] = W @ np.concatenate(vectors)
+    return native_factor(distinct, dims, augmented)

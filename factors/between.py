@@ -1,21 +1,49 @@
-"""Poses and what is measured between two of them: odometry, scan registration, loop closures.
+"""Relative poses: between two poses, and odometry with the slow errors of its device as states.
+
+Poses and what is measured between two of them: odometry, scan registration, loop closures.
 
     r = log( measured^-1 first^-1 second ),    measured = first_T_second + noise in the tangent of the second pose
 
 Wraps GTSAM's `PriorFactorPose*` and `BetweenFactorPose*`, which crash or answer nonsense where a matrix is no pose or a
 covariance has another shape. Tangents are ordered as in `PlanarPose` and `SpatialPose`: (x, y, heading) in the plane,
 (rotation vector, translation) in space. False loop closures are what robust losses are for.
+
+Odometry between consecutive poses in space, with the slow errors of the device as states of their own.
+
+A device that counts wheels or matches scans reports the increment (R_m, d) over dt seconds. Its length is wrong by a
+scale s, its heading turns with a bias b, and its course is off by an angle c: the device is not mounted quite straight
+beside the sensors whose axes the poses have, or the vehicle slips. All three wander slowly:
+
+    R_m = Exp(b dt e_z) R_a^T R_b Exp(noise)
+    d   = (1 + s) Exp(c e_z) R_a^T (t_b - t_a) + noise          (s, b, c)' = (s, b, c) + noise
+
+Residuals, in the frame of the first pose (9 rows):
+
+    r_rotation    = Log( R_m^T Exp(b dt e_z) R_a^T R_b )
+    r_translation = (1 + s) Exp(c e_z) R_a^T (t_b - t_a) - d
+    r_error       = (s, b, c)' - (s, b, c)
+
+The scale stands at the true motion, not at the measured one: there it would scale the noise of d as well, and be drawn
+to where that is small.
+
+With the errors held at 0 by a prior this is the plain factor between two poses. The bias model is that of a gyroscope
+mounted upright (Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed. 2013,
+section 4.4.1), the scale that of a wheel odometer (section 6.3).
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors.errors import FactorError
+from factors.manifolds import SpatialPose, cross_matrix, inverse_right_jacobian, rotation_exp, rotation_log
+from factors.nonlinear import ResidualFactors, residual_factors
 from factors.robust import RobustLoss
-from factors.validation import checked, checked_keys, whitener
+from factors.validation import FactorError, FloatArray, checked, checked_keys, whitener
 
 Pose = gtsam.Pose2 | gtsam.Pose3
 _ORTHONORMAL = 1e-6
@@ -73,3 +101,76 @@ def noise_model(
     """GTSAM's noise model of a covariance, under a robust loss if one is given."""
     gaussian = gaussian_noise(name, covariance, dim)
     return gaussian if robust is None else robust.model(gaussian)
+
+
+ERROR_DIM = 3  # scale, yaw-rate bias in rad/s, course in rad
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def odometry_factors(
+    rows: ArrayLike, a_T_b: ArrayLike, dt: ArrayLike, covariances: ArrayLike, robust: RobustLoss | None = None
+) -> ResidualFactors:
+    """Return n factors of odometry with slow errors.
+
+    rows: (n, 4) keys of the pose before, the pose after (`gtsam.Pose3`), the errors before and after (vectors of 3:
+    scale, yaw-rate bias in rad/s, course in rad); a_T_b: (n, 4, 4) measured increments; dt: (n,) s; covariances:
+    (n, 9, 9), or one for all, of rotation (rad), translation (m) and the errors' change. Raises `FactorError`.
+    """
+    measured = checked("a_T_b", a_T_b, (None, 4, 4))
+    seconds = checked("dt", dt, (len(measured),))
+    if (seconds < 0).any():
+        raise FactorError(f"dt[{int(np.argmax(seconds < 0))}]: expected seconds >= 0, got {seconds.min()}")
+    function = _Odometry(measured[:, :3, :3].copy(), measured[:, :3, 3].copy(), seconds.copy())
+    dims = (SpatialPose(), SpatialPose(), ERROR_DIM, ERROR_DIM)
+    return residual_factors(function, rows, dims, covariances, 6 + ERROR_DIM, "odometry", robust)
+
+
+@dataclass(frozen=True, eq=False)
+class _Odometry:
+    """R (n, 3, 3) and d (n, 3) of the increments, dt (n,)."""
+
+    R: FloatArray
+    d: FloatArray
+    dt: FloatArray
+
+    def residual(self, a: FloatArray, b: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+        translation = self._reported(a, b, before) - self.d
+        return np.concatenate([rotation_log(self._turned(a, b, before)), translation, after - before], axis=1)
+
+    def jacobians(self, a: FloatArray, b: FloatArray, before: FloatArray, after: FloatArray) -> Sequence[FloatArray]:
+        n = len(self.d)
+        Ra, Rb = a[:, :3, :3], b[:, :3, :3]
+        E = self._turned(a, b, before)
+        inverse, moved = inverse_right_jacobian(rotation_log(E)), self._moved(a, b)
+        course = (1 + before[:, 0, None, None]) * _about_up(before[:, 2])
+        J_a, J_b, J_before, J_after = (np.zeros((n, 6 + ERROR_DIM, d)) for d in (6, 6, ERROR_DIM, ERROR_DIM))
+        J_a[:, :3, :3] = -inverse @ Rb.swapaxes(1, 2) @ Ra
+        J_b[:, :3, :3] = inverse
+        axis = E.swapaxes(1, 2) @ self.R.swapaxes(1, 2) @ _UP
+        J_before[:, :3, 1] = self.dt[:, None] * (inverse @ axis[:, :, None])[:, :, 0]
+        J_a[:, 3:6, :3] = course @ cross_matrix(moved)
+        J_a[:, 3:6, 3:] = -course
+        J_b[:, 3:6, 3:] = course @ Ra.swapaxes(1, 2) @ Rb
+        reported = self._reported(a, b, before)
+        J_before[:, 3:6, 0] = reported / (1 + before[:, :1])
+        J_before[:, 3:6, 2] = np.cross(_UP, reported)
+        J_before[:, 6:] = -np.eye(ERROR_DIM)
+        J_after[:, 6:] = np.eye(ERROR_DIM)
+        return [J_a, J_b, J_before, J_after]
+
+    def _turned(self, a: FloatArray, b: FloatArray, before: FloatArray) -> FloatArray:
+        turned = _about_up(before[:, 1] * self.dt)
+        return np.asarray(self.R.swapaxes(1, 2) @ turned @ a[:, :3, :3].swapaxes(1, 2) @ b[:, :3, :3])
+
+    def _reported(self, a: FloatArray, b: FloatArray, before: FloatArray) -> FloatArray:
+        """(n, 3) the translation as a device with these errors reports it."""
+        turned = _about_up(before[:, 2]) @ self._moved(a, b)[:, :, None]
+        return np.asarray((1 + before[:, :1]) * turned[:, :, 0])
+
+    def _moved(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.asarray((a[:, :3, :3].swapaxes(1, 2) @ (b[:, :3, 3] - a[:, :3, 3])[:, :, None])[:, :, 0])
+
+
+def _about_up(angle: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) about the vertical."""
+    return rotation_exp(angle[:, None] * _UP)

@@ -1,25 +1,51 @@
-"""Linear Gaussian factors of any number of variables, native to GTSAM.
+"""Linear Gaussian factors, marginalisation, and what a singular system leaves undetermined.
+
+Linear Gaussian factors of any number of variables, native to GTSAM.
 
     phi(x) = exp( -1/2 || sum_k A_k x_k - b ||_R^2 )
 
 GTSAM keeps it whitened as one block matrix [W A_1 ... W A_n | W b], W R W^T = 1. From Python its `JacobianFactor` takes
 three variables at most; a `GaussianConditional` without frontal variables takes any number, and its clone is a plain
 `JacobianFactor`. Handing the block matrix over whole costs half of handing it over block by block.
+
+Marginalisation of variables: Gaussian factors that keep their information on the others.
+
+    phi(x_b) = max_{x_a} prod phi(x_a, x_b)        ||A_a x_a + A_b x_b - b||^2  ->  ||(Q_2^T A_b) x_b - Q_2^T b||^2
+
+with Q_2 the part of the QR factor of A_a that is orthogonal to it; for Gaussians this is the integral over x_a, up to a
+constant. A node that disappears is marginalised, never just deleted together with its factors.
+
+Two eliminations, both GTSAM's. "cholesky" works on the information matrix A^T A, whose condition number is the square
+of A's; "qr" works on A itself. Over a hundred steps of five coupled nodes at coordinates of 1000 m, measured to 0.1 m
+ten times a second, Cholesky's means come to lie 2e-9 posterior sigmas from those of a covariance filter at an
+acceleration noise of 0.1 m^2/s^3, 2e-6 at 1e-4 and 4e-2 at 1e-8; QR's 1e-10, 1e-8 and 8e-7. QR takes half as long again
+on small components, and up to twenty times as long on a large, densely connected graph. Increments from a point nearby,
+in place of coordinates, shrink both errors alike.
+
+Variables that a singular linear system leaves undetermined.
+
+GTSAM names the one variable at which elimination broke down, which depends on the ordering and is often an innocent
+neighbour. The undetermined directions are the null space of the information matrix Lambda = A^T A. Scaled to a unit
+diagonal, D^-1/2 Lambda D^-1/2, so that units do not matter, its eigenvectors of eigenvalue zero say which variables can
+move without any factor noticing.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors.errors import FactorError
 from factors.validation import (
+    FactorError,
     FloatArray,
     KeyArray,
+    SingularSystemError,
     check_distinct,
     checked,
     checked_covariances,
@@ -185,3 +211,182 @@ def check_dimensions(factors: Iterable[gtsam.GaussianFactor], dims: Mapping[int,
             raise FactorError(
                 f"the factor on {format_keys(keys)} has {width} columns, but these variables have {total} dimensions"
             )
+
+
+_LARGEST = 3000  # dimensions: beyond, the eigenvalues would take minutes
+_ZERO = 1e-11  # eigenvalue relative to the unit diagonal
+_SHARE = 1e-2  # share of a variable in the null space above which it is named
+
+
+def singular_system(graph: gtsam.GaussianFactorGraph, cause: Exception | None = None) -> FactorError:
+    """Return the exception that explains why `graph` cannot be solved; `cause` is what the solver said, if anything.
+
+    A `SingularSystemError` naming the undetermined variables, or a `FactorError` naming those whose factors hold
+    numbers that are not finite.
+    """
+    steps = graph.gradientAtZero()  # one vector a key: the only way to learn the dimensions
+    keys = [int(key) for key in graph.keyVector()]
+    dims = [int(steps.dim(key)) for key in keys]
+    if sum(dims) > _LARGEST:
+        return _unresolved(cause or _complaint(graph))
+    information, vector = graph.hessian(gtsam.Ordering(keys))
+    owner = np.repeat(np.arange(len(keys)), dims)
+    broken = ~(np.isfinite(information).all(axis=1) & np.isfinite(vector))
+    if broken.any():
+        concerned = _owners(keys, owner, broken.astype(float))
+        return FactorError(f"factors on {format_keys(concerned)} hold numbers that are not finite")
+    concerned = _owners(keys, owner, _freedom(information))
+    if not concerned:
+        return SingularSystemError("the linear system is too badly conditioned to be solved")
+    return SingularSystemError(
+        f"the linear system does not determine {format_keys(concerned)}; add factors, or a prior, that do",
+        concerned,
+    )
+
+
+def _complaint(graph: gtsam.GaussianFactorGraph) -> Exception | None:
+    try:
+        graph.optimize()
+    except RuntimeError as error:
+        return error
+    return None
+
+
+def _unresolved(cause: Exception | None) -> FactorError:
+    near = re.search(r"near variable\s+(\d+)", str(cause))
+    if near is None:
+        return FactorError("the linear system cannot be solved: its factors hold numbers that are not finite")
+    key = int(near[1])
+    return SingularSystemError(
+        f"the linear system does not determine all variables: elimination stopped near {format_key(key)}", (key,)
+    )
+
+
+def _freedom(information: FloatArray) -> FloatArray:
+    """Return for each dimension its share in the null space, from 0 to 1."""
+    scale = np.sqrt(np.diagonal(information))
+    scale[scale == 0] = 1.0
+    eigenvalues, vectors = np.linalg.eigh(information / scale[:, None] / scale)
+    null: FloatArray = vectors[:, eigenvalues < _ZERO * max(1.0, len(scale) ** 0.5)]
+    share: FloatArray = (null**2).sum(axis=1)
+    return share
+
+
+def _owners(
+    keys: list[int], owner: np.ndarray[tuple[int, ...], np.dtype[np.int64]], share: FloatArray
+) -> tuple[int, ...]:
+    total = np.zeros(len(keys))
+    np.maximum.at(total, owner, share)
+    return tuple(keys[i] for i in np.flatnonzero(total > _SHARE))
+
+
+Elimination = Literal["cholesky", "qr"]
+
+
+def marginal_factors(
+    graph: gtsam.GaussianFactorGraph, eliminate: Iterable[int], elimination: Elimination = "cholesky"
+) -> gtsam.GaussianFactorGraph:
+    """Return factors on the remaining keys that carry all the graph says about them.
+
+    Factors without eliminated keys are passed on as they are (shared, not copied). Raises `FactorError` for a key that
+    the graph lacks, and `SingularSystemError` when the graph does not determine the eliminated variables.
+    """
+    leaving = checked_keys("eliminate", eliminate)
+    _present(graph, leaving)
+    if not leaving:
+        return graph
+    try:  # in the order COLAMD finds best
+        if _checked(elimination) == "qr":
+            tree, remaining = graph.eliminatePartialMultifrontal(list(leaving), gtsam.EliminateQR)
+        else:
+            tree, remaining = graph.eliminatePartialMultifrontal(list(leaving))
+    except RuntimeError as error:
+        raise singular_system(graph, error) from error
+    if not np.isfinite(tree.gradientAtZero().norm()):  # GTSAM passes NaN on without a word
+        raise singular_system(graph)
+    return remaining
+
+
+def marginal_moments(
+    graph: gtsam.GaussianFactorGraph, keys: Iterable[int], elimination: Elimination = "cholesky"
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean (D,) and covariance (D, D) of `keys` together, in this order, all other variables integrated out.
+
+    Raises `FactorError` for a key that the graph lacks, `SingularSystemError` when the system is not determined.
+    """
+    wanted = checked_keys("keys", keys)
+    _present(graph, wanted)
+    remaining = marginal_factors(graph, set(graph.keyVector()) - set(wanted), elimination)
+    if set(wanted) - set(remaining.keyVector()):  # nothing is left that speaks of them
+        raise singular_system(graph)
+    try:
+        root, mean = _solve(remaining, gtsam.Ordering(list(wanted)), elimination)
+    except np.linalg.LinAlgError as error:
+        raise singular_system(graph, error) from error
+    return mean, root @ root.T
+
+
+def block_covariances(tree: gtsam.GaussianBayesTree, dims: Mapping[int, int]) -> dict[int, FloatArray]:
+    """Return the covariances (d, d) of all variables, one by one, in one pass from the roots of a tree to its leaves.
+
+    dims: of the variables. With x_F = R^-1 (d - S x_S) for the frontal variables of a clique and its separator,
+
+        G = -R^-1 S,     Sigma_FS = G Sigma_SS,     Sigma_FF = R^-1 R^-T + G Sigma_SS G^T
+
+    The separator is part of the clique above, so that nothing but the blocks of the tree is ever computed (Takahashi,
+    Fagan, Chin 1973; Kaess and Dellaert, Robotics and Autonomous Systems 2009). Raises `FactorError` for a tree whose
+    variables have other dimensions, and for hard constraints.
+    """
+    found: dict[int, FloatArray] = {}
+    waiting = [(clique, np.empty((0, 0)), dict[int, slice]()) for clique in tree.roots()]
+    while waiting:
+        clique, above, place = waiting.pop()
+        conditional = clique.conditional()
+        noise = conditional.get_model()
+        if noise is not None and noise.isConstrained():
+            raise FactorError("noise: expected variance in all directions, got a hard constraint")
+        keys, R = list(conditional.keys()), conditional.R()
+        ends = np.cumsum([0, *(dims.get(key, 0) for key in keys)])
+        count = int(np.searchsorted(ends, len(R)))
+        if ends[-1] != len(R) + conditional.S().shape[1] or ends[count] != len(R):
+            raise FactorError(f"dims: expected the dimensions of {format_keys(keys)}")
+        rows = np.r_[tuple(place[key] for key in keys[count:])] if len(keys) > count else np.empty(0, dtype=np.int64)
+        of_separator, inverse = above[rows[:, None], rows], np.linalg.inv(R)
+        G = -inverse @ conditional.S()
+        across = G @ of_separator
+        joint = np.block([[inverse @ inverse.T + across @ G.T, across], [across.T, of_separator]])
+        place = {key: slice(start, stop) for key, start, stop in zip(keys, ends[:-1], ends[1:], strict=True)}
+        found.update({key: joint[place[key], place[key]] for key in keys[:count]})
+        waiting += [(clique[k], joint, place) for k in range(clique.nrChildren())]
+    return found
+
+
+def _solve(
+    graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, elimination: Elimination
+) -> tuple[FloatArray, FloatArray]:
+    """Return a root S of the covariance S S^T, and the mean; raise LinAlgError when there is none."""
+    if elimination == "cholesky":
+        information, vector = graph.hessian(ordering)
+        root = np.linalg.inv(np.linalg.cholesky(information)).T
+        return root, root @ (root.T @ vector)
+    A, b = graph.jacobian(ordering)
+    dim = A.shape[1]
+    triangle: FloatArray = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"), dtype=np.float64)
+    pivots = np.abs(np.diagonal(triangle)[:dim])
+    if len(pivots) < dim or (pivots <= dim * np.finfo(float).eps * pivots.max()).any():
+        raise np.linalg.LinAlgError("rank deficient")
+    root = np.asarray(np.linalg.inv(triangle[:dim, :dim]))
+    return root, root @ triangle[:dim, dim]
+
+
+def _checked(elimination: str) -> str:
+    if elimination not in get_args(Elimination):
+        raise FactorError(f"elimination: expected one of {', '.join(get_args(Elimination))}, got {elimination!r}")
+    return elimination
+
+
+def _present(graph: gtsam.GaussianFactorGraph, keys: tuple[int, ...]) -> None:
+    known = set(graph.keyVector())
+    missing = [key for key in keys if key not in known]
+    if missing:
+        raise FactorError(f"the graph has no variable {format_keys(missing)}")

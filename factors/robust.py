@@ -32,8 +32,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors.errors import FactorError
-from factors.validation import FloatArray, checked
+from factors.validation import FactorError, FloatArray, checked
 
 Loss = Literal["huber", "cauchy", "geman-mcclure", "tukey"]
 

@@ -31,12 +31,9 @@ from typing import Literal, get_args
 import gtsam
 import numpy as np
 
-from factors.errors import FactorError, SingularSystemError
-from factors.gaussian import check_dimensions
-from factors.marginal import block_covariances, marginal_moments
+from factors.gaussian import block_covariances, check_dimensions, marginal_moments, singular_system
 from factors.nonlinear import Linearisable
-from factors.singular import singular_system
-from factors.validation import FloatArray, format_keys
+from factors.validation import FactorError, FloatArray, SingularSystemError, format_keys
 
 _LOG = logging.getLogger(__name__)
 _EXACT = 1e-12  # relative agreement of the error with its prediction from which a problem counts as linear

@@ -1,4 +1,6 @@
-"""Validation of arrays before GTSAM's C++, which answers a wrong shape with a crash or a wrong number.
+"""The exceptions of factors, and validation of arrays before GTSAM's C++ sees them.
+
+Validation of arrays before GTSAM's C++, which answers a wrong shape with a crash or a wrong number.
 
 Noise enters a linear factor by whitening. With Q = L L^T (Cholesky) and W = L^-1,
 
@@ -12,7 +14,24 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.errors import FactorError
+
+class FactorError(ValueError):
+    """An argument of a factor is not what was expected; the text names which one and what was expected."""
+
+
+class SingularSystemError(FactorError):
+    """A linear system does not determine all of its variables.
+
+    `keys` are the variables concerned, as far as they could be found; the text names them in GTSAM's notation.
+    """
+
+    def __init__(self, message: str, keys: tuple[int, ...] = ()) -> None:
+        super().__init__(message)
+        self.keys = keys
+
+    def __reduce__(self) -> tuple[type[SingularSystemError], tuple[str, tuple[int, ...]]]:
+        return type(self), (str(self), self.keys)
+
 
 FloatArray = NDArray[np.float64]
 KeyArray = NDArray[np.uint64]

@@ -9,13 +9,13 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Literal, get_args
 
-from data_tools.files.error_messages import unknown_name
+from data_tools.files.input_files import unknown_name
 from pipelines.configuration import load_settings, read_settings
 from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.model.sensor import Sensor
+from saga_fg.model.stability import LearnedInteractions
 from saga_fg.settings import settings_group
 from saga_fg.tracking import (
     AssociationName,

@@ -1,4 +1,6 @@
-"""Journals of tracking: written by the tracker, read back and explained track by track.
+"""Journals of tracking, read back and explained track by track, and the clocks of sensors in words.
+
+Journals of tracking: written by the tracker, read back and explained track by track.
 
 A journal lies beside the result it belongs to, `RESULT.journal.jsonl`, an event (`saga_fg.tracking.journal`) a line.
 """
@@ -15,16 +17,42 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.figures import FigureTable, count
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import open_bytes
-from data_tools.files.json_stream import parsed_json
+from data_tools.files.readers import parsed_json
 from data_tools.plots import running_graph_picture
 from pipelines.config import Method, TrackConfig
-from pipelines.sensor_clocks import clock_text
 from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.tracking import SensorTime
 from saga_fg.tracking.journal import Event, Journal, of_scene
+
+
+def clock_text(name: str, clock: Mapping[str, Any], since: float | None = None) -> str:
+    """The clock of a sensor, a `SensorTime` as JSON has it, in words; since: time of its first correction, s."""
+    by = f"{clock['objects']} objects in common" if clock["objects"] else "the order of arrival"
+    corrected = f", corrected by {-clock['corrected']:+.3f} s" if clock["corrected"] else ""
+    if corrected and since is not None:
+        corrected += f", first at {since:.3f} s"
+    state = "" if clock["verdict"] == "used" else "; its frames are left out"
+    return f"clock of {name}: {clock['offset']:+.3f} s (+- {clock['deviation']:.3f} s by {by}){corrected}{state}"
+
+
+def clock_table(clocks: Mapping[str, Mapping[str, SensorTime]]) -> FigureTable:
+    """A table of the sensors' clocks by scene, at the end of each."""
+    columns = (
+        *("sensor", "offset, s", "deviation, s", "corrected by, s", "drift, ms/s", "jitter, s", "objects in common"),
+        "latest frame",
+    )
+    rows = []
+    for scene, sensors in clocks.items():
+        for name, each in sensors.items():
+            times = (f"{each.offset:+.4f}", f"{each.deviation:.4f}", f"{-each.corrected:+.4f}")
+            rates = (f"{1e3 * each.drift:+.3f}", f"{each.jitter:.4f}", count(each.objects), each.verdict)
+            rows.append((f"{scene}: {name}" if len(clocks) > 1 else name, *times, *rates))
+    return FigureTable("Clocks of the sensors", columns, tuple(rows))
 
 
 def journal_of(result: Path) -> Path:

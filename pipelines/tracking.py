@@ -1,13 +1,22 @@
-"""Online tracking of recorded scenes: frames in order of time into a tracker, tracks at every moment of the scene.
+"""Online tracking of recorded scenes, with observers, and without a detector.
+
+Online tracking of recorded scenes: frames in order of time into a tracker, tracks at every moment of the scene.
 
 At a moment t of the scene, every frame up to and including t has been taken in; the tracks reported are the tracker's
 state at t, predicted there where the last frame is older. Nothing later than t has any influence.
 
 With horizons, the tracks reported at t are predicted to t plus each of them as well.
+
+This process: the threads of its linear algebra, and its memory.
+
+For matrices as small as a filter's, threads cost more than they bring.
 """
 
 from __future__ import annotations
 
+import ctypes
+import resource
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,16 +25,55 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from data_tools.datasets.detection_files import prediction_writer, predictions_path
-from pipelines.process import one_thread
+from data_tools.lidar import ClusterSettings, detect_clusters
+from data_tools.lidar.scan import ScanSequence
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking import SensorTime
-from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.tracking import SensorTime, Stage, TrackerView
+from saga_fg.types.dataset import Annotations, Dataset, Scene
 from saga_fg.types.frame import Frame
-from saga_fg.types.predicted_tracks import LONGEST, PredictedTracks
-from saga_fg.types.track import Tracks
+from saga_fg.types.track import LONGEST_PREDICTION, PredictedTracks, Tracks
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc
+LARGE = 2**18  # bytes
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Linear algebra on one thread, which also keeps sums in one order."""
+    with threadpool_limits(limits=1):
+        yield
+
+
+def return_large_blocks() -> None:
+    """Give memory of large blocks back to the system when they are freed.
+
+    Only with glibc as C library, which otherwise keeps ever larger ones (mallopt(3)).
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return
+    for parameter in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
+        mallopt(parameter, LARGE)
+
+
+def resident_memory() -> float:
+    """Return the resident memory of this process, MB."""
+    status = Path("/proc/self/statm")
+    if status.exists():
+        return int(status.read_text().split()[1]) * resource.getpagesize() / 1e6
+    return peak_memory()  # elsewhere
+
+
+def peak_memory() -> float:
+    """Return the largest resident memory that this process has had, MB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
 
 Progress = Callable[[str, int, int], None]
 """Called with the scene's name, the number of its frames done, and the number of all its frames."""
@@ -131,7 +179,7 @@ def _predicted(
     if not isinstance(tracker, PredictingTracker):
         raise InputError("--predict: expected a method that predicts, saga or kf")
     since = np.asarray(horizons + (moment - newest))
-    if since[0] < 0 or since[-1] > LONGEST:
+    if since[0] < 0 or since[-1] > LONGEST_PREDICTION:
         return ()
     return (replace(tracker.predict(since), timestamp=moment, horizons=horizons),)
 
@@ -175,3 +223,66 @@ def scene_with_frames(dataset: Dataset, name: str) -> Scene:
     if not scene.frames:
         raise InputError(f"scene {name}: expected frames of detections, there are none")
     return scene
+
+
+class StageClock:
+    """CPU time of each stage of a frame, added up. `start()` is to be called before every frame."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._mark = 0.0
+
+    def start(self) -> None:
+        """Begin a frame."""
+        self._mark = time.thread_time()
+
+    def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
+        """Add the time of a stage that is done."""
+        now = time.thread_time()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
+        self._mark = now
+
+
+class InnovationRecorder:
+    """Squared distances of tracks and the detections they took, in sigmas (NIS, 2 degrees of freedom), by class."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, list[FloatArray]] = {}
+
+    def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
+        """Record the matches of a frame."""
+        if stage != "associate":
+            return
+        now = view()
+        assert now.matching is not None
+        labels = now.table.label[now.matching.track]
+        for label in np.unique(labels).tolist():
+            self._parts.setdefault(label, []).append(now.matching.distance[labels == label])
+
+    @property
+    def by_class(self) -> Mapping[str, FloatArray]:
+        """The squared distances of each class that was ever matched."""
+        return {label: np.concatenate(parts) for label, parts in sorted(self._parts.items())}
+
+
+def cluster_scene(
+    name: str,
+    scans: ScanSequence,
+    world_T_ego: FloatArray | None = None,
+    ground_truth: list[Annotations] | None = None,
+    settings: ClusterSettings | None = None,
+    progress: Progress | None = None,
+) -> Scene:
+    """A scene with a frame of clusters for each scan, in world coordinates, sensor "lidar".
+
+    world_T_ego   (K, 4, 4) poses at the scans, for instance of LiDAR odometry; None for the recording's own
+    ground_truth  K annotations to keep with it
+    """
+    poses = scans.world_T_ego if world_T_ego is None else world_T_ego
+    frames = []
+    for k, timestamp in enumerate(scans.timestamps.tolist()):
+        found = detect_clusters(scans[k].points, settings).transformed(poses[k] @ scans.ego_T_lidar)
+        frames.append(Frame(timestamp, "lidar", found, poses[k]))
+        if progress is not None:
+            progress(name, k + 1, len(scans))
+    return Scene(name, scans.timestamps, np.asarray(poses), ("",) * len(scans), frames, ground_truth)

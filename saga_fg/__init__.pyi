@@ -6,8 +6,7 @@ from .tracking import GreedyTracker, Tracker, TrackerSettings, track
 from .types.boxes import Boxes
 from .types.dataset import Annotations, Dataset, Scene
 from .types.frame import Detection, Detections, Frame
-from .types.predicted_tracks import PredictedTracks
-from .types.track import Track, Tracks
+from .types.track import PredictedTracks, Track, Tracks
 
 __version__: str
 

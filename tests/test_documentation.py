@@ -15,7 +15,7 @@ import pytest
 
 from data_tools.simulator import SimulatorSettings
 from pipelines.config import TrackConfig
-from pipelines.configuration.schema import Listing, Nullable, Schema, Section, Table, settings_of
+from pipelines.configuration.reading import Listing, Nullable, Schema, Section, Table, settings_of
 from pipelines.serving import StreamSettings
 from pipelines.slam.configuration import SlamSettings
 from saga_fg import Tracker

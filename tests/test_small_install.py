@@ -53,7 +53,7 @@ def test_the_command_tracks_and_reports_without_open3d(tmp_path: Path) -> None:
 
 
 def test_what_needs_open3d_says_so(tmp_path: Path) -> None:
-    code = "from data_tools.lidar.open3d_loader import load_open3d; load_open3d()"
+    code = "from data_tools.lidar.scan_files import load_open3d; load_open3d()"
     run = python(code, OPTIONAL, tmp_path)
     assert "open3d cannot be imported" in run.stderr
     assert "pip install open3d" in run.stderr

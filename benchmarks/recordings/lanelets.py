@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.files.error_messages import error_context
+from data_tools.files.input_files import error_context
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import wrap_angle

@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
-from data_tools.files.arrow_tables import NUMBERS, WHOLE, all_of, read_arrow_arrays
-from data_tools.files.error_messages import error_context
+from data_tools.files.input_files import error_context
+from data_tools.files.readers import NUMBERS, WHOLE, all_of, read_arrow_arrays
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED

@@ -20,12 +20,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic
-from data_tools.files.error_messages import unknown_name
-from data_tools.simulator.lights import HEIGHT, Signal
-from data_tools.simulator.scene import scene_from_world
-from data_tools.simulator.sensed_world import objects_seen_from
+from data_tools.files.input_files import unknown_name
+from data_tools.simulator.road_users import SimulatedTrajectories
+from data_tools.simulator.sensed_world import HEIGHT, Signal, objects_seen_from
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, lidar
-from data_tools.simulator.trajectories import SimulatedTrajectories
+from data_tools.simulator.world import scene_from_world
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import yaw_transform

@@ -14,8 +14,7 @@ from benchmarks.recordings.openacc import FILE, openacc_platoons
 from benchmarks.recordings.sensed import MAST, VEHICLE, sensed_scene, true_scene
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings
 from data_tools.datasets.source import ChosenScenes, DatasetSource, option
-from data_tools.files.error_messages import unknown_name
-from data_tools.files.remote_files import local_tree
+from data_tools.files.input_files import local_tree, unknown_name
 from data_tools.simulator import SimulatorSettings
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene

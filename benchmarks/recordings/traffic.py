@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.simulator.trajectories import SimulatedTrajectories
+from data_tools.simulator.road_users import SimulatedTrajectories
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.types.road_map import RoadMap

@@ -13,7 +13,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files import DetectionFile, read_detections
 from data_tools.datasets.source import ChosenScenes, DatasetSource, option
-from data_tools.files.remote_files import is_url, local_copy
+from data_tools.files.input_files import is_url, local_copy
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Detections, Frame

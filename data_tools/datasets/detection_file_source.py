@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport, TruthFile
+from data_tools.datasets.detection_files.column_names import pairs
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.formats import column_names
-from data_tools.datasets.detection_files.table_import import pairs
 from data_tools.datasets.parts import OpenedPart, Parts, file_digest
 from data_tools.datasets.results import SceneResult, read_judged_results, read_table_results
 from data_tools.datasets.source import TRACKING, ChosenScenes, DatasetSource, Verb, names, option
-from data_tools.files.remote_files import expanded, is_url, local_copy, name_of
+from data_tools.files.input_files import expanded, is_url, local_copy, name_of
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 

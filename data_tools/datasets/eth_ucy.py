@@ -25,9 +25,8 @@ import numpy as np
 from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import option
-from data_tools.files.error_messages import error_context, unknown_name
-from data_tools.files.remote_files import local_tree
-from data_tools.files.text_tables import read_table
+from data_tools.files.input_files import error_context, local_tree, unknown_name
+from data_tools.files.readers import read_table
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import IntArray
 from saga_fg.types.boxes import Boxes

@@ -20,7 +20,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files import TRACK_COLUMNS, TrackRows, track_rows, write_rows
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
-from data_tools.datasets.detection_files.track_rows import REQUIRED, track_rows_of
+from data_tools.datasets.detection_files.tracks import REQUIRED, track_rows_of
 from data_tools.datasets.source import LabelledScenes
 from data_tools.files.atomic_files import atomic_file
 from saga_fg.errors import MissingExtraError

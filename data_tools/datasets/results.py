@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.detection_files import TableImport, TrackRows, read_tracks
-from data_tools.files.error_messages import unknown_name
+from data_tools.files.input_files import unknown_name
 from data_tools.metrics import SceneBoxes
 from data_tools.plausibility import Mend, usual_class
 from saga_fg.errors import InputError

@@ -1,4 +1,6 @@
-"""A dataset for all verbs of the command: its options, how it opens, how its results are written, read and scored.
+"""A dataset for all verbs of the command, and datasets by name.
+
+A dataset for all verbs of the command: its options, how it opens, how its results are written, read and scored.
 
 A new dataset is a dataclass derived from `DatasetSource`, whose fields are its options:
 
@@ -14,6 +16,13 @@ A new dataset is a dataclass derived from `DatasetSource`, whose fields are its 
             yield MyRecordings(self.folder, truth)
 
 Everything else has a default: tables of tracks and labels as results, scored by CLEAR figures and RMSE.
+
+Datasets by name: those that come along, those of installed packages, and MODULE:CLASS.
+
+A package offers a `DatasetSource` through the entry point group `saga_fg.datasets`:
+
+    [project.entry-points."saga_fg.datasets"]
+    mine = "my_package.my_module:Mine"
 """
 
 from __future__ import annotations
@@ -22,22 +31,27 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import MISSING, dataclass, field
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from data_tools.files.error_messages import unknown_name
+import numpy as np
+
+from data_tools.files.input_files import unknown_name
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.dataset import Scene
 
 if TYPE_CHECKING:
-    from data_tools.datasets.area_map import AreaMap
     from data_tools.datasets.parts import Parts
     from data_tools.datasets.results import SceneResult
     from data_tools.evaluation import Evaluation
     from data_tools.lidar.scan import ScanSequence
     from data_tools.plausibility import Mend
-    from saga_fg.numerics.arrays import FloatArray
     from saga_fg.smoothing import Labels
-    from saga_fg.types.dataset import Dataset, Scene
+    from saga_fg.types.dataset import Dataset
     from saga_fg.types.track import Tracks
 
 Verb = Literal[
@@ -259,3 +273,105 @@ class DatasetSource(ABC):
         from data_tools.evaluation import evaluate_tracks
 
         return evaluate_tracks([(each.scene, each.found) for each in results.values()], hota, innovations)
+
+
+Kind = Literal["drivable", "walkway", "crossing"]
+REACH = 120.0
+"""Distance to the path of the vehicle, along x and y, up to which a map is kept, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class AreaMap:
+    """Areas and lines in world coordinates, m.
+
+    areas  kind, and rings (N, 2): where rings of an area overlap, there is a hole
+    lines  (N, 2) borders of lanes
+    """
+
+    areas: Sequence[tuple[Kind, Sequence[FloatArray]]]
+    lines: Sequence[FloatArray]
+
+    @classmethod
+    def around(
+        cls, scene: Scene, areas: Iterable[tuple[Kind, Sequence[FloatArray]]], lines: Iterable[FloatArray]
+    ) -> Self:
+        """Return the parts near the path of a scene, cut where they leave its surroundings."""
+        path = scene.world_T_ego[:, :2, 3]
+        low, high = path.min(axis=0) - REACH, path.max(axis=0) + REACH
+        cut = ((kind, [piece for ring in rings if len(piece := clipped(ring, low, high))]) for kind, rings in areas)
+        near = [line for line in lines if ((line >= low) & (line <= high)).all(axis=1).any()]
+        return cls([area for area in cut if area[1]], near)
+
+
+def clipped(ring: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the part of a ring (N, 2) inside a rectangle, as a ring, empty for none (Sutherland and Hodgman, 1974)."""
+    for axis in (0, 1):
+        for sign, bound in ((1.0, high[axis]), (-1.0, -low[axis])):
+            if not len(ring):
+                return ring
+            room = bound - sign * ring[:, axis]  # negative outside
+            nxt, room_next = np.roll(ring, -1, axis=0), np.roll(room, -1)
+            inside = room >= 0
+            crosses = inside != (room_next >= 0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                cut = ring + (room / (room - room_next))[:, None] * (nxt - ring)
+            points = np.stack([ring, cut], axis=1)
+            ring = points[np.stack([inside, crosses], axis=1)]
+    return ring
+
+
+GROUP = "saga_fg.datasets"
+BUILT_IN = {
+    "nuscenes": "data_tools.datasets.nuscenes.source:NuScenesSource",
+    "kitti": "data_tools.datasets.kitti.source:KittiSource",
+    "argoverse2": "data_tools.datasets.argoverse2.source:ArgoverseSource",
+    "eth_ucy": "data_tools.datasets.eth_ucy:EthUcySource",
+    "mcap": "data_tools.datasets.mcap.source:McapSource",
+    "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
+    "simulated": "data_tools.simulator.source:SimulatedSource",
+}
+
+
+def dataset_names() -> tuple[str, ...]:
+    """The names of all datasets, those that come along first."""
+    return (*BUILT_IN, *(name for name in external_datasets() if name not in BUILT_IN))
+
+
+def dataset_source(name: str) -> type[DatasetSource]:
+    """The dataset of a name, or of MODULE:CLASS.
+
+    Raises `InputError` for an unknown name, a name that several packages give, and for what cannot be imported or is no
+    dataset, naming the package.
+    """
+    if ":" in name:
+        return _loaded(name, f"dataset {name}")
+    if name in BUILT_IN and name not in external_datasets():
+        return _loaded(BUILT_IN[name], f"dataset {name}")
+    found = external_datasets().get(name, ())
+    if not found:
+        raise InputError(unknown_name("dataset", name, dataset_names()))
+    packages = [entry.dist.name if entry.dist is not None else entry.value for entry in found]
+    packages += ["saga-fg"] * (name in BUILT_IN)
+    if len(packages) > 1:
+        raise InputError(f"dataset {name}: expected one package to offer it, {' and '.join(packages)} do")
+    return _loaded(found[0].value, f"dataset {name} of the package {packages[0]}")
+
+
+@cache
+def external_datasets() -> dict[str, tuple[EntryPoint, ...]]:
+    """The entry points of installed packages, by name."""
+    found: dict[str, tuple[EntryPoint, ...]] = {}
+    for entry in sorted(entry_points(group=GROUP), key=lambda entry: (entry.name, entry.value)):
+        found[entry.name] = (*found.get(entry.name, ()), entry)
+    return found
+
+
+def _loaded(location: str, what: str) -> type[DatasetSource]:
+    module, _, attribute = location.partition(":")
+    try:
+        found = getattr(import_module(module), attribute)
+    except Exception as error:  # the module is somebody else's code
+        raise InputError(f"{what}: {location} cannot be loaded: {type(error).__name__}: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, DatasetSource)):
+        raise InputError(f"{what}: {location}: expected a class derived from DatasetSource")
+    return found

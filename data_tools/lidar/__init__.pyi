@@ -1,17 +1,29 @@
-from .clusters import ClusterSettings, ObjectSize, detect_clusters
-from .curbs import Line, extract_curbs, straight_lines
-from .degeneracy import Observability, observability
-from .deskew import azimuth_times, constant_velocity, deskewed
-from .ground import Ground, segment_ground
-from .planes import Plane, extract_walls, fit_ground, fit_plane
-from .poles import Pole, extract_poles
-from .registration import Registration, RegistrationError, RegistrationSettings, register
-from .scan import Scan
+from .clusters import ClusterSettings, Ground, ObjectSize, detect_clusters, segment_ground
+from .landmarks import (
+    Line,
+    Plane,
+    Pole,
+    extract_curbs,
+    extract_poles,
+    extract_walls,
+    fit_ground,
+    fit_plane,
+    straight_lines,
+)
+from .places import Submap, scan_to_map_residual, upright
+from .registration import (
+    Observability,
+    Registration,
+    RegistrationError,
+    RegistrationSettings,
+    SurfelMap,
+    Surfels,
+    observability,
+    register,
+    surfels_of,
+)
+from .scan import Scan, azimuth_times, constant_velocity, deskewed, voxel_downsample, voxel_keys
 from .scan_files import read_scan, write_cloud
-from .sharpness import scan_to_map_residual
-from .submap import Submap, upright
-from .surfels import SurfelMap, Surfels, surfels_of
-from .voxels import voxel_downsample, voxel_keys
 
 __all__ = [
     "ClusterSettings",

@@ -1,4 +1,6 @@
-r"""Place recognition: which older submap shows the place of a new one, and how the two lie to each other.
+"""Place recognition between submaps, their overlap, and the sharpness of a map.
+
+Place recognition: which older submap shows the place of a new one, and how the two lie to each other.
 
 A submap is seen from above as an image of heights above the ground, less their mean; cells that were never seen are 0.
 
@@ -10,6 +12,22 @@ The key says which places are compared; the alignment is an exhaustive search an
 elsewhere tells whether the place looks like itself somewhere else (row houses). Sources: Reddy and Chatterji, An
 FFT-based technique for translation, rotation, and scale-invariant image registration, TIP 1996; Lu, Xu, Chen, Xiong,
 Wang, One RING to rule them all: Radon sinogram for place recognition, RA-L 2022.
+
+Submaps: the thinned points of a few dozen metres of way, in a frame of their own.
+
+The frame of a submap is fixed to one of its keyframes: where that keyframe's sensor was, turned so that z points
+up. When the estimate of the keyframe's pose changes, the submap moves along, and its points stay as they are.
+
+Share of the structure above the ground that two registered submaps have in common: the proof of a place.
+
+Ground lies on ground everywhere, so it proves nothing; and what only one of the two has seen says nothing either.
+
+Sharpness of the map of scans along a trajectory, a measure without a true trajectory.
+
+A scan is compared with a map of the scans around it: each of its points q has k nearest neighbours in the map, with
+mean c and normal n (direction of the least spread); its residual is | n . (q - c) |. Wrong poses make surfaces thick,
+which increases residuals. The scan itself is not part of the map. Compare Razlaw et al.,
+Evaluation of registration methods for sparse 3D laser scans, ECMR 2015 (mean plane variance).
 """
 
 from __future__ import annotations
@@ -24,9 +42,10 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
+from data_tools.lidar.scan import voxel_downsample
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.numerics.geometry import transform_points, yaw_transform
+from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 
 CELL, _CELLS = 1.5, 64  # m; of an image in each direction
 _PADDED = 2 * _CELLS
@@ -201,3 +220,135 @@ def _rings() -> FloatArray:
     radius = 0.35 * _PADDED * (np.arange(_RADII) + 1.0) / _RADII
     bearing = np.pi / _BEARINGS * np.arange(_BEARINGS)
     return np.asarray(_PADDED // 2 + np.multiply.outer([np.sin(bearing), np.cos(bearing)], radius).swapaxes(1, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """A piece of the map.
+
+    number             counts submaps from 0 in the order of the drive
+    keyframes          numbers of its first keyframe and of the one after its last
+    anchor             number of the keyframe that carries the frame
+    anchor_T_submap    (4, 4) the frame in that of the anchor's sensor, z up
+    points             (N, 3) float32, m, in the submap's frame
+    way                m driven since the start of the drive, at its first and at its last keyframe
+
+    Raises `InputError` for points that are not finite.
+    """
+
+    number: int
+    keyframes: tuple[int, int]
+    anchor: int
+    anchor_T_submap: FloatArray
+    points: npt.NDArray[np.float32]
+    way: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "anchor_T_submap", checked("anchor_T_submap", self.anchor_T_submap, (4, 4)))
+        points = np.asarray(self.points, dtype=np.float32)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise InputError(f"points: expected finite coordinates (N, 3), got an array of shape {points.shape}")
+        object.__setattr__(self, "points", points)
+
+
+def upright(world_T_sensor: FloatArray) -> FloatArray:
+    """Return the rotation (4, 4) that turns a sensor's axes so that z points up in the world, and x stays ahead."""
+    R = world_T_sensor[:3, :3]
+    heading = np.arctan2(R[1, 0], R[0, 0])
+    c, s = np.cos(heading), np.sin(heading)
+    turned = np.eye(4)
+    turned[:3, :3] = R.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return turned
+
+
+_STANDS = 0.5  # m above the ground
+_SPACING, _CELL = 0.8, 1.0  # m: of the points compared, and of the cells that were seen
+_SEEN, _NEAR = 2.0, 0.6  # m from above to a cell that was seen, and to a point that is the same
+_FEWEST = 20  # points that tell an overlap
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Points above the ground, thinned (M, 3), with trees of more of them, and of the cells seen from above."""
+
+    points: FloatArray
+    tree: cKDTree
+    seen: cKDTree
+
+    @classmethod
+    def of(cls, points: FloatArray) -> Structure:
+        """The structure of points (N, 3), m, z up; N > 0."""
+        standing = points[heights_above_ground(points)[0] > _STANDS]
+        cells = np.unique(np.floor(points[:, :2] / _CELL), axis=0) * _CELL + _CELL / 2
+        standing = standing[voxel_downsample(standing, _SPACING / 2)]
+        return cls(standing[voxel_downsample(standing, _SPACING)], cKDTree(standing), cKDTree(cells))
+
+    def shared(self, other: Structure, self_T_other: FloatArray) -> float:
+        """Share of the points of each that lie on the other, where that one has seen: the smaller one; 0: too few."""
+        return min(share or 0.0 for share in self._shares(other, self_T_other))
+
+    def agreement(self, other: Structure, self_T_other: FloatArray) -> float | None:
+        """Mean of the two shares: for a scan, which sees too little of the other to have most of it; None: too few."""
+        told = [share for share in self._shares(other, self_T_other) if share is not None]
+        return float(np.mean(told)) if told else None
+
+    def _shares(self, other: Structure, T: FloatArray) -> tuple[float | None, float | None]:
+        return self._share(other.points, T), other._share(self.points, inverse_transform(T))
+
+    def _share(self, points: FloatArray, T: FloatArray) -> float | None:
+        """Share of the points that lie on this structure where it has seen; None: too few there."""
+        moved = transform_points(T, points)
+        distance, _ = self.seen.query(moved[:, :2], distance_upper_bound=_SEEN)
+        moved = moved[np.isfinite(distance)]
+        if len(moved) < _FEWEST:
+            return None
+        if not len(self.points):
+            return 0.0
+        distance, _ = self.tree.query(moved, distance_upper_bound=_NEAR)
+        return float(np.isfinite(distance).mean())
+
+
+NEIGHBOURS = 8
+SPACING = 0.2  # m, of the map's points
+THINNED = 0.5  # m, of the scan's
+NEAREST_WITHIN = 0.5  # m; points without a neighbour this near are new and left out
+FARTHEST = 50.0  # m from the sensor: beyond, rings are too far apart for planes
+
+
+def scan_to_map_residual(
+    clouds: Sequence[FloatArray], world_T_lidar: FloatArray, around: int = 10, every: int = 5
+) -> float:
+    """Mean residual, m, of every fifth scan in the map of the ten before it and the ten after it; NaN for one scan.
+
+    clouds         K scans without skew, points (N, 3) in the sensor's frame; asked for when they are needed
+    world_T_lidar  (K, 4, 4)
+    """
+    residuals, thin = [np.empty(0)], dict[int, FloatArray]()
+    for k in range(0, len(clouds), every):
+        near = range(max(0, k - around), min(len(clouds), k + around + 1))
+        thin = {j: thin[j] if j in thin else _thinned(clouds[j]) for j in near}
+        others = [j for j in near if j != k]
+        if others:
+            map_points = np.concatenate([transform_points(world_T_lidar[j], thin[j]) for j in others])
+            residuals.append(_residuals(thin[k], map_points, world_T_lidar[k]))
+    found = np.concatenate(residuals)
+    return float(found.mean()) if len(found) else float("nan")
+
+
+def _thinned(cloud: FloatArray) -> FloatArray:
+    return cloud[voxel_downsample(cloud, SPACING)]
+
+
+def _residuals(scan: FloatArray, map_points: FloatArray, world_T_lidar: FloatArray) -> FloatArray:
+    scan = scan[np.linalg.norm(scan, axis=1) <= FARTHEST]
+    points = transform_points(world_T_lidar, scan[voxel_downsample(scan, THINNED)])
+    map_points = map_points[voxel_downsample(map_points, SPACING)]
+    if len(map_points) < NEIGHBOURS:
+        return np.empty(0)
+    distance, row = cKDTree(map_points).query(points, k=NEIGHBOURS)
+    near = distance[:, 0] <= NEAREST_WITHIN
+    around = map_points[row[near]]
+    mean = around.mean(axis=1)
+    off = around - mean[:, None]
+    normal = np.linalg.eigh(off.swapaxes(1, 2) @ off)[1][:, :, 0]
+    return np.asarray(np.abs(np.einsum("ni,ni->n", points[near] - mean, normal)))

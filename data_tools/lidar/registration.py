@@ -1,4 +1,6 @@
-"""Scan registration: point-to-plane ICP against the surfels of the scans before.
+"""Scan registration: point-to-plane ICP against surfels, and the directions that they leave open.
+
+Scan registration: point-to-plane ICP against the surfels of the scans before.
 
     minimise over T   sum_i rho( n_i . (T p_i - m_i) ),        rho(r) = s^2/2 log(1 + r^2 / s^2)      (Cauchy)
 
@@ -13,11 +15,40 @@ observation c:
 
     P = H^-1 ( sum_c g_c g_c^T ) H^-1,      H = sum_i w J^T J,   g_c = sum_{i in c} w r J^T
 
-Where the surfaces leave motions open (`data_tools.lidar.degeneracy`), steps can be taken among the others alone, C the
+Where the surfaces leave motions open, steps can be taken among the others alone, C the
 columns that span them: x = C y, (C^T H C) y = - C^T g. The rest of the pose stays as it was given.
 
 Sources: Chen and Medioni, Object modelling by registration of multiple range images, 1992; Huber and Ronchetti, Robust
 Statistics, 2nd ed. 2009, section 6.3; Liang and Zeger, Biometrika 73 (1986).
+
+Surfels of the scans before: for each voxel, the Gaussian of the points that fell into it.
+
+    n, m = mean, S = sum (p - m)(p - m)^T;   two sets of points of one voxel together, d = m_b - m_a:
+
+    n = n_a + n_b,   m = m_a + n_b/n d,   S = S_a + S_b + n_a n_b / n d d^T            (Chan et al., 1979)
+
+The eigenvector of S with the smallest eigenvalue is the normal of a surfel whose points lie flat: smallest eigenvalue
+below a share of the second, and the second above that of a line. The voxels are sorted by key, and those too far from
+the vehicle are dropped. Sources: Chan, Golub, LeVeque, Updating
+formulae and a pairwise algorithm for computing sample variances, 1979; Biber and Strasser, The normal distributions
+transform, IROS 2003.
+
+Directions of motion that the surfaces in view leave open: along a tunnel, in an open field.
+
+Each surfel g with a pair counts once, with the mean weight w_g of its points, which is small where they lie off it. Its
+normal n at p sees a motion (rotation w, translation v) of the sensor by n . (v + w x p). With rotations as distances
+at the typical range r of the surfels,
+
+    A = sum_g w_g j_g j_g^T,    j_g = [ (p x n) / max(|p|, r),  n ]      (6, 6)
+
+An eigenvalue of A is the number of surfels that face a motion. Normals have errors, so that some see a motion that none
+faces: by the roughness s_g of the surfels, rad, about sum_g w_g s_g^2 of them. A motion that fewer see than that, and
+`LEAST_SURFELS` more, is unconstrained: a few false surfels, across edges, are everywhere. Sources: Zhang, Kaess, Singh,
+On degeneracy of optimization-based state estimation problems, ICRA 2016; Tuna et al., X-ICP, T-RO 2024.
+
+Registration by Open3D's tensor ICP, in place of our Gauss-Newton loop: the same surfels, pairs by its own search.
+
+The target is the mean and normal of each flat surfel; the estimate is point to plane under a Cauchy loss.
 """
 
 from __future__ import annotations
@@ -27,13 +58,205 @@ from typing import Literal
 
 import gtsam
 import numpy as np
+from scipy.spatial import cKDTree
 
-from data_tools.lidar.degeneracy import Observability, observability
-from data_tools.lidar.surfels import SurfelMap, Surfels
+from data_tools.lidar.scan import voxel_groups, voxel_keys
+from data_tools.lidar.scan_files import load_open3d
 from saga_fg.errors import SagaError
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.numerics.geometry import transform_points
 from saga_fg.settings import Settings, setting
+
+LEAST_POINTS = 6  # of a flat surfel
+FLAT = 1 / 9  # largest share of the smallest eigenvalue in the second: a third of the standard deviation
+WIDTH = 0.05  # least standard deviation along the surface, of a voxel's size: a line is not a surface
+MEMORY = 200.0  # points after which older points lose weight
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels(Columns):
+    """M Gaussians, sorted by voxel.
+
+    voxel    (M,) keys
+    count    (M,) points, older ones with less weight
+    mean     (M, 3) m
+    scatter  (M, 3, 3) sum of the squares about the mean, m^2
+    normal   (M, 3) unit normals, 0 where `flat` is False; flat (M,)
+    """
+
+    voxel: IntArray
+    count: FloatArray
+    mean: FloatArray
+    scatter: FloatArray
+    normal: FloatArray
+    flat: BoolArray
+
+    @classmethod
+    def empty(cls) -> Surfels:
+        none = np.empty(0)
+        voxel = np.empty(0, dtype=np.int64)
+        return cls(voxel, none, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0, dtype=np.bool_))
+
+
+def surfels_of(points: FloatArray, size: float) -> Surfels:
+    """The surfels of points (N, 3), m, in voxels of `size` m."""
+    moments = _moments(points, size)
+    return _with_normals(moments, np.ones(len(moments), dtype=np.bool_), size)
+
+
+class SurfelMap:
+    """Surfels around the vehicle, in the map's frame, and the search for the nearest flat one.
+
+    size   of a voxel, m
+    reach  largest distance of surfels from the last scan's position, m
+    """
+
+    def __init__(self, size: float, reach: float) -> None:
+        self.size, self.reach = size, reach
+        self.surfels = Surfels.empty()
+        self._flat = self.surfels
+        self._tree = cKDTree(np.empty((0, 3)))
+
+    def add(self, points: FloatArray, position: FloatArray) -> None:
+        """Add points (N, 3) observed from `position` (3,), both in the map's frame."""
+        old, new = self.surfels, _moments(points, self.size)
+        row = np.searchsorted(old.voxel, new.voxel)
+        known = np.zeros(len(new), dtype=np.bool_)
+        inside = row < len(old)
+        known[inside] = old.voxel[row[inside]] == new.voxel[inside]
+        merged = _merged(old.select(row[known]), new.select(known))
+        both = old.append(new.select(~known))
+        for name in ("count", "mean", "scatter"):
+            getattr(both, name)[row[known]] = getattr(merged, name)
+        changed = np.zeros(len(both), dtype=np.bool_)
+        changed[row[known]] = changed[len(old) :] = True
+        order = np.argsort(both.voxel, kind="stable")
+        order = order[np.linalg.norm(both.mean[order] - position, axis=1) <= self.reach]
+        self.surfels = _with_normals(both.select(order), changed[order], self.size)
+        self._flat = self.surfels.select(self.surfels.flat)
+        self._tree = cKDTree(self._flat.mean, balanced_tree=False, compact_nodes=False)
+
+    @property
+    def flat(self) -> Surfels:
+        """The flat surfels."""
+        return self._flat
+
+    def nearest(self, points: FloatArray, farthest: float) -> tuple[IntArray, Surfels]:
+        """Rows (K,) of the points that have a flat surfel with its mean within `farthest` m, and the surfel of each."""
+        distance, row = self._tree.query(points, distance_upper_bound=farthest)
+        found = np.flatnonzero(np.isfinite(distance))
+        return found, self._flat.select(row[found])
+
+
+def _moments(points: FloatArray, size: float) -> Surfels:
+    order, start = voxel_groups(points, size)
+    m = len(start)
+    if not m:
+        return Surfels.empty()
+    grouped = points[order]
+    voxel, count = voxel_keys(grouped[start], size), np.diff(start, append=len(points))
+    mean = np.add.reduceat(grouped, start) / count[:, None]
+    off = grouped - np.repeat(mean, count, axis=0)
+    scatter = np.empty((m, 3, 3))
+    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        scatter[:, i, j] = scatter[:, j, i] = np.add.reduceat(off[:, i] * off[:, j], start)
+    return Surfels(voxel, count.astype(np.float64), mean, scatter, np.zeros((m, 3)), np.zeros(m, dtype=np.bool_))
+
+
+def _merged(a: Surfels, b: Surfels) -> Surfels:
+    count = a.count + b.count
+    d = b.mean - a.mean
+    mean = a.mean + d * (b.count / count)[:, None]
+    scatter = a.scatter + b.scatter + (a.count * b.count / count)[:, None, None] * d[:, :, None] * d[:, None, :]
+    kept = np.minimum(1.0, MEMORY / count)
+    return Surfels(a.voxel, count * kept, mean, scatter * kept[:, None, None], a.normal, a.flat)
+
+
+def _with_normals(surfels: Surfels, changed: BoolArray, size: float) -> Surfels:
+    normal, flat = surfels.normal.copy(), surfels.flat.copy()
+    rows = np.flatnonzero(changed & (surfels.count >= LEAST_POINTS))
+    values, vectors = np.linalg.eigh(surfels.scatter[rows] / surfels.count[rows, None, None])
+    flat[rows] = (values[:, 0] < FLAT * values[:, 1]) & (values[:, 1] > (WIDTH * size) ** 2)
+    normal[rows] = np.where(flat[rows, None], vectors[:, :, 0], 0.0)
+    return Surfels(surfels.voxel, surfels.count, surfels.mean, surfels.scatter, normal, flat)
+
+
+LEAST_SURFELS = 3.0
+AXES = ("roll", "pitch", "heading", "along the road", "across the road", "vertically")
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """Motions of a scan that the map determines.
+
+    surfels      (6,) number of surfels that face each of six orthogonal motions, ascending
+    needed       number that a motion needs to be determined
+    motions      (6, 6) rows: those motions, (rotation, translation) in the sensor's frame, rotations times `range`
+    range        m, that a rotation is multiplied with to be a distance
+    """
+
+    surfels: FloatArray
+    needed: float
+    motions: FloatArray
+    range: float
+
+    @property
+    def lost(self) -> FloatArray:
+        """(k, 6) motions that are not determined."""
+        return self.motions[self.surfels < self.needed]
+
+    @property
+    def scale(self) -> FloatArray:
+        """(6,) what a tangent (rad, m) is multiplied with to be a motion."""
+        return np.array([self.range] * 3 + [1.0] * 3)
+
+    def names(self, ahead: FloatArray | None = None) -> tuple[str, ...]:
+        """The motions that are not determined, in words; ahead (3,): the way in the sensor's frame, by default x."""
+        if not len(self.lost):
+            return ()
+        axes = np.zeros((6, 6))
+        axes[:3, :3] = np.eye(3)
+        axes[3:, 3:] = _axes(np.array([1.0, 0.0, 0.0]) if ahead is None else ahead)
+        share = np.square(self.lost @ axes.T).sum(axis=0)  # of each axis in the subspace
+        clear = share > 0.5
+        return tuple(
+            name for name, named in zip(AXES, clear if clear.any() else share == share.max(), strict=True) if named
+        )
+
+
+def observability(points: FloatArray, paired: Surfels, normal: FloatArray, weight: FloatArray) -> Observability:
+    """Return what pairs determine: points (N, 3) and normals (N, 3) in the sensor's frame, weights (N,)."""
+    _, first, group = np.unique(paired.voxel, return_index=True, return_inverse=True)
+    w = np.bincount(group, weight) / np.bincount(group)
+    p, n = points[first], normal[first]
+    distance = np.linalg.norm(p, axis=1)
+    reach = max(float(np.median(distance)), 1e-3)
+    seen = np.hstack([np.cross(p, n) / np.maximum(distance, reach)[:, None], n])
+    number, motions = np.linalg.eigh(seen.T @ (w[:, None] * seen))
+    needed = LEAST_SURFELS + float(w @ _squared_roughness(paired.select(first)))
+    return Observability(number, needed, motions.T, reach)
+
+
+def _squared_roughness(surfels: Surfels) -> FloatArray:
+    """(M,) rad^2: smallest over second eigenvalue of the scatter, from its trace and its second invariant."""
+    S, n = surfels.scatter, surfels.normal
+    trace = np.trace(S, axis1=1, axis2=2)
+    least = np.einsum("ni,nij,nj->n", n, S, n)
+    second = (trace**2 - np.einsum("nij,nij->n", S, S)) / 2  # sum of the products of two eigenvalues
+    rest, product = trace - least, second - least * (trace - least)
+    middle = (rest - np.sqrt(np.maximum(rest**2 - 4 * product, 0.0))) / 2
+    return np.asarray(np.clip(least / np.maximum(middle, 1e-12), 0.0, 1.0))
+
+
+def _axes(ahead: FloatArray) -> FloatArray:
+    """Rows ahead, left and up of a way (3,) over ground."""
+    up = np.array([0.0, 0.0, 1.0])
+    left = np.cross(up, ahead)
+    if np.linalg.norm(left) < 1e-6:
+        return np.eye(3)
+    left /= np.linalg.norm(left)
+    return np.stack([np.cross(left, up), left, up])
+
 
 _TRANSLATION_TOLERANCE = 1e-3  # largest translation of the last step, m
 _ROTATION_TOLERANCE = 1e-4  # largest rotation of the last step, rad
@@ -159,7 +382,6 @@ def _by_open3d(
     farthest: float,
     scale: float,
 ) -> Registration:
-    from data_tools.lidar.open3d_registration import icp  # which imports Open3D
 
     T, iterations, converged = icp(points, surfels, map_T_scan, farthest, scale, MAX_ITERATIONS)
     T = _rigid(T)
@@ -219,3 +441,32 @@ def _rigid(T: FloatArray) -> FloatArray:
     rigid = T.copy()
     rigid[:3, :3] = U @ Vt
     return rigid
+
+
+_PRECISE = 1e-6  # relative change of fitness and residual at which it ends
+
+
+def icp(
+    points: FloatArray, surfels: SurfelMap, map_T_scan: FloatArray, farthest: float, scale: float, iterations: int
+) -> tuple[FloatArray, int, bool]:
+    """Return the pose (4, 4) of points (N, 3), the number of iterations, and whether they converged.
+
+    map_T_scan: (4, 4) to begin with; farthest: m; scale: of the loss, m. Raises `MissingExtraError` without Open3D.
+    """
+    open3d = load_open3d()
+    registration, tensor = open3d.t.pipelines.registration, open3d.core.Tensor
+    flat = surfels.flat
+    target = open3d.t.geometry.PointCloud(tensor(np.ascontiguousarray(flat.mean)))
+    target.point.normals = tensor(np.ascontiguousarray(flat.normal))
+    source = open3d.t.geometry.PointCloud(tensor(np.ascontiguousarray(points)))
+    kernel = registration.robust_kernel
+    loss = kernel.RobustKernel(kernel.RobustKernelMethod.CauchyLoss, scale, 1.0)
+    found = registration.icp(
+        source,
+        target,
+        farthest,
+        tensor(np.ascontiguousarray(map_T_scan)),
+        registration.TransformationEstimationPointToPlane(loss),
+        registration.ICPConvergenceCriteria(_PRECISE, _PRECISE, iterations),
+    )
+    return found.transformation.numpy().astype(np.float64), int(found.num_iterations), bool(found.converged)

@@ -1,13 +1,42 @@
-"""One sweep of a LiDAR, and sequences of sweeps."""
+"""Sweeps of a LiDAR: de-skewed, thinned to voxels, without points on moving objects.
+
+Motion de-skew: points of a sweep transformed to one time.
+
+While the head turns, the vehicle drives on. With constant velocity xi = (w, v) within the sweep, rad/s and m/s in the
+sensor's frame, a point p measured t after the scan's timestamp lies, in the sensor's frame at the timestamp, at
+
+    exp(t xi) p = R(t) p + u(t),      k = w / |w|,  a = |w| t
+    R(t) p = p + sin(a) k x p + (1 - cos(a)) k x (k x p)
+    u(t)   = t v + (1 - cos(a)) / |w| k x v + (t - sin(a) / |w|) k x (k x v)
+
+Source: the exponential of SE(3), e.g. Barfoot, State Estimation for Robotics, 2nd ed. 2024, section 8.1.
+
+For a sensor that turns steadily and gives no times, `azimuth_times` derives them from the azimuths of the points.
+
+Points on grids: voxel downsampling, and clusters of points connected from above.
+
+The voxel of a point p is floor(p / size), three integers packed into one of 3 x 21 bits. With voxels of 0.1 m the grid
+extends 100 km in every direction.
+
+Clusters are the connected components of the occupied cells of a square grid, each cell with its eight neighbours. Two
+dimensions are enough, because objects on the ground are separate from above.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import Literal, Protocol, Self, get_args
 
+import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.boxes import Boxes
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,3 +96,165 @@ class ScanSequence(Protocol):
     def ego_T_lidar(self) -> FloatArray: ...
     def __len__(self) -> int: ...
     def __getitem__(self, row: int) -> Scan: ...
+
+
+Turning = Literal["clockwise", "counter-clockwise"]
+
+
+def azimuth_times(points: FloatArray, period: float, turning: Turning = "clockwise") -> FloatArray:
+    """Times (N,), s, from -period / 2 to period / 2, of points (N, 3) of a head that turns once a `period` (s).
+
+    At the timestamp the head looks ahead (along x); the scan begins and ends behind. `turning` is as seen from above.
+    KITTI's Velodyne turns clockwise.
+    """
+    if turning not in get_args(Turning):
+        raise InputError(f"turning: expected one of {', '.join(get_args(Turning))}, got {turning!r}")
+    sign = -1.0 if turning == "clockwise" else 1.0
+    return np.asarray(sign * np.arctan2(points[:, 1], points[:, 0]) * (period / (2 * np.pi)))
+
+
+def deskewed(scan: Scan, velocity: FloatArray) -> Scan:
+    """The scan with all points at its timestamp; `velocity` (6,): turn rate, rad/s, and velocity, m/s, sensor's frame.
+
+    Raises `InputError` for a scan without times.
+    """
+    if scan.time is None:
+        raise InputError("time: expected the time of each point, the scan has none; see azimuth_times")
+    velocity = checked("velocity", velocity, (6,))
+    w, v = velocity[:3], velocity[3:]
+    rate = float(np.linalg.norm(w))
+    t = scan.time[:, None]
+    if rate < 1e-9:
+        return Scan(scan.points + t * v, scan.intensity, np.zeros(len(scan)))
+    k, a = w / rate, rate * t
+    K = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
+    sine, rest = np.sin(a), 1 - np.cos(a)
+    points = scan.points + sine * (scan.points @ K.T) + rest * (scan.points @ (K @ K).T)
+    points += t * v + rest / rate * (K @ v) + (t - sine / rate) * (K @ K @ v)
+    return Scan(points, scan.intensity, np.zeros(len(scan)))
+
+
+def constant_velocity(before_T_now: FloatArray, duration: float) -> FloatArray:
+    """Velocity (6,), rad/s and m/s, of a rigid motion (4, 4) within `duration` s."""
+    return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(before_T_now)) / duration)
+
+
+MARGIN = 0.3  # m, by which boxes are enlarged on all sides: errors of detectors, and motion during a scan
+LIKELY = 0.5  # probability from which an object counts as moving
+
+
+def on_moving_objects(
+    points: ArrayLike, boxes: Boxes, moving: ArrayLike, margin: float = MARGIN, likely: float = LIKELY
+) -> BoolArray:
+    """Mask (N,) of the points (N, 3) inside boxes of probably moving objects, all in one frame.
+
+    moving: (n,) probability that each object moves; margin: m; likely: probability from which it counts. Boxes without
+    a size or heading are left out. Raises `InputError` for arrays that don't fit the boxes and a negative margin.
+    """
+    places = checked("points", points, (None, 3))
+    probability = checked("moving", moving, (len(boxes),))
+    if not margin >= 0:
+        raise InputError(f"margin: expected metres >= 0, got {margin!r}")
+    known = np.isfinite(boxes.size).all(axis=1) & np.isfinite(boxes.yaw)
+    result = np.zeros(len(places), dtype=bool)
+    for row in np.flatnonzero(known & (probability >= likely)).tolist():
+        half = boxes.size[row] / 2 + margin
+        near = np.flatnonzero(_within(places - boxes.position[row], np.full(3, np.linalg.norm(half))))
+        local = (places[near] - boxes.position[row]) @ yaw_transform(yaw=float(boxes.yaw[row]))[:3, :3]
+        result[near[_within(local, half)]] = True
+    return result
+
+
+def without_objects(scan: Scan, boxes: Boxes) -> Scan:
+    """The scan without points inside boxes, all in one frame."""
+    return scan.select(~on_moving_objects(scan.points, boxes, np.ones(len(boxes)))) if len(boxes) else scan
+
+
+def _within(offset: FloatArray, half: FloatArray) -> BoolArray:
+    return np.asarray((np.abs(offset) <= half).all(axis=1))
+
+
+_BITS = 21
+_HALF = 1 << (_BITS - 1)
+_NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))  # half of the eight: the links are undirected
+
+
+def voxel_keys(points: FloatArray, size: float) -> IntArray:
+    """The voxels (N,) of points (N, 3), m; `size` in m. Raises `InputError` for points off the grid."""
+    cell = _cells(points, size) + _HALF
+    return np.asarray((cell[0] << 2 * _BITS) | (cell[1] << _BITS) | cell[2])
+
+
+def voxel_groups(points: FloatArray, size: float) -> tuple[IntArray, IntArray]:
+    """Rows (N,) of points (N, 3) voxel by voxel, ascending in each, and where (M,) each of the M voxels begins."""
+    if not len(points):
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    cell = _cells(points, size)
+    low = cell.min(axis=1)
+    bits = [int(span).bit_length() for span in cell.max(axis=1) - low]
+    row_bits = len(points).bit_length()
+    key = ((cell[0] - low[0]) << bits[1] | (cell[1] - low[1])) << bits[2] | (cell[2] - low[2])
+    if sum(bits) + row_bits < 63:  # voxel and row as one number: sorting numbers is far quicker than sorting rows
+        packed = np.sort(key << row_bits | np.arange(len(points)))
+        order, key = packed & ((1 << row_bits) - 1), packed >> row_bits
+    else:
+        key = voxel_keys(points, size)
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+    return order, np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+
+
+def voxel_downsample(points: FloatArray, size: float) -> IntArray:
+    """Rows (M,) of `points` (N, 3), ascending: the first point in each voxel of `size` m.
+
+    Means of several points would not lie on the surface near corners.
+    """
+    order, start = voxel_groups(points, size)
+    return np.sort(order[start])
+
+
+def _cells(points: FloatArray, size: float) -> IntArray:
+    """Voxels (3, N) of points (N, 3)."""
+    if not size > 0:
+        raise InputError(f"size: expected a voxel size > 0 m, got {size!r}")
+    index = np.floor(np.ascontiguousarray(points.T) / size)
+    if index.size and max(-index.min(), index.max()) >= _HALF:
+        raise InputError(f"points: expected coordinates within {_HALF * size:g} m for voxels of {size:g} m")
+    return index.astype(np.int64)
+
+
+def clusters_from_above(points: FloatArray, cell: float) -> list[IntArray]:
+    """Rows of points (N, 3), m, of each cluster on a grid of `cell` m."""
+    if not len(points):
+        return []
+    index = np.floor(points[:, :2] / cell).astype(np.int64)
+    index -= index.min(axis=0) - 1
+    width = int(index[:, 1].max()) + 2
+    keys, row = np.unique(index[:, 0] * width + index[:, 1], return_inverse=True)
+    first, second = [], []
+    for dx, dy in _NEIGHBOURS:
+        beside = np.searchsorted(keys, keys + dx * width + dy)
+        beside = np.minimum(beside, len(keys) - 1)
+        linked = np.flatnonzero(keys[beside] == keys + dx * width + dy)
+        first.append(linked)
+        second.append(beside[linked])
+    i, j = np.concatenate(first), np.concatenate(second)
+    _, part = connected_components(csr_array((np.ones(len(i)), (i, j)), shape=(len(keys), len(keys))), directed=False)
+    order = np.argsort(part[row], kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(part[row][order])) + 1)
+
+
+def cell_order_statistics(values: FloatArray, cell: IntArray, cells: int, divisor: int) -> FloatArray:
+    """Value (cells,) of rank count // divisor in each cell, NaN in empty ones; values (N,) and their cells (N,)."""
+    count = np.bincount(cell, minlength=cells)
+    start = np.cumsum(count) - count
+    filled = count > 0
+    result = np.full(cells, np.nan)
+    if len(values):
+        by_value = np.empty(len(values), dtype=np.int64)
+        ranked = np.argsort(values)
+        by_value[ranked] = np.arange(len(values))
+        bits = len(values).bit_length()
+        ordered = np.sort(cell.astype(np.int64) << bits | by_value) & ((1 << bits) - 1)  # ranks, cell by cell
+        result[filled] = values[ranked[ordered[(start + count // divisor)[filled]]]]
+    return result

@@ -6,15 +6,7 @@ from .bootstrap import (
     relative_change,
     root_mean_square,
 )
-from .consistency import coverage, coverages, nees, nees_band
-from .error_sample import ErrorSample
-from .error_summary import (
-    EllipseCoverage,
-    ErrorSummary,
-    calibration,
-    error_summary,
-    errors_by_class,
-)
+from .error_sample import ErrorSample, coverage, coverages, nees, nees_band
 from .hota import HotaMetrics, hota_metrics
 from .kitti_tracking import (
     KittiSimilarity,
@@ -23,19 +15,30 @@ from .kitti_tracking import (
     kitti_hota_metrics,
     kitti_tracking_metrics,
 )
-from .label_errors import LabelErrors, label_errors, label_velocities
+from .label_errors import (
+    EllipseCoverage,
+    ErrorSummary,
+    LabelErrors,
+    TrackSummary,
+    WholeTracks,
+    calibration,
+    error_summary,
+    errors_by_class,
+    label_errors,
+    label_velocities,
+    track_summaries,
+    whole_tracks,
+)
 from .matching import FrameMatch, match_scene
+from .nuscenes_sweep import NuScenesClassMetrics, RecallCurves
 from .nuscenes_tracking import (
-    NuScenesClassMetrics,
     NuScenesTrackingMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
-    RecallCurves,
     nuscenes_tracking_metrics,
 )
 from .scene import SceneMetrics, SceneMetricSettings, scene_metrics, scene_metrics_by_label
 from .scene_boxes import SceneBoxes
-from .track_quality import TrackSummary, WholeTracks, track_summaries, whole_tracks
 
 __all__ = [
     "EllipseCoverage",

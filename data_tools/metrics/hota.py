@@ -24,8 +24,7 @@ import numpy as np
 from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.overlap import bev_iou, iou_3d
+from saga_fg.types.boxes import Boxes, bev_iou, iou_3d
 
 Similarity = Literal["centre", "bev_iou", "iou_3d"]
 

@@ -1,4 +1,6 @@
-"""One-to-one correspondences between true objects and tracks over a scene, as the CLEAR MOT metrics define them.
+"""One-to-one correspondences: CLEAR MOT over a scene, at many thresholds, agreement of groupings.
+
+One-to-one correspondences between true objects and tracks over a scene, as the CLEAR MOT metrics define them.
 
 In every frame, in this order:
 
@@ -11,6 +13,20 @@ Distances are between centres in the horizontal plane; with `same_label` only eq
 
 Source: Bernardin and Stiefelhagen, Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics, EURASIP
 Journal on Image and Video Processing, 2008, section 2.1.
+
+Optimal one-to-one assignment at many score thresholds at once.
+
+At each threshold ("level") some of the candidate pairs are present. Within each group of candidates (a frame and class)
+the assignment has as many pairs as possible, and among those assignments the least sum of costs. Most pairs have no
+competing pair and are chosen at once; the Hungarian method solves the rest, equal problems of several levels once.
+
+Agreement of an estimated and a true grouping of observations: pairwise precision, recall and F1.
+
+    precision = pairs joined in both / pairs joined in the estimate,     recall = pairs joined in both / ... in truth
+    F1 = 2 precision recall / (precision + recall)
+
+over all pairs of observations. Names of groups have no influence. Source: Manning, Raghavan and Schuetze,
+Introduction to Information Retrieval, 2008, section 16.3.
 """
 
 from __future__ import annotations
@@ -20,12 +36,78 @@ from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
 
-from data_tools.metrics.assignment import Candidates, best_pairs
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, checked_rows
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """P candidate pairs: `row` and `column` (P,), `cost` (P,) >= 0, `group` (P,).
+
+    Pairs of different groups share neither row nor column.
+    """
+
+    row: IntArray
+    column: IntArray
+    cost: FloatArray
+    group: IntArray
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+def optimal_pairs(candidates: Candidates, present: BoolArray) -> BoolArray:
+    """(P, T): the candidates chosen at each of T levels, out of those `present` (P, T) there."""
+    chosen = np.zeros_like(present)
+    if not present.any():
+        return chosen
+    levels = present.shape[1]
+    pair, level = np.nonzero(present)
+    alone = _unique(candidates.row[pair], level, levels) & _unique(candidates.column[pair], level, levels)
+    chosen[pair[alone], level[alone]] = True
+    pair, level = pair[~alone], level[~alone]
+    if len(pair) == 0:
+        return chosen
+    key = candidates.group[pair] * levels + level
+    order = np.argsort(key, kind="stable")
+    solved: dict[bytes, IntArray] = {}
+    for members in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+        contested = pair[members]
+        name = contested.tobytes()
+        if name not in solved:
+            solved[name] = contested[
+                _hungarian(candidates.row[contested], candidates.column[contested], candidates.cost[contested])
+            ]
+        chosen[solved[name], level[members[0]]] = True
+    return chosen
+
+
+def best_pairs(candidates: Candidates) -> BoolArray:
+    """(P,): the candidates that the assignment of all of them chooses."""
+    return optimal_pairs(candidates, np.ones((len(candidates), 1), dtype=np.bool_))[:, 0]
+
+
+def _unique(row: IntArray, level: IntArray, levels: int) -> BoolArray:
+    """(Q,) True for entries whose row occurs once at their level."""
+    key = (row - row.min()) * levels + level
+    return np.asarray(np.bincount(key)[key] == 1)
+
+
+def _hungarian(row: IntArray, column: IntArray, cost: FloatArray) -> BoolArray:
+    """Mask of the pairs (row, column) that the assignment chooses."""
+    rows, r = np.unique(row, return_inverse=True)
+    columns, c = np.unique(column, return_inverse=True)
+    outside = 2.0 * min(len(rows), len(columns)) * (cost.max() + 1.0) + 1.0  # more than all pairs together
+    matrix = np.full((len(rows), len(columns)), outside)
+    matrix[r, c] = cost
+    selected = np.zeros(matrix.shape, dtype=np.bool_)
+    selected[linear_sum_assignment(matrix)] = True
+    return np.asarray(selected[r, c])
 
 
 class FoundBoxes(Protocol):
@@ -113,3 +195,34 @@ def _assign(distance: FloatArray, previous: BoolArray) -> tuple[IntArray, IntArr
     rows, columns = np.append(kept_rows, rows[chosen]), np.append(kept_columns, columns[chosen])
     order = np.argsort(rows)
     return rows[order], columns[order]
+
+
+@dataclass(frozen=True)
+class PairwiseAgreement:
+    """precision, recall, f1; precision and recall are 1 without pairs in their denominator."""
+
+    precision: float
+    recall: float
+    f1: float
+
+
+def pairwise_agreement(estimated: ArrayLike, true: ArrayLike) -> PairwiseAgreement:
+    """The agreement of two groupings (n,), given as the group of each observation.
+
+    Raises `InputError` for groupings of different lengths.
+    """
+    groups = checked_rows("estimated", estimated)
+    truth = checked_rows("true", true, len(groups))
+    both = np.unique(np.stack([groups, truth], axis=1), axis=0, return_counts=True)[1]
+    common, claimed, actual = _pairs(both), _pairs(_counts(groups)), _pairs(_counts(truth))
+    precision = common / claimed if claimed else 1.0
+    recall = common / actual if actual else 1.0
+    return PairwiseAgreement(precision, recall, 2 * precision * recall / max(precision + recall, 1e-300))
+
+
+def _counts(groups: IntArray) -> IntArray:
+    return np.unique(groups, return_counts=True)[1].astype(np.int64)
+
+
+def _pairs(counts: IntArray) -> float:
+    return float((counts * (counts - 1) // 2).sum())

@@ -25,8 +25,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from data_tools.metrics.consistency import nees
-from data_tools.metrics.error_sample import ErrorSample
+from data_tools.metrics.error_sample import ErrorSample, nees
 from data_tools.metrics.matching import FoundBoxes, FrameMatch, match_scene
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import wrap_angle

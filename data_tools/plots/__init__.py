@@ -1,10 +1,16 @@
 """Pictures of tracks, paths, graphs and metrics; matplotlib is imported when one is drawn."""
 
-from data_tools.plots.birds_eye import Panel, birds_eye_view, png
-from data_tools.plots.maps import occupancy_picture, paths_from_above, scan_map_from_above
+from data_tools.plots.birds_eye import (
+    Panel,
+    birds_eye_view,
+    occupancy_picture,
+    paths_from_above,
+    plot,
+    png,
+    scan_map_from_above,
+)
 from data_tools.plots.metrics import calibration_plot, error_histograms, recall_sweep
 from data_tools.plots.running_graph import running_graph_picture
-from data_tools.plots.tracks import plot
 
 __all__ = [
     "Panel",

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.metrics.error_summary import BANDS, calibration, errors_by_class
-from data_tools.metrics.label_errors import LabelErrors
-from data_tools.metrics.nuscenes_tracking import RecallCurves
+from data_tools.metrics.label_errors import BANDS, LabelErrors, calibration, errors_by_class
+from data_tools.metrics.nuscenes_sweep import RecallCurves
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.chi_square import chi_square_quantile
+from saga_fg.numerics.gating import chi_square_quantile
 
 _ERRORS = {
     "position": ("position, m", 1.5, 1.0),
@@ -51,7 +50,7 @@ def calibration_plot(errors: LabelErrors) -> Any:
 
     A line for each class; classes with too few boxes to judge are dotted. On the diagonal the covariances are right,
     above it too large, below it too small; the grey bands are those that classes are judged by
-    (`data_tools.metrics.error_summary`).
+    (`data_tools.metrics.label_errors`).
     """
     from matplotlib.figure import Figure
 

@@ -23,7 +23,7 @@ WAYS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1))
 def running_graph_picture(
     record: Mapping[str, Any], title: str = "", centre: Sequence[float] | None = None, radius: float = 30.0
 ) -> Any:
-    """Return a matplotlib `Figure` of a graph as `saga_fg.tracking.graph_record` lists it.
+    """Return a matplotlib `Figure` of a graph as `saga_fg.tracking.journal` lists it.
 
     Variables of the newest time are filled and named; earlier ones are hollow, and set back where they would be hidden.
     `centre` (x, y) and `radius`, m, choose a part. Raises `KeyError`, `IndexError`, `TypeError` or `ValueError` for

@@ -1,17 +1,152 @@
-"""The interface of a world, simulated or recorded, to sensors, detectors and annotators."""
+"""What sensors, detectors and annotators see of a world, and the lights in it.
+
+Traffic lights: positions and colours, their map, and their detections by a camera.
+
+Stop lines that close together share one signal, whose light hangs beyond the first line. A red phase begins with amber.
+A light is visible to vehicles that approach it; its colour may be misclassified.
+
+Ground-truth annotations of a simulated scene.
+
+An object within the annotation range is annotated while a sensor sees enough of it and for `memory` s afterwards. It
+counts as visible only in views of some duration; a shorter view does not reveal its motion.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from data_tools.simulator.lights import Signal
-from data_tools.simulator.occlusion import visible_share
-from data_tools.simulator.trajectories import SimulatedTrajectories
+from data_tools.simulator.road import Lanes
+from data_tools.simulator.road_users import SimulatedTrajectories
+from data_tools.simulator.scene_layout import ClosingLine
+from data_tools.simulator.sensors import in_view, position_errors, sensor_position, visible_share
+from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.geometry import wrap_angle, yaw_of
+from saga_fg.types import road_map
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.road_map import RoadMap
+from saga_fg.types.dataset import Annotations
+from saga_fg.types.frame import Detections
+from saga_fg.types.road_map import COLOURS, RoadMap
+
+BEYOND = 12.0  # m from a stop line to its light
+HEIGHT = 5.0  # m of a light over the ground
+HOUSING = (0.3, 0.4, 1.0)  # m
+MAPPED = (-200.0, 150.0)  # m along the road from the focus: extent of the map
+SPACING = 8.0  # m between the points of a mapped lane
+AMBER_DURATION = 3.0  # duration of amber, the first part of the red phase, s
+MAP_NOISE = 0.2  # standard deviation of positions in the map, m
+VISIBLE_RANGE = 80.0  # largest distance at which the colour of a light is visible, m
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """One light: position (2,), m, heading of approaching vehicles, rad, and red phases (K, 2), s, amber included."""
+
+    name: str
+    position: FloatArray
+    heading: float
+    red: FloatArray
+    amber_duration: float
+
+    def colour(self, time: float) -> str:
+        """The colour shown at `time`."""
+        now = np.flatnonzero((self.red[:, 0] <= time) & (time < self.red[:, 1]))
+        if len(now) == 0:
+            return "green"
+        return "amber" if time < self.red[now[0], 0] + self.amber_duration else "red"
+
+
+def signals_of(lanes: Lanes, lines: tuple[ClosingLine, ...]) -> tuple[Signal, ...]:
+    """The lights of the stop lines."""
+    signals: list[Signal] = []
+    done: set[int] = set()
+    for line in lines:
+        if len(line.lanes) == 0 or id(line.red) in done:
+            continue
+        done.add(id(line.red))
+        lane = line.lanes[:1]
+        middle = np.array([lanes.offset[line.lanes].mean()])
+        position, heading = lanes.pose(lane, np.array([line.s + BEYOND]), middle, np.zeros(1))
+        signals.append(Signal(f"light-{len(signals)}", position[0], float(heading[0]), line.red, AMBER_DURATION))
+    return tuple(signals)
+
+
+def sample_map(
+    lanes: Lanes,
+    focus: float,
+    lines: tuple[ClosingLine, ...],
+    signals: tuple[Signal, ...],
+    rng: np.random.Generator,
+) -> road_map.RoadMap:
+    """Map of the lights, stop lines and lanes around `focus` (m along the road), with random errors."""
+
+    def point(position: FloatArray) -> road_map.Point:
+        return float(position[0]), float(position[1])
+
+    def error() -> FloatArray:
+        return np.asarray(MAP_NOISE * rng.standard_normal(2))
+
+    lights = tuple(road_map.TrafficLight(signal.name, point(signal.position + error())) for signal in signals)
+    half = abs(lanes.offset[1] - lanes.offset[0]) / 2
+    mapped = []
+    for number, line in enumerate(lines):
+        if len(line.lanes) == 0:
+            continue
+        name = next(signal.name for signal in signals if signal.red is line.red)
+        sign = lanes.direction[line.lanes[0]]
+        borders = lanes.offset[line.lanes].max() + half, lanes.offset[line.lanes].min() - half
+        ends, _ = lanes.pose(np.repeat(line.lanes[:1], 2), np.full(2, line.s), np.array(borders[::sign]), np.zeros(2))
+        left, right = ends + error()
+        mapped.append(road_map.StopLine(f"line-{number}", point(left), point(right), name))
+    without_cones = replace(lanes, taper=0.0)  # the map does not contain cones
+    found = []
+    for lane in range(len(lanes.offset)):
+        along = np.arange(focus + MAPPED[0], focus + MAPPED[1], SPACING)
+        s = along if lanes.direction[lane] > 0 else lanes.road.length - along[::-1]
+        same = np.full(len(s), lane)
+        d, slope = without_cones.lateral(same, s)
+        centre, _ = lanes.pose(same, s, d, slope)
+        moved = centre + error()
+        found.append(road_map.Lane(f"lane-{lane}", tuple(map(point, moved)), 2 * float(half)))
+    return road_map.RoadMap(lights, tuple(mapped), tuple(found), max(MAP_NOISE, 1e-3))
+
+
+def detect_lights(
+    sensor: SensorSettings,
+    world_T_ego: FloatArray,
+    signals: tuple[Signal, ...],
+    time: float,
+    rng: np.random.Generator,
+) -> Detections:
+    """Detections of the lights, in world coordinates, by a sensor that classifies colours."""
+    if sensor.colour_accuracy is None or len(signals) == 0:
+        return Detections.empty()
+    true_position = np.array([signal.position for signal in signals])
+    offset = true_position - sensor_position(sensor, world_T_ego)[:2]
+    distance, bearing = np.hypot(*offset.T), np.arctan2(offset[:, 1], offset[:, 0])
+    faces = np.cos(bearing - np.array([signal.heading for signal in signals])) > 0.5
+    within = (distance <= VISIBLE_RANGE) & (
+        np.abs(wrap_angle(bearing - yaw_of(world_T_ego))) <= sensor.field_of_view / 2
+    )
+    seen = np.flatnonzero(faces & within & (rng.random(len(signals)) < sensor.detection_probability))
+    if len(seen) == 0:
+        return Detections.empty()
+    labels = []
+    for row in seen.tolist():
+        true = signals[row].colour(time)
+        wrong = [colour for colour in COLOURS if colour != true]
+        right = rng.random() < sensor.colour_accuracy
+        labels.append(f"traffic_light_{true if right else wrong[int(rng.integers(2))]}")
+    n = len(seen)
+    error, _ = position_errors(sensor, offset[seen], distance[seen], rng)
+    position = np.column_stack([true_position[seen] + error, np.full(n, HEIGHT)])
+    logit = sensor.true_logit + sensor.logit_noise * rng.standard_normal(n)
+    size, nothing = np.tile(np.array(HOUSING), (n, 1)), np.full((n, 2), np.nan)
+    boxes = Boxes(np.array(labels), position, size, np.full(n, np.nan), nothing)
+    return Detections(boxes, 1 / (1 + np.exp(-logit)))
 
 
 class SensedWorld(Protocol):
@@ -48,3 +183,42 @@ def objects_seen_from(
     near = present & (np.linalg.norm(boxes.position[:, :2] - point[:2], axis=1) <= reach)
     around = Boxes.concatenate([boxes.select(near), occluders])
     return boxes, near, visible_share(point, around, np.arange(int(near.sum())))
+
+
+VISIBLE_SHARE = 0.25  # least share of an object that a sensor must see for it to count as visible
+
+
+def annotate(
+    world: SensedWorld, time: FloatArray, world_T_ego: FloatArray, settings: SimulatorSettings
+) -> tuple[Annotations, ...]:
+    """Ground truth at the keyframes `time` (K,), s, with the poses of the vehicle (K, 4, 4)."""
+    boxes_at, present = zip(*(world.objects.at(t) for t in time), strict=True)
+    near, visible = np.zeros((2, len(time), len(world.objects)), dtype=np.bool_)
+    for k, (t, pose, boxes) in enumerate(zip(time, world_T_ego, boxes_at, strict=True)):
+        distance = np.linalg.norm(boxes.position[:, :2] - pose[:2, 3], axis=1)
+        near[k] = present[k] & (distance <= settings.annotation_range)
+        for sensor in settings.sensors.values():
+            _, reached, share = world.visible_from(sensor_position(sensor, pose), t, sensor.max_range)
+            seen = np.zeros(len(boxes), dtype=np.bool_)
+            seen[reached] = share >= VISIBLE_SHARE
+            visible[k] |= seen & in_view(sensor, pose, boxes.position)
+    visible &= near
+    annotated = near & recently_visible(time, visible, settings.memory)
+    visible = without_short_runs(visible, round(settings.shortest_view * settings.keyframe_rate))
+    return tuple(
+        Annotations(world.objects.id[rows], boxes.select(rows), visible[k, rows])
+        for k, (boxes, rows) in enumerate(zip(boxes_at, annotated, strict=True))
+    )
+
+
+def without_short_runs(visible: BoolArray, shortest: int) -> BoolArray:
+    """`visible` (K, N) without runs along the first axis shorter than `shortest` keyframes."""
+    from scipy import ndimage  # a tenth of a second, which every help of the command would pay
+
+    return np.asarray(ndimage.binary_opening(visible, np.ones((max(shortest, 1), 1))))
+
+
+def recently_visible(time: FloatArray, visible: BoolArray, memory: float) -> BoolArray:
+    """Mask (K, N) of the objects that are visible or were so at most `memory` s ago; time (K,), s."""
+    seen = np.where(visible, time[:, None], -np.inf)
+    return np.asarray(time[:, None] - np.maximum.accumulate(seen, axis=0) <= memory + 1e-9)

@@ -1,4 +1,6 @@
-"""Output of the command: results on stdout; progress, warnings and one-line errors on stderr.
+"""Output of the command: results on stdout, progress and errors on stderr, tables and files of them.
+
+Output of the command: results on stdout; progress, warnings and one-line errors on stderr.
 
 Exit codes: 0 done, 2 wrong arguments or input (`SagaError`), 130 interrupted, 143 terminated (`main`); anything else is
 a bug and a traceback.
@@ -9,19 +11,26 @@ from __future__ import annotations
 import functools
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 from typer.core import TyperGroup
 
-from saga_fg.errors import SagaError
+from saga_fg.errors import InputError, SagaError
 
 if TYPE_CHECKING:
+    from data_tools.figures import FigureTable
+    from pipelines.config import TrackConfig
     from pipelines.tracking import Progress as ProgressCallback
+    from pipelines.tracking import TrackedScene
+    from saga_fg.tracking import SensorTime
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +45,7 @@ def error_console() -> Console:
 
 def _factor_error() -> type[Exception]:
     """Exception of `factors`, `SagaError` while that package is not imported."""
-    raised: type[Exception] = getattr(sys.modules.get("factors.errors"), "FactorError", SagaError)
+    raised: type[Exception] = getattr(sys.modules.get("factors.validation"), "FactorError", SagaError)
     return raised
 
 
@@ -111,3 +120,127 @@ def progress_bar(scenes: int | None = None, unit: str = "frames") -> Iterator[Pr
             bar.update(task, description=f"{scene} ({len(seen)}{of})", completed=done, total=total)
 
         yield advance
+
+
+def writable(path: Path | None) -> Path | None:
+    """Refuse a file that cannot be written before the work begins."""
+    if path is not None:
+        from data_tools.files.atomic_files import check_writable
+
+        check_writable(path)
+    return path
+
+
+def writable_picture(path: Path | None) -> Path | None:
+    """Refuse a file that cannot be written, or whose name does not say that it is a PNG file."""
+    if path is not None and path.suffix.lower() != ".png":
+        raise InputError(f"{path}: expected a name that ends in .png")
+    return writable(path)
+
+
+JsonFile = Annotated[
+    Path | None,
+    typer.Option("--json", help="Write the figures to this file too.", metavar="FILE", callback=writable),
+]
+MarkdownFile = Annotated[
+    Path | None,
+    typer.Option("--markdown", help="Write the tables to this file too.", metavar="FILE", callback=writable),
+]
+PictureFile = Annotated[
+    Path | None,
+    typer.Option("--plot", help="Draw the figures to this PNG file too.", metavar="FILE", callback=writable_picture),
+]
+
+
+def report(tables: Iterable[FigureTable], figures: Any, json_file: Path | None, markdown: Path | None = None) -> None:
+    """Print the tables, and write the figures and the tables to the files that were asked for."""
+    from data_tools.figures import write_figures
+    from data_tools.files.atomic_files import write_text
+
+    tables = list(tables)
+    show_tables(tables)
+    if json_file is not None:
+        write_figures(json_file, figures)
+    if markdown is not None:
+        write_text(markdown, "\n".join(table.markdown() for table in tables))
+
+
+def show_summary(table: FigureTable, legend: str) -> None:
+    """Print one table without lines, which is narrow, and what its columns mean."""
+    shown = Table(title=table.title, title_justify="left", box=None, padding=(0, 1), collapse_padding=True)
+    for n, column in enumerate(table.columns):
+        shown.add_column(column, justify="right" if n else "left", no_wrap=True)
+    for row in table.rows:
+        shown.add_row(*row)
+    Console(width=max(Console().width, 80)).print(shown)
+    typer.echo(legend)
+
+
+def show_tables(tables: Iterable[FigureTable]) -> None:
+    """Print the tables on stdout, each as wide as it needs to be: broken lines are no table any more."""
+    for table in tables:
+        shown = Table(title=table.title, title_justify="left")
+        for n, column in enumerate(table.columns):
+            shown.add_column(column, justify="right" if n else "left")
+        for row in table.rows:
+            shown.add_row(*row)
+        widths = (max(map(len, texts)) for texts in zip(table.columns, *table.rows, strict=True))
+        needed = max(len(table.title), sum(width + 3 for width in widths) + 1)
+        Console(width=max(Console().width, needed)).print(shown)
+
+
+@dataclass
+class Summary:
+    """Counts the scenes that pass through it."""
+
+    output: Path
+    scenes: int = 0
+    frames: int = 0
+    boxes: int = 0
+    seconds: float = 0.0
+    best_score: dict[tuple[str, int], float] = field(default_factory=dict)  # of each track, by scene and id
+    milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    classes: set[str] = field(default_factory=set)
+    clocks: dict[str, Mapping[str, SensorTime]] = field(default_factory=dict)  # of the sensors, by scene
+
+    def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
+        """Pass runs on and count them."""
+        for run in runs:
+            self.scenes += 1
+            self.frames += run.frames
+            self.seconds += run.seconds
+            self.milliseconds[run.scene.name] = run.milliseconds
+            if run.clocks:
+                self.clocks[run.scene.name] = run.clocks
+            self.boxes += sum(len(tracks) for tracks in run.tracks)
+            for tracks in run.tracks:
+                self.classes.update(tracks.boxes.label.tolist())
+                for id_, score in zip(tracks.id.tolist(), tracks.score.tolist(), strict=True):
+                    track = (run.scene.name, id_)
+                    self.best_score[track] = max(score, self.best_score.get(track, score))
+            yield run
+
+    def write_record(self, method: str, settings: TrackConfig, recordings: Mapping[str, Any]) -> None:
+        """Write the record of the run beside its result, for reports; recordings: `DatasetSource.kept`."""
+        from pipelines.configuration import write_settings
+        from pipelines.report.page import RunRecord, write_run_record
+
+        rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
+        configuration = write_settings(settings, comments=False)
+        write_run_record(
+            self.output, RunRecord(method, configuration, rounded, recordings=recordings, clocks=self.clocks)
+        )
+
+    def show(self) -> None:
+        """Print the line on stdout."""
+        rate = f", {self.frames / self.seconds:.0f} frames/s" if self.seconds > 0 else ""
+        sure = sum(score > 0.5 for score in self.best_score.values())
+        tracks = f"{counted(len(self.best_score), 'track')} ({sure} with a score above 0.5)"
+        counts = (counted(self.scenes, "scene"), counted(self.frames, "frame"), tracks, counted(self.boxes, "box"))
+        typer.echo(f"{self.output}: {', '.join(counts)}{rate}")
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 box`, `2 boxes`."""
+    plural = "" if number == 1 else "es" if noun.endswith("x") else "s"
+    return f"{number} {noun}{plural}"

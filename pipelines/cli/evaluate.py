@@ -1,4 +1,4 @@
-"""`saga-fg evaluate`: how good are tracks and labels?"""
+"""`saga-fg evaluate` and `saga-fg benchmark`: how good are tracks and labels?"""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipelines.cli import options
-from pipelines.cli import tracking_options as how
-from pipelines.cli.console import progress_bar, working
-from pipelines.cli.datasets import Source, dataset_commands
-from pipelines.cli.tables import JsonFile, MarkdownFile, report, show_summary
+from pipelines.cli import options as how
+from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
+from pipelines.cli.options import Source, dataset_commands
+from pipelines.cli.track import RayAddress, Workers, exit_on_failures, run_at_scale
 from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def _evaluate(
     The scenes scored are those of the result, or those that are named.
     Where detections are given and the metrics are official, errors are those at the labels that detections match.
     """
-    from data_tools.evaluation.summary import LEGEND
+    from data_tools.evaluation import LEGEND
     from data_tools.files.atomic_files import atomic_directory, write_text
     from data_tools.plots import png
     from pipelines.explaining import journal_innovations, journal_of
@@ -93,8 +93,7 @@ def _tracked(
 ) -> tuple[Mapping[str, SceneResult], Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
     from pipelines.doubts import Doubted, Doubts
-    from pipelines.observers import InnovationRecorder
-    from pipelines.tracking import track_dataset
+    from pipelines.tracking import InnovationRecorder, track_dataset
 
     doubts = Doubts(settings.of_method(method), option_for=source.option_for)
     recorder = InnovationRecorder()
@@ -126,7 +125,7 @@ def _evaluate_labels(
     import numpy as np
 
     from data_tools.datasets.label_table import read_label_table
-    from pipelines.label_evaluation import evaluate_labels
+    from pipelines.evaluation import evaluate_labels
     from pipelines.smoothing import load_smooth_config
 
     table = _table(result)
@@ -138,12 +137,12 @@ def _evaluate_labels(
     report(evaluation.tables(), evaluation.figures(), json_file)
 
 
-def _texts(source: Source) -> dict[str, str | None]:
+def _evaluate_texts(source: Source) -> dict[str, str | None]:
     """Options of datasets whose figures have a summary."""
     return {} if source.summarised else {"full": None}
 
 
-_commands = dataset_commands(
+_evaluate_commands = dataset_commands(
     "evaluate",
     _evaluate,
     (
@@ -151,10 +150,10 @@ _commands = dataset_commands(
         "evaluate {result} --hota --json figures.json --plots plots",
         "evaluate {recordings} --method kf",
     ),
-    _texts,
+    _evaluate_texts,
     listed=lambda source: source.has_truth or bool(source.truth_option),
 )
-evaluate_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
+evaluate_app = typer.Typer(cls=_evaluate_commands, no_args_is_help=True, rich_markup_mode=None)
 _label_commands = dataset_commands("evaluate labels", _evaluate_labels, ("evaluate labels {result}",))
 labels_app = typer.Typer(cls=_label_commands, no_args_is_help=True, rich_markup_mode=None)
 evaluate_app.add_typer(labels_app, name="labels")
@@ -180,3 +179,67 @@ def _table(result: Path) -> Path:
     if not found:
         raise InputError(f"{result}: expected labels.csv or labels.ndjson in this folder")
     return found[0]
+
+
+def _benchmark(
+    source: DatasetSource,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder of the run; the same one again continues the run.")
+    ],
+    method: how.MethodOption = "saga",
+    estimator: how.EstimatorOption = None,
+    lag: how.LagOption = None,
+    association: how.AssociationOption = None,
+    hota: Annotated[bool, typer.Option("--hota", help="HOTA too (needs the extra [eval]).")] = False,
+    without_truth: Annotated[
+        bool, typer.Option("--without-truth", help="The submission alone, as for a test split without ground truth.")
+    ] = False,
+    workers: Workers = 0,
+    ray: RayAddress = None,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Track all scenes in parallel, score them, and write figures and a page; for nuScenes and KITTI a submission.
+
+    The figures are the official ones of nuScenes and KITTI, and CLEAR of other datasets. The folder gets tracks/ with a
+    result for each scene, all of them in one, figures.json, report.html, and for nuScenes and KITTI submission.zip for
+    the official server. A scene that is done is not done again, unless its input, the settings or
+    saga-fg have changed.
+    """
+    from pipelines.evaluation import judge_run
+    from pipelines.scale_out import TrackTask
+
+    if not source.all_tracks:
+        raise InputError(f"benchmark {source.name}: expected a dataset with official results: saga-fg benchmark --help")
+    settings = how.configured(source.family, config, method, estimator, lag, association)
+    options.apart(output, *source.input_files())
+    task = TrackTask(settings, method, source)
+    run = run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)
+    exit_on_failures(run)
+    with working("writing the submission"):
+        submission = source.write_submission(output)
+    if not without_truth:
+        with working("scoring"):
+            evaluation = judge_run(source, output, method, task.configuration, hota)
+        show_tables(list(evaluation.tables())[:1])
+        typer.echo(f"{output / 'figures.json'}: all figures; {output / 'report.html'}: a page of them")
+    if submission is not None:
+        typer.echo(f"{submission}: for the official server")
+
+
+_benchmark_commands = dataset_commands(
+    "benchmark",
+    _benchmark,
+    (
+        "benchmark {recordings} --output run   # stopped? the same again",
+        "benchmark {recordings} --output baseline --method kf --workers 4",
+        "benchmark {recordings} --output test --without-truth",
+    ),
+    listed=lambda source: bool(source.all_tracks),
+)
+benchmark_app = typer.Typer(cls=_benchmark_commands, no_args_is_help=True, rich_markup_mode=None)
+
+
+@benchmark_app.callback()
+def benchmark() -> None:
+    """Get the figures of a whole dataset, with tracks, a page and, where there is one, the official submission."""

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipelines.cli import options
-from pipelines.cli.console import ReportingGroup, progress_bar
-from pipelines.cli.datasets import Source, dataset_commands
-from pipelines.cli.summary import counted
-from pipelines.cli.tables import JsonFile, MarkdownFile, report
+from pipelines.cli.console import JsonFile, MarkdownFile, ReportingGroup, counted, progress_bar, report
+from pipelines.cli.options import Source, dataset_commands
 
 if TYPE_CHECKING:
     from data_tools.datasets.source import DatasetSource
@@ -47,8 +45,7 @@ def _interactions(
     from pipelines.config import load_config, load_interactions
     from pipelines.configuration import write_settings
     from pipelines.learning import scenes_to_learn_from
-    from pipelines.learning.interaction_tables import learned_figures, learned_tables
-    from pipelines.learning.interactions import LearningSettings, learn_interactions
+    from pipelines.learning.interactions import LearningSettings, learn_interactions, learned_figures, learned_tables
 
     check_writable(output)
     options.apart(output, *source.input_files(), *(() if start is None else (start,)))
@@ -123,7 +120,7 @@ class LearnGroup(ReportingGroup):
     """The kinds of settings that can be learned; names the command where a dataset is given in their place."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        from data_tools.datasets.registry import dataset_names
+        from data_tools.datasets.source import dataset_names
 
         if args and args[0] in dataset_names():
             ctx.fail(f"No such command '{args[0]}'; try 'learn noise {args[0]}' or 'learn interactions {args[0]}'.")

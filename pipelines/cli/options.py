@@ -1,15 +1,30 @@
-"""Options that several commands share, and the parsing of their values."""
+"""Options that commands share, how to track among them, and the commands of a verb for each dataset."""
 
 from __future__ import annotations
 
+import inspect
 import os
+from collections.abc import Callable, Mapping
+from copy import copy
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import typer
+from typer.core import TyperGroup
 
 from pipelines.cli.console import set_up_logging
 from saga_fg.errors import InputError
+from saga_fg.tracking import AssociationName
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from data_tools.datasets.source import DatasetSource, Verb
+    from pipelines.config import Method, TrackConfig
+    from saga_fg.numerics.arrays import FloatArray
+    from saga_fg.tracking import SensorTime
 
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say more on stderr.", callback=set_up_logging, show_default=False)
@@ -50,3 +65,344 @@ def counts(option: str, value: str, least: int = 1) -> tuple[int, ...]:
     if not entries or not all(entry.isdecimal() and len(entry) < 10 and int(entry) >= least for entry in entries):
         raise InputError(f"{option}: expected whole numbers >= {least} with commas between them, got {value[:40]!r}")
     return tuple(map(int, entries))
+
+
+_METHOD = typer.Option(
+    "--method",
+    help="saga: graph-aware Kalman filter; kf: without edges, trails and lanes; centerpoint: greedy nearest centre.",
+)
+MethodOption = Annotated[Literal["saga", "kf", "centerpoint"], _METHOD]
+MethodOrNone = Annotated[Literal["saga", "kf", "centerpoint"] | None, _METHOD]
+
+EstimatorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        help="kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph of "
+        "the last --lag seconds, which puts late frames where they belong; MODULE:NAME, which is imported, or the name "
+        "of an installed entry point: your own. The bounds of kalman (tracker.tolerance, "
+        "tracker.max_component) move tracks by millimetres, a centimetre at most in our recordings.  "
+        "[default: as configured]",
+        metavar="NAME",
+    ),
+]
+LagOption = Annotated[
+    float | None,
+    typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
+]
+AssociationOption = Annotated[
+    AssociationName | None,
+    typer.Option(
+        "--association",
+        help="How detections are matched to tracks. hungarian: least total cost; greedy: the cheapest pair first; "
+        "graph: relative positions count as well.  [default: as configured]",
+    ),
+]
+InteractionsOption = Annotated[
+    Path | None,
+    typer.Option("--interactions", help="Edge rules from `saga-fg learn interactions`.", metavar="FILE"),
+]
+ExplainOption = Annotated[
+    bool,
+    typer.Option("--explain", help="Keep a journal beside the output, for `saga-fg explain`: OUTPUT.journal.jsonl."),
+]
+LearnOffsetsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--learn-offsets",
+        help="YAML file to write: the offsets of the sensors' clocks, from objects that several of them see, for "
+        "`--config`.",
+        metavar="FILE",
+    ),
+]
+PredictOption = Annotated[
+    str | None,
+    typer.Option(
+        "--predict",
+        help="Predict the tracks of every moment to these s after it, and keep that beside the output: "
+        "OUTPUT.predictions.csv, for `saga-fg report`.",
+        metavar="S,S,...",
+    ),
+]
+
+
+def configured(
+    family: str | Path,
+    config: Path | None,
+    method: Method,
+    estimator: str | None,
+    lag: float | None,
+    association: AssociationName | None = None,
+    interactions: Path | None = None,
+) -> TrackConfig:
+    """The settings of a run: the family's, the file's, then the options'."""
+    from pipelines.config import load_config
+
+    settings = with_interactions(load_config(family, config), method, interactions)
+    _estimator_fits(method, estimator, lag, settings.tracker.estimator)
+    association_fits(method, association)
+    return settings.with_estimator(estimator, lag).with_association(association)
+
+
+def association_fits(method: str, association: str | None) -> None:
+    """Raise `InputError` where --association would have no effect."""
+    if method == "centerpoint" and association is not None:
+        raise InputError("--association: the method centerpoint has its own")
+
+
+def with_interactions(config: TrackConfig, method: str, interactions: Path | None) -> TrackConfig:
+    """The configuration with learned edge rules, if a file of them is given; it has an effect on saga alone."""
+    from pipelines.config import load_interactions
+
+    if interactions is None:
+        return config
+    if method != "saga":
+        raise InputError(f"--interactions {interactions}: goes with --method saga, {method} has no interactions")
+    return config.with_interactions(load_interactions(interactions))
+
+
+def horizons(predict: str | None, method: Method) -> FloatArray | None:
+    """The horizons (H,) of --predict, s; None if it is left out. Raises `InputError` for anything else."""
+    from saga_fg.types.track import checked_horizons
+
+    if predict is None:
+        return None
+    if method == "centerpoint":
+        raise InputError("--predict: expected --method saga or kf, centerpoint predicts nothing")
+    try:
+        return checked_horizons([float(text) for text in predict.split(",")])
+    except InputError as error:
+        raise InputError(f"--predict: {error}") from error
+    except ValueError as error:
+        raise InputError(f"--predict: expected seconds with commas between them, got {predict[:40]!r}") from error
+
+
+def _estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:
+    """Raise `InputError` where --estimator or --lag would have no effect."""
+    from saga_fg.tracking.by_name import estimator_parameters
+
+    if method == "centerpoint" and (estimator is not None or lag is not None):
+        raise InputError("--estimator, --lag: the method centerpoint has no estimator")
+    if lag is not None and "lag" not in estimator_parameters(estimator or configured):
+        raise InputError(f"--lag {lag:g}: goes with --estimator fixed-lag")
+
+
+def journal(explain: bool, output: Path, at_scale: bool) -> Path | None:
+    """Path of the journal, None if none is wanted. Raises `InputError` where none can be kept."""
+    from pipelines.explaining import journal_of
+
+    if explain and at_scale:
+        raise InputError("--explain: goes without --workers and --ray")
+    return journal_of(output) if explain else None
+
+
+def check_learn_offsets(path: Path | None, method: str, at_scale: bool = False) -> None:
+    """Raise `InputError` where --learn-offsets would have no effect, or its file is not writable."""
+    from data_tools.files.atomic_files import check_writable
+
+    if path is None:
+        return
+    if method == "centerpoint":
+        raise InputError("--learn-offsets: expected --method saga or kf")
+    if at_scale:
+        raise InputError("--learn-offsets: goes without --workers and --ray")
+    check_writable(path)
+
+
+def write_offsets(path: Path, scenes: Iterable[Mapping[str, SensorTime]], settings: TrackConfig, origin: str) -> None:
+    """Write the file of --learn-offsets, and say what is in it."""
+    from data_tools.files.atomic_files import write_text
+    from pipelines.learning import offset_fragment
+
+    text, offsets = offset_fragment(scenes, settings.sensors, origin)
+    write_text(path, text)
+    found = ", ".join(f"{name} {offset:+.4f} s" for name, offset in offsets.items())
+    typer.echo(f"{path}: {found or 'no two sensors have moving objects in common'}", err=True)
+
+
+Source = type["DatasetSource"]
+_WIDTH = 92  # columns of an example
+
+
+def dataset_commands(
+    verb: Verb,
+    run: Callable[..., None],
+    examples: tuple[str, ...],
+    texts: Callable[[Source], Mapping[str, str | None]] = lambda source: {},
+    listed: Callable[[Source], bool] | None = None,
+) -> type[TyperGroup]:
+    """A group with a command `saga-fg VERB DATASET` for each dataset, beside those that are added to it.
+
+    run       called with the dataset and the values of its other parameters, which are the verb's options; its
+              docstring is the help
+    examples  what follows `saga-fg`, with the fields {recordings}: name and options of the dataset, {result}: the same
+              with a result, {name} alone, {tracks}: name of a result alone
+    texts     of the verb's options that differ for a dataset, by parameter; None leaves the option out
+    listed    which datasets the help lists; all if left out
+    """
+
+    class DatasetGroup(TyperGroup):
+        def list_commands(self, ctx: Any) -> list[str]:
+            from data_tools.datasets.source import dataset_names
+
+            names = [name for name in dataset_names() if listed is None or _is_listed(name, listed)]
+            return [*names, *super().list_commands(ctx)]
+
+        def get_command(self, ctx: Any, cmd_name: str) -> Any:
+            from data_tools.datasets.source import dataset_names, dataset_source
+
+            own = super().get_command(ctx, cmd_name)
+            if own is not None:
+                return own
+            if cmd_name not in dataset_names() and Path(cmd_name).exists():
+                raise InputError(_without_dataset(verb, cmd_name))
+            try:
+                return _command(verb, run, dataset_source(cmd_name), examples, texts)
+            except InputError as error:
+                if cmd_name not in dataset_names():
+                    raise
+                return _broken(cmd_name, error)  # so that the list of all datasets can be shown
+
+    return DatasetGroup
+
+
+def _without_dataset(verb: str, place: str) -> str:
+    """Error message for a file or folder given in place of a dataset's name."""
+    path = Path(place)
+    bag = path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file()
+    if path.is_dir() and not bag:
+        return f"{place}: expected the name of a dataset before a folder: saga-fg {verb} --help lists them"
+    return f"{place}: expected a dataset before the file: saga-fg {verb} {'mcap' if bag else 'file'} {quote(place)} ..."
+
+
+def _is_listed(name: str, listed: Callable[[Source], bool]) -> bool:
+    from data_tools.datasets.source import dataset_source
+
+    try:
+        return listed(dataset_source(name))
+    except InputError:
+        return True  # its command says what is wrong with it
+
+
+def _command(
+    verb: Verb,
+    run: Callable[..., None],
+    source: Source,
+    examples: tuple[str, ...],
+    texts: Callable[[Source], Mapping[str, str | None]],
+) -> Any:
+    """The command of a verb for one dataset."""
+    _, *of_verb = inspect.signature(run).parameters.values()
+    hints = get_type_hints(run, localns={"DatasetSource": object}, include_extras=True)
+    of_verb = [each.replace(annotation=hints[each.name]) for each in of_verb]
+    reads_result = any(each.name == "result" for each in of_verb)
+    different = {"config": _config_text(source), **texts(source)}
+    parameters = [
+        _described(each, different[each.name]) if each.name in different else each
+        for each in of_verb
+        if different.get(each.name, "") is not None
+    ]
+    of_dataset = _parameters(source, verb, reads_result)
+    taken = {each.name for each in parameters} & {each.name for each in of_dataset}
+    if taken:
+        raise InputError(f"dataset {source.name}: {min(taken)}: expected another name, {verb} has such an option")
+    settings = _settings(source)
+
+    def command(**values: Any) -> None:
+        from pipelines.configuration import load_settings
+        from pipelines.report.page import as_recorded
+
+        chosen = {each.name: values.pop(each.name) for each in of_dataset}
+        for name, kind in settings.items():
+            if chosen.get(name) is not None:
+                chosen[name] = load_settings(kind, chosen[name])
+        chosen_source = source(**chosen)
+        if values.get("result") is not None:
+            chosen_source = as_recorded(chosen_source, values["result"])
+        run(chosen_source, **values)
+
+    ordered = sorted([*of_dataset, *parameters], key=lambda each: each.name != "result")
+    keyword = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in ordered]
+    command.__signature__ = inspect.Signature(keyword)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in keyword}
+    app = typer.Typer(rich_markup_mode=None, add_completion=False)
+    text = f"{inspect.getdoc(run)}\n\n{inspect.getdoc(source)}\n\n{_examples(verb, source, examples)}"
+    app.command(source.name, help=text, short_help=(inspect.getdoc(source) or "").partition("\n\n")[0])(command)
+    return typer.main.get_command(app)
+
+
+def _config_text(source: Source) -> str:
+    fitting = f", those of {source.family}" if source.family != source.name else ""
+    return f"YAML file over the settings for {source.name}{fitting}; see `saga-fg config --for {source.name}`."
+
+
+def _broken(name: str, error: InputError) -> Any:
+    """A command in place of one that cannot be made, which says why."""
+    app = typer.Typer(rich_markup_mode=None, add_completion=False)
+
+    def command(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+        raise error
+
+    context = {"ignore_unknown_options": True}
+    app.command(name, help=f"Cannot be loaded: {error}", context_settings=context)(command)
+    return typer.main.get_command(app)
+
+
+def _parameters(source: Source, verb: Verb, reads_result: bool) -> list[inspect.Parameter]:
+    """The options of a dataset that a verb has."""
+    hints, settings, parameters = get_type_hints(source), _settings(source), []
+    for each in fields(source):
+        about = each.metadata
+        if "text" not in about or (about["verbs"] and verb not in about["verbs"]):
+            continue
+        common = {"help": about["text"], "metavar": about["metavar"], "min": about["least"]}
+        flag = about["flag"] or f"--{each.name.replace('_', '-')}"
+        is_argument = about["argument"] and not reads_result
+        info = typer.Argument(**common) if is_argument else typer.Option(flag, **common)
+        required = each.default is MISSING or verb in about["required"]
+        parameters.append(
+            inspect.Parameter(
+                each.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=inspect.Parameter.empty if required else each.default,
+                annotation=Annotated[Path | None if each.name in settings else hints[each.name], info],
+            )
+        )
+    return parameters
+
+
+def _settings(source: Source) -> dict[str, type[Any]]:
+    """The options of a dataset that are read from YAML files: their dataclasses by name."""
+    hints = get_type_hints(source)
+    kinds = {each.name: (hints[each.name], *get_args(hints[each.name])) for each in fields(source)}
+    found = {name: [kind for kind in of if isinstance(kind, type) and is_dataclass(kind)] for name, of in kinds.items()}
+    return {name: of[0] for name, of in found.items() if of}
+
+
+def _described(parameter: inspect.Parameter, text: str | None) -> inspect.Parameter:
+    """Option with another help."""
+    kind, info = get_args(parameter.annotation)
+    other = copy(info)
+    other.help = text
+    return parameter.replace(annotation=Annotated[kind, other])
+
+
+def _examples(verb: Verb, source: Source, examples: tuple[str, ...]) -> str:
+    """Worked examples, in lines that are not too long."""
+    required = [each.name for each in _parameters(source, verb, False) if each.default is inspect.Parameter.empty]
+    options = source.example or " ".join(f"--{name.replace('_', '-')} {name.upper()}" for name in required)
+    arguments = [f"--{each.name} " for each in fields(source) if each.metadata.get("argument")]
+    recordings = f"{source.name} {options}"
+    result = "labels" if verb == "evaluate labels" else source.tracks_example
+    beside = f"{source.name} {result} {''.join(arguments)}{options}"
+    if verb == "evaluate" and source.truth_option:
+        recordings = f"{source.name} {''.join(arguments)}{options} {source.truth_option} truth.csv"
+        beside = f"{source.name} {result} {source.truth_option} truth.csv"
+    lines = []
+    for example in examples:
+        line = "  saga-fg " + example.format(recordings=recordings, result=beside, name=source.name, tracks=result)
+        while len(line) > _WIDTH and (cut := line.rfind(" --", 20, _WIDTH - 2)) > 0:
+            lines.append(f"{line[:cut]} \\")
+            line = f"     {line[cut:]}"
+        lines.append(line)
+    return "\n".join(["\b", "Example:" if len(examples) == 1 else "Examples:", *lines])

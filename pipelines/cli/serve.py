@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.cli import tracking_options as how
+from pipelines.cli import options as how
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.termination import TERMINATED
 from saga_fg.errors import InputError
@@ -86,9 +86,9 @@ def serve(
     from pipelines.config import load_config
     from pipelines.configuration import load_settings
     from pipelines.doubts import Doubts
-    from pipelines.process import one_thread, return_large_blocks
     from pipelines.serving import StopRequest, StreamSettings, StreamTracker
-    from pipelines.serving.log_limit import LogLimitFilter
+    from pipelines.serving.settings import LogLimitFilter
+    from pipelines.tracking import one_thread, return_large_blocks
 
     if not verbose:
         for handler in logging.getLogger().handlers:
@@ -192,7 +192,7 @@ def status(
 
 
 def _summary(answer: dict[str, Any]) -> str:
-    from pipelines.sensor_clocks import clock_text
+    from pipelines.explaining import clock_text
 
     counts = ", ".join(
         f"{answer[name]} {text}"

@@ -7,17 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pipelines.cli.console import progress_bar, working
+from pipelines.cli.console import counted, progress_bar, working
 from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
-from pipelines.cli.summary import counted
 
 if TYPE_CHECKING:
     from data_tools.lidar.scan import ScanSequence
     from data_tools.sensor_logs import SensorLog
-    from pipelines.slam.lidar_slam_types import LidarSlamResult
+    from pipelines.slam.joint import SlamWithObjects
+    from pipelines.slam.lidar_slam import LidarSlamResult
     from pipelines.slam.localisation import LocaliserSettings
-    from pipelines.slam.slam_map import Origin, SlamMap
-    from pipelines.slam.with_objects import SlamWithObjects
+    from pipelines.slam.submaps import Origin, SlamMap
     from saga_fg.numerics.arrays import FloatArray
     from saga_fg.slam.sensors import SensorSettings
 
@@ -100,15 +99,13 @@ def kitti(
     from dataclasses import replace
 
     from data_tools.datasets.kitti import KittiScans, KittiTracking
-    from data_tools.datasets.kitti.oxts import read_origin
+    from data_tools.datasets.kitti.dataset import read_origin
     from data_tools.files.atomic_files import check_writable_folder
-    from pipelines.slam.configuration import load_slam_config
-    from pipelines.slam.joint import path_tracker
+    from pipelines.slam.configuration import load_slam_config, sensor_log
+    from pipelines.slam.joint import path_tracker, with_objects
     from pipelines.slam.lidar_results import write_lidar_slam
     from pipelines.slam.lidar_slam import lidar_slam
-    from pipelines.slam.sensor_options import sensor_log
-    from pipelines.slam.slam_map import read_map
-    from pipelines.slam.with_objects import with_objects
+    from pipelines.slam.submaps import read_map
     from saga_fg.errors import InputError
 
     if detections is not None and not objects:

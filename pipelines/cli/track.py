@@ -1,21 +1,103 @@
-"""`saga-fg track`: detections in, tracks out."""
+"""`saga-fg track` and `saga-fg smooth`: detections in, tracks or labels out, in parallel if wanted."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from pipelines.cli import options
-from pipelines.cli import tracking_options as how
-from pipelines.cli.console import progress_bar
-from pipelines.cli.datasets import Source, dataset_commands
-from pipelines.cli.scaling import RayAddress, Workers, at_scale, exit_on_failures, run_at_scale
-from pipelines.cli.summary import Summary, counted
+from pipelines.cli import options as how
+from pipelines.cli.console import Summary, counted, progress_bar
+from pipelines.cli.options import Source, dataset_commands
+from saga_fg.errors import InputError
 
 if TYPE_CHECKING:
     from data_tools.datasets.source import DatasetSource
+    from pipelines.scale_out import Pool, RunSummary, SceneTask
+    from pipelines.smoothing import SmoothedScene, StreamedScene
+    from saga_fg.types.dataset import Dataset
+
+FAILED_SCENES = 1  # exit code
+
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        min=0,
+        help="Process scenes in parallel, in this many processes (0: one per core); a second run continues where the "
+        "first stopped.",
+        metavar="N",
+    ),
+]
+RayAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        help='Process scenes on a Ray cluster: "auto", HOST:PORT, ray://HOST:PORT, or "local" for one of --workers '
+        "CPUs on this machine.",
+        metavar="ADDRESS",
+    ),
+]
+
+
+def at_scale(workers: int | None, ray: str | None) -> bool:
+    """True if scenes are to be done in parallel."""
+    return workers is not None or ray is not None
+
+
+def run_at_scale(
+    source: DatasetSource,
+    task: SceneTask,
+    output: Path,
+    workers: int | None,
+    ray: str | None,
+    merged: str,
+    merge: Callable[[Path, Sequence[str], Dataset | None], None],
+) -> RunSummary:
+    """Do the task with all parts of a dataset; print and return what became of them.
+
+    merge  makes the file `merged` of what they left, if all have done it; "" for none
+    """
+    from pipelines.scale_out import LocalPool, RayPool, file_name, run_scenes
+
+    if output.suffix:
+        raise InputError(f"--output {output}: expected the name of a folder, since scenes are done in parallel")
+
+    def new_pool(scratch: Path) -> Pool:
+        return LocalPool(workers or 0, scratch) if ray is None else RayPool(ray, workers or 0)
+
+    def finish(report: RunSummary) -> None:
+        if merged and not report.failed:
+            merge(output, [file_name(name) for name in there.names], there.dataset)
+
+    with source.parts() as there, progress_bar(unit="scenes") as bar:
+        if merged:
+            (output / merged).unlink(missing_ok=True)
+        report = run_scenes(
+            there.parts,
+            len(there.names),
+            task,
+            output,
+            new_pool,
+            lambda _, done, of: bar("scenes", done, of),
+            finish,
+        )
+    counts = "".join(f", {number} {noun}" for noun, number in report.counts.items())
+    states = f"{len(report.done)} done, {len(report.unchanged)} unchanged, {len(report.failed)} failed"
+    typer.echo(f"{output}: {counted(report.scenes, 'scene')}: {states}{counts}")
+    return report
+
+
+def exit_on_failures(report: RunSummary) -> None:
+    """Name the scenes that failed, with their reasons, and end the command with an exit code if there are any."""
+    for name, reason in report.failed.items():
+        typer.echo(f"failed: {name}: {reason}", err=True)
+    if report.failed:
+        raise typer.Exit(FAILED_SCENES)
 
 
 def _track(
@@ -72,7 +154,7 @@ def _track(
         )
 
 
-_EXAMPLES = (
+_TRACK_EXAMPLES = (
     "track {recordings} --output {tracks}",
     "track {recordings} --output {tracks} --method kf --config mine.yaml",
     "track {recordings} --output {tracks} --estimator fixed-lag --lag 3",
@@ -87,10 +169,95 @@ def _texts(source: Source) -> dict[str, str]:
     return {"output": source.tracks + " With --workers or --ray: a folder." * is_file}
 
 
-_commands = dataset_commands("track", _track, _EXAMPLES, _texts)
-track_app = typer.Typer(cls=_commands, no_args_is_help=True, rich_markup_mode=None)
+_track_commands = dataset_commands("track", _track, _TRACK_EXAMPLES, _texts)
+track_app = typer.Typer(cls=_track_commands, no_args_is_help=True, rich_markup_mode=None)
 
 
 @track_app.callback()
 def track() -> None:
     """Track recorded detections of a dataset."""
+
+
+def _smooth(
+    source: DatasetSource,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    method: how.MethodOption = "saga",
+    association: how.AssociationOption = None,
+    interactions: how.InteractionsOption = None,
+    table: Annotated[
+        Literal["csv", "ndjson", "parquet"],
+        typer.Option("--table", help="Format of the table of boxes; parquet needs the extra [parquet]."),
+    ] = "csv",
+    workers: Workers = None,
+    ray: RayAddress = None,
+    config: options.Config = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Label recordings: a table of boxes, a summary, and the labels in the dataset's own format if it has one.
+
+    Tables of detections are smoothed as they are read: memory does not grow with their length.
+    """
+    from pipelines.doubts import Doubted, Doubts
+    from pipelines.scale_out import SmoothTask
+    from pipelines.smoothing import (
+        load_smooth_config,
+        smooth_dataset,
+        smooth_stream,
+        write_labels,
+        write_streamed_labels,
+    )
+
+    how.association_fits(method, association)
+    settings = load_smooth_config(source.family, config)
+    tracking = how.with_interactions(settings.tracking, method, interactions)
+    settings = replace(settings, tracking=tracking.with_association(association))
+    usual = load_smooth_config(source.family).tracking
+    doubts = Doubts(settings.tracking.of_method(method), usual, source.option_for)
+    if at_scale(workers, ray):
+        doubts.see_first(source)
+        task = SmoothTask(settings, method, source, f".{table}")
+        report = run_at_scale(source, task, output, workers, ray, source.merged[1], source.merge_labels)
+        exit_on_failures(report)
+        return
+    stream = source.stream()
+    if stream is not None:
+        with stream as parts, progress_bar() as progress:
+            streamed = write_streamed_labels(
+                output,
+                lambda folder: smooth_stream(doubts.over(parts), settings, folder, method, progress=progress),
+                f".{table}",
+            )
+        _show(output, streamed)
+        return
+    with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
+        runs = smooth_dataset(Doubted(dataset, doubts), settings, method, progress=progress)
+        done = write_labels(
+            output, runs, f".{table}", lambda folder, labels: source.write_labels(folder, dataset, labels)
+        )
+    _show(output, done)
+
+
+_SMOOTH_EXAMPLES = (
+    "smooth {recordings} --output labels",
+    "smooth {recordings} --output labels --workers 0   # all cores",
+)
+_smooth_commands = dataset_commands("smooth", _smooth, _SMOOTH_EXAMPLES)
+smooth_app = typer.Typer(cls=_smooth_commands, no_args_is_help=True, rich_markup_mode=None)
+
+
+@smooth_app.callback()
+def smooth() -> None:
+    """Make labels of recorded detections: past and future of every object, gaps filled, uncertainty stated."""
+
+
+def _show(output: Path, runs: tuple[SmoothedScene, ...] | tuple[StreamedScene, ...]) -> None:
+    """The line that says what was done."""
+    from saga_fg.smoothing import LabelCounts
+
+    total = LabelCounts.sum(run.counts for run in runs)
+    typer.echo(
+        f"{output}: {counted(len(runs), 'scene')}, {counted(total.objects, 'object')}, {counted(total.boxes, 'box')}: "
+        f"{total.observed} observed, {total.filled} filled, {total.extended} extended; "
+        f"{total.dropped} dropped with {counted(total.dropped_objects, 'object')}; "
+        f"{counted(total.joined, 'tracklet')} joined to others"
+    )

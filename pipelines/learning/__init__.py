@@ -1,9 +1,7 @@
 """Settings learned from recordings."""
 
-from pipelines.learning.fragment import learned_fragment
-from pipelines.learning.noise import LearnedNoise, learn_noise, learned_motions
-from pipelines.learning.offsets import offset_fragment
-from pipelines.learning.scenes import scenes_to_learn_from
+from pipelines.learning.interactions import scenes_to_learn_from
+from pipelines.learning.noise import LearnedNoise, learn_noise, learned_fragment, learned_motions, offset_fragment
 
 __all__ = [
     "LearnedNoise",

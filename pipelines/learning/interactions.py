@@ -2,7 +2,7 @@
 
 Edge rules can act in several forms, which differ in what they do to objects in view, whose detections say more than
 their neighbours. So the recordings are split into two parts, and every form, fitted to one part, tracks the other
-with made gaps (`pipelines.learning.gap_runs`), on the tracker's own configuration:
+with made gaps (`pipelines.learning.gaps`), on the tracker's own configuration:
 
     everywhere   edges act as fitted
     hidden       edges are weighted by their information gain, low into objects in view, and fitted with it
@@ -22,19 +22,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.annotated import detected
+from data_tools.datasets.source import DatasetSource
+from data_tools.figures import FigureTable, cell
 from pipelines.config import TrackConfig
-from pipelines.learning.gap_runs import Contender, GapBenchSettings, Run, bench_gaps
-from pipelines.tracking import Progress
+from pipelines.learning.gaps import Contender, GapBenchSettings, Run, bench_gaps, situation_figures, situation_tables
+from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
 from saga_fg.learning import MOST_GAPS, TEMPLATE, GapSettings, HiddenObjects, Rule, fit_interactions, hidden_objects
 from saga_fg.learning.gaps import LENGTHS
 from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
-from saga_fg.model.learned_interactions import LearnedInteractions
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.types.dataset import Scene
+from saga_fg.model.sensor import Sensor
+from saga_fg.model.stability import LearnedInteractions
+from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.track import Tracks
 
 BASE, SHIPPED, LEARNED = "base motion", "shipped edges", "learned edges"
 NOWHERE = "nowhere"
@@ -275,3 +282,57 @@ def _moments(scene: Scene, kept: slice) -> Scene:
     frames = [f for f in scene.frames if len(time) and time[0] - 1e-6 <= f.timestamp <= time[-1] + 1e-6]
     poses, truth = scene.world_T_ego[kept], scene.ground_truth[kept]
     return Scene(scene.name, time, poses, scene.tokens[kept], frames, truth)
+
+
+def scenes_to_learn_from(source: DatasetSource, config: TrackConfig, with_truth: bool) -> dict[str, Scene]:
+    """Scenes by name. With the truth, what is annotated and visible is detected, by the only sensor that the
+    configuration has a model of. Without it, the tracks of the tracker without edges stand for the truth.
+
+    Raises `InputError` for what cannot be read.
+    """
+    if with_truth:
+        with source.ground_truth() as dataset:
+            return {name: _detected(dataset.scene(name), config) for name in dataset.scenes}
+    with source.open() as dataset:
+        scenes = [dataset.scene(name) for name in dataset.scenes]
+    return {scene.name: _with_tracks(scene, track_scene(scene, config.new_tracker("kf")).tracks) for scene in scenes}
+
+
+def _detected(scene: Scene, config: TrackConfig) -> Scene:
+    frames, named = detected(scene), [name for name in config.sensors if name != DEFAULT]
+    if len(named) == 1 and config.sensors.get(DEFAULT, Sensor()) == Sensor():
+        frames = [replace(frame, sensor=named[0]) for frame in frames]
+    return replace(scene, frames=frames)
+
+
+def _with_tracks(scene: Scene, tracks: Sequence[Tracks]) -> Scene:
+    seen = [moment.select(moment.coasting == 0) for moment in tracks]
+    truth = [Annotations(each.id.astype(np.str_), each.boxes, np.ones(len(each), dtype=np.bool_)) for each in seen]
+    return replace(scene, ground_truth=truth)
+
+
+TITLE = "recordings held out"
+
+
+def learned_tables(learned: LearnedForms) -> list[FigureTable]:
+    """The forms that were tried, and the errors in the gaps of recordings held out."""
+    rows = tuple(
+        (", ".join(group), form, cell(ratio, 3), "written" if form == learned.forms[group] else "")
+        for group, ratios in learned.ratios.items()
+        for form, ratio in ratios.items()
+    )
+    columns = ("classes", "form", f"errors / those of the {BASE}", "")
+    forms = FigureTable(f"{TITLE}: forms of the edges", columns, rows)
+    return [table for table in (forms, *situation_tables(learned.runs, TITLE, BASE)) if table.rows]
+
+
+def learned_figures(learned: LearnedForms) -> dict[str, Any]:
+    """For programs: what the tables show."""
+    return {
+        "forms": [
+            {"classes": group, "form": learned.forms[group], "ratios": ratios}
+            for group, ratios in learned.ratios.items()
+        ],
+        "reference": BASE,
+        "situations": situation_figures(learned.runs, BASE),
+    }

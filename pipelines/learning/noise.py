@@ -1,16 +1,27 @@
-"""Sensors' models and process noise from recordings, with ground truth or without.
+"""Sensors' models, process noise and clock offsets from recordings, as pieces of configuration.
+
+Sensors' models and process noise from recordings, with ground truth or without.
 
 With ground truth, detections are compared with the true objects next to them. Without, the tracker with the present
 settings assigns detections to objects; then once more with the settings learned from that.
+
+Offsets of the sensors' clocks as a piece of configuration: what `--learn-offsets` writes.
+
+The offsets of several scenes are joined by their weights, with a deviation that allows for scenes that differ:
+
+    o = sum_k o_k / s_k^2 / sum_k 1 / s_k^2,   s^2 = max(1, chi^2 / (n - 1)) / sum_k 1 / s_k^2
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
+import yaml
 
 from pipelines.config import TrackConfig
 from pipelines.tracking import Progress
@@ -31,7 +42,7 @@ from saga_fg.learning import (
 )
 from saga_fg.model.motion import ConstantVelocity, Curvilinear, Motion
 from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
-from saga_fg.tracking import ClassSettings, Tracker
+from saga_fg.tracking import ClassSettings, SensorTime, Tracker
 from saga_fg.types.by_class import DEFAULT, class_settings
 from saga_fg.types.dataset import Dataset, Scene
 
@@ -169,3 +180,70 @@ def _with_motions(
 ) -> LearnedNoise:
     counts = {name: len(sample.detections) for name, sample in samples.items()}
     return LearnedNoise(config.with_motions(motions), counts, tuple(motions))
+
+
+DIGITS = 4
+
+
+def offset_fragment(
+    scenes: Iterable[Mapping[str, SensorTime]], sensors: Mapping[str, Sensor], origin: str
+) -> tuple[str, dict[str, float]]:
+    """The YAML text for `--config`, and the new `time_offset` (s) of each sensor that shares objects with others.
+
+    scenes: clocks of the sensors in each; sensors: their models so far; origin: what it was learned from
+    """
+    found: dict[str, list[SensorTime]] = {}
+    for clocks in scenes:
+        for name, each in clocks.items():
+            if each.objects:
+                found.setdefault(name, []).append(each)
+    offsets, comments = {}, []
+    for name, parts in sorted(found.items()):
+        offset, deviation = _joined(parts)
+        offsets[name] = round(sensor_model(sensors, name).time_offset - offset, DIGITS)
+        objects = sum(each.objects for each in parts)
+        comments.append(f"# {name}: {-offset:+.4f} s, deviation {deviation:.4f} s, from {objects} objects in common\n")
+    data = {"sensors": {name: {"time_offset": offset} for name, offset in offsets.items()}}
+    head = f"# Offsets of clocks, learned from {origin}; pass it to --config.\n"
+    return head + "".join(comments) + str(yaml.safe_dump(data, sort_keys=False)), offsets
+
+
+def _joined(parts: list[SensorTime]) -> tuple[float, float]:
+    """Weighted mean of the offsets of one sensor, s, and its standard deviation."""
+    weights = [1 / each.deviation**2 for each in parts]
+    total = sum(weights)
+    mean = sum(w * each.offset for w, each in zip(weights, parts, strict=True)) / total
+    chi2 = sum(w * (each.offset - mean) ** 2 for w, each in zip(weights, parts, strict=True))
+    return mean, math.sqrt(max(1.0, chi2 / max(len(parts) - 1, 1)) / total)
+
+
+LEARNED = ("noise", "calibration", "detection_probability", "class_detection_probability", "field_of_view", "confusion")
+KINDS: dict[type, str] = {ConstantVelocity: "constant_velocity", Curvilinear: "curvilinear"}
+
+
+def learned_fragment(learned: LearnedNoise, origin: str) -> str:
+    """The YAML text; `origin` says in its first line what it was learned from."""
+    sensors = {}
+    for name in learned.detections:
+        values = asdict(learned.config.sensors[name])
+        sensors[name] = {key: _rounded(values[key]) for key in LEARNED if values[key] != {}}
+    tracker: dict[str, Any] = {}
+    if any("confusion" in values for values in sensors.values()):  # it is one among the classes of these groups
+        tracker["class_groups"] = [list(group) for group in learned.config.tracker.class_groups]
+    if learned.classes:
+        classes = learned.config.tracker.classes
+        motions = {label: class_settings(classes, ClassSettings, label).motion for label in learned.classes}
+        tracker["classes"] = {
+            label: {"motion": {"kind": KINDS[type(motion)], **_rounded(asdict(motion))}}
+            for label, motion in motions.items()
+        }
+    data: dict[str, Any] = {"sensors": sensors, **({"tracker": tracker} if tracker else {})}
+    text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
+    return f"# Learned by saga-fg learn noise from {origin}; pass it to --config.\n{text}"
+
+
+def _rounded(value: Any) -> Any:
+    """Plain numbers of a few digits."""
+    if isinstance(value, dict):
+        return {key: _rounded(part) for key, part in value.items()}
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value

@@ -3,10 +3,16 @@
 result + recordings -> `ReportScene`s, tables, charts -> `report_page` -> one file
 """
 
-from pipelines.report.charts import Chart, Series, accuracy_charts, latency_chart
-from pipelines.report.page import Report, report_page
-from pipelines.report.results import result_report, result_scenes
-from pipelines.report.run_record import RunRecord, read_run_record, record_path
+from pipelines.report.figures import Chart, Series, accuracy_charts, latency_chart
+from pipelines.report.page import (
+    Report,
+    RunRecord,
+    read_run_record,
+    record_path,
+    report_page,
+    result_report,
+    result_scenes,
+)
 from pipelines.report.scenes import ReportScene, scene_of_run
 
 __all__ = [

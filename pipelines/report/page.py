@@ -1,6 +1,13 @@
-"""The page: one HTML file with style, script and data in it.
+"""The page: results on disk as one HTML file with style, script and data, and the record of their run.
+
+The page: one HTML file with style, script and data in it.
 
 The data is JSON, deflated, in base64; the browser inflates it.
+
+The record of a run, written beside its result for reports: method, version, configuration and times.
+
+{"method": "saga", "version": "0.1.0", "configuration": YAML, "milliseconds": {scene: [of each frame]},
+ "recordings": how they were read, "clocks": {scene: {sensor: its clock}} where there are several}
 """
 
 from __future__ import annotations
@@ -9,16 +16,28 @@ import base64
 import html
 import json
 import zlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from data_tools.datasets.detection_files import read_predictions
+from data_tools.datasets.results import SceneResult
+from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable, as_json
-from pipelines.report.charts import Chart
-from pipelines.report.scenes import ReportScene, scene_data
-from pipelines.report.thresholds import start_thresholds
-from pipelines.report.track_figures import UNSEEN
+from data_tools.files.atomic_files import write_text
+from data_tools.files.input_files import read_bytes
+from data_tools.files.readers import parsed_json
+from pipelines.config import load_config
+from pipelines.explaining import clock_table
+from pipelines.report.figures import UNSEEN, Chart, accuracy_charts, latency_chart, track_charts, track_figures
+from pipelines.report.scenes import ReportScene, scene_data, start_thresholds, thumbnails
+from saga_fg.errors import InputError
+from saga_fg.tracking import SensorTime
 
 SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.js", "player.js")
 
@@ -87,3 +106,187 @@ def _table(table: FigureTable) -> str:
         f"<figure class=table><figcaption>{html.escape(table.title)}</figcaption><div class=wide><table>"
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div></figure>"
     )
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """method; version of saga-fg; configuration, YAML; milliseconds in the tracker for every frame, by scene.
+
+    recordings  how the dataset was read, `DatasetSource.kept`
+    clocks      of the sensors by scene
+    """
+
+    method: str
+    configuration: str
+    milliseconds: Mapping[str, Sequence[float]]
+    version: str = version("saga-fg")
+    recordings: Mapping[str, Any] = field(default_factory=dict)
+    clocks: Mapping[str, Mapping[str, SensorTime]] = field(default_factory=dict)
+
+
+def record_path(result: Path) -> Path:
+    """Return the path of a result's record: beside a file, or in a folder of results."""
+    return result / "run.json" if result.is_dir() else result.with_name(f"{result.stem}.run.json")
+
+
+def write_run_record(result: Path, record: RunRecord) -> None:
+    """Write the record of a result that has just been written."""
+    write_text(record_path(result), json.dumps(asdict(record)) + "\n")
+
+
+def read_run_record(result: Path) -> RunRecord | None:
+    """Read the record of a result, None if it has none. Raises `InputError` for a broken one."""
+    path = record_path(result)
+    if not path.is_file():
+        return None
+    raw = parsed_json(read_bytes(path), str(path))
+    try:
+        milliseconds = {str(name): [float(ms) for ms in times] for name, times in raw["milliseconds"].items()}
+        kept = dict(raw.get("recordings", {}))
+        clocks = {
+            str(name): {str(k): SensorTime(**v) for k, v in of.items()} for name, of in raw.get("clocks", {}).items()
+        }
+        return RunRecord(str(raw["method"]), str(raw["configuration"]), milliseconds, str(raw["version"]), kept, clocks)
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: expected the record of a run: {error}") from error
+
+
+def as_recorded(source: DatasetSource, result: Path) -> DatasetSource:
+    """A dataset, read as it was for a result, where its options do not say otherwise."""
+    record = read_run_record(result)
+    return source if record is None else source.with_kept(record.recordings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Result:
+    """A result that has been read: of a method, by scene, with the record of its run where there is one."""
+
+    method: str
+    path: Path
+    found: Mapping[str, SceneResult]
+    record: RunRecord | None
+
+
+def result_report(source: DatasetSource, result: Path, beside: Path | None = None, images: int = 0) -> Report:
+    """Report on the result of any tracker; with figures where the dataset has ground truth, else of the tracks alone.
+
+    beside  another result of the same recordings, to show beside it
+    images  width of the camera images to show, pixels; 0: none
+
+    Raises `InputError` for missing or broken files, and for a result that does not fit the dataset or the other one.
+    """
+    results = [_read(source, result)]
+    if beside is not None:
+        results = _with_distinct_names(results[0], _read(source, beside))
+    scenes = _scenes(source, results[0])
+    for other in results[1:]:
+        scenes = [_joined(scene, other, added) for scene, added in _pairs(scenes, _scenes(source, other))]
+    scenes = _on_the_ground(source, scenes, images)
+    tables: list[FigureTable] = []
+    charts: list[Chart] = []
+    for each in results:
+        found = {scene.scene.name: each.found[scene.scene.name] for scene in scenes if scene.scene.name in each.found}
+        prefix = f"{each.method}: " if len(results) > 1 else ""
+        own_tables, own_charts = _figures(source, found)
+        if each.record is not None:
+            times = [ms for of_scene in each.record.milliseconds.values() for ms in of_scene]
+            own_charts += [latency_chart(np.array(times))] if times else []
+            own_tables += [clock_table(each.record.clocks)] if each.record.clocks else []
+        tables += [replace(table, title=prefix + table.title) for table in own_tables]
+        charts += [replace(chart, title=prefix + chart.title) for chart in own_charts]
+    first = results[0]
+    names = [each.scene.name for each in scenes]
+    facts = [", ".join(each.path.name for each in results)]
+    facts += [f"{len(names)} scenes" if len(names) > 3 else ", ".join(names)]
+    facts += [f"{sum(len(each.scene) for each in scenes)} moments"]
+    facts += [f"{sum(len(found.found) for found in first.found.values())} boxes"]
+    facts += [f"saga-fg {first.record.version}"] if first.record is not None else []
+    return Report(
+        f"{' and '.join(each.method for each in results)} on {source.title}",
+        facts,
+        scenes,
+        tables,
+        charts,
+        first.record.configuration if first.record is not None else "",
+        beside=results[1].method if beside is not None else "",
+    )
+
+
+def result_scenes(source: DatasetSource, result: Path, found: Mapping[str, SceneResult]) -> list[ReportScene]:
+    """Return the scenes of a result, with edges by the rules of the dataset's default configuration.
+
+    Raises `InputError` for a broken record of the run, or broken predictions.
+    """
+    record = read_run_record(result)
+    return _scenes(source, _Result(record.method if record is not None else "tracks", result, found, record))
+
+
+def _read(source: DatasetSource, path: Path) -> _Result:
+    record = read_run_record(path)
+    return _Result(record.method if record is not None else path.stem, path, source.read_results(path), record)
+
+
+def _with_distinct_names(one: _Result, other: _Result) -> list[_Result]:
+    """Give two results different names."""
+    if one.method != other.method:
+        return [one, other]
+    if one.path.stem != other.path.stem:
+        return [replace(each, method=each.path.stem) for each in (one, other)]
+    return [replace(each, method=f"{each.path.parent.name}/{each.path.stem}") for each in (one, other)]
+
+
+def _scenes(source: DatasetSource, result: _Result) -> list[ReportScene]:
+    config, predicted = load_config(source.family), read_predictions(result.path)
+    return [
+        ReportScene(
+            each.scene,
+            {result.method: each.found},
+            {} if each.coasting is None else {result.method: each.coasting},
+            config.tracker.edges,
+            config.sensors,
+            {result.method: predicted[name]} if name in predicted else {},
+        )
+        for name, each in result.found.items()
+    ]
+
+
+def _pairs(
+    scenes: Sequence[ReportScene], others: Sequence[ReportScene]
+) -> Sequence[tuple[ReportScene, ReportScene | None]]:
+    by_name = {each.scene.name: each for each in others}
+    if scenes and not any(each.scene.name in by_name for each in scenes):
+        raise InputError(f"--beside: expected a scene of the result, e.g. {scenes[0].scene.name}; it has none")
+    return [(each, by_name.get(each.scene.name)) for each in scenes]
+
+
+def _joined(scene: ReportScene, result: _Result, other: ReportScene | None) -> ReportScene:
+    """Add the tracks of another result."""
+    if other is None:
+        return scene
+    if not np.array_equal(scene.scene.timestamps, other.scene.timestamps):
+        name = scene.scene.name
+        raise InputError(f"{result.path}: scene {name}: expected the moments of the other result; give --detections")
+    return replace(
+        scene,
+        tracks={**other.tracks, **scene.tracks},
+        coasting={**other.coasting, **scene.coasting},
+        predictions={**other.predictions, **scene.predictions},
+    )
+
+
+def _on_the_ground(source: DatasetSource, scenes: Sequence[ReportScene], width: int) -> list[ReportScene]:
+    """Add the maps of the places and the images of the cameras."""
+    by_name = {each.scene.name: each.scene for each in scenes}
+    maps, images = source.maps(by_name), source.images(by_name) if width else {}
+    return [
+        replace(each, map=maps.get(name), cameras=thumbnails(images.get(name, {}), width))
+        for name, each in zip(by_name, scenes, strict=True)
+    ]
+
+
+def _figures(source: DatasetSource, found: Mapping[str, SceneResult]) -> tuple[list[FigureTable], list[Chart]]:
+    if source.has_truth:
+        evaluation = source.evaluate(found)
+        return list(evaluation.tables()), accuracy_charts(evaluation.errors)
+    results = list(found.values())
+    return [track_figures(results)], track_charts(results)

@@ -1,9 +1,11 @@
-"""Scenes as data of the page's player: rows of whole numbers, centimetres and milliradians, about the scene's start.
+"""Scenes as data of the page's player: tracks, road, camera images, score threshold.
+
+Scenes as data of the page's player: rows of whole numbers, centimetres and milliradians, about the scene's start.
 
     scene   {"name", "times": [s], "ego": [[x, y, yaw]], "labels": [class], "methods": {name: {"ids": [name],
              "moments": [[track, ...]], "edges": [[[target id, source id, rate], ...]],
              "horizons": [ms], "predictions": [[prediction, ...]], [] without}},
-             "truth": [[object, ...]], "detections": [[detection, ...]], "road": see `pipelines.report.road`,
+             "truth": [[object, ...]], "detections": [[detection, ...]], "road": see below,
              "map": {"areas": [[kind, ring, ...]], "lines": [[x, y, ...]]} or null, "cameras": {name: [JPEG]}}
     track      [id, class, x, y, length, width, yaw, vx, vy, score, cov_xx, cov_xy, cov_yy, coasting]
     prediction [id, horizon, x, y, cov_xx, cov_xy, cov_yy]
@@ -12,23 +14,36 @@
 
 Lengths in cm, yaw in mrad, velocities in cm/s, scores and rates in thousandths, covariances in cm^2, coasting and
 horizons in ms; null is unknown. `ids`, `labels` are counted from 0.
+
+The road of a scene as the page's player wants it: lanes, stop lines and lights that its frames brought along.
+
+    road  {"lanes": [[width, x, y, x, y, ...]], "lines": [[light, x, y, x, y]], "lights": [[x, y]],
+           "colours": [[colour of each light]]}, or null where no frame brought a map
+
+Lengths in cm about the scene's start; lights are counted from 0. A colour is 0 red, 1 amber, 2 green
+(`saga_fg.types.road_map.COLOURS`), the one last reported at or before the moment; null before the first report. A
+report is of the light nearest to it, or of none if that is further than `SignalSettings.max_distance` is by default.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import base64
+import io
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.area_map import AreaMap
 from data_tools.datasets.detection_files import PredictionRows
+from data_tools.datasets.source import AreaMap, Images
+from data_tools.evaluation import best_thresholds, score_sweep
+from data_tools.files.isolated_reading import isolated
 from data_tools.metrics import SceneBoxes
-from pipelines.report.images import Thumbnails
-from pipelines.report.road import map_data, road_data
-from pipelines.report.unseen import unseen_for
+from pipelines.report.figures import unseen_for
 from pipelines.tracking import TrackedScene
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
@@ -38,6 +53,99 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_of
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
+from saga_fg.types.frame import Frame
+from saga_fg.types.road_map import COLOUR_LABELS, MAX_LIGHT_DISTANCE, Lane, StopLine, TrafficLight
+
+Thumbnails = Mapping[str, list[str | None]]
+QUALITY = 60  # of JPEG, in percent
+
+
+def thumbnails(images: Images, width: int) -> Thumbnails:
+    """Return the images of a scene by camera, `width` pixels wide or less. Raises `InputError` for a broken one."""
+    return {
+        camera: [None if file is None else _isolated(file, width) for file in files] for camera, files in images.items()
+    }
+
+
+def _isolated(file: Path, width: int) -> str:
+    return "".join(isolated("expected an image", _thumbnail, file, width))
+
+
+def _thumbnail(file: Path, width: int) -> Iterator[str]:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    with Image.open(file) as image:
+        image.draft("RGB", (2 * width, 2 * width))  # JPEG is then decoded at a fraction of its size
+        small = image.convert("RGB")
+        small.thumbnail((width, width))
+        small.save(buffer, "JPEG", quality=QUALITY)
+    yield base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+Colours = list[list[int | None]]
+
+
+def road_data(frames: Iterable[Frame], detections: Sequence[Boxes], origin: FloatArray) -> dict[str, Any] | None:
+    """Return the data of the road, ready for JSON; see the module's docstring.
+
+    detections  of each moment, in world coordinates and in order of time
+    origin      (2,) place of the scene's start, m
+    """
+    lanes: dict[str, Lane] = {}
+    lines: dict[str, StopLine] = {}
+    lights: dict[str, TrafficLight] = {}
+    maps = {id(frame.road_map): frame.road_map for frame in frames if frame.road_map is not None}  # most bring the same
+    for known in maps.values():
+        for light in known.lights:  # the first entry of a name stays, as in the tracker
+            lights.setdefault(light.name, light)
+        for line in known.stop_lines:
+            lines.setdefault(line.name, line)
+        for lane in known.lanes:
+            lanes.setdefault(lane.name, lane)
+    if not lanes and not lights:
+        return None
+    number = {name: k for k, name in enumerate(lights)}
+    places = np.array([light.position for light in lights.values()]).reshape(-1, 2)
+    return {
+        "lanes": [[round(100 * lane.width), *_centimetres(lane.centre, origin)] for lane in lanes.values()],
+        "lines": [[number[line.light], *_centimetres(line.ends, origin)] for line in lines.values()],
+        "lights": [_centimetres(place, origin) for place in places],
+        "colours": _colours(places, detections),
+    }
+
+
+def map_data(known: AreaMap, origin: FloatArray) -> dict[str, Any]:
+    """Return areas and lines, ready for JSON, in cm about the scene's start."""
+    return {
+        "areas": [[kind, *(_centimetres(ring, origin) for ring in rings)] for kind, rings in known.areas],
+        "lines": [_centimetres(line, origin) for line in known.lines],
+    }
+
+
+def _colours(lights: FloatArray, detections: Sequence[Boxes]) -> Colours:
+    """Return for each moment the colour last reported of each light; lights (L, 2)."""
+    reach = MAX_LIGHT_DISTANCE
+    now: list[int | None] = [None] * len(lights)
+    colours = []
+    for boxes in detections:
+        reported = boxes.select(np.flatnonzero(np.isin(boxes.label, COLOUR_LABELS)))
+        if len(lights) and len(reported):
+            now = now.copy()
+            apart = np.linalg.norm(reported.position[:, None, :2] - lights, axis=2)
+            nearest = apart.argmin(axis=1)
+            for label, light, far in zip(reported.label, nearest.tolist(), apart.min(axis=1), strict=True):
+                if far < reach:
+                    now[light] = COLOUR_LABELS.index(str(label))
+        colours.append(now)
+    return colours
+
+
+def _centimetres(points: Any, origin: FloatArray) -> list[int]:
+    """Return points (..., 2), flattened."""
+    flat: list[float] = (100 * (np.asarray(points) - origin)).ravel().tolist()
+    return [round(value) for value in flat]
+
 
 Rows = list[list[int | None]]
 Edges = tuple[IntArray, IntArray, FloatArray]
@@ -233,3 +341,31 @@ def latest_detections(scene: Scene, sensors: Mapping[str, Sensor]) -> tuple[list
 
 def _whole(rows: FloatArray) -> Rows:
     return [[None if x != x else round(x) for x in row] for row in rows.tolist()]
+
+
+PLAIN = 0.3
+"""Threshold without ground truth, or where no score makes tracks better than none."""
+
+
+def start_thresholds(scenes: Sequence[ReportScene]) -> dict[str, float]:
+    """Return the least score to show first, by the tracker's name: that of the class with the most true objects.
+
+    Where all scores are below `PLAIN`, all tracks are shown.
+    """
+    names = dict.fromkeys(chain.from_iterable(scene.tracks for scene in scenes))
+    return {name: _threshold(scenes, name) for name in names}
+
+
+def _threshold(scenes: Sequence[ReportScene], name: str) -> float:
+    mine = [each for each in scenes if name in each.tracks]
+    scores = np.concatenate([each.tracks[name].score for each in mine])
+    lowest = PLAIN if (scores >= PLAIN).any() else min(0.0, float(scores.min(initial=0.0)))
+    judged = [each for each in mine if each.scene.ground_truth is not None]
+    if not judged:
+        return lowest
+    sweep = score_sweep([(each.scene, each.tracks[name]) for each in judged])
+    best = best_thresholds(sweep)
+    common = Counter({label: int(sweep.per_class[label].gt) for label in best}).most_common(1)
+    if not common or not np.isfinite(best[common[0][0]]) or not sweep.per_class[common[0][0]].mota > 0:
+        return lowest
+    return float(np.floor(100 * best[common[0][0]]) / 100)

@@ -1,11 +1,8 @@
 """Many scenes in parallel: on the cores of this machine or on a Ray cluster, with a manifest of the results."""
 
-from pipelines.scale_out.job import Job, Outcome, SceneTask, perform
-from pipelines.scale_out.local_pool import LocalPool
-from pipelines.scale_out.manifest import Manifest, Record, file_name
-from pipelines.scale_out.ray_pool import RayPool
-from pipelines.scale_out.run import Pool, RunSummary, run_scenes
-from pipelines.scale_out.tasks import SmoothTask, TrackTask
+from pipelines.scale_out.job import Job, Manifest, Outcome, Record, SceneTask, file_name, perform
+from pipelines.scale_out.pools import LocalPool, RayPool
+from pipelines.scale_out.run import Pool, RunSummary, SmoothTask, TrackTask, run_scenes
 
 __all__ = [
     "Job",

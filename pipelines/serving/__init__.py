@@ -7,11 +7,9 @@
 """
 
 from pipelines.serving.client import StreamClient
-from pipelines.serving.pipe import serve_pipe
-from pipelines.serving.server import SocketServer
+from pipelines.serving.server import SocketServer, StopRequest, serve_pipe
 from pipelines.serving.settings import Address, StreamSettings, parse_address
-from pipelines.serving.state_keeper import StateKeeper
-from pipelines.serving.stopping import StopRequest
+from pipelines.serving.state import StateKeeper
 from pipelines.serving.stream import StreamTracker
 
 __all__ = [

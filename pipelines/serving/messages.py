@@ -33,8 +33,7 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Coordinates, Detections, Frame
-from saga_fg.types.predicted_tracks import PredictedTracks, checked_horizons
-from saga_fg.types.track import Tracks
+from saga_fg.types.track import PredictedTracks, Tracks, checked_horizons
 
 REQUESTS = ("status", "subscribe", "predict", "reset")
 MAX_HORIZON = 10.0  # furthest time of a prediction, s

@@ -1,4 +1,6 @@
-"""A service on a TCP or Unix socket: any number of clients, one tracker.
+"""A service on a TCP or Unix socket or on standard input, one tracker, stopped within bounded time.
+
+A service on a TCP or Unix socket: any number of clients, one tracker.
 
     clients --lines--> worker thread: the stream --answers--> clients
 
@@ -14,24 +16,89 @@ import asyncio
 import errno
 import logging
 import os
+import queue
 import resource
+import select
+import signal
 import socket
 import stat
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from types import FrameType, TracebackType
+from typing import IO, Any, Self, cast
 
-from pipelines.serving.log_limit import LogLimit
 from pipelines.serving.messages import LineSplitter, encode
-from pipelines.serving.settings import Address
-from pipelines.serving.stopping import StopRequest
+from pipelines.serving.settings import Address, LogLimit
 from pipelines.serving.stream import StreamTracker
 from saga_fg.errors import InputError
+
+SAVING = 1.0  # s
+
+
+class StopRequest:
+    """A context in which SIGINT and SIGTERM do not interrupt but request to stop; `number`: of the first signal.
+
+    timeout  time to finish, s; then the process ends in spite of its other threads
+    save     called before that end, for at most `SAVING` s
+    clear    called last, to remove unfinished files
+    """
+
+    def __init__(
+        self, timeout: float, save: Callable[[], object] = lambda: None, clear: Callable[[], object] = lambda: None
+    ) -> None:
+        self.number: int | None = None
+        self._timeout = timeout
+        self._save = save
+        self._clear = clear
+        self._callbacks: list[Callable[[], object]] = []
+        self._requests: queue.SimpleQueue[int] = queue.SimpleQueue()  # a signal handler may put into this kind
+        self._finished = threading.Event()
+        self._before: dict[int, object] = {}
+
+    def notify(self, callback: Callable[[], object]) -> None:
+        """Call `callback` on a request to stop, in a signal handler; at once if there was one."""
+        self._callbacks.append(callback)
+        if self.number is not None:
+            callback()
+
+    def __enter__(self) -> Self:
+        threading.Thread(target=self._watch, name="stop", daemon=True).start()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._request)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._finished.set()
+        self._requests.put(0)
+        for number, before in self._before.items():
+            signal.signal(number, before)  # type: ignore[arg-type]
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        if self.number is None:
+            self.number = number
+            self._requests.put(number)
+            for callback in self._callbacks:
+                callback()
+
+    def _watch(self) -> None:
+        number = self._requests.get()
+        if not self._finished.wait(self._timeout):
+            saving = threading.Thread(target=self._save, daemon=True)
+            with suppress(Exception):
+                saving.start()
+                saving.join(SAVING)
+            with suppress(Exception):
+                self._clear()
+            os._exit(128 + number)
+
 
 log = logging.getLogger(__name__)
 
@@ -347,3 +414,42 @@ def _clear_stale(path: Path) -> None:
             path.unlink(missing_ok=True)
             return
     raise InputError(f"{path}: another server listens there")
+
+
+def serve_pipe(
+    stream: StreamTracker[None], source: IO[bytes], sink: IO[bytes], stop: StopRequest | None = None
+) -> None:
+    """Answer lines until the source ends or `stop` is requested, then the frames that are held back.
+
+    source: a file with a descriptor; nothing may have been read from its buffer. A slow reader of the answers slows the
+    reading: nothing piles up. Raises `BrokenPipeError` when that reader goes away.
+    """
+
+    def send(answers: Iterable[tuple[None, dict[str, Any]]]) -> None:
+        for _, answer in answers:
+            sink.write(encode(answer))
+        sink.flush()
+
+    splitter, descriptor = LineSplitter(stream.settings.max_message), source.fileno()
+    stopped, wake = os.pipe()  # stays open: a signal may come at any time
+    if stop is not None:
+        stop.notify(lambda: os.write(wake, b"."))
+    ended = False
+    while not ended:
+        ready, _, _ = select.select([descriptor, stopped], [], [])
+        ended = stopped in ready
+        if descriptor in ready:
+            piece = _read(descriptor)
+            ended |= not piece
+            for line in splitter.feed(piece) if piece else splitter.finish():
+                send(stream.handle(line, None))
+    send(stream.flush())
+
+
+def _read(descriptor: int) -> bytes:
+    """The next bytes, none at the end or where they cannot be read."""
+    try:
+        return os.read(descriptor, PIECE)
+    except OSError as error:
+        log.warning("standard input: %s", error)
+        return b""

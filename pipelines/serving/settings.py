@@ -1,8 +1,11 @@
-"""The address of a service, and its limits: how it treats time, how much it takes in, and how long it waits."""
+"""The address and the limits of a service, of its log lines as well."""
 
 from __future__ import annotations
 
 import ipaddress
+import logging
+import time
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,3 +88,36 @@ def parse_address(text: str) -> Address:
     if not colon or not port.isascii() or not port.isdigit() or int(port) > 65535:
         raise InputError(f"{text}: expected HOST:PORT, or a path with a slash for a Unix socket")
     return Address(host.strip("[]") or "127.0.0.1", int(port))
+
+
+MOST = 1000  # kinds that are remembered
+
+
+class LogLimit:
+    """Allows one log line of each kind of event in `seconds`."""
+
+    def __init__(self, seconds: float = 60.0) -> None:
+        self._seconds = seconds
+        self._latest: dict[Hashable, float] = {}
+
+    def due(self, kind: Hashable) -> bool:
+        """Return True if an event of this kind may be logged now."""
+        now = time.monotonic()
+        if now - self._latest.get(kind, -self._seconds) < self._seconds:
+            return False
+        if len(self._latest) >= MOST:
+            self._latest.clear()
+        self._latest[kind] = now
+        return True
+
+
+class LogLimitFilter(logging.Filter):
+    """Limits the log lines of every line of code."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._limit = LogLimit()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return True if this record may be logged."""
+        return self._limit.due((record.name, record.lineno))

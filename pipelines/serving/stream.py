@@ -14,8 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from pipelines.doubts import Doubts
-from pipelines.process import resident_memory
-from pipelines.serving.log_limit import LogLimit
+from pipelines.serving.frame_order import Numbering, Reordering
 from pipelines.serving.messages import (
     FrameMessage,
     about,
@@ -25,10 +24,8 @@ from pipelines.serving.messages import (
     tracks_message,
     unconfirmed_message,
 )
-from pipelines.serving.numbering import Numbering
-from pipelines.serving.reordering import Reordering
-from pipelines.serving.settings import StreamSettings
-from pipelines.tracking import ClockComparing, OnlineTracker, PredictingTracker, compared_clocks
+from pipelines.serving.settings import LogLimit, StreamSettings
+from pipelines.tracking import ClockComparing, OnlineTracker, PredictingTracker, compared_clocks, resident_memory
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import SensorTime, TimeVerdict
@@ -48,7 +45,7 @@ MAX_HELD = 256  # largest number of frames held back; beyond it the oldest is tr
 
 
 class StateSaver(Protocol):
-    """Keeper of the stream's state on the disk, `pipelines.serving.state_keeper.StateKeeper`."""
+    """Keeper of the stream's state on the disk, `pipelines.serving.state.StateKeeper`."""
 
     def save(self) -> bool:
         """Write the state; return True if it is on the disk now."""

@@ -1,7 +1,16 @@
-"""Joint estimation of the vehicle's path and the objects around it, from the frames of one scene.
+"""The vehicle's path and the objects around it in one graph, from frames, or with LiDAR SLAM.
+
+Joint estimation of the vehicle's path and the objects around it, from the frames of one scene.
 
 Ego odometry comes from the scene's own poses, degraded by a stated amount. The joint estimate is compared with the
 decoupled pipeline: the odometry's path, and objects tracked along it.
+
+LiDAR SLAM with objects: the vehicle, walls, poles, loops and the objects of a detector, in one graph.
+
+The graph of `pipelines.slam.lidar_slam` (odometry, landmarks, loops) and that of `saga_fg.slam.joint` (detections,
+interactions, stationary objects) are solved as one. Its moments are the keyframes, and scans in between where the
+vehicle is slow, since objects move while it is stationary. Poses are those of the sensor; detections are brought into
+its frame. The vehicle's sensors measure between moments, so their factors are made anew from their log.
 """
 
 from __future__ import annotations
@@ -12,12 +21,19 @@ from functools import partial
 
 import numpy as np
 
+from data_tools.lidar.scan import ScanSequence
+from data_tools.sensor_logs import SensorLog
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.settings import LightSettings, SurroundingSettings
 from data_tools.trajectories import Trajectory, TrajectoryErrors, degraded_odometry, trajectory_errors
 from pipelines.config import TrackConfig
+from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, known_providers
+from pipelines.slam.scan_content import frames_at
+from pipelines.slam.submaps import world_T_submap
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import (
     JointEstimate,
     JointSettings,
@@ -27,10 +43,14 @@ from saga_fg.slam.joint import (
     estimate_jointly,
     estimate_online,
 )
-from saga_fg.slam.joint.settings import KEYFRAME_PERIOD
+from saga_fg.slam.joint.record import KEYFRAME_PERIOD
+from saga_fg.slam.mapping import LandmarkSettings
+from saga_fg.slam.sensors import SensorBuffer, SensorSettings, sensor_providers
+from saga_fg.slam.submaps.graph import GATE
 from saga_fg.tracking import Tracker
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
+from saga_fg.types.landmark import Observation
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,4 +143,98 @@ def keyframes(frames: Sequence[Frame], period: float) -> list[Frame]:
     for frame in frames:
         if not chosen or frame.timestamp > chosen[-1].timestamp + period:
             chosen.append(frame)
+    return chosen
+
+
+@dataclass(frozen=True, eq=False)
+class SlamWithObjects:
+    """slam: with the trajectory, landmarks and covariances of the common solution; alone: without the objects.
+
+    estimate: poses of the sensor, errors of the odometry and objects in the world at the moments of the graph.
+    """
+
+    slam: LidarSlamResult
+    alone: LidarSlamResult
+    estimate: JointEstimate
+
+
+def with_objects(
+    result: LidarSlamResult,
+    scans: ScanSequence,
+    frames: Sequence[Frame],
+    config: TrackConfig,
+    settings: LidarSlamSettings | None = None,
+    lag: float | None = None,
+    new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
+    log: SensorLog | None = None,
+    sensors: SensorSettings | None = None,
+) -> SlamWithObjects:
+    """Solve again with the objects in `frames`, which cover the times of all scans; config: of the tracker.
+
+    lag: s, to estimate poses, landmarks and objects online as well, in a window so long; `slam.online` is then by that.
+    new_providers: gives fresh providers of other factors; log, sensors: of the vehicle's sensors, as of `lidar_slam`.
+    Raises `InputError` for a scan without a frame.
+    """
+    s = settings or LidarSlamSettings()
+    rows = _moments(result.drive.keyframes, scans.timestamps, KEYFRAME_PERIOD)
+    lidar_T_ego = inverse_transform(scans.ego_T_lidar)
+
+    def new_tracker() -> Tracker:
+        return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
+
+    seen = frames_at(frames, scans.timestamps[rows], lidar_T_ego, new_tracker())
+    seen = _with_sensors(seen, log)
+    motions = result.motions(rows)
+    odometry = OdometryIncrements(
+        scans.timestamps[rows],
+        np.array([motion for motion, _ in motions]).reshape(-1, 4, 4),
+        np.array([covariance for _, covariance in motions]).reshape(-1, 6, 6),
+    )
+    at = np.searchsorted(rows, result.keyframes)
+    known = known_providers(result, at.tolist(), s.submaps)
+    named = () if log is None else tuple(log.tables)
+    of_sensors = sensor_providers(sensors or SensorSettings(), named, lidar_T_ego)
+    start = result.drive.poses[0]
+    estimate = estimate_jointly(
+        seen, odometry, new_tracker, s.objects, start, new_providers=lambda: [*known, *of_sensors, *new_providers()]
+    )
+    poses = result.drive.carried(estimate.world_T_ego, rows) @ lidar_T_ego
+    placed = estimate.world_T_ego[at]
+    slam = replace(
+        result,
+        trajectory=Trajectory(scans.timestamps, poses),
+        covariances=estimate.pose_covariances[at],
+        landmarks=known[0].landmarks(estimate.solution, s.submaps.confirm_after),
+        world_T_submap=np.array([world_T_submap(one, placed[one.anchor]) for one in result.submaps]),
+        world_T_lidar=placed,
+    )
+    if lag is not None:
+        observed: list[list[Observation]] = [[] for _ in rows]
+        for one in result.observations:
+            observed[at[one.pose]].append(one.observation)
+        marks, others = LandmarkSettings(GATE, s.submaps.confirm_after), [*of_sensors, *new_providers()]
+        online = estimate_online(seen, odometry, new_tracker(), lag, s.objects, start, observed, marks, others)
+        placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
+        slam = replace(slam, online=Trajectory(scans.timestamps, placed))
+    return SlamWithObjects(slam, result, estimate)
+
+
+def _with_sensors(frames: Sequence[Frame], log: SensorLog | None) -> list[Frame]:
+    """The frames, each with what the log has of the time since the one before."""
+    if log is None:
+        return list(frames)
+    fed, buffer, found = SensorLog(log.tables), SensorBuffer(), list[Frame]()
+    for frame in frames:
+        fed.feed(buffer, frame.timestamp)
+        found.append(replace(frame, ego=buffer.take(frame.timestamp)))
+    return found
+
+
+def _moments(keyframes: Sequence[int], timestamps: FloatArray, period: float) -> list[int]:
+    """Rows of the scans that are moments of the graph: all keyframes, and those more than `period` s after the last."""
+    chosen: list[int] = []
+    waiting = set(keyframes)
+    for row, time in enumerate(timestamps.tolist()):
+        if row in waiting or not chosen or time > timestamps[chosen[-1]] + period:
+            chosen.append(row)
     return chosen

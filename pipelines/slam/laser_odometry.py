@@ -1,27 +1,39 @@
-"""Odometry of a robot with a planar laser, without implausible steps, and the scale of the wheels.
+"""Odometry, keyframes and loops of a robot with a planar laser.
+
+Odometry of a robot with a planar laser, without implausible steps, and the scale of the wheels.
 
 Along a bare corridor odometry alone tells the way, and wheels of another size than the robot believes err by some per
 cent. The scale k is estimated from the steps s that registration determines, as x ahead:
 
     s_registered = k s_wheels + noise of variance v,        k ~ N(1, 0.05^2)
+
+Loops of a planar laser: keyframes are searched for in older submaps, by branch and bound.
+
+The window is what the graph leaves open: it grows with the way along measurements between the two, so that what has
+been closed before is searched closely and what has drifted widely. A place that has a rival is no loop; one found in a
+wide window waits for another that agrees with it. Along a bare corridor a scan tells no place.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from data_tools.laser import LaserLog
+from data_tools.laser.mapping import SMEAR, Fit, LineMap, ScoreGrid, thinned
+from pipelines.slam.loop_closures import Agreement
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.planar_poses import transforms, vectors
+from saga_fg.numerics.geometry import moved, transform, transforms, vector, vectors
+from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
 
 _SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
 _SCALE = 0.05  # standard deviation of the scale of wheels
 _STEP_NOISE = 0.02  # m, of a step that registration determines: it errs with the map
-_KNOWN = 0.005  # standard deviation at which the scale is as good as known
+_KNOWN_SCALE = 0.005  # standard deviation at which the scale is as good as known
 _BELIEVED = 0.3  # share of a step by which registration may differ: beyond, wheels slipped, or it erred
 _STILL, _CHANGED, _MANY = 1e-6, 0.3, 0.3  # m of the wheels; m of a reading, and the share of a scan, that show motion
 _log = logging.getLogger(__name__)
@@ -94,7 +106,7 @@ class WheelScale:
     @property
     def known(self) -> bool:
         """True if more steps hardly change it."""
-        return self._information > _KNOWN**-2
+        return self._information > _KNOWN_SCALE**-2
 
     def corrected(self, step: FloatArray) -> FloatArray:
         """A step (3, 3) of the wheels in true metres."""
@@ -110,3 +122,150 @@ class WheelScale:
         weight = 1 / (float(covariance[0, 0]) + _STEP_NOISE**2)
         self._information += weight * wheels**2
         self._weighted += weight * wheels * driven
+
+
+_FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any number of points, m^2 and rad^2
+_DETERMINED = 0.05  # ratio of information along and across below which a place is a bare corridor
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A scan (n, 2) of the graph, its pose by scan matching alone, the row of the scan, and the way until there, m."""
+
+    points: FloatArray
+    matched: FloatArray
+    row: int
+    way: float
+
+
+def joined(frames: Sequence[Keyframe], centre: Keyframe) -> FloatArray:
+    """Points (n, 2) of keyframes in the frame of `centre`."""
+    back = np.linalg.inv(centre.matched)
+    return np.concatenate([moved(frame.points, back @ frame.matched) for frame in frames])
+
+
+def measured_by(first: int, second: int, fit: Fit) -> Measured:
+    """The measurement between two keyframes by a registration."""
+    measured = transform(fit.pose)
+    return Measured(first, second, measured, covariance_of(_firm(fit.information) / SMEAR, measured))
+
+
+def determined(information: FloatArray) -> bool:
+    """True if a registration determines the place in all directions: not along a bare corridor."""
+    values = np.linalg.eigvalsh(information[:2, :2])
+    return bool(values[0] > _DETERMINED * values[1])
+
+
+def _firm(information: FloatArray) -> FloatArray:
+    """Information without what scatter seems to say along a bare corridor."""
+    values, vectors = np.linalg.eigh(information[:2, :2])
+    ratio = values[0] / max(values[1], 1e-9)
+    if ratio >= _DETERMINED:
+        return information
+    S = np.eye(3)
+    S[:2, :2] -= (1 - max(ratio, 0.0) / _DETERMINED) * np.outer(vectors[:, 0], vectors[:, 0])
+    return np.asarray(S @ information @ S)
+
+
+def covariance_of(information: FloatArray, pose: FloatArray) -> FloatArray:
+    """Covariance in the pose's own frame of what is known in the axes of the map."""
+    R = np.eye(3)
+    R[:2, :2] = pose[:2, :2]
+    own = R.T @ np.linalg.inv(information + np.diag([1e-3, 1e-3, 1e-3])) @ R
+    return np.asarray((own + own.T) / 2 + np.diag(_FLOOR))
+
+
+_KNOWN_SHARE = 0.8  # m, half width of a window up to which a corridor may be recognised: it then says nothing along it
+_UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
+_ACROSS = 5.0  # m from the centre of a submap that it is searched from, besides the window
+_UNIQUE = 0.92  # share of the best score that a rival may have
+_LONGEST = 60.0  # m of way from which the search of headings does not grow
+
+
+@dataclass(frozen=True, eq=False)
+class _Submap:
+    """Keyframes from `first` to before `end`, in the frame of `centre`."""
+
+    first: int
+    end: int
+    centre: int
+    grid: ScoreGrid
+    lines: LineMap
+
+
+def _agreement() -> Agreement[Measured]:
+    return Agreement(np.array([0.3, 0.06]), np.array([0.03, 0.003]), patience=15.0)
+
+
+@dataclass(eq=False)
+class LoopSearch:
+    """Submaps of a growing list of keyframes, and the search in them.
+
+    length  m of way in a submap; drift: half width of the window, share of the way; score: least mean score of a loop
+    """
+
+    keyframes: Sequence[Keyframe]
+    graph: RunningPoseGraph
+    length: float
+    drift: float
+    score: float
+    _submaps: list[_Submap] = field(default_factory=list)
+    _agreement: Agreement[Measured] = field(default_factory=_agreement)
+
+    def extend(self) -> None:
+        """Close a submap if the keyframes since the last one go far enough."""
+        frames = self.keyframes
+        first = self._submaps[-1].end if self._submaps else 0
+        if frames[-1].way - frames[first].way > self.length:
+            centre = (first + len(frames)) // 2
+            points = joined(frames[first:], frames[centre])
+            self._submaps.append(_Submap(first, len(frames), centre, ScoreGrid.of(points), LineMap.of(points)))
+
+    def loops(self, row: int) -> list[Measured]:
+        """Loops of a keyframe to the nearest older submaps whose windows reach it, and those that they confirm."""
+        frames = self.keyframes
+        over = [each for each in self._submaps if frames[each.end - 1].way < frames[row].way - self.length]
+        if not over:
+            return []
+        centres = np.array([each.centre for each in over])
+        way = self.graph.distances(row)[centres]
+        poses = self.graph.poses
+        window = 0.5 + self.drift * way
+        apart = np.linalg.norm(poses[centres, :2, 2] - poses[row, :2, 2], axis=1)
+        near = np.flatnonzero(apart < _ACROSS + window)
+        near = near[np.argsort(apart[near])]
+        source = self._source(row)
+        found: list[Measured] = []
+        for at in near[: 3 + int(window[near].min(initial=0.0))].tolist():
+            guess = np.linalg.inv(poses[centres[at]]) @ poses[row]
+            turn = np.deg2rad(5) + 0.01 * min(way[at], _LONGEST)
+            loop = self._loop(over[at], row, source, guess, float(window[at]), float(turn))
+            if loop is not None:
+                found += [loop] if window[at] < _UNSURE else self._confirmed(loop)
+                if len(found) >= 2:
+                    break
+        return found
+
+    def _confirmed(self, loop: Measured) -> Sequence[Measured]:
+        frames = self.keyframes
+        return self._agreement.confirmed(
+            loop,
+            lambda one, other: np.asarray(np.linalg.inv(frames[one].matched) @ frames[other].matched),
+            lambda row: frames[row].way,
+        )
+
+    def _loop(
+        self, submap: _Submap, row: int, source: FloatArray, guess: FloatArray, window: float, turn: float
+    ) -> Measured | None:
+        found = submap.grid.search(source, vector(guess), window, turn, self.score)
+        if found is None or found.rival > _UNIQUE * found.score:
+            return None
+        fit = submap.lines.fit(self.keyframes[row].points, found.pose, np.diag([1.0, 1.0, 10.0]), reach=0.4)
+        if fit.share < self.score or (window > _KNOWN_SHARE and not determined(fit.information)):
+            return None
+        return measured_by(submap.centre, row, fit)
+
+    def _source(self, row: int) -> FloatArray:
+        """Points of a keyframe and of the four before it, in its frame."""
+        frames = self.keyframes[max(0, row - 4) : row + 1]
+        return thinned(joined(frames, frames[-1]), 0.2)

@@ -2,7 +2,7 @@
 
 1. Each scan that has moved is registered with a map of the last keyframes, point to line; odometry is its prior.
 2. A keyframe comes every half metre or 30 degrees, and is measured from the one before: a graph that runs (iSAM2).
-3. Loops: each second keyframe is searched for in older submaps (`pipelines.slam.laser_loops`).
+3. Loops: each second keyframe is searched for in older submaps (`pipelines.slam.laser_odometry`).
 4. At the end false loops are found by consensus, and all keyframes are registered anew with every other pass of the
    same place, twice.
 """
@@ -15,20 +15,82 @@ from typing import Annotated
 import numpy as np
 
 from data_tools.laser.carmen import LaserLog
-from data_tools.laser.line_map import SMEAR, LineMap, thinned
-from data_tools.laser.score_grid import ScoreGrid
-from pipelines.slam.laser_interpolation import between_keyframes
-from pipelines.slam.laser_keyframes import Keyframe, covariance_of
-from pipelines.slam.laser_loops import LoopSearch
-from pipelines.slam.laser_odometry import WheelScale, check_wheels, warn_of_times, without_jumps
-from pipelines.slam.laser_passes import registered_passes
+from data_tools.laser.mapping import SMEAR, LineMap, ScoreGrid, thinned
+from pipelines.slam.laser_odometry import (
+    Keyframe,
+    LoopSearch,
+    WheelScale,
+    check_wheels,
+    covariance_of,
+    joined,
+    measured_by,
+    warn_of_times,
+    without_jumps,
+)
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
-from saga_fg.numerics.planar_poses import heading, moved, transform, vector
+from saga_fg.numerics.geometry import heading, moved, transform, transforms, vector, vectors
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
-from saga_fg.slam.pose_graph.running import RunningPoseGraph, path_lengths
+from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph, path_lengths
+
+
+def between_keyframes(matched: FloatArray, poses: FloatArray, rows: IntArray) -> FloatArray:
+    """Poses (n, 3, 3) of all scans: the correction of the keyframes before and after, by the way between them.
+
+    matched: (n, 3, 3) by scan matching alone; poses: (k, 3, 3) of the keyframes, the scans `rows` (k,).
+    """
+    step = np.linalg.inv(matched[:-1]) @ matched[1:]
+    way = np.concatenate([[0.0], np.cumsum(path_lengths(step))])
+    key = np.clip(np.searchsorted(rows, np.arange(len(matched)), side="right") - 1, 0, len(rows) - 1)
+    after = np.minimum(key + 1, len(rows) - 1)
+    length = way[rows[after]] - way[rows[key]]
+    share = np.where(length > 0, (way - way[rows[key]]) / np.where(length > 0, length, 1), 0.0)
+    share = np.clip(share, 0, 1)  # scans before the first keyframe
+    from_before = poses[key] @ np.linalg.inv(matched[rows[key]]) @ matched
+    from_after = poses[after] @ np.linalg.inv(matched[rows[after]]) @ matched
+    one, other = vectors(from_before), vectors(from_after)
+    off = other - one
+    off[:, 2] = np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2]))
+    return transforms(one + share[:, None] * off)
+
+
+_NEARBY = 3.0  # m between keyframes that see the same walls
+_GAP = 5.0  # m of way without a keyframe nearby, from which on it is another pass
+_SHARED = 3  # keyframes in a row that share a map
+_MOST_PASSES = 4  # that a keyframe is registered with
+_PRIOR = np.diag([100.0, 100.0, 1000.0])  # information of the graph about where the other pass is
+
+
+def registered_passes(
+    frames: list[Keyframe], poses: FloatArray, reach: float, local_map: float, least_share: float
+) -> list[Measured]:
+    """Registrations of each keyframe with the map of every other pass nearby, of points within `reach`, m.
+
+    poses (n, 3, 3) of the keyframes; local_map: m of way; least_share: of the points that must lie on the map.
+    """
+    found: list[Measured] = []
+    maps: dict[int, LineMap] = {}
+    places = poses[:, :2, 2]
+    way = np.array([frame.way for frame in frames])
+    for row in range(len(poses)):
+        apart = np.linalg.norm(places[:row] - places[row], axis=1)
+        others = np.flatnonzero((apart < _NEARBY) & (way[:row] < way[row] - 2 * local_map))
+        if not len(others):
+            continue
+        runs = np.split(others, np.flatnonzero(np.diff(way[others]) > _GAP) + 1)
+        nearest = sorted((int(run[np.argmin(apart[run])]) for run in runs), key=lambda k: apart[k])
+        for other in dict.fromkeys(near // _SHARED * _SHARED for near in nearest[:_MOST_PASSES]):
+            if other not in maps:
+                around = [frame for frame in frames if abs(frame.way - way[other]) < local_map / 3]
+                maps[other] = LineMap.of(joined(around, frames[other]))
+            guess = np.linalg.inv(poses[other]) @ poses[row]
+            fit = maps[other].fit(frames[row].points, vector(guess), _PRIOR, reach)
+            if fit.share > least_share:
+                found.append(measured_by(other, row, fit))
+    return found
+
 
 _SCAN_STEP = 0.1  # m: scans that moved less, and turned less than 3 degrees, are not registered
 _LEAST_POINTS = 20  # of a scan that is registered

@@ -6,7 +6,7 @@ odometry.tum                by odometry alone; online.tum: as estimated when eac
 covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
 reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
-map/                        the points of each submap (PLY or PCD) and its place (`pipelines.slam.slam_map`)
+map/                        the points of each submap (PLY or PCD) and its place (`pipelines.slam.submaps`)
 graph.g2o, observations.csv keyframes, odometry, loops, landmarks: the whole graph (`pipelines.slam.saved_graph`)
 landmarks.json              each landmark; landmarks.csv: the same as a table, with shapes as WKT
 landmarks.ply               points along the poles and on the observed pieces of the walls
@@ -34,11 +34,9 @@ from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_cloud
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
-from pipelines.slam.drive import KeyframeClouds
-from pipelines.slam.graph_export import write_landmark_table
-from pipelines.slam.lidar_slam import LidarSlamSettings
-from pipelines.slam.lidar_slam_types import LidarSlamResult
-from pipelines.slam.odometry import OdometrySettings
+from pipelines.slam.joint import SlamWithObjects
+from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings
+from pipelines.slam.odometry import KeyframeClouds, OdometrySettings
 from pipelines.slam.results import (
     confirmed_paths,
     landmark_rows,
@@ -46,10 +44,9 @@ from pipelines.slam.results import (
     write_covariances,
     write_objects,
 )
-from pipelines.slam.saved_graph import write_graph
-from pipelines.slam.scan_landmarks import GROUND, LINE, WALL
-from pipelines.slam.slam_map import Origin, SlamMap, write_map
-from pipelines.slam.with_objects import SlamWithObjects
+from pipelines.slam.saved_graph import write_graph, write_landmark_table
+from pipelines.slam.scan_content import GROUND, LINE, WALL
+from pipelines.slam.submaps import Origin, SlamMap, write_map
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
 from saga_fg.types.landmark import Landmark

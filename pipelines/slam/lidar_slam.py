@@ -1,4 +1,6 @@
-"""SLAM with a LiDAR, scan by scan: odometry, keyframes, submaps and landmarks, loops, in one running graph.
+"""SLAM with a LiDAR, scan by scan: odometry, keyframes, submaps and landmarks, loops, in one graph.
+
+SLAM with a LiDAR, scan by scan: odometry, keyframes, submaps and landmarks, loops, in one running graph.
 
     prior         the first pose
     odometry      || log( (T_k^-1 T_(k+1))^-1  D_k ) ||_{P_k}      between successive keyframes
@@ -16,7 +18,7 @@ Odometry is that of the LiDAR, or the recording's own poses, for comparison and 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -24,34 +26,111 @@ from typing import Literal
 import numpy as np
 
 from data_tools.lidar import Scan, Submap, voxel_downsample
-from data_tools.lidar.moving import without_objects
-from data_tools.lidar.scan import ScanSequence
+from data_tools.lidar.scan import ScanSequence, without_objects
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
-from pipelines.slam.drive import Odometry, OdometryPath, RecordedOdometry, checked_step, moved_pose
-from pipelines.slam.lidar_slam_types import START, LidarSlamResult, SlamStep
-from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
-from pipelines.slam.moving_objects import MovingObjects, frames_at
-from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
-from pipelines.slam.scan_landmarks import ScanLandmarkSettings, observe_landmarks
-from pipelines.slam.slam_map import CloudFormat
-from pipelines.slam.submap_loops import ClosedSubmaps, SubmapLoops
-from pipelines.slam.submaps import SubmapBuilder, world_T_submap
+from pipelines.slam.loop_closures import ClosedSubmaps, LoopSettings, PlaceLoops, SubmapLoops
+from pipelines.slam.odometry import (
+    Drive,
+    LidarOdometry,
+    Odometry,
+    OdometryPath,
+    OdometrySettings,
+    OdometryStep,
+    RecordedOdometry,
+    checked_step,
+    moved_pose,
+)
+from pipelines.slam.scan_content import MovingObjects, ScanLandmarkSettings, frames_at, observe_landmarks
+from pipelines.slam.submaps import CloudFormat, SubmapBuilder, world_T_submap
 from pipelines.slam.vehicle_sensors import VehicleSensors
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.landmarks.detector import LandmarkDetector
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.model.landmarks import LandmarkDetector
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryNoise
+from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings
-from saga_fg.slam.submaps import SubmapGraph, SubmapSettings
+from saga_fg.slam.submaps import LoopClosure, Loops, LoopSelection, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix, ImuSamples, WheelSpeed
+from saga_fg.types.landmark import Landmark, Observation
+
+START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
+
+
+@dataclass(frozen=True, eq=False)
+class SlamStep:
+    """One scan placed.
+
+    world_T_lidar  (4, 4) the sensor's pose now, in the map
+    covariance     (6, 6) of that, (rotation, translation) in the sensor's frame, rad^2, m^2
+    odometry       what the odometry said of the scan
+    keyframe       number of the keyframe that the scan became, None for none
+    submap         the one that it closed, None for none
+    loops          those found in it, between keyframes
+    """
+
+    world_T_lidar: FloatArray
+    covariance: FloatArray
+    odometry: OdometryStep
+    keyframe: int | None
+    submap: Submap | None
+    loops: tuple[LoopClosure, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LidarSlamResult:
+    """Result for K scans, M of them keyframes, in S submaps, in the world of the first pose.
+
+    drive          the odometry; keyframes (M,) are rows among the scans
+    odometry       (K) poses of the vehicle by odometry alone; trajectory (K): by the graph; online (K): as estimated
+                   when the scan came
+    covariances    (M, 6, 6) of the keyframes' poses, (rotation, translation) in the sensor's frame, rad^2, m^2
+    landmarks      of the map, those seen more than once
+    observations   of landmarks, with the landmark and the keyframe of each
+    loops          that were closed and agree with each other, between keyframes
+    false_loops    those that do not, and are left out of the solution
+    selection      how loops were chosen, and deviations of odometry to those stated, as they demand
+    degenerate     (K) motions that each scan left open, in words
+    moving         (K) boxes of moving objects that were left out of each scan, in its frame
+    misfits        what does not fit of the vehicle's sensors, in words, by their names
+    unjudged       sensors that have measured too little to tell, likewise
+    submaps        S, and world_T_submap (S, 4, 4) their places
+    world_T_lidar  (M, 4, 4) poses of the keyframes
+    """
+
+    drive: Drive
+    odometry: Trajectory
+    trajectory: Trajectory
+    online: Trajectory
+    covariances: FloatArray
+    landmarks: Sequence[Landmark]
+    observations: Sequence[AssociatedObservation]
+    loops: Sequence[LoopClosure]
+    false_loops: Sequence[LoopClosure]
+    selection: LoopSelection
+    degenerate: Sequence[tuple[str, ...]]
+    moving: Sequence[Boxes]
+    misfits: Mapping[str, str]
+    unjudged: Mapping[str, str]
+    submaps: Sequence[Submap]
+    world_T_submap: FloatArray
+    world_T_lidar: FloatArray
+
+    def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
+        """Motions (4, 4) between scans by odometry, as `Drive.motions`, with the covariances of the solution."""
+        return [(T, self.selection.inflated(P)) for T, P in self.drive.motions(rows)]
+
+    @property
+    def keyframes(self) -> IntArray:
+        """(M,) rows of the keyframes among the scans."""
+        return np.array(self.drive.keyframes, dtype=np.int64)
+
 
 OdometrySource = Literal["lidar", "oxts"]
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
@@ -297,3 +376,15 @@ def lidar_slam(
         if progress is not None:
             progress("slam", k + 1, len(scans))
     return slam.finish()
+
+
+def known_providers(
+    result: LidarSlamResult, epochs: Sequence[int], settings: SubmapSettings
+) -> tuple[LandmarkObservations, Loops]:
+    """Providers of landmarks seen from keyframes and of loops between these, whose poses are those of `epochs`."""
+    start = {mark.number: mark.state for mark in result.landmarks}
+    seen: dict[int, list[tuple[int, Observation]]] = {}
+    for one in result.observations:
+        if one.landmark in start:
+            seen.setdefault(epochs[one.pose], []).append((one.landmark, one.observation))
+    return LandmarkObservations(seen, start, settings.robust), Loops(result.loops, epochs)

@@ -1,4 +1,6 @@
-"""Localisation: a drive in the map of an earlier one.
+"""Localisation: a drive in the map of an earlier one, by its places and by registration.
+
+Localisation: a drive in the map of an earlier one.
 
     odometry      LiDAR odometry, scan by scan, as in SLAM
     where first   a guess, or place recognition: the points of the first metres, as a submap, are looked for among the
@@ -20,27 +22,172 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from data_tools.lidar import Scan, upright, voxel_downsample
-from factors import Robust
-from pipelines.slam.drive import OdometryPath, moved_pose
-from pipelines.slam.map_places import MapPlaces
-from pipelines.slam.map_registration import MapRegistration, MeasuredPose
-from pipelines.slam.odometry import LOST_TRANSLATION, LidarOdometry, OdometrySettings
-from pipelines.slam.slam_map import SlamMap
+from data_tools.lidar import (
+    Registration,
+    RegistrationError,
+    RegistrationSettings,
+    Scan,
+    SurfelMap,
+    register,
+    upright,
+    voxel_downsample,
+)
+from data_tools.lidar.places import PlaceImage, PlaceIndex, Structure
+from factors import Robust, pose_prior_factor
+from pipelines.slam.loop_closures import COMPARED, FEWEST, SURFEL, agreeing, fits_otherwise, registered
+from pipelines.slam.odometry import LOST_TRANSLATION, LidarOdometry, OdometryPath, OdometrySettings, moved_pose
+from pipelines.slam.submaps import SlamMap
 from pipelines.slam.vehicle_sensors import VehicleSensors
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators import IncrementalSmoother
-from saga_fg.graph import EGO_POSE, FactorProvider
+from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import MeasuredMotion
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings
-from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
+from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
+
+_REGISTERED = 6  # places for each search
+
+
+@dataclass(eq=False)
+class MapPlaces:
+    """Places of a map, m.
+
+    radius       of what counts as around a place
+    min_overlap  share of the structure that a cloud and its place have in common
+    spacing      of the points that are registered
+    ambiguous    whether the last cloud that was looked for has fitted several places
+    """
+
+    slam_map: SlamMap
+    radius: float
+    min_overlap: float
+    spacing: float
+    registration: RegistrationSettings
+    ambiguous: bool = False
+    _index: PlaceIndex | None = field(default=None, init=False)
+
+    def around(self, number: int, centre: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Points (N, 3) around a centre, that of submap `number` if None, in its frame, and that frame (4, 4)."""
+        frames = self.slam_map.map_T_submap
+        frame = frames[number]
+        near = np.linalg.norm(frames[:, :3, 3] - (frame[:3, 3] if centre is None else centre), axis=1) <= self.radius
+        near[number] = True
+        inverse = inverse_transform(frame)
+        moved = [
+            transform_points(inverse @ frames[k], self.slam_map.points[k].astype(np.float64))
+            for k in np.flatnonzero(near).tolist()
+        ]
+        return np.concatenate(moved), frame
+
+    def nearest(self, centre: FloatArray) -> int:
+        """The submap whose frame is nearest to a point (3,) of the map."""
+        return int(np.argmin(np.linalg.norm(self.slam_map.map_T_submap[:, :3, 3] - centre, axis=1)))
+
+    def recognised(self, query: FloatArray, near: FloatArray | None = None) -> FloatArray | None:
+        """map_T_query (4, 4) of the one place that points (N, 3), z up, show, None for none and for several.
+
+        near: a place (2,) or (3,) in the map; places farther than the radius from it are left out
+        """
+        self.ambiguous = False
+        if len(query) < FEWEST:
+            return None
+        if self._index is None:
+            self._index = PlaceIndex()
+            for number, cloud in enumerate(self.slam_map.points):
+                if len(cloud) >= FEWEST:
+                    self._index.add(number, PlaceImage.of(cloud.astype(np.float64)))
+        mine, points = Structure.of(query), query[voxel_downsample(query, self.spacing)]
+        found: list[tuple[float, FloatArray]] = []
+        otherwise = False
+        older = None
+        if near is not None:
+            off = np.linalg.norm(self.slam_map.map_T_submap[:, :2, 3] - near[:2], axis=1)
+            older = np.flatnonzero(off <= self.radius).tolist()
+        for match in self._index.candidates(PlaceImage.of(query), older, COMPARED)[:_REGISTERED]:
+            around, frame = self.around(match.number)
+            fine = registered(around, points, match.place_T_query, self.registration)
+            if fine is None:
+                continue
+            overlap = Structure.of(around).shared(mine, fine.map_T_scan)
+            if overlap > self.min_overlap:
+                if fits_otherwise(match):
+                    otherwise = True
+                else:
+                    found.append((overlap, frame @ fine.map_T_scan))
+        found.sort(key=lambda one: -one[0])
+        self.ambiguous = otherwise and not found
+        if not found:
+            return None
+        places = np.array([map_T_query for _, map_T_query in found])
+        agreed = agreeing(places[:, :3, 3], np.array([overlap for overlap, _ in found]))
+        self.ambiguous = not agreed
+        return places[0] if agreed else None
+
+
+_MAX_RESIDUAL = 0.3  # largest mean distance of the points of a scan from the map, m
+_MIN_PAIRS = 0.4  # least share of the points of a scan that the map must have surfels for
+_RELOADED = 15.0  # m of way after which the surfels around are taken anew
+
+
+class MapRegistration:
+    """The surroundings of a place in a map, which follow the vehicle; spacing: of the points registered, m."""
+
+    def __init__(self, places: MapPlaces, spacing: float) -> None:
+        self._places, self._spacing = places, spacing
+        self._surfels, self._centre = SurfelMap(SURFEL, np.inf), np.full(3, np.inf)
+        self._structure, self._structure_frame = Structure.of(np.zeros((1, 3))), np.eye(4)
+
+    def registered(self, points: FloatArray, predicted: FloatArray, rough: bool) -> Registration | None:
+        """The registration of a scan (N, 3) with the map, None where it does not fit.
+
+        predicted: map_T_scan (4, 4); rough: to metres alone
+        """
+        if np.linalg.norm(predicted[:3, 3] - self._centre) > _RELOADED:
+            self._load(predicted[:3, 3])
+        thin = points[voxel_downsample(points, self._spacing)] if len(points) else points
+        criteria, start = self._places.registration, predicted
+        try:
+            if rough:
+                start = register(thin, self._surfels, start, 3 * SURFEL, 1.0, criteria, "hold").map_T_scan
+            found = register(thin, self._surfels, start, 1.5 * SURFEL, 0.1, criteria, "hold")
+        except RegistrationError:
+            return None
+        fits = found.converged and found.pairs >= _MIN_PAIRS * len(thin) and found.residual <= _MAX_RESIDUAL
+        return found if fits else None
+
+    def agreement(self, points: FloatArray, map_T_points: FloatArray) -> float | None:
+        """Share of what stands above the ground in points (N, 3) that the map has, None where there is too little."""
+        near_T_points = inverse_transform(self._structure_frame) @ map_T_points
+        return self._structure.agreement(Structure.of(points), near_T_points)
+
+    def _load(self, centre: FloatArray) -> None:
+        """Take the surfels and the structure around a place."""
+        points, frame = self._places.around(self._places.nearest(centre), centre)
+        self._surfels, self._centre = SurfelMap(SURFEL, np.inf), centre
+        self._surfels.add(transform_points(frame, points), centre)
+        self._structure, self._structure_frame = Structure.of(points), frame
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPose:
+    """Provider of the pose of this epoch as measured in the map: (4, 4) and its covariance (6, 6), with a loss."""
+
+    map_T_lidar: FloatArray
+    covariance: FloatArray
+    robust: Robust
+    name: str = "map"
+
+    def factors(self, view: GraphView) -> Additions:
+        key = view.key(EGO_POSE, 0)
+        return Additions(factors=[pose_prior_factor(key, self.map_T_lidar, self.covariance, self.robust)])
+
 
 _LOG = logging.getLogger(__name__)
 _GUESSED = np.diag([0.02, 0.02, 0.1, 1.0, 1.0, 0.5]) ** 2  # of a pose that was given or recognised

@@ -27,7 +27,7 @@ from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_p
 from pipelines.slam.lidar_results import LIDAR_FILES
 from pipelines.slam.localisation import Localiser, LocaliserSettings
 from pipelines.slam.results import write_covariances
-from pipelines.slam.slam_map import SlamMap
+from pipelines.slam.submaps import SlamMap
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray

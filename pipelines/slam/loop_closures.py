@@ -1,4 +1,6 @@
-"""Loop closures by place: submaps that look alike from above, proved by registration.
+"""Loop closures: submaps that look alike from above, proved by registration and by agreement.
+
+Loop closures by place: submaps that look alike from above, proved by registration.
 
 1. Recognition (`data_tools.lidar.places`): the images of older submaps that are most like the new one are aligned with
    it, without a guess. Submaps further off than any drift are left out.
@@ -8,25 +10,155 @@
 3. Drift: errors of relative poses grow with the way between two submaps along measurements. A loop within what
    odometry may be off is believed at once; one further off must be proved better, or waits until another one, found
    later on the way, agrees with it. Then odometry is wrong, and the loop is `confirmed`: no robust loss gives it up.
+
+The submaps of a drive and the loops between them, searched for once for every submap, when it is closed.
+
+    search.add(submap, world_T_submap)  ->  loops between this submap and older ones
+
+A loop says where the frame of one submap is in that of another. It enters the running graph as a factor between the two
+anchors, under a robust loss.
+
+The proof that two clouds show one place: registration, first rough and then fine, and rivals.
+
+A place that fits nearly as well elsewhere is none: the same two clouds aligned otherwise (row houses), or another place
+that says that the vehicle is elsewhere (streets that look alike).
+
+Acceptance of loop closures by agreement of several, for the planar laser and the LiDAR.
+
+A loop within the drift of odometry is accepted at once. Any other waits for a second one, found from another place on
+the way, that agrees with it: both loops and the odometry between their ends compose to the identity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from data_tools.lidar import RegistrationSettings, Submap, voxel_downsample
-from data_tools.lidar.overlap import Structure
-from data_tools.lidar.places import PlaceImage, PlaceIndex, PlaceMatch
-from pipelines.slam.loop_agreement import Agreement, deviation
-from pipelines.slam.place_proof import COMPARED, FEWEST, SAME, SPACING, agreeing, fits_otherwise, registered
+from data_tools.lidar import (
+    Registration,
+    RegistrationError,
+    RegistrationSettings,
+    Submap,
+    SurfelMap,
+    register,
+    voxel_downsample,
+)
+from data_tools.lidar.places import PlaceImage, PlaceIndex, PlaceMatch, Structure
+from data_tools.lidar.registration import Undetermined
+from pipelines.slam.odometry import LEAST
+from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.numerics.geometry import carried_covariance, inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
-from saga_fg.slam.pose_graph.distances import shortest_paths
-from saga_fg.slam.submaps import LoopClosure
+from saga_fg.slam.pose_graph.running import shortest_paths
+from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
+
+
+class PoseLoop(Protocol):
+    """A measurement between two poses: first_T_second (3, 3) in the plane or (4, 4) in space."""
+
+    @property
+    def first(self) -> int: ...
+    @property
+    def second(self) -> int: ...
+    @property
+    def first_T_second(self) -> FloatArray: ...
+
+
+Loop = TypeVar("Loop", bound=PoseLoop)
+
+
+def deviation(T: FloatArray) -> FloatArray:
+    """Translation, m, and rotation, rad, (2,) of a transform (3, 3) or (4, 4)."""
+    d = len(T) - 1
+    turned = float(np.linalg.norm(T[:d, :d] - np.eye(d))) / (2 * np.sqrt(2))  # sin of half the angle
+    return np.array([float(np.linalg.norm(T[:d, d])), 2 * np.arcsin(min(turned, 1.0))])
+
+
+@dataclass(eq=False)
+class Agreement(Generic[Loop]):
+    """Loops that wait for another one that agrees with them.
+
+    within    largest difference of two loops that agree (2,), m and rad; `drift` (2,) more for each m between them
+    patience  m of way that a loop waits
+    apart     least way between the places that the two are found from, m
+    """
+
+    within: FloatArray
+    drift: FloatArray
+    patience: float
+    apart: float = 0.0
+    _waiting: list[Loop] = field(default_factory=list)
+
+    def confirmed(
+        self, loop: Loop, between: Callable[[int, int], FloatArray], way: Callable[[int], float]
+    ) -> Sequence[Loop]:
+        """The loop with those of before that agree with it; it waits if there are none.
+
+        between: pose of the second in the frame of the first, by odometry; way: driven until a pose, m
+        """
+        now = way(loop.second)
+        agreed = []
+        self._waiting = [k for k in self._waiting if way(k.second) > now - self.patience]
+        for other in self._waiting:
+            far = abs(way(loop.first) - way(other.first)) + abs(now - way(other.second))
+            one = between(other.first, loop.first) @ loop.first_T_second
+            off = deviation(np.linalg.inv(one) @ other.first_T_second @ between(other.second, loop.second))
+            if now - way(other.second) >= self.apart and (off < self.within + self.drift * far).all():
+                agreed.append(other)
+        held = {id(other) for other in agreed}
+        self._waiting = [k for k in self._waiting if id(k) not in held]
+        if not agreed:
+            self._waiting.append(loop)
+            return []
+        return [loop, *agreed]
+
+
+FEWEST = 200  # points of a submap that shows a place
+COMPARED = 12  # places whose images are compared in each search
+SURFEL, SPACING = 1.0, 1.5  # m: voxels of the map, and spacing of the points registered
+SAME = 4.0  # m that two findings of one place differ by, besides drift
+_SINGLE = 0.8  # share of the correlation that another alignment of the two may have
+_UNIQUE = 0.92  # share of the structure in common that another place may have
+
+
+def registered(
+    old: FloatArray,
+    points: FloatArray,
+    old_T_points: FloatArray,
+    settings: RegistrationSettings,
+    undetermined: Undetermined = "refuse",
+) -> Registration | None:
+    """Register points (N, 3) with the points (M, 3) of a place, from an alignment of images; None: they do not fit."""
+    surfels = SurfelMap(SURFEL, reach=np.inf)
+    surfels.add(old, np.zeros(3))
+    try:
+        rough = register(points, surfels, old_T_points, 3 * SURFEL, 1.0, settings, undetermined)
+        fine = register(points, surfels, rough.map_T_scan, SURFEL, 0.1, settings, undetermined)
+    except RegistrationError:
+        return None
+    return fine if fine.converged else None
+
+
+def fits_otherwise(match: PlaceMatch) -> bool:
+    """True if another alignment of the two is nearly as good."""
+    return match.rival > _SINGLE * match.score
+
+
+def agreeing(places: FloatArray, overlap: FloatArray, spread: FloatArray | float = SAME) -> Sequence[int]:
+    """Those of the places (P, 3), m, that agree with the first; none if another is nearly as good and says otherwise.
+
+    overlap (P,) of each, spread (P,) m that it may be off the first
+    """
+    elsewhere = np.linalg.norm(places - places[0], axis=1) >= spread
+    if (overlap[elsewhere] > _UNIQUE * overlap[0]).any():
+        return []
+    return np.flatnonzero(~elsewhere).tolist()
+
 
 _REGISTERED, _TAKEN = 4, 2  # places for each submap
 _ALIKE = 0.3  # correlation of images from which places are registered
@@ -62,7 +194,7 @@ class _Proved:
 
 @dataclass(eq=False)
 class PlaceLoops:
-    """Submaps in, loops out: `pipelines.slam.submap_loops.SubmapLoops`."""
+    """Submaps in, loops out: `SubmapLoops`."""
 
     settings: LoopSettings = field(default_factory=LoopSettings)
     _index: PlaceIndex = field(default_factory=PlaceIndex)
@@ -177,3 +309,51 @@ def _off(frames: FloatArray, loop: LoopClosure) -> float:
     """Distance of where a loop says that the submap is from where it is estimated, m."""
     found = frames[loop.first] @ loop.first_T_second
     return float(np.linalg.norm(found[:3, 3] - frames[loop.second, :3, 3]))
+
+
+_LOG = logging.getLogger(__name__)
+
+
+class SubmapLoops(Protocol):
+    """Keeps what it needs of the submaps: descriptors, points."""
+
+    def add(self, submap: Submap, world_T_submap: FloatArray) -> Sequence[LoopClosure]:
+        """Take the next submap and return loops, `first` and `second` numbers of submaps.
+
+        world_T_submap: (number + 1, 4, 4) frames of all submaps so far, as estimated now, this one's last
+        """
+
+
+class ClosedSubmaps:
+    """The submaps of a drive so far; search: for loops between them, None for none."""
+
+    def __init__(self, search: SubmapLoops | None) -> None:
+        self.submaps, self.loops = list[Submap](), list[LoopClosure]()  # loops are between keyframes
+        self._search = search
+
+    def close(self, builder: SubmapBuilder, graph: SubmapGraph, poses: FloatArray) -> Submap:
+        """Close the running submap, poses (n, 4, 4) of all keyframes up to its last."""
+        submap = builder.close(poses[-len(builder) :])
+        self.submaps.append(submap)
+        if self._search is not None:
+            frames = np.array([world_T_submap(one, poses[one.anchor]) for one in self.submaps])
+            found = [self._between_anchors(loop) for loop in self._search.add(submap, frames)]
+            graph.close_loops(found)
+            anchors = [one.anchor for one in self.submaps]
+            self.loops += [replace(one, first=anchors[one.first], second=anchors[one.second]) for one in found]
+        return submap
+
+    def judged(self, selection: LoopSelection) -> tuple[list[LoopClosure], list[LoopClosure]]:
+        """The loops between keyframes that are true, and those that are false, which a warning counts."""
+        kept = selection.kept
+        true, false = ([self.loops[row] for row in np.flatnonzero(rows).tolist()] for rows in (kept, ~kept))
+        if false:
+            _LOG.warning("%d of %d loops contradict the other %d, and are left out", len(false), len(kept), len(true))
+        return true, false
+
+    def _between_anchors(self, loop: LoopClosure) -> LoopClosure:
+        """A loop between frames of submaps as one between their anchors."""
+        first, second = (self.submaps[n].anchor_T_submap for n in (loop.first, loop.second))
+        covariance = carried_covariance(second, loop.covariance) + LEAST
+        moved = first @ loop.first_T_second @ inverse_transform(second)
+        return replace(loop, first_T_second=moved, covariance=covariance)

@@ -1,21 +1,159 @@
-"""The vehicle's sensors beside its LiDAR: what they measured since the last keyframe, their factors, and their fit."""
+"""The vehicle's sensors beside its LiDAR: joined between keyframes, wheels compared with scans.
+
+Comparison of the wheels' speed with the motion by scans, once, over the first way on which scans show the motion.
+
+The ratio k of both is the median over scans, with deviation 1.25 s / sqrt(n), s by the median absolute deviation. Until
+then speeds enter the graph only where scans leave motions open. Within `_SURE` deviations of 1, that of k and the
+`share` of the settings together, wheels are taken as they are. Beyond, the speed is divided by k from then on; it is
+left out if k changes too much, or is none that radius or calibration of wheels explain.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
-from pipelines.slam.between_keyframes import BetweenKeyframes
 from pipelines.slam.odometry import OdometryStep
-from pipelines.slam.wheel_comparison import WheelComparison
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import checked_transform, inverse_transform
+from saga_fg.providers import Wheels
+from saga_fg.providers.odometry import mounting
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings, sensor_providers
-from saga_fg.types.ego_measurements import EgoMeasurements, WheelSpeed
+from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix, ImuSamples, WheelSpeed
+
+_LOG = logging.getLogger(__name__)
+
+
+class BetweenKeyframes:
+    """Measurements that no keyframe has taken yet.
+
+    sensors: that the graph has; others_read: whether other providers may read the rest; speed_deviation: of wheel
+    speeds without one of their own, m/s
+    """
+
+    def __init__(self, sensors: Collection[str], others_read: bool, speed_deviation: float) -> None:
+        self._sensors, self._others_read, self._speed_deviation = sensors, others_read, speed_deviation
+        self._imu: list[ImuSamples] = []
+        self._wheels: list[WheelSpeed] = []
+        self._fix: tuple[float, GpsFix] | None = None  # the newest, and when it was taken
+        self._warned: set[str] = set()
+
+    def check(self, measured: EgoMeasurements) -> None:
+        """Raise `InputError` for a measurement that nothing reads, and warn once where only other providers may."""
+        for name in ("gps", "imu", "wheels"):
+            if getattr(measured, name) is None or name in self._sensors:
+                continue
+            if not self._others_read:
+                raise InputError(f"{name}: expected it among the sensors that were named, as in sensors=[{name!r}]")
+            if name not in self._warned:
+                _LOG.warning("%s: not among the sensors; only the providers that were given can read it", name)
+                self._warned.add(name)
+
+    def add(self, time: float, measured: EgoMeasurements) -> None:
+        """Add what came with a scan at `time`, s."""
+        self._imu += [] if measured.imu is None else [measured.imu]
+        self._wheels += [] if measured.wheels is None else [measured.wheels]
+        if measured.gps is not None:
+            self._fix = time - measured.gps.age, measured.gps
+
+    def frame(self, time: float, detections: Detections | None) -> Frame | None:
+        """The measurements of a keyframe at `time`, s, besides its scan, for providers; the newest fix has its age."""
+        if not self._imu and not self._wheels and self._fix is None and detections is None:
+            return None
+        samples, speed, fix = None, None, None
+        if self._imu:
+            columns = ("dt", "acceleration", "angular_rate")
+            samples = ImuSamples(*(np.concatenate([getattr(one, name) for one in self._imu]) for name in columns))
+        if self._wheels:
+            speed = self._speed()
+        if self._fix is not None:
+            fix = replace(self._fix[1], age=max(time - self._fix[0], 0.0))
+        ego = EgoMeasurements(gps=fix, imu=samples, wheels=speed)
+        return Frame(time, "lidar", Detections.empty() if detections is None else detections, None, "ego", ego=ego)
+
+    def clear(self) -> None:
+        """Everything was taken."""
+        self._imu, self._wheels, self._fix = [], [], None
+
+    def _speed(self) -> WheelSpeed:
+        """The mean speed; errors of the speeds are independent."""
+        dt = np.array([one.dt for one in self._wheels])
+        share = dt / dt.sum() if dt.sum() > 0 else np.full(len(dt), 1 / len(dt))
+        deviation = None
+        if any(one.deviation is not None for one in self._wheels):
+            own = [self._speed_deviation if one.deviation is None else one.deviation for one in self._wheels]
+            deviation = float(np.linalg.norm(share * own))
+        return WheelSpeed(float(share @ [one.speed for one in self._wheels]), float(dt.sum()), deviation)
+
+
+_WAY, _LEAST = 15.0, 15  # m and scans that are compared
+_MOVING = 1.0  # m/s from which a speed tells a scale
+_SURE = 3.0  # deviations
+_SCALES, _SPREAD = (0.75, 1.33), 0.1  # of wheels that are scaled, and the largest s of theirs
+
+
+class WheelComparison:
+    """Takes each speed before its scan is placed (`corrected`), and the scan after (`used`, `update`).
+
+    settings: of the wheels; ego_T_lidar: (4, 4) pose of the LiDAR on the vehicle
+    """
+
+    def __init__(self, settings: Wheels, ego_T_lidar: FloatArray) -> None:
+        self._settings = settings
+        self._lidar_T_axle = inverse_transform(ego_T_lidar) @ mounting("mounted", settings.mounted).matrix()
+        self._scale: float | None = 1.0  # None: left out
+        self._raw: WheelSpeed | None = None
+        self._used: WheelSpeed | None = None
+        self._last: OdometryStep | None = None
+        self._ratios, self._way, self._judged = list[float](), 0.0, settings.estimate_scale
+
+    def corrected(self, wheels: WheelSpeed | None) -> WheelSpeed | None:
+        """The speed to use; None if wheels are left out."""
+        self._raw = self._used = wheels
+        if wheels is not None and self._scale != 1:
+            self._used = None if self._scale is None else replace(wheels, speed=self._scale * wheels.speed)
+        return self._used
+
+    def used(self, step: OdometryStep) -> WheelSpeed | None:
+        """The speed that enters the graph with a scan that was placed."""
+        shown = step.registration is not None and not step.degenerate
+        return self._used if self._judged or not shown else None
+
+    def update(self, step: OdometryStep) -> str:
+        """Compare the last speed with the motion to a scan; returns once what does not fit, in words."""
+        last, self._last = self._last, step if step.registration is not None and not step.degenerate else None
+        if self._judged or self._raw is None or last is None or self._last is None:
+            return ""
+        dt = step.timestamp - last.timestamp
+        moved = inverse_transform(last.map_T_lidar @ self._lidar_T_axle) @ step.map_T_lidar @ self._lidar_T_axle
+        speed = float(gtsam.Pose3.Logmap(gtsam.Pose3(moved))[3]) / dt
+        if abs(speed) < _MOVING or abs(self._raw.dt - dt) > dt / 2:
+            return ""
+        self._ratios.append(self._raw.speed / speed)
+        self._way += abs(speed) * dt
+        return self._judged_misfit() if self._way >= _WAY and len(self._ratios) >= _LEAST else ""
+
+    def _judged_misfit(self) -> str:
+        ratio = float(np.median(self._ratios))
+        spread = 1.4826 * float(np.median(np.abs(np.array(self._ratios) - ratio)))
+        deviation = np.hypot(self._settings.share, 1.25 * spread / np.sqrt(len(self._ratios)))
+        self._judged = True
+        allowed = _SURE * deviation
+        if abs(ratio - 1) <= allowed:
+            return ""
+        scaled = 1 / ratio if _SCALES[0] <= ratio <= _SCALES[1] and spread <= _SPREAD else None
+        self._scale = scaled
+        then = "they are left out from here on" if scaled is None else f"it is multiplied by {scaled:.3f} from here on"
+        return (
+            f"{self._settings.name}: over the first {self._way:.0f} m their speed is {ratio:.3f} times that by the "
+            f"scans, where its settings and the spread of the ratio allow {allowed:.1%} off; {then}"
+        )
 
 
 class VehicleSensors:

@@ -1,11 +1,8 @@
 """Offline labelling of recordings: the online pass, the passes of smoothing, the labels."""
 
-from pipelines.smoothing.chunks import ChunkSettings
-from pipelines.smoothing.config import SmoothConfig, load_smooth_config
-from pipelines.smoothing.output import write_labels, write_streamed_labels
-from pipelines.smoothing.passes import smooth_known_objects
-from pipelines.smoothing.scene import SmoothedScene, smooth_dataset, smooth_scene
-from pipelines.smoothing.streaming import StreamedScene, smooth_stream
+from pipelines.smoothing.output import SmoothedScene, smooth_dataset, smooth_scene, write_labels, write_streamed_labels
+from pipelines.smoothing.passes import SmoothConfig, load_smooth_config, smooth_known_objects
+from pipelines.smoothing.streaming import ChunkSettings, StreamedScene, smooth_stream
 
 __all__ = [
     "ChunkSettings",

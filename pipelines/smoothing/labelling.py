@@ -1,14 +1,26 @@
-"""Smoothed objects to labels: size, height, heading, score and quality of every box at the moments wanted."""
+"""Smoothed objects to labels, by attributes of whole objects: size, height, heading, score, quality.
+
+Attributes of whole objects, gathered chunk by chunk while a recording streams by: size, score, front, identity.
+
+A chunk has all positions of its objects, and a part of the evidence on their sizes, scores and fronts. The parts are
+summed: probabilities and opportunities of the score, metres and votes of the front, and of the size the weights of all
+measured values, to half a millimetre.
+
+Every chunk stitches tracklets into objects anew, and names an object after its first tracklet there. A tracklet that
+was part of an object before stays so: the object keeps the name of its tracklets. Where they have several, it is that
+of the tracklet that reaches furthest towards the chunk, so that an object's name does not change across the boundary.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from pipelines.smoothing.passes import SmoothedObjects
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.smoothing import (
     Evidence,
     Headings,
@@ -19,11 +31,13 @@ from saga_fg.smoothing import (
     SmoothingSettings,
     StateTable,
     constant_sizes,
+    is_reversed,
     lifespans_of,
     quality_of,
     scalar_readings,
     smooth_headings,
     smooth_walks,
+    weighted_medians,
 )
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
@@ -178,3 +192,172 @@ def _sources(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -
     row = online.rows_of(states.id)
     beyond = (states.moment < online.first[row]) | (states.moment > online.last[row])
     return np.where(beyond, "extended", np.where(observed, "observed", "filled"))
+
+
+RESOLUTION = 5e-4  # m, of the sizes that are kept
+MOST_VALUES = 4096  # kept before equal ones are put together
+
+
+class ObjectAttributes(NamedTuple):
+    """Final attributes of an object: size (3,) m, score, and whether its headings are half a turn off."""
+
+    size: FloatArray
+    score: float
+    reversed: bool
+
+
+@dataclass
+class _WeightedValues:
+    """Measured values (m,), m, of a dimension with their weights (m,); equal ones are put together."""
+
+    value: FloatArray = field(default_factory=lambda: np.empty(0))
+    weight: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def add(self, value: FloatArray, weight: FloatArray) -> None:
+        self.value = np.concatenate([self.value, value])
+        self.weight = np.concatenate([self.weight, weight])
+        if len(self.value) > MOST_VALUES:
+            steps, index = np.unique(np.rint(self.value / RESOLUTION), return_inverse=True)
+            self.value = steps * RESOLUTION
+            self.weight = np.bincount(index, self.weight).astype(np.float64)
+
+    def median(self) -> float:
+        return float(weighted_medians(np.zeros(len(self.value), dtype=np.int64), 1, self.value, self.weight)[0])
+
+
+def _unmeasured() -> tuple[_WeightedValues, ...]:
+    """Length, width and height without any value."""
+    return _WeightedValues(), _WeightedValues(), _WeightedValues()
+
+
+@dataclass(slots=True)
+class _Summary:
+    """One object so far: sums for the score and the front; lengths, widths and heights."""
+
+    probability: float = 0.0
+    detections: int = 0
+    opportunities: int = 0
+    path: float = 0.0
+    votes: float = 0.0
+    yaw: float = np.nan  # latest heading written
+    sign: float = 1.0  # -1 where the latest headings are half a turn off those at the object's start
+    sizes: tuple[_WeightedValues, ...] = field(default_factory=_unmeasured)
+
+    def measure(self, size: FloatArray, weight: FloatArray) -> None:
+        """Sizes (m, 3), m, with weights (m,)."""
+        for column, values in zip(self.sizes, size.T, strict=True):
+            column.add(values, weight)
+
+    def median_size(self) -> FloatArray:
+        """(3,) m, NaN where none was measured."""
+        return np.array([column.median() for column in self.sizes])
+
+
+class ObjectSummaries:
+    """The objects of a recording by id. Of closed ones the attributes alone are kept."""
+
+    def __init__(self) -> None:
+        self._open: dict[int, _Summary] = {}
+        self._closed: dict[int, tuple[FloatArray, _Summary]] = {}
+
+    @property
+    def ids(self) -> list[int]:
+        """Ids of all objects so far, ascending."""
+        return sorted([*self._open, *self._closed])
+
+    def heading_sign(self, id_: int, yaw: float) -> float:
+        """-1 where a chunk's headings are half a turn off those at the object's start, else 1.
+
+        yaw: the chunk's heading at the moment of the latest one written, rad
+        """
+        summary = self._open.get(id_)
+        if summary is None or not np.isfinite(summary.yaw) or not np.isfinite(yaw):
+            return 1.0 if summary is None else summary.sign
+        return summary.sign * (-1.0 if np.cos(yaw - summary.yaw) < 0 else 1.0)
+
+    def add_detections(self, id_: int, probability: FloatArray, size: FloatArray, weight: FloatArray) -> None:
+        """Add detections (m,) of an object: probability, size (m, 3) in m, NaN for unmeasured, and its weight."""
+        summary = self._summary(id_)
+        summary.probability += float(probability.sum())
+        summary.detections += len(probability)
+        known = np.isfinite(size).all(axis=1)
+        summary.measure(size[known], weight[known])
+
+    def add_opportunities(self, id_: int, count: int) -> None:
+        """Add frames with the object in their field of view."""
+        self._summary(id_).opportunities += count
+
+    def add_headings(self, id_: int, sign: float, yaw: float, path: float, votes: float) -> None:
+        """Add headings up to `yaw` (rad), of a `heading_sign`, with the metres moved along them and their votes."""
+        summary = self._summary(id_)
+        summary.path += sign * path
+        summary.votes += sign * votes
+        summary.sign, summary.yaw = sign, yaw
+
+    def close(self, present: IntArray) -> None:
+        """Reduce the summaries of objects that are no longer present to their attributes."""
+        for id_ in self._open.keys() - set(present.tolist()):
+            summary = self._open.pop(id_)
+            size = summary.median_size()
+            summary.sizes = ()
+            self._closed[id_] = (size, summary)
+
+    def attributes(self, id_: int, prior: float) -> ObjectAttributes:
+        """Attributes of a closed object; prior: opportunities without a detection that every object starts with."""
+        size, summary = self._closed[id_]
+        score = summary.probability / (max(summary.opportunities, summary.detections, 1) + prior)
+        reversed_ = is_reversed(np.array([summary.path]), np.array([summary.votes]))
+        return ObjectAttributes(size, score, bool(reversed_[0]))
+
+    def _summary(self, id_: int) -> _Summary:
+        if id_ in self._closed and id_ not in self._open:  # it appears again
+            size, summary = self._closed.pop(id_)
+            summary.sizes = _unmeasured()
+            if np.isfinite(size).all():
+                summary.measure(size[None], np.array([float(max(summary.detections, 1))]))
+            self._open[id_] = summary
+        return self._open.setdefault(id_, _Summary())
+
+
+class Identities:
+    """Names of objects that hold over all chunks. joined: number of tracklets so far stitched to another."""
+
+    def __init__(self) -> None:
+        self.joined = 0
+        self._owner: dict[int, tuple[int, float]] = {}  # by tracklet: its object's name, and when it was last used
+
+    def name(
+        self, ids: IntArray, object_of: IntArray, track_of: IntArray, times: FloatArray, span: tuple[float, float]
+    ) -> dict[int, int]:
+        """The names of objects (n,), ascending, in a chunk [begin, end), s, that may be infinite.
+
+        Names are unique: an object whose names are all taken gets that of another one that no longer needs it.
+
+        object_of, track_of (N,): of the detections in order of time, -1 for none; times (N,), s
+        """
+        begin, end = span
+        rows = np.flatnonzero((track_of >= 0) & np.isin(object_of, ids))
+        pairs = np.unique(np.stack([object_of[rows], track_of[rows]], axis=1), axis=0)
+        tracklets, begins = np.unique(track_of[rows], return_index=True)
+        first = dict(zip(tracklets.tolist(), times[rows[begins]].tolist(), strict=True))
+        names: dict[int, int] = {}
+        for id_ in ids.tolist():
+            tracks = self._in_order(pairs[pairs[:, 0] == id_, 1].tolist(), first, begin)
+            known = [self._owner[track][0] for track in tracks if track in self._owner]
+            taken = set(names.values())
+            names[id_] = next(name for name in (*known, id_, *ids.tolist()) if name not in taken)
+            for k, track in enumerate(tracks):
+                if k == 0 or first[track] < end:
+                    self.joined += track != names[id_] and track not in self._owner
+                    self._owner[track] = (names[id_], begin)
+        return names
+
+    def forget(self, before: float) -> None:
+        """Forget tracklets of chunks that begin before a time, s."""
+        self._owner = {track: owner for track, owner in self._owner.items() if owner[1] >= before}
+
+    @staticmethod
+    def _in_order(tracks: Sequence[int], first: dict[int, float], begin: float) -> list[int]:
+        """Tracklets from before a chunk, the latest first; then those that begin in it, the earliest first."""
+        old = sorted((track for track in tracks if first[track] < begin), key=lambda track: -first[track])
+        return old + sorted((track for track in tracks if first[track] >= begin), key=lambda track: first[track])

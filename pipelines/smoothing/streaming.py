@@ -1,14 +1,23 @@
-"""A recording smoothed as it is read, in memory that does not grow with its length.
+"""A recording smoothed chunk by chunk as it is read, in memory that does not grow with its length.
+
+A recording smoothed as it is read, in memory that does not grow with its length.
 
     frames -> tracker, frame by frame -> chunks, smoothed one by one with margins -> labels, on disk
 
 The tracker sees the recording once, from one end to the other. All passes of smoothing (`pipelines.smoothing.passes`)
-are made anew for every chunk (`pipelines.smoothing.chunks`). Size, score, front and identity of objects are gathered
-over the chunks (`pipelines.smoothing.object_summaries`) and put in at the end, when the labels are read back from disk.
+are made anew for every chunk. Size, score, front and identity of objects are gathered
+over the chunks (`pipelines.smoothing.labelling`) and put in at the end, when the labels are read back from disk.
 Memory is that of a chunk with its margins, and a few numbers for every object that ever was.
 
 A recording no longer than a chunk and a margin is one chunk, with exactly the labels of `smooth_scene`. Where it is
 longer, stationary and weak objects are judged by a chunk with its margins.
+
+Chunks of a recording that is smoothed as it is read; they follow each other without a gap.
+
+    [a, b) is smoothed within [a - margin, b + margin]        b = a + length, earlier where there are enough detections
+
+Labels are written for the moments of the chunk alone; beyond the margins measurements have no influence on it. Memory
+and work follow the detections in a chunk and its margins, so that crowds are cut into shorter ones.
 """
 
 from __future__ import annotations
@@ -17,32 +26,203 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
 from pipelines.config import Method
-from pipelines.process import one_thread
-from pipelines.smoothing.chunks import Backlog, ChunkSettings, TrackedFrame
-from pipelines.smoothing.config import SmoothConfig
-from pipelines.smoothing.label_spool import LabelSpool
-from pipelines.smoothing.labelling import LabelledStates, dropped_boxes, label_states, source_counts
-from pipelines.smoothing.object_summaries import Identities, ObjectSummaries
-from pipelines.smoothing.passes import SmoothedObjects, smooth_objects, track_evidence
-from pipelines.tracking import OnlineTracker, Progress
+from pipelines.smoothing.labelling import (
+    Identities,
+    LabelColumns,
+    LabelledStates,
+    ObjectSummaries,
+    dropped_boxes,
+    label_states,
+    source_counts,
+)
+from pipelines.smoothing.passes import SmoothConfig, SmoothedObjects, smooth_objects, track_evidence
+from pipelines.tracking import OnlineTracker, Progress, one_thread
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
 from saga_fg.smoothing import (
     Evidence,
     LabelCounts,
+    Labels,
+    SmoothingSettings,
     gather_evidence,
     measured_in_order,
     opportunities,
+    quality_of,
     size_weights,
 )
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
+
+
+@dataclass(frozen=True)
+class ChunkSettings(Settings):
+    """Lengths of the chunks of a long recording."""
+
+    length: Positive = setting(30.0, "length of a chunk, s; higher: more memory")
+    margin: Positive = setting(7.0, "time smoothed beyond either end of a chunk, s")
+    detections: Annotated[int, Range(1, 10**9)] = setting(60_000, "number of detections that ends a chunk early")
+    shortest: NonNegative = setting(5.0, "least length of a chunk that ends early, s")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """A frame, its time of measurement (s), and the tracks (n,) of its usable detections, -1 for none."""
+
+    time: float
+    frame: Frame
+    track_of: IntArray
+
+
+class Backlog:
+    """The part of a recording still needed: tracked frames in order of time, and moments at which boxes are wanted."""
+
+    def __init__(self, settings: ChunkSettings) -> None:
+        self._settings = settings
+        self._frames: list[TrackedFrame] = []
+        self._moments = np.empty(0)
+        self._begin: float | None = None  # of the next chunk
+
+    def extend(self, frames: list[TrackedFrame]) -> None:
+        """Take in frames that were tracked."""
+        self._frames += frames
+
+    def want(self, moments: FloatArray) -> None:
+        """Boxes are wanted at these times (m,), s, too: later ones than before."""
+        self._moments = np.concatenate([self._moments, moments])
+
+    @property
+    def tracked(self) -> float:
+        """Time of the newest frame, s; -inf before the first."""
+        return self._frames[-1].time if self._frames else -np.inf
+
+    def chunks(self, until: float) -> Iterator[tuple[float, float]]:
+        """The spans [begin, end), s, that are complete, with their margins, before a time; infinite: all that is left.
+
+        Frames that later chunks do not need are forgotten when the next chunk is asked for.
+        """
+        length, margin = self._settings.length, self._settings.margin
+        if self._begin is None:
+            if not self._frames and not len(self._moments):
+                return
+            self._begin = self._oldest(np.inf)
+        while len(self._moments):
+            end = self._end(self._begin)
+            last = until == np.inf and end + margin >= max(self._moments[-1], self.tracked)
+            if end + margin >= until and not last:
+                return
+            yield self._begin, (np.inf if last else end)
+            if last:
+                return
+            self._frames = [tracked for tracked in self._frames if tracked.time >= end - margin]
+            self._moments = self._moments[self._moments >= end - margin]
+            pause = self._oldest(end) - margin - end
+            self._begin = end + max(0.0, pause // length) * length  # past empty chunks
+
+    def around(self, begin: float, end: float) -> tuple[list[TrackedFrame], FloatArray]:
+        """The frames of a chunk with its margins, and the times (m,), s, that are wanted."""
+        first, last = begin - self._settings.margin, end + self._settings.margin
+        wanted = self._moments[(self._moments >= first) & (self._moments < last)]
+        return [tracked for tracked in self._frames if first <= tracked.time < last], wanted
+
+    def _end(self, begin: float) -> float:
+        """End of a chunk: after its length, or once it has enough detections."""
+        settings, count = self._settings, 0
+        for tracked in self._frames:
+            if tracked.time >= begin:
+                count += len(tracked.track_of)
+                if count >= settings.detections:
+                    return min(max(tracked.time, begin + settings.shortest), begin + settings.length)
+        return begin + settings.length
+
+    def _oldest(self, otherwise: float) -> float:
+        """Time of the first frame or moment that is left, s."""
+        return min([*self._moments[:1].tolist(), *(tracked.time for tracked in self._frames[:1])], default=otherwise)
+
+
+_FINAL = ("size", "score", "quality")  # columns that are known at the end
+
+
+@dataclass(frozen=True, eq=False)
+class _AttributeTable:
+    """Columns of the final attributes of all objects, by ascending id."""
+
+    id: IntArray
+    size: FloatArray
+    score: FloatArray
+    turn: FloatArray  # of the headings, rad
+
+
+class LabelSpool:
+    """The labels of a recording, added chunk by chunk, and read back when it is over."""
+
+    def __init__(self, folder: Path, name: str, settings: SmoothingSettings) -> None:
+        folder.mkdir()
+        self._folder, self._name, self._settings = folder, name, settings
+        self._chunks = 0
+        self._attributes: _AttributeTable | None = None
+
+    def add(
+        self,
+        wanted: FloatArray,
+        at: IntArray,
+        labelled: LabelledStates,
+        names: Mapping[int, int],
+        signs: Mapping[int, float],
+    ) -> None:
+        """Add the labels at the times `wanted` (M,), s, which are the moments `at` (M,) of the states.
+
+        names: the final id of each object; signs: -1 where its headings are half a turn off those before, else 1
+        """
+        spans = [labelled.states.at(moment) for moment in at.tolist()]
+        rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(span.start, span.stop) for span in spans)])
+        ids = labelled.states.id[rows].tolist()
+        columns = replace(labelled.columns.select(rows), id=np.array([names[id_] for id_ in ids], dtype=np.int64))
+        np.savez(
+            self._folder / f"{self._chunks:06d}.npz",
+            time=wanted,
+            bounds=np.cumsum([0, *(span.stop - span.start for span in spans)]),
+            sign=np.array([signs[id_] for id_ in ids], dtype=np.float64),
+            **{name: column for name, column in vars(columns).items() if name not in _FINAL},
+        )
+        self._chunks += 1
+
+    def finish(self, summaries: ObjectSummaries, prior: float) -> None:
+        """Take the final attributes of all objects; prior: see `ObjectSummaries.attributes`."""
+        ids = np.array(summaries.ids, dtype=np.int64)
+        found = [summaries.attributes(id_, prior) for id_ in ids.tolist()]
+        self._attributes = _AttributeTable(
+            ids,
+            np.array([each.size for each in found]).reshape(-1, 3),
+            np.array([each.score for each in found]),
+            np.array([np.pi * each.reversed for each in found]),
+        )
+
+    def labels(self) -> Iterator[tuple[Scene, tuple[Labels, ...]]]:
+        """The labels, chunk by chunk: a part of the scene without frames or poses, and one table a moment."""
+        assert self._attributes is not None, "the recording is not over"
+        for number in range(self._chunks):
+            with np.load(self._folder / f"{number:06d}.npz", allow_pickle=False) as columns:
+                yield self._complete(dict(columns), self._attributes)
+
+    def _complete(self, stored: dict[str, Any], attributes: _AttributeTable) -> tuple[Scene, tuple[Labels, ...]]:
+        times, bounds, sign = (stored.pop(name) for name in ("time", "bounds", "sign"))
+        at = np.searchsorted(attributes.id, stored["id"])
+        score = attributes.score[at]
+        quality = quality_of(score, stored["position_covariance"])
+        stored["yaw"] = wrap_angle(stored["yaw"] + np.pi * (sign < 0) + attributes.turn[at])
+        columns = LabelColumns(**stored, size=attributes.size[at], score=score, quality=quality)
+        spans = zip(times.tolist(), pairwise(bounds.tolist()), strict=True)
+        moments = tuple(columns.select(slice(a, b)).labels(time) for time, (a, b) in spans)
+        return Scene(self._name, times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), ()), moments
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,10 +5,8 @@
 """
 
 from pipelines.view.drawing import Drawing, in_order
-from pipelines.view.files import check_view_file, write_view
-from pipelines.view.scenes import SceneView, draw_scene
-from pipelines.view.slam import SlamView, draw_slam, read_slam_view
-from pipelines.view.to_rerun import load_rerun, show_rerun
+from pipelines.view.scenes import SceneView, SlamView, draw_scene, draw_slam, read_slam_view
+from pipelines.view.writers import check_view_file, load_rerun, show_rerun, write_view
 
 __all__ = [
     "Drawing",

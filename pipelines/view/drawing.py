@@ -1,6 +1,6 @@
 """Drawings for any viewer: shapes with a name, in a frame of coordinates, at a time.
 
-    scenes.py, slam.py -> `Drawing`s in order of time -> to_rerun.py, to_mcap.py
+    scenes.py -> `Drawing`s in order of time -> writers.py
 
 Frames are a tree of names: `Drawing(frame="scene/ego", name="lidar", shape=Pose(...))` says where the frame
 `scene/ego/lidar` is in `scene/ego`. A drawing replaces the one before it of the same name.

@@ -23,6 +23,8 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from saga_fg.conformance.programs import (
+    CAR,
+    TRAM,
     Add,
     Marginalise,
     Operation,
@@ -30,10 +32,10 @@ from saga_fg.conformance.programs import (
     TextbookEstimator,
     Update,
     new_nodes,
+    random_graph,
     random_program,
     run,
 )
-from saga_fg.conformance.random_graphs import CAR, TRAM, random_graph
 from saga_fg.errors import SagaError
 from saga_fg.estimators import Estimator, Measurements
 from saga_fg.estimators.base import missing

@@ -1,4 +1,6 @@
-r"""Smoothing: from the filter's pass back to the marginals given everything (modified Bryson-Frazier smoother).
+"""Smoothing backwards over a filter's pass, and Gauss-Newton with Anderson acceleration by such passes.
+
+Smoothing: from the filter's pass back to the marginals given everything (modified Bryson-Frazier smoother).
 
 Backwards through the same interval, from r = 0 and N = 0 after the last epoch,
 
@@ -21,10 +23,26 @@ given the future. So joint covariances are smoothed over components joined throu
 nodes need no more of N than its blocks over the components of P, for P N P has no others on its diagonal, and those of
 an epoch follow from those of the next: F does not leave the components that it leads to. (Where a component has been
 taken apart in between, the rest of its N acts through what had decayed to `BlockGaussian.decoupled`'s last digit.)
+
+Gauss-Newton over a recording: linearised at the smoothed means until they converge.
+
+Source: Bell, The iterated Kalman smoother as a Gauss-Newton method, SIAM J. Optimization 4 (1994).
+
+Anderson acceleration: x = g(x) found from fewer evaluations of g.
+
+Iteratively reweighted least squares converges linearly, slowly where a robust loss holds many measurements down. From
+the last evaluations, with f_i = g(x_i) - x_i, the next point is
+
+    x = sum_i a_i g(x_i),     a = argmin || sum_i a_i f_i ||,  sum_i a_i = 1
+
+Where the step grew, the memory is dropped and the plain step is taken. Source: Walker and Ni, Anderson acceleration for
+fixed-point iterations, SIAM J. Numerical Analysis 49 (2011).
 """
 
 from __future__ import annotations
 
+import logging
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -36,10 +54,10 @@ from scipy.sparse.csgraph import connected_components
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian, block_product, joint_block
 from saga_fg.estimators.correction import Gain, solve_lower
-from saga_fg.estimators.epoch import FilterStep
-from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.partition import BlockDiagonal, Partition, regrouped, zeros
+from saga_fg.estimators.epoch import Epoch, FilterStep, filter_epochs
+from saga_fg.estimators.partition import BlockDiagonal, Partition, StateLayout, regrouped, zeros
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.settings import setting
 
 
 def smoothed_means(steps: Iterable[FilterStep]) -> list[FloatArray]:
@@ -260,3 +278,65 @@ def _before(gain: Gain, N: BlockDiagonal, x: BlockGaussian, partition: Partition
     A_joined, C_joined = regrouped(tuple(A), fine, partition, every), regrouped(tuple(C), fine, partition, every)
     products = (np.swapaxes(a, 1, 2) @ n @ a + c for a, n, c in zip(A_joined, N, C_joined, strict=True))
     return tuple((product + np.swapaxes(product, 1, 2)) / 2 for product in products)
+
+
+_MEMORY = 6  # evaluations that are kept
+_GROWTH = 2.0  # of the step, from which the memory misleads
+
+
+class AndersonAcceleration:
+    """The memory of an iteration."""
+
+    def __init__(self) -> None:
+        self._images: list[FloatArray] = []
+        self._steps: list[FloatArray] = []
+
+    def next(self, x: FloatArray, image: FloatArray, scale: FloatArray) -> FloatArray:
+        """The point at which to evaluate next, given `image` = g(x) (D,); `scale` (D,): the unit of each entry."""
+        step = (image - x) / scale
+        if self._steps and np.abs(step).max(initial=0.0) > _GROWTH * np.abs(self._steps[-1]).max(initial=0.0):
+            self._images, self._steps = [], []
+        self._images, self._steps = [*self._images, image][-_MEMORY:], [*self._steps, step][-_MEMORY:]
+        if len(self._steps) == 1:
+            return image
+        differences = np.diff(np.array(self._steps), axis=0).T
+        gamma = np.linalg.lstsq(differences, step, rcond=1e-12)[0]
+        return np.asarray(image - np.diff(np.array(self._images), axis=0).T @ gamma)
+
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class GaussNewtonSettings:
+    """Settings of Gauss-Newton over a recording."""
+
+    max_iterations: int = setting(100, "largest number of linearisations of the whole recording")
+    tolerance: float = setting(1e-9, "largest step of a mean at convergence, standard deviations")
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1:
+            raise InputError(f"max_iterations: expected at least 1, got {self.max_iterations}")
+        if not self.tolerance > 0:
+            raise InputError(f"tolerance: expected a positive number, got {self.tolerance}")
+
+
+def relinearised(
+    steps: Sequence[FilterStep], prior: BlockGaussian, epochs: Sequence[Epoch], settings: GaussNewtonSettings
+) -> tuple[list[FilterStep], list[FloatArray]]:
+    """The converged filter's pass and smoothed means, from a first pass."""
+    means, step, iteration = smoothed_means(reversed(steps)), math.inf, AndersonAcceleration()
+    ends = np.cumsum([len(mean) for mean in means])[:-1]
+    for count in range(settings.max_iterations):
+        found = filter_epochs(prior, epochs, means)
+        solved = smoothed_means(reversed(found))
+        sigma = np.sqrt(np.concatenate([step.filtered.variances() for step in found]))
+        before, after = np.concatenate(means), np.concatenate(solved)
+        step = float(np.max(np.abs(after - before) / sigma, initial=0.0))
+        log.debug("iteration %d: largest step %.3g standard deviations", count + 1, step)
+        if step <= settings.tolerance:
+            break
+        means = np.split(iteration.next(before, after, sigma), ends)
+    else:
+        log.warning("no convergence in %d iterations; last step %.2g sigma", settings.max_iterations, step)
+    return found, solved

@@ -25,13 +25,13 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.object_factors import prior_graph
+from saga_fg.estimators.partition import StateLayout
 from saga_fg.estimators.protocol import Estimator
 from saga_fg.graph.providers import FactorProvider
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.kernels.components import planar_marginals
-from saga_fg.model.transition import Transition
+from saga_fg.model.discretisation import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.frame import Frame
 

@@ -1,9 +1,18 @@
-"""The batch smoother: a whole recording, every state given everything measured.
+"""Whole recordings at once: the batch smoother, and the batch back end of the running graph.
+
+The batch smoother: a whole recording, every state given everything measured.
 
 All factors since the start are solved at once, with the means and covariances of every node at every epoch, in
 whichever order of elimination takes least time (`saga_fg.estimators.sparse_elimination`). Robust losses are solved by
 iteratively reweighted least squares, or by graduated non-convexity, which finds outliers without a good start
 (`saga_fg.estimators.graduated`).
+
+The batch back end of the running graph: everything at once, nothing marginalised, by Levenberg-Marquardt.
+
+Providers are asked epoch by epoch, as by `saga_fg.estimators.IncrementalSmoother`, or a graph is handed over whole;
+it is solved when somebody asks for an estimate. Residual functions of one family are linearised together in NumPy
+(`factors.solve`); losses that ask for graduated non-convexity get it (`saga_fg.estimators.graduated`). A last step by
+QR brings back the digits that Cholesky leaves behind, unless cliques are wide.
 """
 
 from __future__ import annotations
@@ -16,22 +25,26 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors import FactorError, Robust
+from factors import FactorError, Robust, SolverSettings, linearised
 from saga_fg.errors import InputError, require_type
+from saga_fg.estimators.backward import GaussNewtonSettings
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.bounds import checked_most
+from saga_fg.estimators.dynamics import checked_most
 from saga_fg.estimators.epoch import Epoch
-from saga_fg.estimators.gauss_newton import GaussNewtonSettings
-from saga_fg.estimators.graduated import GraduatedNonConvexity
+from saga_fg.estimators.graduated import GraduatedNonConvexity, solve_graduated
+from saga_fg.estimators.graph_window import GraphSolution
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.estimators.recorded_smoother import RecordedSmoother, SmoothedState
 from saga_fg.estimators.recording import Recording, RecordingState
 from saga_fg.estimators.sparse_elimination import NoSolution, Order, SparseSolution, cheapest_order
-from saga_fg.graph.errors import GraphError
+from saga_fg.estimators.windowed import RecordedSmoother, SmoothedState
+from saga_fg.graph.factor_checks import solver_error
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.model.transition import Transition
+from saga_fg.graph.variables import GraphError, LinearisationPoint
+from saga_fg.model.discretisation import Transition
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.frame import Frame
 
 log = logging.getLogger(__name__)
 
@@ -239,3 +252,134 @@ class BatchSmoother(RecordedSmoother):
 
 def _all_measurements(epochs: Sequence[Epoch]) -> Iterable[RecordedMeasurements]:
     return (recorded for epoch in epochs for recorded in epoch.measurements)
+
+
+class BatchSolver:
+    """The graph of some providers, solved as a whole.
+
+    providers   asked once an epoch, in this order. What they see of the states is where these begin, or were at the
+                last solution; asking for a covariance solves what there is so far
+    graph       to begin with, by default an empty one; it is copied
+    settings    of Levenberg-Marquardt
+
+    Every method raises `GraphError`, for what the graph does not take, and then the solver is as it was before.
+    """
+
+    def __init__(
+        self,
+        providers: Sequence[FactorProvider] = (),
+        graph: SceneFactorGraph | None = None,
+        settings: SolverSettings | None = None,
+    ) -> None:
+        self.providers = tuple(providers)
+        self.origin = np.zeros(2)  # origin of the positions of objects, world, m
+        self._settings = settings or SolverSettings()
+        self._graph = SceneFactorGraph()
+        self._solution: GraphSolution | None = None
+        self._shared = False  # a caller may hold the graph, so that its values are copied before a change
+        if graph is not None:
+            self.restore(graph)
+
+    @property
+    def time(self) -> float:
+        """Time of the newest epoch, s."""
+        return self._graph.time
+
+    def step(self, time: float, providers: Sequence[FactorProvider] | None = None, frame: Frame | None = None) -> None:
+        """Begin the epoch at `time`, s, and ask the providers, by default those of the solver.
+
+        frame: the input of the epoch
+        """
+        asked = self.providers if providers is None else providers
+        unchanged, begun = (self._graph, self._solution, self._shared), predictors(asked)
+        self._ask(time, begun or asked, frame)
+        if begun:
+            try:
+                self._ask(None, asked, frame)
+            except GraphError:
+                self._graph, self._solution, self._shared = unchanged
+                self._graph.erase_unknown_values()
+                raise
+
+    def extend(self, providers: Sequence[FactorProvider]) -> None:
+        """Ask some more providers at the present epoch."""
+        self._ask(None, providers)
+
+    def marginalise(self, keys: Iterable[int]) -> None:
+        """Integrate variables out, linearised at the solution; their information on others stays."""
+        graph = self.graph().copy()
+        graph.marginalise(keys)
+        self._replace_graph(graph)
+
+    def solve(self) -> GraphSolution:
+        """Minimise, unless nothing has changed; raises `UndeterminedError` naming the variables that are not."""
+        if self._solution is None:
+            graph = self._graph.copy()
+            graph.erase_unknown_values()  # when a provider asks, others have added some already
+            self._solution = _minimise(graph, self._settings)
+            self._graph = graph
+        return self._solution
+
+    def graph(self) -> SceneFactorGraph:
+        """The graph itself, solved: its variables, factors and values. To be read, not changed."""
+        self.solve()
+        self._shared = True
+        return self._graph
+
+    def state(self, key: int) -> object:
+        """Value of a variable: a vector, or a pose."""
+        return self.graph().state(key)
+
+    def covariance(self, key: int) -> FloatArray:
+        """Marginal covariance (d, d) of a variable; of a pose in its own frame, as GTSAM's."""
+        self._graph.variable(key)
+        return self.solve().marginal(key)
+
+    def joint_covariance(self, keys: Sequence[int]) -> FloatArray:
+        """Joint covariance of variables in the order given."""
+        for key in keys:
+            self._graph.variable(key)
+        return self.solve().covariance(keys)
+
+    def snapshot(self) -> SceneFactorGraph:
+        """The graph as a value, which can be pickled."""
+        return self._graph.copy()
+
+    def restore(self, graph: SceneFactorGraph) -> None:
+        """Continue from a graph, of whichever back end."""
+        require_type("graph", graph, SceneFactorGraph)
+        self._replace_graph(graph.copy())
+
+    def _ask(self, time: float | None, providers: Sequence[FactorProvider], frame: Frame | None = None) -> None:
+        known = self._graph
+        graph = known.copy(share_values=not self._shared)
+        view = GraphView(graph, self.covariance, self.origin, frame)
+        try:
+            if time is not None:
+                graph.advance(time)
+            for provider in providers:
+                ask(provider, graph, view)
+        except GraphError:
+            known.erase_unknown_values()
+            raise
+        self._replace_graph(graph)
+
+    def _replace_graph(self, graph: SceneFactorGraph) -> None:
+        self._graph, self._solution, self._shared = graph, None, False
+
+
+def _minimise(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:
+    """The minimum, to which the graph moves."""
+    native, ours = graph.solver_inputs()
+    try:
+        found = solve_graduated(native, ours, graph.values, settings)
+        rough = GraphSolution(
+            LinearisationPoint(graph.variables, found.values, found.values), found.linear, found.converged
+        )
+        graph.moved_to(found.values.retract(rough.step))
+        values = graph.values
+        return GraphSolution(
+            LinearisationPoint(dict(graph.variables), values, values), linearised(native, ours, values), found.converged
+        )
+    except FactorError as error:
+        raise solver_error(graph.variables, graph.groups, error) from error

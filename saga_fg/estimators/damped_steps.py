@@ -20,8 +20,8 @@ import gtsam
 import numpy as np
 
 from factors import FactorError, SingularSystemError, Solution, SolverSettings, solve
+from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.factor_groups import ActiveRows, HeldGroup
-from saga_fg.graph.messages import solver_error
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
 from saga_fg.numerics.arrays import IntArray

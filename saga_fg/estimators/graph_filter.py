@@ -23,28 +23,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors import Robust
-from factors.marginal import Elimination
+from factors.gaussian import Elimination
 from saga_fg.errors import InputError, UnknownNodeError, require_type
 from saga_fg.estimators.base import EstimatorBase
-from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian
-from saga_fg.estimators.covariance_floor import not_smaller
+from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian, not_smaller
 from saga_fg.estimators.dynamics import Dynamics, predict
-from saga_fg.estimators.graph_solution import linear_solution
-from saga_fg.estimators.graph_window import SAME_TIME, GraphWindow, WindowEpoch
+from saga_fg.estimators.graph_window import SAME_TIME, GraphWindow, WindowEpoch, linear_solution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
-from saga_fg.estimators.independent import IndependentObjects
-from saga_fg.estimators.independent_variables import IndependentVariables
-from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.joint_gaussian import by_covariance, lossy, merged, replace_by_prior
-from saga_fg.estimators.layout import StateLayout, checked_prior
+from saga_fg.estimators.independent import IndependentObjects, IndependentVariables
+from saga_fg.estimators.interval_dynamics import IntervalDynamics, by_covariance, lossy, merged, replace_by_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements, log_likelihood
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
+from saga_fg.estimators.partition import StateLayout, checked_prior
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.estimators.recorded_smoother import JointCovariance, SmoothedState
-from saga_fg.graph.keys import MAP_NODE, OBJECT, node_key, node_kind
+from saga_fg.estimators.windowed import JointCovariance, SmoothedState
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
-from saga_fg.model.transition import Transition
+from saga_fg.graph.variables import MAP_NODE, OBJECT, node_key, node_kind
+from saga_fg.model.discretisation import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, shallow_copy
 from saga_fg.types.frame import Frame
 
@@ -80,7 +76,7 @@ class GraphFilter(EstimatorBase):
     by covariances; their window begins anew there.
 
     The covariance of nodes that are `unsettled` is not smaller than the one predicted over the last interval, see
-    `saga_fg.estimators.covariance_floor`: what was measured meanwhile counts for their place alone.
+    `saga_fg.estimators.block_gaussian`: what was measured meanwhile counts for their place alone.
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, likelihoods: bool = True) -> None:

@@ -1,6 +1,6 @@
 """`gtsam.ISAM2` as the engine of a running graph: any factors, one variable a node and epoch, fluid relinearisation.
 
-iSAM2 gets linear factors on increments from the base of every variable (`saga_fg.graph.linearisation_point`) and never
+iSAM2 gets linear factors on increments from the base of every variable (`saga_fg.graph.variables`) and never
 linearises itself: no callback runs inside it, and a factor that raises does so before. When a variable has moved by
 more than `threshold` of its own standard deviations from where its factors were linearised, these are linearised
 anew, families in NumPy all at once, and exchanged: the old ones out, the new ones in (Kaess et al., "iSAM2", IJRR 31,
@@ -21,18 +21,16 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 
 import numpy as np
 
-from factors.marginal import Elimination
+from factors.gaussian import Elimination
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.estimators.graph_window import GraphSolution
+from saga_fg.estimators.interval_dynamics import joint_gaussian
 from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
-from saga_fg.estimators.joint_gaussian import joint_gaussian
-from saga_fg.estimators.layout import StateLayout
-from saga_fg.graph.condensation import Condensation
-from saga_fg.graph.errors import GraphError
-from saga_fg.graph.linearisation_point import LinearisationPoint
+from saga_fg.estimators.partition import StateLayout
 from saga_fg.graph.providers import FactorProvider, GraphView, OtherVariables, ask, predictors
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.scene_factor_graph import Condensation, SceneFactorGraph
+from saga_fg.graph.variables import GraphError, LinearisationPoint
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.frame import Frame
 
@@ -208,7 +206,7 @@ class IncrementalSmoother:
         )
 
     def joint_gaussian(self, layout: StateLayout, keys: Sequence[int]) -> BlockGaussian:
-        """The joint Gaussian of variables by components, as `saga_fg.estimators.joint_gaussian` has it."""
+        """The joint Gaussian of variables by components, as `saga_fg.estimators.interval_dynamics` has it."""
         engine, graph = self._ready(), self._graph
         return joint_gaussian(graph, engine.covariance, layout, keys)
 

@@ -1,33 +1,35 @@
-r"""Objects that nothing ties to others, over the epochs of a window: all of them in one batch, in closed form.
+"""Objects that nothing ties to others: in one batch, in closed form, and as providers see them.
+
+Objects that nothing ties to others, over the epochs of a window: all of them in one batch, in closed form.
 
     x_i' = F_ii x_i + b_i + q_i,    z = H x_i + v        P = blockdiag( P_1, ..., P_n )
 
 Eliminating the chain of such an object in the order of time is the Kalman filter, whose kernels do it here for all
-objects at once (`saga_fg.estimators.filter_steps`). What would be their factors are arrays; those of an object that is
+objects at once (`saga_fg.estimators.correction`). What would be their factors are arrays; those of an object that is
 tied to others, or that somebody looks at, are made then, over all of its epochs in the window.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
 
-from factors import GaussianFactors, joint_prior_factor, stacked_gaussian_factors, stacked_prior_factors
+from factors import GaussianFactors, Vector, joint_prior_factor, stacked_gaussian_factors, stacked_prior_factors
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.correction import corrected, predicted
 from saga_fg.estimators.dynamics import Dynamics, noise_ratio
-from saga_fg.estimators.filter_steps import corrected, predicted
-from saga_fg.estimators.joint_gaussian import LARGEST_RATIO, merged
-from saga_fg.estimators.layout import StateLayout
+from saga_fg.estimators.interval_dynamics import LARGEST_RATIO, merged
 from saga_fg.estimators.measurements import LinearisedMeasurements, RecordedMeasurements
 from saga_fg.estimators.object_factors import measurement_factors
+from saga_fg.estimators.partition import StateLayout
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import NewVariable
-from saga_fg.model.transition import Blocks
+from saga_fg.graph.variables import GraphVariable, NewVariable, VariableKind, node_key, node_kind
+from saga_fg.model.discretisation import Blocks
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
@@ -234,3 +236,71 @@ def _motion_factors(
         names = np.array([[keys[node], earlier[node]] for node in ids], dtype=np.uint64)
         identity = np.broadcast_to(np.eye(F.values.shape[1]), F.values.shape)
         yield stacked_gaussian_factors(names, [identity, -F.values], own.b[own.layout.spans(rows)], noise[rows])
+
+
+class IndependentVariables:
+    """Independent objects, by the keys that their variables have in a graph. See `saga_fg.graph.providers`.
+
+    taken: those that have entered the graph, keys by id, by the number of the epoch
+    """
+
+    def __init__(self, objects: IndependentObjects, labels: Mapping[int, str]) -> None:
+        self._objects, self._labels, self._epochs = objects, labels, objects.epochs
+        self.taken: dict[int, dict[int, int]] = {}
+        self._gone = set[int]()
+
+    @cached_property
+    def _places(self) -> dict[int, tuple[int, int]]:
+        """Epoch of the window and id of each, by key."""
+        here = self._objects.layout.nodes
+        return {
+            node_key(node, epoch.number): (k, node)
+            for k, epoch in enumerate(self._epochs)
+            for node in here[np.isin(here, epoch.x.layout.nodes)].tolist()
+            if node not in self._gone
+        }
+
+    @cached_property
+    def variables(self) -> Mapping[int, GraphVariable]:
+        """All of them by key."""
+        types = [
+            dict(zip(one.x.layout.nodes.tolist(), one.x.layout.dims.tolist(), strict=True)) for one in self._epochs
+        ]
+        vectors = {dim: Vector(dim) for every in types for dim in every.values()}
+        found = {}
+        for key, (k, node) in self._places.items():
+            (kind, number), epoch = node_kind(node), self._epochs[k]
+            label = self._labels.get(node) or kind.name
+            found[key] = GraphVariable(key, kind, number, epoch.number, epoch.time, vectors[types[k][node]], label)
+        return found
+
+    def of(self, kind: VariableKind, epoch: int) -> dict[int, GraphVariable]:
+        """The variables of a kind and an epoch, by id."""
+        return {one.id: one for one in self.variables.values() if one.kind == kind and one.epoch == epoch}
+
+    def state(self, key: int) -> FloatArray:
+        """Value of one of them."""
+        k, node = self._places[key]
+        x = self._epochs[k].x
+        return np.array(x.mean[x.layout.places(x.layout.rows([node]))])
+
+    def covariance(self, key: int) -> FloatArray:
+        """Its marginal covariance (d, d)."""
+        k, node = self._places[key]
+        x = self._epochs[k].x
+        return x.joint(x.layout.rows([node]))
+
+    def add_to(self, graph: SceneFactorGraph, keys: Collection[int]) -> None:
+        """Put those among `keys` into the graph, with their factors."""
+        nodes = sorted({self._places[key][1] for key in keys if key in self._places})
+        if nodes:
+            self.tie(graph, np.array(nodes, dtype=np.int64))
+
+    def tie(self, graph: SceneFactorGraph, nodes: IntArray) -> None:
+        """Put some objects, and those that are correlated with them, into the graph, with their factors."""
+        nodes = np.setdiff1d(self._objects.components_of(nodes), list(self._gone))
+        for epoch, keys in zip(self._epochs, self._objects.add_to(graph, nodes, self._labels), strict=True):
+            self.taken.setdefault(epoch.number, {}).update(keys)
+        for cached in ("variables", "_places"):
+            self.__dict__.pop(cached, None)
+        self._gone |= set(nodes.tolist())

@@ -25,15 +25,12 @@ import numpy as np
 import scipy.linalg
 
 from factors import FactorError, SingularSystemError, marginal_moments
-from factors.gaussian import native_factor
-from factors.marginal import Elimination, block_covariances
-from factors.singular import singular_system
+from factors.gaussian import Elimination, block_covariances, native_factor, singular_system
 from saga_fg.estimators.damped_steps import solve_damped
-from saga_fg.graph.errors import GraphError, UndeterminedError
+from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.factor_groups import HeldGroup
-from saga_fg.graph.messages import solver_error
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import insert_state
+from saga_fg.graph.variables import GraphError, UndeterminedError, insert_state
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
 

@@ -1,4 +1,6 @@
-"""SAGA-KF itself: one Kalman filter over the joint state of all nodes of the scene graph (Sani et al., ICPR 2024).
+"""SAGA-KF itself: one Kalman filter over the joint state, extended by the factors of providers.
+
+SAGA-KF itself: one Kalman filter over the joint state of all nodes of the scene graph (Sani et al., ICPR 2024).
 
     predict   m <- F m + b              P <- F P F^T + Q                    F block-sparse, Q block-diagonal
     update    S = H P H^T + R = L L^T   W = L^-1 H P    m <- m + W^T L^-1 (z - H m)    P <- P - W^T W
@@ -6,32 +8,249 @@
 Interactions correlate the nodes of a connected graph, and no others: the covariance is kept as one dense block for each
 component of nodes that have become correlated, and components of equal size are worked on together. A node that is
 measured so rarely, or left its neighbours so long ago, that its correlation has decayed below rounding is split off.
+
+Providers' factors in the Kalman filter: an extended Kalman filter on the newest variables of the running graph.
+
+Once a frame the providers are asked, and what they give is linearised where the variables are then, robust losses
+weighted there,
+
+    || A delta - b ||      delta: increments of variables
+
+with n the variables that are new and o those that were there. By QR the factors on new ones say
+
+    n = T o + c + R^-1 e,    e ~ N(0, 1)        what the new ones are, given the others
+    || A' o - b' ||                             and what is left, a measurement of these
+
+Variables beside the nodes (landmarks, the vehicle's pose) are blocks of the joint Gaussian under their keys: increments
+from the base, where each was first put (error state). Those of an epoch leave with the next one at which providers are
+asked, after these have had the chance to tie the one to the other.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factors import SingularSystemError
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.base import EstimatorBase
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.bounds import ComponentBounds
-from saga_fg.estimators.filter_steps import corrected, predicted
-from saga_fg.estimators.kalman_providers import AuxiliaryVariables, asked
-from saga_fg.estimators.layout import checked_prior
+from saga_fg.estimators.correction import WhitenedFactor, correct_whitened, corrected, predicted
+from saga_fg.estimators.dynamics import ComponentBounds, Dynamics, identity, predict
+from saga_fg.estimators.interval_dynamics import IntervalDynamics, replace_by_prior
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
 from saga_fg.estimators.object_factors import prior_graph
+from saga_fg.estimators.partition import Partition, StateLayout, checked_prior
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.graph.providers import FactorProvider, predictors
+from saga_fg.graph.factor_checks import solver_error
+from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.model.transition import Transition
+from saga_fg.graph.variables import GraphError, GraphVariable, LinearisationPoint, NewVariable, insert_state, node_kind
+from saga_fg.model.discretisation import Blocks, Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray, shallow_copy
 from saga_fg.types.frame import Frame
+
+_TOGETHER = -(1 << 62)  # id of the new variables while they are one node
+_NO_ROWS = np.empty(0, dtype=np.int64)
+_UNDETERMINED = 1e-12  # share of its column that is left of a variable which the factors do not determine
+
+Linear = tuple[list[int], FloatArray]  # keys and [A | b]
+
+
+@dataclass(frozen=True, eq=False)
+class AuxiliaryVariables:
+    """The part of the running graph that a filter keeps beside its joint state.
+
+    graph    variables without factors: those beside the nodes, and the nodes as they were when last asked
+    labels   of nodes, by id
+    """
+
+    graph: SceneFactorGraph = field(default_factory=SceneFactorGraph)
+    labels: Mapping[int, str] = field(default_factory=dict)
+
+    def rows(self, layout: StateLayout) -> IntArray:
+        """Rows of the auxiliary variables in the joint state."""
+        known = self.graph.variables
+        if not known:
+            return _NO_ROWS
+        return np.array([row for row, node in enumerate(layout.nodes.tolist()) if node in known], dtype=np.int64)
+
+    def dynamics(self, transition: Transition, x: BlockGaussian) -> Dynamics:
+        """Dynamics of a transition over the nodes; the auxiliary variables stay as they are."""
+        interval, others = IntervalDynamics(transition), self.rows(x.layout)
+        if len(others) == 0:
+            return interval.linearised(x.layout, x.mean)
+        nodes = x.without(others)
+        return interval.linearised(nodes.layout, nodes.mean).with_static(x.layout, others)
+
+    def priors(self, x: BlockGaussian, time: float) -> SceneFactorGraph:
+        """All that is known at `time`, as one prior for each component."""
+        graph, ids = self.at(x, time)
+        graph.marginalise([key for key in graph.variables if key not in ids])
+        keys = {node: key for key, node in ids.items()}
+        replace_by_prior(graph, x, keys, keys)
+        return graph
+
+    def at(self, x: BlockGaussian, time: float) -> tuple[SceneFactorGraph, dict[int, int]]:
+        """The variables at `time`, and the id in the joint state of each that is in it, by key."""
+        graph, joint = self.graph.copy(), x.layout.nodes.tolist()
+        ids = {node: node for node in joint if node in graph.variables}
+        if time > graph.time:
+            graph.advance(time)
+        else:  # asked again: the nodes have changed since
+            graph.marginalise([key for key in graph.variables if key not in ids])
+        _move(graph, x, ids)
+        nodes = []
+        for node, state in zip(joint, np.split(x.mean, x.layout.offsets[1:-1]), strict=bool(joint)):
+            if node not in ids:
+                kind, number = node_kind(node)
+                nodes.append((node, NewVariable(kind, number, state, label=self.labels.get(node, ""))))
+        keys = graph.add_variables("tracks", [new for _, new in nodes])
+        return graph, ids | {key: node for key, (node, _) in zip(keys, nodes, strict=True)}
+
+
+def asked(
+    x: BlockGaussian,
+    auxiliary: AuxiliaryVariables,
+    providers: Sequence[FactorProvider],
+    time: float,
+    origin: FloatArray,
+    frame: Frame | None,
+    last: bool,
+) -> tuple[BlockGaussian, AuxiliaryVariables]:
+    """The joint state with what providers add at `time`; the epoch before leaves where they are the `last` ones.
+
+    Raises `GraphError` for what the filter does not take.
+    """
+    bare, ids = auxiliary.at(x, time)
+    graph, known, prior = bare.copy(), dict(ids), x
+    view = GraphView(graph, lambda key: _covariance(prior, known, graph.point(), key), origin, frame)
+    for provider in providers:
+        ask(provider, graph, view)
+    new = {key: one for key, one in graph.variables.items() if key not in bare.variables}
+    factors = _linear(graph, ids, new)
+    if new:
+        base = graph.base
+        bare.add_variables("", [_again(one, one.type.read(base, key)) for key, one in new.items()])
+        x, factors = _with_new_variables(graph, x, ids, new, factors)
+        ids |= {key: key for key in new}
+    increment, others, measured = np.zeros(len(x.mean)), x.layout.places(AuxiliaryVariables(bare).rows(x.layout)), []
+    increment[others] = x.mean[others]
+    for keys, A in factors:
+        rows = x.layout.rows([ids[key] for key in keys])
+        measured.append(WhitenedFactor(rows, A[:, :-1], A[:, -1] - A[:, :-1] @ increment[x.layout.places(rows)]))
+    x = correct_whitened(x, measured)
+    leaving = [key for key, one in bare.variables.items() if last and one.epoch not in (None, bare.epoch)]
+    bare.marginalise(leaving)
+    x = x.without(x.layout.rows([key for key in leaving if key in ids]))
+    _move(bare, x, ids)
+    return x, AuxiliaryVariables(bare, auxiliary.labels)
+
+
+def _move(graph: SceneFactorGraph, x: BlockGaussian, ids: Mapping[int, int]) -> None:
+    """Put variables where the joint state has them."""
+    values, base = graph.values, graph.base
+    for key in ids.keys() & graph.variables.keys():
+        one, state = graph.variable(key), x.mean[x.layout.places(x.layout.rows([ids[key]]))]
+        values.erase(key)
+        insert_state(values, one, one.type.retract(one.type.read(base, key), state) if ids[key] == key else state)
+    graph.moved_to(values)
+
+
+def _again(variable: GraphVariable, state: Any) -> NewVariable:
+    return NewVariable(variable.kind, variable.id, state, variable.epoch is None, variable.label, variable.type)
+
+
+def _linear(graph: SceneFactorGraph, ids: Mapping[int, int], new: Collection[int]) -> list[Linear]:
+    """All factors, on increments from the base. Raises `GraphError` for one on a node's state that is past."""
+    point, result = graph.point(), []
+    for number, held in graph.groups.items():
+        for keys in held.factors.rows:
+            old = [graph.variable(key) for key in keys if key not in ids and key not in new]
+            if old or held.name is not None:
+                expected = (
+                    f"expected the newest states, {old[0]} is past" if old else "expected no name to replace it by"
+                )
+                names = ", ".join(str(graph.variable(key)) for key in keys)
+                raise GraphError(
+                    f"provider {held.provider}: {held.factors.name} on {names}: {expected}; the estimator kalman takes "
+                    "a factor once and for all, isam2 and fixed-lag take this one"
+                )
+        result += [(list(one.keys()), np.array(one.augmentedJacobian())) for one in graph.linear(number, point)]
+    return result
+
+
+def _with_new_variables(
+    graph: SceneFactorGraph,
+    x: BlockGaussian,
+    ids: Mapping[int, int],
+    new: Mapping[int, GraphVariable],
+    factors: Sequence[Linear],
+) -> tuple[BlockGaussian, list[Linear]]:
+    """Add new variables to the joint state, by the factors on them; returns also the factors left on the others."""
+    mine = [factor for factor in factors if not new.keys().isdisjoint(factor[0])]
+    left = [factor for factor in factors if new.keys().isdisjoint(factor[0])]
+    others = list(dict.fromkeys(key for keys, _ in mine for key in keys if key not in new))
+    A, span = _stacked(mine, {key: graph.variable(key).dim for key in (*new, *others)})
+    size, width = sum(one.dim for one in new.values()), A.shape[1] - 1
+    triangle = np.zeros((width, width + 1))
+    upper = np.linalg.qr(A, mode="r")[:width]
+    triangle[: len(upper)] = upper
+    R, rest = triangle[:size, :size], triangle[size:, size:]
+    lost = np.abs(np.diagonal(R)) <= _UNDETERMINED * np.linalg.norm(A[:, :size], axis=0)
+    if lost.any():
+        raise solver_error(
+            graph.variables, graph.groups, SingularSystemError("", tuple(key for key in new if lost[span[key]].any()))
+        )
+    if others:
+        left.append((others, rest))
+    solved = np.linalg.solve(R, np.column_stack([triangle[:size, size:], np.eye(size)]))
+    T, c, root = np.split(solved, [width - size, width - size + 1], axis=1)
+    layout, rows = x.layout.extended([_TOGETHER], size), np.arange(len(x.layout))
+    last = rows[-1:] + 1 if len(rows) else np.zeros(1, dtype=np.int64)
+    F, mean = [], c[:, 0].copy()
+    for key in others:
+        row, block = x.layout.rows([ids[key]]), -T[:, span[key].start - size : span[key].stop - size]
+        F.append(Blocks(last, row, block[None]))
+        if ids[key] == key:
+            mean += block @ x.mean[x.layout.places(row)]
+    dynamics = Dynamics(
+        layout, (*identity(layout, rows), *F), np.zeros(layout.size), (Blocks(last, last, (root @ root.T)[None]),)
+    )
+    x = predict(x.extended(layout, np.zeros((1, size)), np.eye(size)[None]), dynamics)
+    whole, label = x.layout.without(last), x.partition.label
+    for key, one in new.items():
+        whole = whole.extended([key], one.dim)
+    partition = Partition(whole, np.concatenate([label[:-1], np.full(len(new), label[-1])]))
+    return BlockGaussian(partition, np.concatenate([x.mean[:-size], mean]), x.blocks), left
+
+
+def _stacked(factors: Sequence[Linear], dims: Mapping[int, int]) -> tuple[FloatArray, dict[int, slice]]:
+    """[A | b] of factors together, over variables in the order of `dims`; the columns of each."""
+    span, width = dict[int, slice](), 0
+    for key, dim in dims.items():
+        span[key] = slice(width, width + dim)
+        width += dim
+    rows = [np.zeros((len(A), width + 1)) for _, A in factors]
+    for into, (keys, A) in zip(rows, factors, strict=True):
+        for key, block in zip(keys, np.split(A, np.cumsum([dims[key] for key in keys]), axis=1), strict=False):
+            into[:, span[key]] = block
+        into[:, -1] = A[:, -1]
+    return np.concatenate([np.empty((0, width + 1)), *rows]), span
+
+
+def _covariance(x: BlockGaussian, ids: Mapping[int, int], point: LinearisationPoint, key: int) -> FloatArray:
+    """Marginal covariance of a variable; of a pose in its own frame."""
+    if key not in ids:
+        raise GraphError(f"{point.variables[key]}: expected a variable that was in the filter before this frame")
+    P, D = x.joint(x.layout.rows([ids[key]])), point.transport(key)
+    return P if D is None else D @ P @ D.T
+
 
 _DECOUPLE_EVERY = 10  # predictions between looks for components that have fallen apart
 

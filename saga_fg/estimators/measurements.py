@@ -22,7 +22,7 @@ from factors import FactorError, MeasurementModel, Robust
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.graduated import GraduatedNonConvexity
-from saga_fg.estimators.layout import StateLayout
+from saga_fg.estimators.partition import StateLayout
 from saga_fg.estimators.protocol import Measurements
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 

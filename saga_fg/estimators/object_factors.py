@@ -32,14 +32,13 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
-from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.partition import StateLayout
 from saga_fg.estimators.protocol import Measurements
-from saga_fg.graph.keys import node_key, node_kind
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import NewVariable
-from saga_fg.model.transition import Blocks, Transition
+from saga_fg.graph.variables import NewVariable, node_key, node_kind
+from saga_fg.model.discretisation import Blocks, Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 _SINGULAR = 1e-13  # share of the variances of axes below which a direction has none

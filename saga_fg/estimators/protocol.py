@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.graph.providers import FactorProvider
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.model.transition import Transition
+from saga_fg.model.discretisation import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_covariances, checked_rows
 from saga_fg.types.frame import Frame
 

@@ -1,7 +1,7 @@
 """A record of epochs, with the filter over them, on which the smoothers are built.
 
 A measurement of the past repeats the filter's pass from its time on. Where something is nonlinear or robust, all
-of the record is linearised again (`saga_fg.estimators.gauss_newton`).
+of the record is linearised again (`saga_fg.estimators.backward`).
 """
 
 from __future__ import annotations
@@ -15,27 +15,31 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.backward import (
+    GaussNewtonSettings,
     MarginalCovariances,
     SmoothedCovariance,
     joint_covariances,
+    relinearised,
     smoothed_marginals,
     smoothed_means,
 )
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.epoch import Epoch, FilterStep, NewNodes, initial_step
-from saga_fg.estimators.filter_pass import (
+from saga_fg.estimators.epoch import (
+    Epoch,
+    FilterStep,
+    NewNodes,
     completed,
     completed_within,
     dead_reckoned,
     filter_backwards,
     filter_epochs,
+    initial_step,
     step_at,
 )
-from saga_fg.estimators.gauss_newton import GaussNewtonSettings, relinearised
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
-from saga_fg.estimators.layout import StateLayout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
 from saga_fg.estimators.object_factors import recording_graph
+from saga_fg.estimators.partition import StateLayout, checked_prior
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray, checked
 

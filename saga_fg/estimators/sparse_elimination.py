@@ -9,7 +9,7 @@ with everybody it is dearer. The sparse orders are eliminated symbolically, whic
 variables with s that remain: f^3/3 + f^2 s + f s^2 multiplications), and the seconds follow from measured speeds.
 
 GTSAM eliminates the linearised factors to a Bayes tree; means come by back substitution, covariances from the roots
-down (`saga_fg.estimators.graph_solution`). Linear problems are solved twice, the second time for the digits that the
+down (`saga_fg.estimators.graph_window`). Linear problems are solved twice, the second time for the digits that the
 first left; nonlinear and robust ones until steps are short.
 """
 
@@ -27,13 +27,12 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from factors import GaussianFactors, Linearisable, ResidualFactors, linearised, nonlinear_graph
-from factors.marginal import block_covariances
-from saga_fg.estimators.anderson import AndersonAcceleration
-from saga_fg.estimators.backward import MarginalCovariances
+from factors.gaussian import block_covariances
+from saga_fg.estimators.backward import AndersonAcceleration, MarginalCovariances
 from saga_fg.estimators.epoch import Epoch
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.layout import StateLayout
 from saga_fg.estimators.object_factors import recording_factors
+from saga_fg.estimators.partition import StateLayout
 from saga_fg.estimators.recording import Recording
 from saga_fg.numerics.arrays import FloatArray, IntArray
 

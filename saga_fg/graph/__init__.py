@@ -1,8 +1,9 @@
 """The running graph: one factor graph of objects, the vehicle and landmarks, fed by factor providers."""
 
-from saga_fg.graph.errors import GraphError, ProviderError, UndeterminedError
 from saga_fg.graph.factor_groups import FactorEntry
-from saga_fg.graph.keys import (
+from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_all, predictors
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.variables import (
     EGO_BIAS,
     EGO_CALIBRATION,
     EGO_ERROR,
@@ -11,14 +12,16 @@ from saga_fg.graph.keys import (
     LANDMARK,
     MAP_NODE,
     OBJECT,
+    GraphError,
+    GraphVariable,
     KeyId,
+    NewVariable,
+    ProviderError,
+    UndeterminedError,
     VariableKind,
     key_id,
     key_of,
 )
-from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_all, predictors
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphVariable, NewVariable
 
 __all__ = [
     "EGO_BIAS",

@@ -1,4 +1,6 @@
-"""Checks of the factors that a running graph takes, before GTSAM's C++ sees them.
+"""Checks of the factors that a running graph takes, and error messages that name their variables.
+
+Checks of the factors that a running graph takes, before GTSAM's C++ sees them.
 
 | given | becomes |
 |---|---|
@@ -23,21 +25,25 @@ import gtsam
 import numpy as np
 
 from factors import (
+    FactorError,
     GaussianFactors,
     Linearisable,
     OrientedPlane,
     PlanarPose,
     ResidualFactor,
     ResidualFactors,
+    SingularSystemError,
     SpatialPose,
     Vector,
     unwrapped_angles,
 )
-from saga_fg.graph.errors import GraphError
+from factors.validation import format_key
+from saga_fg.errors import InputError
 from saga_fg.graph.factor_groups import (
     CustomGroup,
     FactorGroup,
     GaussianGroup,
+    HeldGroup,
     LinearGroup,
     NativeGroup,
     SingleGroup,
@@ -46,9 +52,8 @@ from saga_fg.graph.factor_groups import (
     first_residual,
     members,
 )
-from saga_fg.graph.keys import described
-from saga_fg.graph.linearisation_point import LARGEST
-from saga_fg.graph.variables import GraphVariable
+from saga_fg.graph.variables import LARGEST_INCREMENT, GraphError, GraphVariable, UndeterminedError, described
+from saga_fg.numerics.arrays import IntArray
 
 Factor = gtsam.JacobianFactor | GaussianFactors | gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph | Linearisable
 _EXPECTED = "expected a gtsam.JacobianFactor, a GTSAM nonlinear factor, or a factor with keys, error and linearise"
@@ -153,8 +158,8 @@ def _check_linear(provider: str, factor: gtsam.JacobianFactor, variables: Mappin
         wrong = f"expected {total} columns, as the variables have dimensions, got {factor.cols() - 1}"
     elif factor.isConstrained():
         wrong = "expected noise with variances, no hard constraint"
-    elif not (np.abs(factor.augmentedJacobian()) <= LARGEST).all():
-        wrong = f"expected finite numbers, at most {LARGEST:g} standard deviations"
+    elif not (np.abs(factor.augmentedJacobian()) <= LARGEST_INCREMENT).all():
+        wrong = f"expected finite numbers, at most {LARGEST_INCREMENT:g} standard deviations"
     _check_fit(provider, "linear factor", mine, wrong)
 
 
@@ -201,8 +206,8 @@ def _misfit(group: FactorGroup, row: int, variables: Sequence[GraphVariable]) ->
     elif isinstance(group, GaussianGroup):
         if not all(kind == Vector(dim) for kind, dim in zip(types, group.factors.dims, strict=True)):
             return f"expected vectors of {group.factors.dims} entries, got {', '.join(map(str, types))}"
-        if not (np.abs(group.factors.augmented[row]) <= LARGEST).all():
-            return f"expected finite numbers, at most {LARGEST:g} standard deviations"
+        if not (np.abs(group.factors.augmented[row]) <= LARGEST_INCREMENT).all():
+            return f"expected finite numbers, at most {LARGEST_INCREMENT:g} standard deviations"
     elif isinstance(group, StackedGroup):
         expected = [Vector(dim) if isinstance(dim, int | np.integer) else dim for dim in group.factors.dims]
         plain = [
@@ -224,7 +229,7 @@ def _fits(factors: GaussianFactors, variables: Mapping[int, GraphVariable]) -> b
         vector = Vector(dim)
         if any((one := variables.get(key)) is None or one.type != vector for key in column):
             return False
-    return bool((np.abs(factors.augmented) <= LARGEST).all())
+    return bool((np.abs(factors.augmented) <= LARGEST_INCREMENT).all())
 
 
 def _types(expected: Sequence[Any], got: Sequence[Any]) -> str:
@@ -240,3 +245,49 @@ def _lengths(factor: gtsam.NonlinearFactor) -> int | None:
     if isinstance(factor, gtsam.BetweenFactorVector):
         return len(factor.measured())
     return None
+
+
+Variables = Mapping[int, GraphVariable]
+
+
+def solver_error(variables: Variables, groups: Mapping[int, HeldGroup], error: Exception) -> GraphError:
+    """Return a solver's error in the names of the graph: an `UndeterminedError` where the system is singular."""
+    if not isinstance(error, SingularSystemError) or not error.keys:
+        return GraphError(with_names(variables, str(error), variables))
+    names = [str(variables[key]) if key in variables else described(key) for key in error.keys[:8]]
+    more = f" and {len(error.keys) - 8} more" if len(error.keys) > 8 else ""
+    first = error.keys[0]
+    its = f" (factors on {names[0]}: {_factors_on(groups.values(), first)})" if first in variables else ""
+    return UndeterminedError(
+        f"{', '.join(names)}{more}: not determined by the factors{its}; "
+        "expected a prior, or measurements of all components",
+        error.keys,
+    )
+
+
+def factor_error(variables: Variables, held: HeldGroup, rows: IntArray, error: Exception) -> GraphError:
+    """Return the error of factors, with their provider, kind and variables."""
+    keys = dict.fromkeys(key for row in rows.tolist() for key in held.factors.rows[row])
+    named = [str(variables[key]) for key in list(keys)[:6]] + ["..."] * (len(keys) > 6)
+    expected = isinstance(error, FactorError | InputError)
+    text = " ".join(str(error).split()) if expected else " ".join(repr(error).split())
+    where = f"{held.factors.name} on {', '.join(named)}: "
+    return GraphError(f"provider {held.provider}: {where}{with_names(variables, text, keys).removeprefix(where)[:500]}")
+
+
+def with_names(variables: Variables, text: str, keys: Iterable[int]) -> str:
+    """Replace keys in a text by the names of their variables."""
+    for key in keys:
+        if format_key(key) in text:
+            text = text.replace(format_key(key), str(variables[key]))
+    return text
+
+
+def _factors_on(groups: Iterable[HeldGroup], key: int) -> str:
+    """Describe the factors on a variable."""
+    counts: dict[str, int] = {}
+    for held in groups:
+        mine = sum(key in held.factors.rows[row] for row in held.rows.tolist())
+        if mine:
+            counts[held.factors.name] = counts.get(held.factors.name, 0) + mine
+    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"

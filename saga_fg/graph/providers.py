@@ -23,12 +23,9 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from saga_fg.graph.errors import GraphError, ProviderError
-from saga_fg.graph.factor_checks import Factor, mentioned_keys
-from saga_fg.graph.keys import VariableKind, key_of
-from saga_fg.graph.messages import with_names
+from saga_fg.graph.factor_checks import Factor, mentioned_keys, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphVariable, NewVariable
+from saga_fg.graph.variables import GraphError, GraphVariable, NewVariable, ProviderError, VariableKind, key_of
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.frame import Frame
 

@@ -1,4 +1,6 @@
-"""The running graph: variables over time, factors on them, and where the variables are.
+"""The running graph: variables over time, factors on them, and what marginalised variables leave.
+
+The running graph: variables over time, factors on them, and where the variables are.
 
     minimise over x   sum_i rho_i( || r_i(x) ||_{R_i} )
 
@@ -9,6 +11,11 @@ leaves is marginalised with all factors on it, linearised where everything is th
 
 so that its information on the rest is kept. The graph holds values and factors, no solver, and can be pickled if its
 factors can (a `gtsam.CustomFactor` and a lambda cannot).
+
+Condensation: nonlinear factors in place of the linear prior that marginalised variables leave.
+
+The prior is linear in increments from the linearisation point, and valid near it only. A closed submap moves by metres
+as a whole when a loop closes; its factors have to move with it.
 """
 
 from __future__ import annotations
@@ -18,20 +25,19 @@ import math
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, get_args
+from typing import Any, Protocol, get_args
 
 import gtsam
 import numpy as np
 
 from factors import FactorError, Solution, SolverSettings, Vector, marginal_factors, solve
-from factors.marginal import Elimination
+from factors.gaussian import Elimination
 from saga_fg.errors import require_type
-from saga_fg.graph.condensation import Condensation
-from saga_fg.graph.errors import GraphError
-from saga_fg.graph.factor_checks import Factor, check_angles, check_variables, grouped
+from saga_fg.graph.factor_checks import Factor, check_angles, check_variables, factor_error, grouped, solver_error
 from saga_fg.graph.factor_groups import (
     ActiveRows,
     FactorEntry,
+    FactorIndex,
     GaussianGroup,
     HeldGroup,
     LinearGroup,
@@ -39,12 +45,39 @@ from saga_fg.graph.factor_groups import (
     PriorGroup,
     StackedGroup,
 )
-from saga_fg.graph.factor_index import FactorIndex
-from saga_fg.graph.keys import VariableKind, described, key_of
-from saga_fg.graph.linearisation_point import LinearisationPoint
-from saga_fg.graph.messages import factor_error, solver_error
-from saga_fg.graph.variables import GraphVariable, NewVariable, insert_state, variable_type
+from saga_fg.graph.variables import (
+    GraphError,
+    GraphVariable,
+    LinearisationPoint,
+    NewVariable,
+    VariableKind,
+    described,
+    insert_state,
+    key_of,
+    variable_type,
+)
 from saga_fg.numerics.arrays import FloatArray, IntArray
+
+
+class Condensation(Protocol):
+    """Makes factors of the marginal that eliminated variables leave; `name` is their provider's, and theirs."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def anchor(self) -> int:
+        """A variable that leaves with the others, but is in the marginal. What a condensation of this name gave for it
+        earlier is handed over apart."""
+
+    def factors(
+        self,
+        marginal: Sequence[gtsam.JacobianFactor],
+        earlier: Sequence[gtsam.JacobianFactor],
+        point: LinearisationPoint,
+    ) -> Sequence[Factor]:
+        """Return factors in place of both, which are on increments from the base, linearised at `point`."""
+
 
 _MARGINALS = "marginals"
 _RECORDED = (LinearGroup, PriorGroup, GaussianGroup, StackedGroup)  # groups that are values

@@ -1,4 +1,6 @@
-"""Variables of the running graph: kind, id, time, and the manifold they live on.
+"""Variables of the running graph: kind, id, time and manifold, their keys, values and errors.
+
+Variables of the running graph: kind, id, time, and the manifold they live on.
 
 A variable x of dimension d moves by increments, x = retract(base, delta), delta = local(base, x) in R^d. Its base is
 where it was first put; while it is in the graph the base stays. For a vector the increment is the difference.
@@ -8,10 +10,29 @@ The derivative of the increment counted from the present point by that counted f
     D = d local(x, retract(base, delta)) / d delta     (d, d),    the identity for vectors and at the base itself,
 
 takes Jacobians from one to the other (for poses, by central differences).
+
+Keys of variables: kind, id and epoch in one number.
+
+    64 bits  =  letter of the kind (8)  |  id (28)  |  epoch (28)
+
+An epoch is a moment of the graph, numbered from 0. What does not move has one variable for all time: its epoch is None,
+stored as all ones. GTSAM prints such a key as a symbol; `key_id` reads it back, and a graph that holds the variable
+names it as people do: "car 12 at 3.40 s".
+
+Linearisation points of factors: the value of every variable, and its increment from the base.
+
+A factor linearised at x says || J delta' + r || of the increment delta' from x. Counted from the base, with delta_0 the
+increment of x and D its derivative,
+
+    delta' = D (delta - delta_0),      || (J D) delta - (J D delta_0 - r) ||
+
+so that factors linearised at different points speak of the same unknowns: exact for vectors, and for poses exact at x,
+with the gradient and the covariance that factors linearised there have in GTSAM's own coordinates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,9 +40,107 @@ import gtsam
 import numpy as np
 
 from factors import FactorError, ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
-from saga_fg.graph.errors import GraphError
-from saga_fg.graph.keys import VariableKind
+from factors.gaussian import native_factor
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
+
+
+class GraphError(InputError):
+    """A variable or factor that the graph does not take; the graph is as it was before."""
+
+
+class ProviderError(GraphError):
+    """A provider of a user's raised, or gave what the graph does not take."""
+
+
+class UndeterminedError(GraphError):
+    """The factors leave variables undetermined; `keys` are these variables, as far as they could be found."""
+
+    def __init__(self, message: str, keys: tuple[int, ...] = ()) -> None:
+        super().__init__(message)
+        self.keys = keys
+
+    def __reduce__(self) -> tuple[type[UndeterminedError], tuple[str, tuple[int, ...]]]:
+        return type(self), (str(self), self.keys)
+
+
+_BITS = 28
+_FOR_ALL_TIME = (1 << _BITS) - 1
+LARGEST = _FOR_ALL_TIME - 1  # id or epoch
+
+
+@dataclass(frozen=True)
+class VariableKind:
+    """A kind of variable: its name, and the letter (A-Z, a-z) by which keys tell it from other kinds."""
+
+    name: str
+    letter: str
+
+    def __post_init__(self) -> None:
+        if len(self.letter) != 1 or not (self.letter.isascii() and self.letter.isalpha()):
+            raise GraphError(f"kind {self.name!r}: expected one letter from A to Z or a to z, got {self.letter!r}")
+
+
+OBJECT = VariableKind("object", "o")
+EGO_POSE = VariableKind("ego pose", "x")
+EGO_VELOCITY = VariableKind("ego velocity", "v")
+EGO_BIAS = VariableKind("ego bias", "b")  # of accelerometers and gyroscopes
+EGO_ERROR = VariableKind("ego error", "e")  # slow errors of the odometry
+EGO_CALIBRATION = VariableKind("calibration", "c")  # of the vehicle's sensors, for all time
+LANDMARK = VariableKind("landmark", "l")
+MAP_NODE = VariableKind("map node", "m")
+KINDS = (OBJECT, EGO_POSE, EGO_VELOCITY, EGO_BIAS, EGO_ERROR, EGO_CALIBRATION, LANDMARK, MAP_NODE)
+
+
+@dataclass(frozen=True)
+class KeyId:
+    """The parts of a key; epoch: None for what has one variable for all time."""
+
+    letter: str
+    id: int
+    epoch: int | None
+
+
+def key_of(kind: VariableKind, id: int, epoch: int | None) -> int:  # noqa: A002 -- GTSAM and the tables call it id
+    """Return the key. Raises `GraphError` for an id or epoch that is no whole number from 0 to `LARGEST`."""
+    if type(id) is int and type(epoch) is int and 0 <= id <= LARGEST and 0 <= epoch <= LARGEST:
+        return ord(kind.letter) << 2 * _BITS | id << _BITS | epoch
+    for name, number in (("id", id), ("epoch", 0 if epoch is None else epoch)):
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 0 <= number <= LARGEST:
+            raise GraphError(f"{kind.name}: expected {name} to be a whole number from 0 to {LARGEST}, got {number!r}")
+    when = _FOR_ALL_TIME if epoch is None else int(epoch)
+    return ord(kind.letter) << 2 * _BITS | int(id) << _BITS | when
+
+
+def node_kind(node: int) -> tuple[VariableKind, int]:
+    """Kind and id of a node of an estimator; those of a road map count down from -1."""
+    return (OBJECT, node) if node >= 0 else (MAP_NODE, -node)
+
+
+def node_key(node: int, epoch: int | None) -> int:
+    """The key of a node of an estimator."""
+    return key_of(*node_kind(node), epoch)
+
+
+def key_id(key: int) -> KeyId:
+    """Return the parts of a key. Raises `GraphError` for one of another scheme."""
+    letter = chr(int(key) >> 2 * _BITS)
+    if not (letter.isascii() and letter.isalpha()):
+        raise GraphError(f"{key}: expected a key made by key_of")
+    when = int(key) & _FOR_ALL_TIME
+    return KeyId(letter, int(key) >> _BITS & _FOR_ALL_TIME, None if when == _FOR_ALL_TIME else when)
+
+
+def described(key: int) -> str:
+    """Describe a key whose variable is not known."""
+    try:
+        parts = key_id(key)
+    except GraphError:
+        return f"variable {key}"
+    names = {kind.letter: kind.name for kind in KINDS}
+    name = f"{names.get(parts.letter, f'variable {parts.letter}')} {parts.id}"
+    return name if parts.epoch is None else f"{name} of epoch {parts.epoch}"
+
 
 _STEP = 1e-6
 
@@ -112,3 +231,73 @@ def transport(variable: Variable, base: Any, delta: FloatArray) -> FloatArray | 
         for step in _STEP * np.eye(variable.dim)
     ]
     return np.stack(columns, axis=1) / (2 * _STEP)
+
+
+LARGEST_INCREMENT = 1e30  # of whitened numbers, whose squares numbers can hold
+
+
+class LinearisationPoint:
+    """values: where; base: of the variables of the graph. Both are read, never changed."""
+
+    def __init__(self, variables: Mapping[int, GraphVariable], base: gtsam.Values, values: gtsam.Values) -> None:
+        self.variables, self.base, self.values = variables, base, values
+        self._vectors: dict[int, FloatArray] = {}
+        self._transports: dict[int, FloatArray | None] = {}
+
+    def base_vector(self, key: int) -> FloatArray:
+        """The base (d,) of a vector."""
+        if key not in self._vectors:
+            self._vectors[key] = self.base.atVector(key)
+        return self._vectors[key]
+
+    def increment(self, key: int) -> FloatArray:
+        """The increment (d,) of a variable from its base."""
+        kind = self.variables[key].type
+        return kind.local(kind.read(self.base, key), kind.read(self.values, key))
+
+    def transport(self, key: int) -> FloatArray | None:
+        """D (d, d) of a variable, None for the identity."""
+        if key not in self._transports:
+            kind = self.variables[key].type
+            base = None if isinstance(kind, Vector) else kind.read(self.base, key)
+            self._transports[key] = None if base is None else transport(kind, base, self.increment(key))
+        return self._transports[key]
+
+    def transported(self, keys: Sequence[int], P: FloatArray) -> FloatArray:
+        """A joint covariance of variables, counted from the base, in the coordinates of where they are."""
+        P, start = P.copy(), 0
+        for key in keys:
+            span, D = slice(start, start + self.variables[key].dim), self.transport(key)
+            if D is not None:
+                P[span] = D @ P[span]
+                P[:, span] = P[:, span] @ D.T
+            start = span.stop
+        return P
+
+    def dims(self, keys: Sequence[int]) -> list[int]:
+        """Dimensions of variables."""
+        return [self.variables[key].dim for key in keys]
+
+    def from_base(self, keys: Sequence[int], augmented: FloatArray) -> gtsam.JacobianFactor:
+        """A factor [J | -r] (m, sum(d) + 1), whitened, on increments from the values, on those from the base.
+
+        Raises `FactorError` for other columns than the variables have dimensions, and numbers that are not finite.
+        """
+        result = np.array(augmented, order="F")
+        dims = self.dims(keys)
+        if result.shape[1] != sum(dims) + 1:
+            raise FactorError(f"expected Jacobians of {sum(dims)} columns together, got {result.shape[1] - 1}")
+        if not (np.abs(result) <= LARGEST_INCREMENT).all():
+            raise FactorError(
+                "expected a residual and Jacobians of finite numbers, "
+                f"at most {LARGEST_INCREMENT:g} standard deviations"
+            )
+        column = 0
+        for key in keys:
+            columns = slice(column, column + self.variables[key].dim)
+            D = self.transport(key)
+            if D is not None:
+                result[:, columns] = result[:, columns] @ D
+            result[:, -1] += result[:, columns] @ self.increment(key)
+            column = columns.stop
+        return native_factor(keys, dims, result)

@@ -18,6 +18,9 @@ from functools import cache, update_wrapper
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
 import saga_fg.kernels
 from saga_fg.errors import KernelError
 
@@ -190,3 +193,10 @@ def _announce_compilation() -> None:
             pass
 
     event.register("numba:compile", Announcement())
+
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+StrArray = NDArray[np.str_]
+CodeArray = NDArray[np.uint32]  # of characters

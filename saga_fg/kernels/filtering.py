@@ -13,8 +13,7 @@ import math
 
 import numpy as np
 
-from saga_fg.kernels.array_types import FloatArray, IntArray
-from saga_fg.kernels.compilation import kernel, kernel_part
+from saga_fg.kernels.compilation import FloatArray, IntArray, kernel, kernel_part
 
 TILE = 16  # rows and columns that are turned at once: as much as the nearest cache holds
 
@@ -282,7 +281,7 @@ def tie_strengths(
 ) -> FloatArray:
     """(m,) largest correlation that each block of F between two parts brings about, 0 within one.
 
-    In deviations before the interval, see `saga_fg.estimators.bounds`; part (n,) of each node
+    In deviations before the interval, see `saga_fg.estimators.dynamics`; part (n,) of each node
     """
     strength = np.zeros(len(target))
     for e in range(len(target)):

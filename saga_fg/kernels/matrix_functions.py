@@ -11,8 +11,7 @@ import math
 
 import numpy as np
 
-from saga_fg.kernels.array_types import FloatArray, IntArray
-from saga_fg.kernels.compilation import kernel, kernel_part
+from saga_fg.kernels.compilation import FloatArray, IntArray, kernel, kernel_part
 
 
 @kernel_part

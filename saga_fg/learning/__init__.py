@@ -1,8 +1,5 @@
 """Learn from recordings: noise, scores and detection probability of sensors, process noise, and interactions."""
 
-from saga_fg.learning.class_confusion import learn_confusion
-from saga_fg.learning.curvilinear_motion import fit_curvilinear, fit_curvilinear_by_class
-from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
 from saga_fg.learning.hidden_objects import GapPrediction, GapSettings, HiddenObjects, hidden_objects
 from saga_fg.learning.interaction_fit import (
     MOST_GAPS,
@@ -12,23 +9,26 @@ from saga_fg.learning.interaction_fit import (
     fit_interactions,
     negative_log_likelihood,
 )
-from saga_fg.learning.measurement_noise import fit_position_noise
-from saga_fg.learning.process_noise import (
-    MeasuredTrajectory,
-    fit_acceleration_noise,
-    fit_acceleration_noise_by_class,
-)
-from saga_fg.learning.score_calibration import fit_score_calibration
-from saga_fg.learning.sensor_fit import fit_sensor
-from saga_fg.learning.tracked_trajectories import DetectedTrajectory, sample_with_tracker
-from saga_fg.learning.trajectory_noise import fit_trajectory_noise
-from saga_fg.learning.truth_matches import (
+from saga_fg.learning.labelled_scene import (
     GATE,
+    DetectionSample,
     MatchedFrame,
+    SampledDetections,
+    SampledObjects,
+    learn_confusion,
     match_to_truth,
     measured_trajectories,
     sample_with_truth,
 )
+from saga_fg.learning.process_noise import (
+    MeasuredTrajectory,
+    fit_acceleration_noise,
+    fit_acceleration_noise_by_class,
+    fit_curvilinear,
+    fit_curvilinear_by_class,
+)
+from saga_fg.learning.sensor_fit import fit_position_noise, fit_score_calibration, fit_sensor
+from saga_fg.learning.trajectory_noise import DetectedTrajectory, fit_trajectory_noise, sample_with_tracker
 
 __all__ = [
     "GATE",

@@ -1,19 +1,41 @@
-"""Gaps: real ones, in which a labelled object has no detection, and made ones, in which its detections are taken away.
+"""Gaps in which objects are not detected, real or made, and the situations of objects in them.
+
+Gaps: real ones, in which a labelled object has no detection, and made ones, in which its detections are taken away.
 
 A gap lasts from the last moment with a detection before it to the first moment with one after it. An object *moves* if
 it travels faster than `MOVING` over the gap.
+
+Situations of hidden objects, decided by the labels alone, until each length of a gap.
+
+    all                every object
+    moving             travels faster than `MOVING` over the gap;  stationary: does not
+    visible leader     a vehicle whose leader has its detections in the gap: the nearest vehicle within `LEADER_REACH`
+                       ahead and `PATH_HALF_WIDTH` beside its route at the start, that travels in its direction
+    free               a vehicle without a leader, seen or not
+    halting            travels at `UNDER_WAY` or more at the start, and stands at the end;  starting: the reverse
+    turning            moving, and its heading changes by more than `TURN`
+    at red             a vehicle that comes to a stop line within `LINE_REACH`, the first on its route, whose light was
+                       last reported red or amber: it is the first at the line, or behind others
+
+The route is where the labels say that the object goes after the start, and straight on from the last of them.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Self
 
 import numpy as np
 
+from saga_fg.learning.interaction_fit import ROAD_USERS
 from saga_fg.learning.labelled_scene import LabelledScene
 from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.geometry import feet, wrap_angle
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.road_map import RoadMap, StopLine
 
 MOVING = 0.5  # m/s
 SHORTEST, LONGEST = 1.0, 6.0  # s: real gaps
@@ -168,3 +190,162 @@ def _moving(labelled: LabelledScene, row: int, start: int, stop: int) -> bool:
     a, b = labelled.position[[start, stop], row]
     elapsed = float(labelled.scene.timestamps[stop] - labelled.scene.timestamps[start])
     return bool(np.hypot(*(b - a)) > MOVING * elapsed)
+
+
+STEP = 0.5  # m between points: shorter ones are noise
+ONWARD = 80.0  # m beyond the last label
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """A line of S segments: ends (S + 1, 2), m, world; way (S + 1,) along it, m; direction (S,), rad."""
+
+    ends: FloatArray
+    way: FloatArray
+    direction: FloatArray
+
+    @classmethod
+    def of(cls, labelled: LabelledScene, row: int, start: int) -> Self | None:
+        """The route of an object from a moment on; None where neither labels nor heading tell a direction."""
+        labels = labelled.position[start:, row]
+        points = [labels[0]]
+        for point in labels[np.isfinite(labels[:, 0])]:
+            if np.hypot(*(point - points[-1])) >= STEP:
+                points.append(point)
+        if len(points) > 2:
+            onward = points[-1] - points[-3]
+        else:
+            yaw = labelled.yaw[start, row]
+            onward = np.array([np.cos(yaw), np.sin(yaw)]) if np.isfinite(yaw) else points[-1] - points[0]
+        length = float(np.hypot(*onward))
+        if length == 0:
+            return None
+        return cls.through(np.array([*points, points[-1] + ONWARD / length * onward]))
+
+    @classmethod
+    def through(cls, ends: FloatArray) -> Self:
+        """The route through points (S + 1, 2), neighbours apart."""
+        step = np.diff(ends, axis=0)
+        way = np.append(0.0, np.cumsum(np.hypot(step[:, 0], step[:, 1])))
+        return cls(ends, way, np.arctan2(step[:, 1], step[:, 0]))
+
+    def project(self, place: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Arc length (N,), m, lateral offset (N,), m, left is positive, and direction (N,), rad, of places (N, 2).
+
+        NaN for places of NaN. The way of places behind the start is negative, the last segment runs on.
+        """
+        known = np.isfinite(place[:, 0])
+        at = feet(self.ends, place[known])
+        found = np.full((3, len(place)), np.nan)
+        found[:, known] = at.s, at.e, np.arctan2(at.direction[:, 1], at.direction[:, 0])
+        return found[0], found[1], found[2]
+
+    def crossing(self, line: FloatArray) -> tuple[float, float]:
+        """The way to a line (2, 2) that the route crosses, m, and its direction there; infinite where it does not."""
+        a, step, across = self.ends[:-1], np.diff(self.ends, axis=0), line[1] - line[0]
+        area = step[:, 0] * across[1] - step[:, 1] * across[0]
+        offset = line[0] - a
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (offset[:, 0] * across[1] - offset[:, 1] * across[0]) / area
+            u = (offset[:, 0] * step[:, 1] - offset[:, 1] * step[:, 0]) / area
+        hit = np.flatnonzero((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1))
+        if len(hit) == 0:
+            return float("inf"), 0.0
+        k = int(hit[0])
+        return float(self.way[k] + t[k] * (self.way[k + 1] - self.way[k])), float(self.direction[k])
+
+
+SITUATIONS = ("all", "moving", "stationary", "visible leader", "free", "halting", "starting", "turning", "at red")
+UNDER_WAY = 1.0  # m/s; an object stands below `MOVING`
+LEADER_REACH, PATH_HALF_WIDTH = 50.0, 1.6  # m
+SEEN_SHARE = 0.8  # of the moments of the gap at which a visible leader has a detection
+TURN = np.radians(20.0)
+LINE_REACH = 60.0  # m
+REPORT_AGE = 3.0  # s: a light shows what it was last seen to show for so long
+LIGHT_REACH = 3.0  # m, from a light of the map to its report
+REPORT = "traffic_light_"
+CLOSED = ("red", "amber")
+TOUCHING = 1.0  # m: objects this close are no leaders but errors of labels
+
+
+def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset[str]]:
+    """The situations of the object until each length that the gap reaches."""
+    row, start = gap.row, gap.start
+    speed = np.hypot(*labelled.velocity[:, row].T)
+    always = {"all", "moving" if gap.moving else "stationary"}
+    leader: int | None = None
+    if labelled.label[row] in ROAD_USERS and (route := Route.of(labelled, row, start)) is not None:
+        leader = leader_on(labelled, row, start, route)
+        if leader is None:
+            always.add("free")
+        road, closed = lights_at(labelled, float(labelled.scene.timestamps[start]))
+        line = first_line(road, route)
+        if line is not None and line[1].light in closed:
+            always.add("at red")
+    found = {}
+    for length, end in reached(labelled.scene.timestamps, gap).items():
+        mine = set(always)
+        if leader is not None and labelled.detected[start + 1 : end + 1, leader].mean() >= SEEN_SHARE:
+            mine.add("visible leader")
+        if speed[start] >= UNDER_WAY and speed[end] < MOVING:
+            mine.add("halting")
+        if speed[start] < MOVING and speed[end] >= UNDER_WAY:
+            mine.add("starting")
+        if gap.moving and abs(wrap_angle(labelled.yaw[end, row] - labelled.yaw[start, row])) > TURN:
+            mine.add("turning")
+        found[length] = frozenset(mine)
+    return found
+
+
+def leader_on(labelled: LabelledScene, row: int, start: int, route: Route) -> int | None:
+    """The row of the nearest vehicle ahead of an object, None where there is none."""
+    along, aside, direction = route.project(labelled.position[start])
+    ahead = (along > TOUCHING) & (along <= LEADER_REACH) & (np.abs(aside) <= PATH_HALF_WIDTH)
+    ahead &= ~(np.cos(labelled.yaw[start] - direction) < 0.5)  # a heading that is not known is none against it
+    ahead &= np.isin(labelled.label, ROAD_USERS)
+    ahead[row] = False
+    rows = np.flatnonzero(ahead)
+    return int(rows[np.argmin(along[rows])]) if len(rows) else None
+
+
+def first_line(road: RoadMap | None, route: Route) -> tuple[float, StopLine] | None:
+    """The first stop line that a route comes to within `LINE_REACH`, and the way to it, m."""
+    lines = road.stop_lines if road is not None else ()
+    crossed = [(way, line) for line in lines if (way := _way_to(line, route)) <= LINE_REACH]
+    return min(crossed, key=lambda each: each[0]) if crossed else None
+
+
+def _way_to(line: StopLine, route: Route) -> float:
+    """m along the route to a line that it crosses in the direction of travel; infinite where it does not."""
+    way, direction = route.crossing(line.ends)
+    return way if np.cos(direction - line.heading) > 0 else float("inf")
+
+
+def lights_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, frozenset[str]]:
+    """The road map at a time, and the names of its lights that were last reported closed."""
+    road, shown = colours_at(labelled, time)
+    return road, frozenset(name for name, colour in shown.items() if colour in CLOSED)
+
+
+@lru_cache(maxsize=64)
+def colours_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, Mapping[str, str]]:
+    """The road map at a time, and the colours of its lights by their names, where these were reported lately."""
+    road: RoadMap | None = None
+    shown: dict[str, str] = {}
+    recent: list[Boxes] = []
+    for frame, boxes in zip(labelled.scene.frames, labelled.boxes, strict=True):
+        if frame.timestamp > time + 1e-6:
+            break
+        road = road if frame.road_map is None else frame.road_map
+        if frame.timestamp >= time - REPORT_AGE:
+            recent.append(boxes)
+    if road is None or not road.lights:
+        return road, {}
+    lights = np.array([light.position for light in road.lights])
+    for boxes in recent:
+        for k in np.flatnonzero(np.char.startswith(boxes.label, REPORT)).tolist():
+            away = np.hypot(*(lights - boxes.position[k, :2]).T)
+            nearest = int(away.argmin())
+            if away[nearest] <= LIGHT_REACH:
+                shown[road.lights[nearest].name] = str(boxes.label[k]).removeprefix(REPORT)
+    return road, shown

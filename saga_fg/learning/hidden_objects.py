@@ -1,4 +1,6 @@
-r"""Objects of recordings that are hidden for some seconds while the tracks around them go on, predicted by the tracker.
+"""Hidden objects of recordings, predicted while the tracks around them go on.
+
+Objects of recordings that are hidden for some seconds while the tracks around them go on, predicted by the tracker.
 
 A tracker without edges goes through a recording. Each of its tracks that holds a labelled object begins a gap at many
 moments: from there on its object is hidden, and the track is predicted by the tracker's own step
@@ -6,6 +8,13 @@ moments: from there on its object is hidden, and the track is predicted by the t
 beginning of each step the tracks around it are set to what the tracker knew of them then. So they are taken as known:
 the hidden track depends on them, and not the other way round. All gaps are predicted side by side, as one large scene
 in which they are kilometres apart.
+
+Marginals of nodes whose correlations are left out, under a transition of the scene graph.
+
+    m_i <- sum_j F_ij m_j + b_i        P_i <- sum_j F_ij P_j F_ij^T + Q_i
+
+For nodes whose sources are known, such as tracks that go on beside a hidden one: there the correlation of a target with
+its sources is lost anyway as soon as they are measured again.
 """
 
 from __future__ import annotations
@@ -16,27 +25,140 @@ from functools import partial
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
-from saga_fg.learning.marginals import Marginals
-from saga_fg.learning.recorded_tracks import RecordedTracks, recorded_tracks
+from saga_fg.estimators.base import EstimatorBase
+from saga_fg.model.discretisation import Transition
 from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import Interaction, NodeTable
 from saga_fg.model.modes import Mixture
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.columns import Columns
-from saga_fg.tracking import TrackerSettings
-from saga_fg.tracking.box_filter import MOVING
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
+from saga_fg.numerics.assignment import assign
+from saga_fg.tracking import Tracker, TrackerSettings
 from saga_fg.tracking.joint_state import JointTrackState
-from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.prediction import predict
+from saga_fg.tracking.track_filters import MOVING, Kinematics
+from saga_fg.tracking.track_table import SensorEvidence, TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings
-from saga_fg.types.dataset import Scene
-from saga_fg.types.labelled_objects import LabelledObjects
+from saga_fg.types.dataset import LabelledObjects, Scene
+
+
+class Marginals(EstimatorBase):
+    """n nodes with the ids 0 to n - 1 as far as a tracker's prediction needs an estimator.
+
+    means (n, D), covariances (n, D, D): padded to the largest state
+    wanted  the first so many are predicted, the others stay
+    """
+
+    time: float = 0.0
+    nodes: IntArray = np.empty(0, dtype=np.int64)
+
+    def __init__(self, means: FloatArray, covariances: FloatArray, wanted: int) -> None:
+        self.means, self.covariances, self._wanted = means, covariances, wanted
+        self.nodes = np.arange(len(means))
+
+    def predict(self, transition: Transition) -> None:
+        """Move the first nodes on by a transition over all."""
+        m, P, n = self.means, self.covariances, self._wanted
+        mean, covariance = m.copy(), P.copy()
+        mean[:n], covariance[:n] = 0.0, 0.0
+        for blocks in transition.F:
+            mine = np.flatnonzero(blocks.target < n)
+            t, s, F = blocks.target[mine], blocks.source[mine], blocks.values[mine]
+            i, j = F.shape[1:]
+            np.add.at(mean[:, :i], t, (F @ m[s, :j, None])[..., 0])
+            np.add.at(covariance[:, :i, :i], t, F @ P[s, :j, :j] @ np.swapaxes(F, 1, 2))
+        for blocks in transition.Q:
+            mine = np.flatnonzero(blocks.target < n)
+            t, d = blocks.target[mine], blocks.values.shape[1]
+            covariance[t, :d, :d] += blocks.values[mine]
+        dims, start = transition.graph.dims[:n], transition.offsets[:n]
+        for d in np.unique(dims).tolist():
+            rows = np.flatnonzero(dims == d)
+            mean[rows, :d] += transition.b[start[rows][:, None] + np.arange(d)]
+        self.means, self.covariances = mean, covariance
+        self.time += transition.dt
+
+    def mean(self, nodes: ArrayLike) -> FloatArray:
+        """(k, D) means, padded."""
+        return np.asarray(self.means[np.asarray(nodes)])
+
+    def covariance(self, nodes: ArrayLike) -> FloatArray:
+        """(k, D, D) covariances, padded."""
+        return np.asarray(self.covariances[np.asarray(nodes)])
+
+    def planar_marginals(self, nodes: ArrayLike, places: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Positions and velocities (k, 4) with their covariances (k, 4, 4); places (k, 4) in the states, -1: zeros."""
+        rows, known = np.arange(len(places))[:, None], places >= 0
+        mean = np.where(known, self.mean(nodes)[rows, places], 0.0)
+        covariance = self.covariance(nodes)[rows[:, :, None], places[:, :, None], places[:, None, :]]
+        return mean, np.where(known[:, :, None] & known[:, None, :], covariance, 0.0)
+
+
+GATE = 2.0  # m, from a track to its object
+
+
+@dataclass(eq=False)
+class RecordedTracks(Columns):
+    """n tracks at some moments of a recording, as the tracker had them.
+
+    table         their rows; without the evidence of sensors, with times counted from the moment
+    mean, P       (n, D), (n, D, D) of their states, padded to the largest
+    """
+
+    table: TrackTable
+    mean: FloatArray
+    P: FloatArray
+
+
+def recorded_tracks(
+    scene: Scene, settings: TrackerSettings, sensors: Mapping[str, Sensor], labels: LabelledObjects
+) -> tuple[list[RecordedTracks], FloatArray, list[IntArray]]:
+    """The tracks after each frame, in world coordinates; the times of the frames; the object of each track, -1: none.
+
+    Only tracks that were just detected hold an object.
+    """
+    settings = replace(settings, edges=(), providers=(), estimator="kalman")
+    tracker = Tracker(settings, sensors)
+    state = TrackerState(settings, ())
+    parts, times, held = [], [], []
+    for frame in scene.frames:
+        tracker.step(frame)
+        if tracker.time_verdict == "late":
+            continue
+        state.restore(tracker.snapshot())
+        table, time = state.table, state.start + state.time
+        if len(table) == 0:
+            continue
+        kinds = state.joint.rows_by_type(table.label)
+        D = max(kind.dim for kind, _ in kinds)
+        mean, P = np.zeros((len(table), max(D, 6))), np.zeros((len(table), max(D, 6), max(D, 6)))
+        for kind, rows in kinds:
+            mean[rows, : kind.dim] = state.joint.estimator.mean(table.id[rows])
+            P[rows, : kind.dim, : kind.dim] = state.joint.estimator.covariance(table.id[rows])
+        position = mean[:, :2] + state.origin
+        truth = labels.at(time)
+        apart = np.hypot(*np.moveaxis(position[:, None] - truth[None], -1, 0))
+        fresh = table.last_detected >= state.time - 1e-6
+        possible = fresh[:, None] & (table.label[:, None] == labels.label) & (np.nan_to_num(apart, nan=np.inf) < GATE)
+        row, column = assign(np.nan_to_num(apart, nan=1e9), possible, unmatched=GATE)
+        owner = np.full(len(table), -1)
+        owner[row] = column
+        mean[:, :2] = position
+        table.stationarity.position = table.stationarity.position + state.origin
+        for name in ("initiated", "last_detected", "last_in_view"):
+            setattr(table, name, getattr(table, name) - state.time)
+        table.sensors = SensorEvidence.empty(len(table))
+        parts.append(RecordedTracks(table, mean, P))
+        times.append(time)
+        held.append(owner)
+    return parts, np.array(times), held
+
 
 APART = 5000.0  # m between gaps: no edge reaches as far
 LATER = 1e9  # s between recordings: no trail is remembered for as long

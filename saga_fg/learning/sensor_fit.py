@@ -1,6 +1,23 @@
-"""A sensor's model from a sample: noise, calibration, detection probability and field of view, class by class.
+"""A sensor's model from a sample: noise by robust maximum likelihood, score calibration, detection.
+
+A sensor's model from a sample: noise, calibration, detection probability and field of view, class by class.
 
 A class with few samples takes the values of all classes together.
+
+Measurement noise from known errors: the sensor's noise model by robust maximum likelihood.
+
+    (along, across) ~ (1 - e) N(0, f^2 (position^2 + (range_noise r)^2)) N(0, f^2 (position^2 + (bearing_noise r)^2))
+                      + e / (area of the gate),                  f = 1 + low_score_growth (1 - p)
+
+The uniform part models wrong matches. All parameters are positive and are estimated as logarithms; a normal prior of
+width 1 about the values of all classes decides where there is little data.
+
+Score calibration: the logistic model of the probability that a detection with a given score is true.
+
+    logit P(true) = offset + slope s,   s the logit of the score        maximum likelihood, with two weak priors:
+    slope ~ N(1, 1), offset ~ N(0, 1.5^2)                               for classes with few detections
+
+Source: Platt, Probabilistic outputs for support vector machines, 1999. Solved by Newton's method.
 """
 
 from __future__ import annotations
@@ -9,13 +26,108 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import minimize
 
-from saga_fg.learning.detection_sample import DetectionSample, SampledDetections, SampledObjects
-from saga_fg.learning.measurement_noise import FEWEST, fit_position_noise, robust_deviation
-from saga_fg.learning.score_calibration import fit_score_calibration
-from saga_fg.model.sensor import NoiseModel, ScoreCalibration, Sensor
-from saga_fg.model.sensor_geometry import FieldOfView
+from saga_fg.errors import InputError
+from saga_fg.learning.labelled_scene import DetectionSample, SampledDetections, SampledObjects
+from saga_fg.model.sensor import FieldOfView, NoiseModel, ScoreCalibration, Sensor
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.types.by_class import DEFAULT
+
+PRIOR = NoiseModel(position=0.2, range_noise=0.005, bearing_noise=0.005, low_score_growth=0.3)
+PRIOR_WIDTH = 1.0  # of the logarithms
+WRONG = 0.05  # share of wrong matches expected
+POSITION = ("position", "range_noise", "bearing_noise", "low_score_growth")
+LEAST = 1e-4  # smaller parameters count as zero
+NINE_IN_TEN = 1.6448536269514722  # standard deviations of a normal distribution
+FEWEST = 10  # errors, for a standard deviation
+
+
+def fit_position_noise(
+    along: FloatArray,
+    across: FloatArray,
+    distance: FloatArray,
+    probability: FloatArray,
+    gate: float,
+    prior: NoiseModel = PRIOR,
+) -> NoiseModel:
+    """`prior` with the most probable noise of positions whose errors (N,), m, and ranges (N,), m, are these.
+
+    probability (N,): calibrated scores; gate: the largest error a match may have, m. Raises `InputError` for no error.
+    """
+    if len(along) == 0:
+        raise InputError("along: expected at least one error")
+    start = np.log([max(getattr(prior, name), LEAST) for name in POSITION])
+    spread = 1 - probability
+
+    odds = math.log(WRONG / (1 - WRONG))
+
+    def cost(theta: FloatArray) -> float:
+        position, range_noise, bearing_noise, low_score_growth = np.exp(theta[:4])
+        wrong = 1 / (1 + math.exp(-theta[4]))
+        f = 1 + low_score_growth * spread
+        var_along = (f**2) * (position**2 + (range_noise * distance) ** 2)
+        var_across = (f**2) * (position**2 + (bearing_noise * distance) ** 2)
+        density = np.exp(-0.5 * (along**2 / var_along + across**2 / var_across)) / (
+            2 * np.pi * np.sqrt(var_along * var_across)
+        )
+        likelihood = np.log((1 - wrong) * density + wrong / (np.pi * gate**2))
+        penalty = 0.5 * (((theta[:4] - start) / PRIOR_WIDTH) ** 2).sum() + 0.5 * (theta[4] - odds) ** 2
+        return float(penalty - likelihood.sum()) / len(along)
+
+    bounds = [(math.log(LEAST), math.log(30.0))] * 4 + [(-7.0, 1.0)]
+    found = min(
+        (
+            minimize(cost, np.append(first, odds), method="L-BFGS-B", bounds=bounds)
+            for first in (start, *_starts(prior))
+        ),
+        key=lambda result: float(result.fun),
+    )
+    fitted = {name: float(value) for name, value in zip(POSITION, np.exp(found.x[:4]), strict=True)}
+    return replace(prior, **fitted)
+
+
+def _starts(prior: NoiseModel) -> list[FloatArray]:
+    """Starts near a good and near a poor sensor (logarithms): the cost also has a minimum with all matches wrong."""
+    low = max(prior.low_score_growth, 0.1)
+    return [np.log([0.1, 0.005, 0.005, low]), np.log([0.3, 0.03, 0.01, low])]
+
+
+def robust_deviation(errors: FloatArray) -> float:
+    """Standard deviation of the errors (N,), NaN left out, by the 90 % quantile.
+
+    NaN for less than ten errors. Errors of velocity and heading have long tails, which a median would ignore.
+    """
+    known = errors[np.isfinite(errors)]
+    return float(np.quantile(np.abs(known), 0.9)) / NINE_IN_TEN if len(known) >= FEWEST else math.nan
+
+
+PRIOR_MEAN = np.array([0.0, 1.0])  # offset, slope
+PRIOR_PRECISION = np.array([1 / 1.5**2, 1.0])
+LEAST_SLOPE = 0.05  # a falling calibration is taken for one without information
+
+
+def fit_score_calibration(
+    logit: FloatArray, true: BoolArray, prior: ScoreCalibration | None = None
+) -> ScoreCalibration:
+    """The most probable calibration of detections with these logits of their scores (N,), true or not (N,).
+
+    prior: for classes with few detections, in place of the identity.
+    """
+    mean = PRIOR_MEAN if prior is None else np.array([prior.offset, prior.slope])
+    X = np.column_stack([np.ones(len(logit)), logit])
+    y = np.asarray(true, dtype=np.float64)
+    beta = mean.copy()
+    for _ in range(100):
+        p = 1 / (1 + np.exp(-np.clip(X @ beta, -50, 50)))
+        gradient = X.T @ (y - p) - PRIOR_PRECISION * (beta - mean)
+        hessian = X.T @ (X * (p * (1 - p))[:, None]) + np.diag(PRIOR_PRECISION)
+        step = np.linalg.solve(hessian, gradient)
+        beta = beta + step * min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-12))
+        if np.abs(step).max() < 1e-9:
+            break
+    return ScoreCalibration(slope=max(float(beta[1]), LEAST_SLOPE), offset=float(beta[0]))
+
 
 FEWEST_CHANCES = 20  # to detect an object of a class, for a detection probability of its own
 FEWEST_DETECTIONS = 200  # to find the sector that a sensor does not see

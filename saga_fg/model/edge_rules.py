@@ -1,12 +1,30 @@
-r"""Edge rules: which nodes of the estimated graph interact, through which function, and at what rate.
+"""Edge rules: which nodes of the estimated graph interact, through which function, and at what rate.
 
-    rate_ij = r_j * rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
+rate_ij = r_j * rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
               r_j * rate * exp( -ahead_ij / gap_scale ) * ...                                  behind a leader
 
 The nearer a leader, the sooner its speed becomes one's own; on recorded traffic this decides more than how the law
 depends on the gap. r_j is the probability that the source exists: the rate is the expected one, and clutter pulls at
 nobody.
 A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the tracker in place of these.
+
+Information gain of an edge: how much the velocity of its source says about that of its target.
+
+    gain_ij = s_i^2 / ( s_i^2 + s_j^2 + spread^2 ),     s^2 = variance of the velocity + ( unseen_acceleration t )^2
+
+This is the gain of a Kalman filter that takes the velocity of j, off by the spread, for a measurement of that of i. A
+detected object learns more from its detections than from neighbours, who pull on a bus that brakes for its stop; a
+hidden one soon has nothing else to go by. t is the time since an object was last detected: the variance that a filter
+states rests on the noise of corrected states, and an object out of sight may have braked since. The gain of edges into
+detected objects is therefore low.
+
+The line that cones and barriers form ahead of a vehicle.
+
+In the frame of the vehicle (a ahead, y to the left), the cones near its path, in order of a, are a line y(a). Its side
+is that of the nearest cone, and the vehicle has to pass on the other one: with m = +1 if that is the left, else -1, and
+the distance c that drivers keep between cones and the middle of their vehicle,
+
+    demand(a) = m y(a) + c         how far to the side the vehicle has to be by a; above 0: it is pushed
 """
 
 from __future__ import annotations
@@ -14,30 +32,153 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.edges import leader_rates, neighbour_rates
-from saga_fg.kernels.lanes import pairs_ahead
-from saga_fg.model.cone_geometry import ConeGeometry, anticipated
-from saga_fg.model.edge_information import EdgeInformation, information_setting
-from saga_fg.model.edge_pairs import LEAST, pairs_within, strongest
-from saga_fg.model.intelligent_driver import IntelligentDriver
-from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedCourse, SharedVelocity
-from saga_fg.model.nonlinear_interactions import AccelerationLaw, SmoothDriver, SocialForce, nearest_offset
-from saga_fg.model.paths import NO_PATHS, SHARP
+from saga_fg.kernels.edges import leader_rates, neighbour_rates, pairs_ahead
+from saga_fg.model.interactions import (
+    NO_PATHS,
+    SHARP,
+    CarFollowing,
+    Interaction,
+    NodeTable,
+    SharedCourse,
+    SharedVelocity,
+    unit,
+)
+from saga_fg.model.nonlinear_interactions import (
+    AccelerationLaw,
+    IntelligentDriver,
+    SmoothDriver,
+    SocialForce,
+    nearest_offset,
+)
 from saga_fg.model.scene_graph import NonlinearEdges
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
+from saga_fg.numerics.gating import near_pairs
 from saga_fg.settings import (
     NonNegative,
     NonNegativeInt,
+    Positive,
     PositiveOrInf,
     Settings,
     setting,
     settings_group,
 )
+
+CONES = ("traffic_cone", "barrier")
+MIN_SPEED = 1.0  # m/s; slower vehicles are not pushed
+BESIDE = 3.0  # m behind the middle of a vehicle, up to which a cone is still beside it
+CORRIDOR = 6.0  # cones further aside are ignored, m
+REACH = 45.0  # cones further ahead are ignored, m
+
+
+@dataclass(frozen=True)
+class ConeGeometry(Settings):
+    """Range of cones that concern a vehicle, and the clearance to them."""
+
+    clearance: Positive = setting(
+        1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m; usual 1.5 to 2"
+    )
+    preview: Positive = setting(
+        1.5, "time by which drivers look ahead along the line, s; usual 0.5 to 3; higher: vehicles move aside earlier"
+    )
+    classes: tuple[str, ...] = setting(CONES, "classes of objects that form a line")
+
+
+class ConesAhead(NamedTuple):
+    """The cones ahead of n vehicles, nearest first: rows (n, m) of nodes; ahead, demand (n, m), m; known (n, m) whether
+    there is one; side (n,) m; speed (n,) along the heading, m/s."""
+
+    row: IntArray
+    ahead: FloatArray
+    demand: FloatArray
+    known: BoolArray
+    side: FloatArray
+    speed: FloatArray
+
+
+def cones_ahead(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) -> ConesAhead:
+    """The cones ahead of `vehicles` (n,), rows of `nodes`."""
+    cones = np.flatnonzero(of_classes(nodes.label, geometry.classes))
+    u = unit(nodes.heading[vehicles])
+    offset = nodes.position[cones] - nodes.position[vehicles, None]
+    ahead = np.einsum("nmi,ni->nm", offset, u)
+    left = u[:, None, 0] * offset[..., 1] - u[:, None, 1] * offset[..., 0]
+    known = (ahead > -BESIDE) & (ahead < REACH) & (np.abs(left) < CORRIDOR)
+    order = np.argsort(np.where(known, ahead, np.inf), axis=1)
+    ahead, left, known = (np.take_along_axis(x, order, axis=1) for x in (ahead, left, known))
+    first = left[:, 0] if len(cones) else np.zeros(len(vehicles))
+    side = np.where(first < 0, 1.0, -1.0)
+    demand = side[:, None] * left + geometry.clearance
+    speed = np.einsum("ni,ni->n", nodes.velocity[vehicles], u)
+    return ConesAhead(cones[order], ahead, demand, known, side, speed)
+
+
+def anticipated(nodes: NodeTable, classes: tuple[str, ...], geometry: ConeGeometry) -> FloatArray:
+    """Positions (n, 2) of all nodes, those of vehicles moved aside as far as the cones before them will push them."""
+    position = nodes.position.copy()
+    vehicles = np.flatnonzero(of_classes(nodes.label, classes))
+    if len(vehicles) == 0 or not of_classes(nodes.label, geometry.classes).any():
+        return position
+    line = cones_ahead(nodes, vehicles, geometry)
+    pushed = np.where(line.known & (line.ahead > 0), line.demand, 0.0).max(axis=1, initial=0.0)
+    pushed = np.where(line.speed > MIN_SPEED, pushed, 0.0)
+    u = unit(nodes.heading[vehicles])
+    position[vehicles] += (line.side * pushed)[:, None] * np.stack([-u[:, 1], u[:, 0]], axis=-1)
+    return position
+
+
+def information_setting() -> Any:
+    """The field of an edge rule that holds its `EdgeInformation`."""
+    return settings_group(
+        lambda: None,
+        "weight edges by their information gain, as edges into well-known velocities tell little; null: full weight",
+    )
+
+
+@dataclass(frozen=True)
+class EdgeInformation(Settings):
+    """Weight edges by their information gain."""
+
+    spread: NonNegative = setting(
+        0.5, "standard deviation of the difference between the velocities of a pair, m/s; higher: edges gain less"
+    )
+    unseen_acceleration: NonNegative = setting(
+        0.0, "growth of the velocity deviation of undetected objects, m/s^2; higher: edges out of them gain less"
+    )
+
+    def variances(self, nodes: NodeTable) -> FloatArray:
+        """s^2 (n,) of the module."""
+        if nodes.unseen is None:
+            return nodes.velocity_variance
+        return np.asarray(nodes.velocity_variance + (self.unseen_acceleration * nodes.unseen) ** 2)
+
+
+LEAST = 1e-9  # probability that a certain object does not exist
+
+
+def pairs_within(
+    position: FloatArray, targets: BoolArray, sources: BoolArray, radius: float
+) -> tuple[IntArray, IntArray]:
+    """All pairs (E,) of different rows of two masks (n,) within `radius` m: target rows, source rows."""
+    to, of = targets.nonzero()[0], sources.nonzero()[0]
+    if len(to) == 0 or len(of) < 2:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    i, j = near_pairs(position[to], position[of], np.full(len(to), radius))
+    target, source = to[i], of[j]
+    different = target != source
+    return target[different], source[different]
+
+
+def strongest(target: IntArray, rate: FloatArray, n: int, degree: int) -> IntArray:
+    """Rows (k,) of at most `degree` edges into each of n nodes, the strongest of E edges: target (E,), rate (E,)."""
+    order = np.lexsort((-rate, target))
+    rank = np.arange(len(order)) - np.searchsorted(target[order], np.arange(n))[target[order]]
+    return order[rank < degree]
+
 
 Leaders = Literal["any", "moving", "stationary"]
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")

@@ -117,7 +117,7 @@ class Curvilinear(Settings):
 
     The acceleration along the heading fades (Singer 1970), that across it is that of the turn. White noise
     acceleration, which differs along and across the heading, acts besides. The heading and the turn rate are known
-    inputs of an interval (`saga_fg.model.known_course`); where they are missing the motion is straight and its noise
+    inputs of an interval (`saga_fg.model.turning`); where they are missing the motion is straight and its noise
     the same in all directions. Source of the split: Best and Norton, A new model and efficient tracker for a target
     with curvilinear motion, IEEE Transactions on Aerospace and Electronic Systems 33(3), 1997.
     """

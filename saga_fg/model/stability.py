@@ -1,4 +1,6 @@
-r"""Stability of edge rules, alone and together: they must not drive objects apart.
+"""Stability of edge rules, alone and together, and interactions learned from recordings.
+
+Stability of edge rules, alone and together: they must not drive objects apart.
 
 By Gershgorin's theorem the eigenvalues of couplings whose rates sum to K_i at node i lie in discs about -K_i of radius
 K_i, so within 2 max K_i of zero, and two nodes that act on each other at the rate max K_i reach that bound. Rules are
@@ -12,11 +14,17 @@ for velocities may feed each other while headings are held; but in the next inte
 
 Rules by which lanes, lines or cones act on vehicles are not tried, as their sources are stationary. Nor are laws of
 acceleration, which are bounded in themselves.
+
+Interactions learned from recordings, as a value that is written to a file and given to a tracker.
+
+Learned dynamics must be stable: construction checks them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy.linalg
@@ -30,6 +38,7 @@ from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.settings import Range, Settings, setting, settings_group
 
 LONGEST_STEP = 1.0  # s
 _STEPS = (0.1, 0.25, 0.5, LONGEST_STEP)
@@ -141,3 +150,33 @@ def _pairs_of_nodes(rules: Sequence[MovingRule], turns: FloatArray) -> tuple[Sce
             total += float(rate.max())
             groups.append(Edges(type(law).__name__, target, source, rate, *law.triples(nodes, target, source)))
     return SceneGraph.of(nodes.id, node_type, groups), total
+
+
+FORMAT = "saga-fg interactions"
+VERSION = 1
+HIGHEST_RATE = 20.0  # 1/s, of an edge: beyond, an interaction is a rigid bond
+
+
+@dataclass(frozen=True)
+class LearnedInteractions(Settings):
+    """Edge rules, and how much of the process noise they explain.
+
+    Raises `InputError` for another format or version, and for rules that would make the dynamics, or a step, unstable.
+    """
+
+    format: Literal["saga-fg interactions"] = setting("saga-fg interactions", "format of this file")
+    version: int = setting(VERSION, "version of the format")
+    learned_from: str = setting("", "data it was learned from")
+    edges: tuple[Following | Neighbours, ...] = settings_group(tuple, "edge rules of the scene graph")
+    explained_noise: Annotated[float, Range(0, 10)] = setting(
+        0.0, "process noise is scaled by exp(-explained_noise K) at the total rate K of interactions, s; usual 0 to 2"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.version != VERSION:
+            raise InputError(f"version: expected {VERSION}, the one this program writes, got {self.version}")
+        for k, rule in enumerate(self.edges):
+            if rule.rate > HIGHEST_RATE:
+                raise InputError(f"edges[{k}].rate: expected at most {HIGHEST_RATE:g} 1/s, got {rule.rate:g}")
+        require_stable(self.edges)

@@ -1,4 +1,6 @@
-"""Validation of arrays at construction: convert once, check once, freeze.
+"""Validated arrays, and tables that are held by columns.
+
+Validation of arrays at construction: convert once, check once, freeze.
 
 Every public value type funnels its arrays through `checked`, so that nothing of a wrong shape, with a NaN where a
 number is needed, ever reaches the numerics (or GTSAM, which would crash the interpreter).
@@ -7,18 +9,18 @@ number is needed, ever reaches the numerics (or GTSAM, which would crash the int
 from __future__ import annotations
 
 import weakref
-from collections.abc import Container
-from typing import Any, Literal, TypeVar
+from collections.abc import Container, Sequence
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.array_types import BoolArray as BoolArray
-from saga_fg.kernels.array_types import FloatArray as FloatArray
-from saga_fg.kernels.array_types import IntArray as IntArray
-from saga_fg.kernels.array_types import StrArray as StrArray
-from saga_fg.kernels.labels import numbered_rows
+from saga_fg.kernels.compilation import BoolArray as BoolArray
+from saga_fg.kernels.compilation import FloatArray as FloatArray
+from saga_fg.kernels.compilation import IntArray as IntArray
+from saga_fg.kernels.compilation import StrArray as StrArray
+from saga_fg.kernels.components import numbered_rows
 
 Values = Literal["finite", "finite-or-nan", "any"]
 _MOST = np.iinfo(np.int64).max
@@ -199,3 +201,75 @@ def of_classes(label: StrArray, classes: Container[str]) -> BoolArray:
     """(n,) which labels are among `classes`."""
     names, index = distinct(label)
     return np.array([name in classes for name in names], dtype=bool)[index]
+
+
+class Columns:
+    """For dataclasses whose fields are arrays (n, ...), or other tables, row by row of the same n things.
+
+    A field that is neither belongs to the whole table, and is the same in every selection.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __len__(self) -> int:
+        return len(self.__dict__[next(iter(self.__dataclass_fields__))])
+
+    def select(self, rows: IntArray | BoolArray | slice | Sequence[int]) -> Self:
+        """The rows of a mask, of row indices or of a slice."""
+        if isinstance(rows, slice):
+            return self._rows(rows)
+        index = np.asarray(rows, dtype=None if len(rows) else np.int64)
+        if index.dtype == np.bool_:
+            if len(index) != len(self):
+                raise IndexError(f"expected a mask of {len(self)} rows, got {len(index)}")
+            index = index.nonzero()[0]
+        return self._rows(index)
+
+    def _rows(self, rows: Any) -> Self:
+        """The rows of a validated table: nothing to check again."""
+        mine, chosen = self.__dict__, object.__new__(type(self))
+        columns = chosen.__dict__
+        for name in self.__dataclass_fields__:
+            column = mine[name]
+            if isinstance(column, np.ndarray):  # anything else belongs to the whole table, or is one
+                matrix = column.ndim > 1 and not isinstance(rows, slice)
+                column = column.take(rows, 0) if matrix else column[rows]  # each the fastest of its kind
+                if column.dtype.char == "U":
+                    column.flags.writeable = False  # strings are replaced as a whole, and looked up often
+            elif isinstance(column, Columns):
+                column = column._rows(rows)
+            columns[name] = column
+        return chosen
+
+    def copied(self) -> Self:
+        """A table of the same rows that shares no array with this one that can be written."""
+        twin = object.__new__(type(self))
+        columns = twin.__dict__
+        for name in self.__dataclass_fields__:
+            column = self.__dict__[name]
+            if isinstance(column, np.ndarray):
+                column = column.copy() if column.flags.writeable else column
+            elif isinstance(column, Columns):
+                column = column.copied()
+            columns[name] = column
+        return twin
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """The rows of all parts, of which there is one at least, in order; nothing is checked again."""
+        tables, whole = [part.__dict__ for part in parts], object.__new__(cls)
+        columns = whole.__dict__
+        for name in cls.__dataclass_fields__:
+            column = tables[0][name]
+            if isinstance(column, np.ndarray):
+                column = np.concatenate([table[name] for table in tables])
+                if column.dtype.char == "U":
+                    column.flags.writeable = False
+            elif isinstance(column, Columns):
+                column = column.concatenate([table[name] for table in tables])
+            columns[name] = column
+        return whole
+
+    def append(self, other: Self) -> Self:
+        """With the rows of another at the end."""
+        return self.concatenate([self, other])

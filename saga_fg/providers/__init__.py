@@ -6,15 +6,9 @@ Each reads what a frame brings (`Frame.ego`) and works in the running graph wher
     providers: [{kind: "saga_fg.providers:Odometry"}, {kind: "saga_fg.providers:Gps", deviation: 0.5}]
 """
 
-from saga_fg.providers.gps import Gps
-from saga_fg.providers.imu import Imu
-from saga_fg.providers.landmarks import Landmarks
-from saga_fg.providers.lanes import LaneKeeping
-from saga_fg.providers.odometry import Odometry
-from saga_fg.providers.relative_detections import RelativeDetections
-from saga_fg.providers.start import StartSettings
-from saga_fg.providers.stationary import StationaryObjects
-from saga_fg.providers.wheels import Wheels
+from saga_fg.providers.navigation import Gps, Imu
+from saga_fg.providers.odometry import Odometry, StartSettings, Wheels
+from saga_fg.providers.surroundings import Landmarks, LaneKeeping, RelativeDetections, StationaryObjects
 
 __all__ = [
     "Gps",

@@ -1,33 +1,33 @@
-from .association import assign_detections, assign_free_detections, stitch_tracklets
-from .batch_states import no_edges, robust_weights, smooth_states
-from .boxes import (
-    Headings,
-    constant_sizes,
-    is_reversed,
-    size_weights,
-    smooth_headings,
-    weighted_medians,
-)
-from .edges import SmoothedEdges
-from .evidence import (
+from .association import (
     Evidence,
     EvidenceFrame,
+    assign_detections,
+    assign_free_detections,
     evidence_scores,
     frame_rate,
     gather_evidence,
     measured_in_order,
     opportunities,
+    stitch_tracklets,
 )
-from .labels import LabelCounts, Labels, Quality, Source, quality_of
-from .random_walk import scalar_readings, smooth_walks
+from .batch_states import StationaryStates, no_edges, robust_weights, smooth_states, stationary_states
+from .boxes import (
+    Headings,
+    constant_sizes,
+    is_reversed,
+    scalar_readings,
+    size_weights,
+    smooth_headings,
+    smooth_walks,
+    weighted_medians,
+)
 from .settings import (
     OfflineClass,
     SmoothingSettings,
     StationarySettings,
     StitchingSettings,
 )
-from .states import Lifespans, StateTable, lifespans_of
-from .stationarity import StationaryStates, stationary_states
+from .states import LabelCounts, Labels, Lifespans, Quality, SmoothedEdges, Source, StateTable, lifespans_of, quality_of
 
 __all__ = [
     "Evidence",

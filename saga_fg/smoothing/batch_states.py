@@ -1,4 +1,6 @@
-r"""States of all objects at all moments of a recording, given all of its detections.
+"""States of all objects at all moments given all detections, those at rest, and factors of users' own.
+
+States of all objects at all moments of a recording, given all of its detections.
 
     prior         position unknown, velocity as of a new track             first moment of an object
     interaction   || x_i(k+1) - sum_j F_ij x_j(k) - b_i ||_{Q_i}            every interval, edges frozen
@@ -7,36 +9,177 @@ r"""States of all objects at all moments of a recording, given all of its detect
 
 over one factor graph (`saga_fg.estimators.BatchSmoother`; long recordings in windows, by `WindowedSmoother`, which
 comes to the same within a millimetre and does not keep all matrices of an hour; with factors of users' own the running
-graph itself, `saga_fg.smoothing.graph_states`). The edges of an interval follow from given states at its start: those
+graph itself). The edges of an interval follow from given states at its start: those
 of an earlier, simpler pass. Robust losses (`factors.robust`) are reached by reweighting between passes.
 
 The velocity of a stationary object is zero with the covariance d^2/dt in every interval dt, by which its position
 wanders by d in a second, whatever the rate of frames: as far as the vehicle's own poses drift. A recording of one
 moment has no interval; there dt is a second.
+
+A recording as a running graph, in which factors of users' own take part.
+
+Objects are variables by id and moment, with the new objects, interactions and detections of the smoother in NumPy, and
+start at its result, the states without the users' factors. `BatchSolver` solves everything at once.
+
+Stationary objects, recognised from smoothed states and their detections.
+
+A run of moments is a halt if the smoothed speed stays below `stationary_speed` for at least `min_time`, and the
+positions measured meanwhile do not drift: with the weighted regression
+
+    z_k = p + u (t_k - t_mean) + e_k,   weights w_k = 2 / tr R_k,   u* = sum w (t - t_mean) z / sum w (t - t_mean)^2
+
+the drift |u*| T over its duration T is below `stationary_drift`. A parked vehicle is stationary all its life.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from factors import Robust
-from saga_fg.estimators import BatchSmoother, Measurements, NewObjects, SmoothedState, WindowedSmoother
-from saga_fg.graph import FactorProvider
-from saga_fg.model.discretisation import discretise
+from saga_fg.estimators import (
+    BatchSmoother,
+    BatchSolver,
+    DetectionFactors,
+    Interactions,
+    Measurements,
+    NewObjects,
+    SmoothedState,
+    WindowedSmoother,
+)
+from saga_fg.graph import OBJECT, Additions, FactorProvider, GraphView, key_of
+from saga_fg.model.discretisation import Transition, discretise
 from saga_fg.model.interactions import VELOCITY
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.smoothing.evidence import Evidence
-from saga_fg.smoothing.graph_states import RecordingEpoch, states_in_graph
-from saga_fg.smoothing.settings import OfflineClass
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.smoothing.association import Evidence
+from saga_fg.smoothing.settings import OfflineClass, StationarySettings
 from saga_fg.smoothing.states import Lifespans, StateTable
-from saga_fg.smoothing.stationarity import StationaryStates
-from saga_fg.types.by_class import class_settings
+from saga_fg.types.by_class import class_settings, class_values
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingEpoch:
+    """A moment of the recording: how objects got here, who is new, what is measured, and ids of who goes afterwards."""
+
+    moment: int
+    transition: Transition | None
+    new_objects: NewObjects
+    measurements: Sequence[Measurements]
+    gone: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class _At:
+    """A provider whose objects begin at known states, by id."""
+
+    provider: FactorProvider
+    states: Mapping[int, FloatArray]
+
+    @property
+    def name(self) -> str:
+        return self.provider.name
+
+    def factors(self, view: GraphView) -> Additions:
+        additions = self.provider.factors(view)
+        return replace(additions, variables=[replace(new, state=self.states[new.id]) for new in additions.variables])
+
+
+def states_in_graph(
+    epochs: Sequence[RecordingEpoch],
+    start: StateTable,
+    evidence: Evidence,
+    labels: Mapping[int, str],
+    providers: Sequence[FactorProvider],
+) -> StateTable:
+    """Smoothed states with the users' factors; start: without them; labels of the objects by id.
+
+    Raises `GraphError`, naming the provider, for what the graph does not take.
+    """
+    solver = BatchSolver()
+    solver.origin = evidence.origin
+    for epoch in epochs:
+        rows = start.at(epoch.moment)
+        states = dict(zip(start.id[rows].tolist(), start.mean[rows], strict=True))
+        moved = [] if epoch.transition is None else [_At(Interactions(epoch.transition), states)]
+        new = _At(replace(epoch.new_objects, labels=labels), states)
+        solver.step(
+            float(evidence.times[epoch.moment]), [*moved, new, *map(DetectionFactors, epoch.measurements), *providers]
+        )
+    if not solver.solve().converged:
+        log.warning("the states with the factors of %s have not settled", ", ".join(one.name for one in providers))
+    number = {epoch.moment: k for k, epoch in enumerate(epochs)}
+    keys = [key_of(OBJECT, i, number[k]) for k, i in zip(start.moment.tolist(), start.id.tolist(), strict=True)]
+    mean = np.array([solver.state(key) for key in keys]).reshape(start.mean.shape)
+    covariance = np.array([solver.covariance(key) for key in keys]).reshape(start.covariance.shape)
+    return replace(start, mean=mean, covariance=covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class StationaryStates:
+    """States (m,) of stationary objects: moments in ascending order, and ids; settings of how firmly they are held."""
+
+    settings: StationarySettings = field(default_factory=StationarySettings)
+    moment: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    id: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def at(self, moment: int, ids: IntArray) -> BoolArray:
+        """(n,) which of these objects are stationary at a moment."""
+        first, last = np.searchsorted(self.moment, [moment, moment + 1])
+        return np.isin(ids, self.id[first:last])
+
+
+def stationary_states(
+    states: StateTable,
+    lifespans: Lifespans,
+    evidence: Evidence,
+    object_of: IntArray,
+    settings: StationarySettings,
+    classes: Mapping[str, OfflineClass],
+) -> StationaryStates:
+    """The states in which objects are stationary."""
+    order = np.lexsort((states.moment, states.id))
+    ids, moments = states.id[order], states.moment[order]
+    label = lifespans.label[lifespans.rows_of(ids)]
+    max_speed, max_drift = class_values(classes, OfflineClass, label, "stationary_speed", "stationary_drift")
+    slow = np.hypot(*states.mean[order, 2:].T) <= max_speed
+    begins = np.flatnonzero(slow & np.concatenate([[True], (ids[1:] != ids[:-1]) | ~slow[:-1]]))
+    ends = np.flatnonzero(slow & np.concatenate([(ids[1:] != ids[:-1]) | ~slow[1:], [True]]))
+    times = evidence.times
+    rows = np.flatnonzero(object_of >= 0)
+    rows = rows[np.argsort(object_of[rows], kind="stable")]
+    owner, seen_at = object_of[rows], evidence.moment[rows]
+    kept: list[IntArray] = []
+    for a, b in zip(begins.tolist(), ends.tolist(), strict=True):
+        if times[moments[b]] - times[moments[a]] < settings.min_time:
+            continue
+        mine = slice(np.searchsorted(owner, ids[a]), np.searchsorted(owner, ids[a], side="right"))
+        within = rows[mine][(seen_at[mine] >= moments[a]) & (seen_at[mine] <= moments[b])]
+        if len(within) and _drift(evidence, within) <= max_drift[a]:
+            kept.append(np.arange(a, b + 1))
+    chosen = np.concatenate([np.empty(0, dtype=np.int64), *kept])
+    chosen = chosen[np.argsort(moments[chosen], kind="stable")]
+    return StationaryStates(settings, moments[chosen], ids[chosen])
+
+
+def _drift(evidence: Evidence, rows: IntArray) -> float:
+    """Drift of the measured positions of an object from its first to its last detection, m."""
+    t = evidence.times[evidence.moment[rows]]
+    w = 2 / np.trace(evidence.R[rows, :2, :2], axis1=1, axis2=2)
+    dt = t - np.average(t, weights=w)
+    spread = float(np.sum(w * dt**2))
+    if spread == 0:
+        return 0.0
+    slope = (w * dt) @ evidence.boxes.position[rows, :2] / spread
+    return float(np.hypot(*slope) * (t[-1] - t[0]))
+
 
 LONG_RECORDING = 120.0  # s from which it is smoothed in windows
 MOST_JOINT = 64  # objects that are smoothed jointly: their covariance takes half a megabyte

@@ -1,16 +1,28 @@
-"""Objects over the moments of a recording: their lifespans, and their smoothed states as one table."""
+"""Objects over the moments of a recording: states, edges, and labels of each moment.
+
+Edges of a recording: the tracker's rules at smoothed estimates, which use its future too.
+
+An online edge depends on the estimates of its time; offline the same rules get smoothed positions, and whether an
+object ever moves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Literal, Self, get_args
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.columns import Columns
+from saga_fg.errors import InputError
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.graph_building import build_graph
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.motion import NodeType
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
+from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,3 +139,134 @@ class StateTable(Columns):
     def _keys(self) -> IntArray:
         """(R,) one ascending number for each moment and object."""
         return self.moment * self._span + self.id
+
+
+Source = Literal["observed", "filled", "extended"]
+"""Observed: the object was detected; filled: between detections; extended: before its online track or after it."""
+
+Quality = Literal["high", "medium", "low"]
+MEDIUM_SCORE = 0.2  # least score of a box of medium quality
+HIGH_SCORE = 0.5  # least score of a box of high quality
+HIGH_DEVIATION = 0.3  # largest standard deviation of the position of a box of high quality, m
+MEDIUM_DEVIATION = 0.8  # likewise of a box of medium quality, m
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """The boxes of one moment.
+
+    tracks    boxes (world), ids, scores and covariances; `coasting` is the time to the nearest detection, s
+    yaw_variance (N,)  of the heading, rad^2; NaN where unknown
+    source    (N,) observed, filled or extended
+    quality   (N,) high, medium or low
+
+    Raises `InputError` for columns of another length or other words.
+    """
+
+    tracks: Tracks
+    yaw_variance: FloatArray
+    source: StrArray
+    quality: StrArray
+
+    def __post_init__(self) -> None:
+        for name, words in (("source", get_args(Source)), ("quality", get_args(Quality))):
+            column = np.asarray(getattr(self, name), dtype=np.str_)
+            if column.shape != (len(self.tracks),) or not np.isin(column, words).all():
+                raise InputError(f"{name}: expected {len(self.tracks)} of {', '.join(words)}")
+            object.__setattr__(self, name, column)
+        if np.shape(self.yaw_variance) != (len(self.tracks),):
+            raise InputError(f"yaw_variance: expected {len(self.tracks)} numbers")
+
+    def __len__(self) -> int:
+        return len(self.tracks)
+
+
+@dataclass(frozen=True)
+class LabelCounts:
+    """Numbers of boxes of a recording that were observed, filled and extended, and dropped with their objects; of
+    objects kept and dropped, and of tracklets stitched to another."""
+
+    observed: int = 0
+    filled: int = 0
+    extended: int = 0
+    dropped: int = 0
+    objects: int = 0
+    dropped_objects: int = 0
+    joined: int = 0
+
+    @property
+    def boxes(self) -> int:
+        """Boxes written."""
+        return self.observed + self.filled + self.extended
+
+    @classmethod
+    def sum(cls, counts: Iterable[LabelCounts]) -> Self:
+        """Add up several recordings."""
+        parts = list(counts)
+        return cls(*(sum(getattr(part, name) for part in parts) for name in cls.__dataclass_fields__))
+
+
+def quality_of(score: FloatArray, covariance: FloatArray) -> StrArray:
+    """(N,) the quality of boxes with these scores (N,) and position covariances (N, 2, 2), m^2."""
+    deviation = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]) if len(score) else np.empty(0)
+    high = (score >= HIGH_SCORE) & (deviation <= HIGH_DEVIATION)
+    medium = (score >= MEDIUM_SCORE) & (deviation <= MEDIUM_DEVIATION)
+    return np.where(high, "high", np.where(medium, "medium", "low"))
+
+
+MOVING = 2.0  # speed that is no estimation error, m/s
+FACING = 1.0  # speed from which an object heads where it moves, m/s
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedEdges:
+    """Graphs by edge rules at smoothed states; called with a moment, the ids of the objects there and their types.
+
+    yaw (n,) and length (n,) of the objects by their detections, NaN where unknown
+    """
+
+    rules: Sequence[EdgeRule]
+    explained_noise: float
+    lifespans: Lifespans
+    states: StateTable
+    yaw: FloatArray
+    length: FloatArray
+
+    @cached_property
+    def has_moved(self) -> BoolArray:
+        """(n,) which objects are ever clearly in motion."""
+        speed = np.hypot(*self.states.mean[:, 2:].T)
+        sigma = np.sqrt(np.trace(self.states.covariance[:, 2:, 2:], axis1=1, axis2=2) / 2)
+        moving = self.states.id[(speed > MOVING) & (speed > 3 * sigma)]
+        return np.isin(self.lifespans.id, moving)
+
+    def __call__(self, moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGraph:
+        at = self.states.rows_of(np.full(len(ids), moment), ids)
+        rows, objects = np.flatnonzero(at >= 0), self.lifespans.rows_of(ids)
+        mean, P = self.states.mean[at[rows]], self.states.covariance[at[rows]]
+        label: StrArray = self.lifespans.label[objects[rows]]
+        velocity = mean[:, 2:]
+        course = np.arctan2(velocity[:, 1], velocity[:, 0])
+        known = np.isfinite(self.yaw[objects[rows]]) & (np.hypot(*velocity.T) < FACING)
+        nodes = NodeTable(
+            ids[rows],
+            label,
+            tuple(types[row] for row in rows.tolist()),
+            mean[:, :2],
+            velocity,
+            np.where(known, self.yaw[objects[rows]], course),
+            np.nan_to_num(self.length[objects[rows]]),
+            np.trace(P[:, 2:, 2:], axis1=1, axis2=2) / 2,
+            self.has_moved[objects[rows]],
+        )
+        graph = build_graph(nodes, self.rules, explained_noise=self.explained_noise)
+        if len(rows) == len(ids):
+            return graph
+        missing = np.setdiff1d(np.arange(len(ids)), rows)  # objects the states do not know move on their own
+        return SceneGraph(
+            np.concatenate([graph.nodes, ids[missing]]),
+            (*graph.types, *(types[row] for row in missing.tolist())),
+            graph.edges,
+            np.concatenate([graph.diffusion_scale, np.ones(len(missing))]),
+            graph.nonlinear,
+        )

@@ -1,9 +1,8 @@
 from .clock import ClockSettings, TimeVerdict
 from .clock_offsets import SensorTime
 from .greedy import GreedySettings, GreedyTracker
-from .journal import Journal
+from .journal import Journal, Observer, Stage, TrackerView
 from .names import AssociationName
-from .observer import Observer, Stage, TrackerView
 from .settings import (
     AssociationSettings,
     ClassSettings,
@@ -11,8 +10,8 @@ from .settings import (
     ExistenceSettings,
     TrackerSettings,
 )
-from .stationarity import StationaritySettings
 from .table_tracking import track
+from .track_filters import StationaritySettings
 from .tracker import Tracker
 from .traffic import SpeedPriorSettings, TrafficSettings
 

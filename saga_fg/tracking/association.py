@@ -13,7 +13,7 @@ all among many weak ones, and of two detections the more probable one is preferr
 
 Candidates are the pairs of one class inside its gate. The assignment is the one of least total cost (`hungarian`), is
 made cheapest pair first (`greedy`), or registers the observed graph to the predicted graph (`graph`): the costs above
-are then joined by those of `saga_fg.numerics.pairwise_costs` between pairs of candidates, of all classes, whose tracks
+are then joined by those of `saga_fg.numerics.assignment` between pairs of candidates, of all classes, whose tracks
 have correlated errors.
 
 Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Rezatofighi et al.,
@@ -29,21 +29,24 @@ import numpy as np
 
 from saga_fg.kernels.pairs import gated_pairs
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, distinct
-from saga_fg.numerics.assignment import Matching, cheapest_first, gate, least_total
-from saga_fg.numerics.near_pairs import near_pairs
-from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs
-from saga_fg.numerics.quadratic_matching import QuadraticMatching
-from saga_fg.tracking.class_belief import ClassEvidence
-from saga_fg.tracking.ego_node import relative_covariances
-from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.relinking import relinked
-from saga_fg.tracking.retrodiction import past_cross_covariances, past_positions
+from saga_fg.numerics.assignment import (
+    CrossCovariances,
+    Matching,
+    QuadraticMatching,
+    cheapest_first,
+    gate,
+    least_total,
+    pair_costs,
+)
+from saga_fg.numerics.gating import near_pairs
+from saga_fg.tracking.initiation import over_confirmed, relinked
+from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
+from saga_fg.tracking.track_table import ClassEvidence
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.tracking.unresolved import over_confirmed
-from saga_fg.types.boxes import Boxes
+from saga_fg.tracking.update import past_cross_covariances, past_positions
+from saga_fg.types.boxes import Boxes, paired_giou_3d
 from saga_fg.types.by_class import class_settings, class_values
-from saga_fg.types.overlap import paired_giou_3d
 
 LEAST_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
 

@@ -1,6 +1,14 @@
 """The joint kinematic state of all tracks and nodes: an estimator, addressed by ids and class labels.
 
 Positions are local, counted from the scene's origin.
+
+Measurements that arrive late, as measurements of the present state, along the objects' own motion.
+
+    x(t - delay) = exp(-A delay) (x(t) - w),   w ~ N(0, Q)
+    z = H x(t - delay) + v = H exp(-A delay) x(t) + v',   v' ~ N(0, R + H exp(-A delay) Q exp(-A delay)^T H^T)
+
+Source: Bar-Shalom, Update with out-of-sequence measurements in tracking, IEEE Transactions on Aerospace and Electronic
+Systems 38(3), 2002; here without the correlation of w with the present estimate.
 """
 
 from __future__ import annotations
@@ -23,9 +31,22 @@ from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct, shallow_copy
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.providers import RelativeDetections
-from saga_fg.tracking.kinematics import Kinematics, RelativePositions
-from saga_fg.tracking.out_of_sequence import moved_to_present
+from saga_fg.tracking.track_filters import Kinematics, RelativePositions
 from saga_fg.types.frame import Frame
+
+
+def moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
+    """H (..., m, d) and R (..., m, m) of a measurement `delay` s old, as one of the present state."""
+    F, Q = own_motion(node_type, delay)
+    H_past = H @ np.linalg.inv(F)
+    return H_past, R + H_past @ Q @ np.swapaxes(H_past, -1, -2)
+
+
+def past_position(node_type: NodeType, delay: float) -> FloatArray:
+    """(2, d) matrix that takes the present state to the position `delay` s ago."""
+    H = node_type.selector(POSITION)
+    return H @ np.linalg.inv(own_motion(node_type, delay)[0]) if delay > 0 else H
+
 
 _UNKNOWN_POSITION = 1e5  # standard deviation, m
 

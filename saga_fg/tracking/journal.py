@@ -1,4 +1,10 @@
-"""A journal of a tracker: an event for every track and frame with the reasons, as values that JSON can hold.
+"""Observing a tracker at work: stages of a frame, a journal of every track, its running graph.
+
+Observing a tracker at work: the state and the results at the end of each step of a frame.
+
+A tracker without an observer pays nothing for the possibility; a view is made only for an observer that asks for it.
+
+A journal of a tracker: an event for every track and frame with the reasons, as values that JSON can hold.
 
     initiated  detection and its probability, and the nearest tracks that did not take it
     matched    candidates with their squared distances in sigmas, the chosen one, and why the others were not chosen
@@ -6,29 +12,264 @@
     unsettled  in frames for which the solver found no minimum of the graph, as far as the track is concerned
     deleted    time without a detection, existence, and the limit that was passed
     clocks     offsets of the sensors' clocks, whenever one is corrected anew, or its frames are left out or used again
-    graph      running graph of the interval that the frame ended (`saga_fg.tracking.graph_record`), once a frame
+    graph      running graph of the interval that the frame ended, once a frame
 
 `matched` and `missed` also list the edges that acted on the prediction, and the effect of each. Positions are in world
 coordinates.
+
+The running graph as a value that JSON can hold, to be drawn: variables at their positions, factors by kind.
+
+nodes    name ("car 12 at 3.40 s"), kind, time (s; null: for all time), position [x, y], m, in the world; where known
+         covariance (2, 2), m^2, and outline [[x, y], ...] of a box or of a line of the map
+factors  kind; nodes: their numbers in the list above; edges: the interaction function and the rate, 1/s, by which each
+         node from the third on acts on the first
+
+Variables without a position, such as biases, are left out, and so are factors on these alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, Protocol
 
+import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.assignment import gate, mahalanobis
-from saga_fg.tracking.class_belief import ClassGroups
-from saga_fg.tracking.edge_effects import EdgeEffect, edge_effects
-from saga_fg.tracking.graph_record import graph_of_frame
+from saga_fg.graph import EGO_ERROR, MAP_NODE, OBJECT, GraphVariable, SceneFactorGraph
+from saga_fg.model.interactions import NodeTable
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.assignment import Matching, gate, mahalanobis
+from saga_fg.tracking.clock import Clock
+from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.observer import Stage, TrackerView
+from saga_fg.tracking.prediction import EdgeEffect, edge_effects, node_table
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
+from saga_fg.tracking.track_table import ClassGroups, TrackTable
+from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_settings
+
+Stage = Literal["predict", "measure", "associate", "update", "existence", "initiate", "delete", "report"]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerView:
+    """A tracker with n tracks at the end of a stage.
+
+    timestamp     s, of the state
+    sensor        of the frame
+    table         the tracks, with times in s as timestamps are
+    nodes         as edge rules see them: the tracks, the vehicle, the map; positions are local, see `origin`
+    P             (n, 2, 2) covariance of the positions, m^2
+    origin        (2,) of the local positions in the world, m
+    graph         scene graph of the latest interval, None before the first
+    measurements  of the frame, from the stage `measure` on
+    matching      rows of tracks and of measurements, from the stage `associate` on
+    initiated     (b,) rows of the measurements that initiated the last b tracks, at the stage `initiate`
+    boxes         of the tracks, in the world
+    clock, shared of the sensors, and what their frames have in common, see `clocks`
+    settled       (n,) tracks for which the solver has found the minimum of the graph
+    running       the running graph, where factor providers take part; its positions are local
+    """
+
+    timestamp: float
+    sensor: str
+    table: TrackTable
+    nodes: NodeTable
+    P: FloatArray
+    origin: FloatArray
+    graph: SceneGraph | None
+    measurements: FrameMeasurements | None
+    matching: Matching | None
+    initiated: IntArray
+    boxes: Boxes
+    clock: Clock
+    shared: SharedObservations
+    settled: BoolArray
+    running: SceneFactorGraph | None
+
+    @classmethod
+    def of(
+        cls,
+        state: TrackerState,
+        sensor: str,
+        measurements: FrameMeasurements | None = None,
+        matching: Matching | None = None,
+        initiated: IntArray | None = None,
+    ) -> TrackerView:
+        """View a state and the results of a frame so far."""
+        table, now = state.table.snapshot(), state.kinematics()
+        table.last_detected += state.start
+        table.last_in_view += state.start
+        return cls(
+            state.start + state.time,
+            sensor,
+            table,
+            node_table(state),
+            now.P,
+            state.origin,
+            state.graph,
+            measurements,
+            matching,
+            np.empty(0, dtype=np.int64) if initiated is None else initiated,
+            replace(state.boxes(now.position, now.velocity)),
+            state.clock,
+            state.shared,
+            state.joint.settled(table.id),
+            state.joint.estimator.graph() if state.providers else None,
+        )
+
+    @property
+    def clocks(self) -> dict[str, SensorTime]:
+        """The clocks of the sensors, where there are several."""
+        return sensor_times(self.clock, self.shared) if len(self.clock.sensors) > 1 else {}
+
+    def positions(self) -> FloatArray:
+        """(n, 2) positions of the tracks in the world, m."""
+        return np.asarray(self.nodes.position[: len(self.table)] + self.origin)
+
+
+class Observer(Protocol):
+    """Anything that observes how a tracker comes to its tracks."""
+
+    def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
+        """Take note of a stage; `view()` returns the tracker's view and is valid during this call only."""
+        ...
+
+
+OWN = {
+    "interactions": "interaction",
+    "detections": "detection",
+    "new objects": "initiation",
+    "marginals": "marginal prior",
+}
+"""Kinds of the factors that the toolkit's own providers add, by provider."""
+KNOWN_POSE = "known ego pose"  # no variable
+
+
+class GraphRecord:
+    """Nodes and factors, collected."""
+
+    def __init__(self) -> None:
+        self.nodes: list[dict[str, Any]] = []
+        self.factors: list[dict[str, Any]] = []
+
+    def node(self, kind: str, name: str, time: float | None, position: ArrayLike, **more: ArrayLike) -> int:
+        """Add a node; returns its number. `more`: covariance and outline, left out where they are not finite."""
+        known = {key: _rounded(value) for key, value in more.items() if np.isfinite(value).all() and np.size(value)}
+        where = name if time is None else f"{name} at {time:.2f} s"
+        self.nodes.append({"name": where, "kind": kind, "time": time, "position": _rounded(position), **known})
+        return len(self.nodes) - 1
+
+    def factor(self, kind: str, nodes: list[int], **more: Any) -> None:
+        """Add a factor on nodes."""
+        self.factors.append({"kind": kind, "nodes": nodes, **more})
+
+    def add(
+        self,
+        graph: SceneFactorGraph,
+        origin: ArrayLike = (0.0, 0.0),
+        known: Mapping[int, int] | None = None,
+        covariance: Callable[[int], FloatArray] | None = None,
+    ) -> None:
+        """Add a running graph, whose positions are from `origin`.
+
+        known: numbers of nodes that are here already, by key; then only factors on the present are added, without
+        interactions; covariance: of a variable by key, as the estimator's method
+        """
+        numbers, origin = dict(known or {}), np.asarray(origin, dtype=float)
+
+        def number(variable: GraphVariable) -> int:
+            key = variable.key
+            if key not in numbers:
+                vector = covariance is not None and isinstance(graph.state(key), np.ndarray)
+                more = {"covariance": covariance(key)[:2, :2]} if covariance is not None and vector else {}
+                name, place = f"{variable.label} {variable.id}", _position(variable, graph) + origin
+                numbers[key] = self.node(variable.kind.name, name, variable.time, place, **more)
+            return numbers[key]
+
+        for factor in graph.factors():
+            on = [variable for variable in factor.variables if len(_position(variable, graph))]
+            present = any(variable.epoch in (graph.epoch, None) for variable in on)
+            if on and (known is None or (present and factor.provider not in ("interactions", "marginals"))):
+                self.factor(OWN.get(factor.provider, f"{factor.provider}: {factor.kind}"), [number(one) for one in on])
+
+
+def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -> dict[str, Any]:
+    """The graph of the interval that a frame ended, at the stage `initiate`; `before`: the frame before.
+
+    Times are counted from `start`. The states at the beginning of the interval have a joint prior, which is not listed.
+    """
+    record, time, n = GraphRecord(), now.timestamp - start, len(now.table.id)
+    table, corners, numbers = now.nodes, now.boxes.corners(), dict[int, int]()
+    for row, id_ in enumerate(table.id.tolist()):
+        if id_ >= 0:
+            more = {"covariance": now.P[row], "outline": corners[row]} if row < n else {}
+            place = table.position[row] + now.origin
+            numbers[id_] = record.node(OBJECT.name, f"{table.label[row]} {id_}", time, place, **more)
+    if before is not None and now.graph is not None and now.timestamp > before.timestamp:
+        _interactions(record, before, now, numbers, start)
+    if now.running is not None:
+        present = now.running.of(OBJECT, now.running.epoch)
+        ours = {one.key: numbers[id_] for id_, one in present.items() if id_ in numbers}  # others were handed over
+        record.add(now.running, now.origin, ours)
+    elif now.matching is not None and now.measurements is not None:
+        for row in now.matching.track.tolist():
+            record.factor("detection", [row])
+        for row in range(n - len(now.initiated), n):
+            record.factor("initiation", [row])
+        if now.measurements.viewpoint is not None:
+            record.node(KNOWN_POSE, "vehicle", time, now.measurements.viewpoint[:2])
+    return {"nodes": record.nodes, "factors": record.factors}
+
+
+def _interactions(
+    record: GraphRecord, before: TrackerView, now: TrackerView, numbers: Mapping[int, int], start: float
+) -> None:
+    """States at the beginning of the interval, the nodes of the map that act, and one interaction factor a track."""
+    assert now.graph is not None
+    table, time, graph = before.nodes, before.timestamp - start, now.graph
+    rows = {id_: row for row, id_ in enumerate(table.id.tolist())}
+    earlier: dict[int, int] = {}
+
+    def node(id_: int) -> int:
+        if id_ not in earlier:
+            row, name = rows[id_], f"{table.label[rows[id_]]} {abs(id_)}"
+            place, line = table.position[row] + before.origin, table.outline.get(row, np.empty(0))
+            if id_ < 0:
+                outline = line + before.origin if len(line) else line
+                earlier[id_] = record.node(MAP_NODE.name, name, None, place, outline=outline)
+            else:
+                earlier[id_] = record.node(OBJECT.name, name, time, place)
+        return earlier[id_]
+
+    acting: dict[int, list[tuple[int, str, float]]] = {}
+    ids = graph.nodes.tolist()
+    for group in graph.edges:
+        for target, source, rate in zip(group.target.tolist(), group.source.tolist(), group.rate.tolist(), strict=True):
+            acting.setdefault(ids[target], []).append((ids[source], group.interaction, rate))
+    for id_ in ids:
+        if id_ in numbers and id_ in rows:
+            on = [one for one in acting.get(id_, ()) if one[0] in rows]
+            nodes = [numbers[id_], node(id_), *(node(source) for source, _, _ in on)]
+            record.factor("interaction", nodes, edges=[[name, round(rate, 3)] for _, name, rate in on])
+
+
+def _position(variable: GraphVariable, graph: SceneFactorGraph) -> FloatArray:
+    """Position (2,) of a variable, m; (0,) for one without a position."""
+    state = graph.state(variable.key)
+    if isinstance(state, gtsam.Pose2 | gtsam.Pose3):
+        return np.asarray(state.translation())[:2]
+    vector = isinstance(state, np.ndarray) and len(state) >= 2 and variable.kind != EGO_ERROR
+    return np.asarray(state[:2] if vector else np.empty(0))
+
+
+def _rounded(values: ArrayLike) -> Any:
+    return np.round(np.asarray(values, dtype=float), 3).tolist()
+
 
 Event = dict[str, Any]
 LISTED = 5  # candidates of an event

@@ -1,17 +1,44 @@
-"""Lights, stop lines, lanes and walls of a map as nodes of the joint state, with the states of the lights.
+"""Maps as nodes of the joint state: lights, stop lines, lanes, walls; tiles joined, colours inferred.
+
+Lights, stop lines, lanes and walls of a map as nodes of the joint state, with the states of the lights.
 
 Nodes are the elements of those classes that some edge rule reads: others would cost time alone.
 
 Nodes of the map are stationary; their positions start at those of the map, as uncertain as the map, and are corrected
 by detections of lights and through the interactions of vehicles that stop at a line or keep a lane. Ids count down from
--1, so that they are never those of tracks. Detections labelled `saga_fg.types.signal.COLOUR_LABELS` report the
+-1, so that they are never those of tracks. Detections labelled `saga_fg.types.road_map.COLOUR_LABELS` report the
 colour of the nearest known light within reach.
+
+Elements of several maps, such as tiles along a drive: which are the same, and a name of its own for each.
+
+Two elements of one class are the same if they have one name and lie beside each other, as in a map that was corrected
+or cut elsewhere; or if they lie in one place under two names, and none of that place has this name already. Another
+element of a name that is taken gets a number after it. Elements of one map are never the same.
+
+Colours of lights inferred from traffic: the first vehicle before each stop line drives by its light.
+
+    L_k <- L_k + r ( a_k T dv - (a_k T)^2 / 2 ) / V,    V = max( P + q T - P', q T )
+    L_k <- max( L_k - max L, log h ),    p_k <- p_k exp( change of L_k ) / sum
+
+is Bayes' rule with the likelihoods N(dv; a_k T, V) of the states k of the light. dv is the change of the vehicle's
+estimated speed along its lane between two detections T seconds apart, P and P' the variances of the two estimates, so
+that V is that of dv (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001,
+section 5.4), and r the probability that the track exists. a_k is the acceleration that the edge rules expect, at the
+estimate at the first of the two: in red and amber that of `RedLight`, in green that of `GreenLight`; drivers who wait
+have not reacted yet in the state `starting`. The exponent is linear in dv, so that the noise of the estimated speeds
+does not add up over the frames.
+
+A share h of the drivers does not comply with the light: they turn at red, or cannot leave at green. So no vehicle
+says more than a factor 1 / h. All lines of a light gain by what is inferred, and by colours that are reported as well.
+Hidden vehicles tell nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,27 +46,198 @@ from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.motion import Motion, RandomWalk
 from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, of_classes
+from saga_fg.model.stop_lines import GreenLight, RedLight, coming_vehicles, halting
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, of_classes
 from saga_fg.numerics.assignment import assign, gate, mahalanobis
 from saga_fg.tracking.joint_state import JointTrackState
-from saga_fg.tracking.kinematics import Kinematics
-from saga_fg.tracking.map_tiles import Element, elements, in_known_names
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
-from saga_fg.tracking.signal_inference import FirstVehicles
+from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.types.by_class import class_settings
 from saga_fg.types.frame import Frame
-from saga_fg.types.lanes_across import LanesAcross
-from saga_fg.types.road_map import LANE, LIGHT, MAP_CLASSES, STOP_LINE, WALL, Lane, RoadMap, StopLine
-from saga_fg.types.signal import (
+from saga_fg.types.road_map import (
     COLOUR_LABELS,
     COLOURS,
+    LANE,
+    LIGHT,
+    MAP_CLASSES,
     MAX_LIGHT_DISTANCE,
     STATES,
+    STOP_LINE,
+    WALL,
+    Lane,
+    LanesAcross,
+    RoadMap,
     SignalSettings,
+    StopLine,
+    TrafficLight,
+    Wall,
     colour_updated,
     colours,
     updated,
 )
+
+Element = TrafficLight | StopLine | Lane | Wall
+E = TypeVar("E", TrafficLight, StopLine, Lane, Wall)
+
+BESIDE = 4.0  # m, to which corrections move an element; others of its name are farther away
+SAME = 0.1  # m, within which maps that write one place twice agree
+_NUMBER = " ("  # before the number of a name that occurs again
+
+
+def elements(road_map: RoadMap) -> tuple[Element, ...]:
+    """All elements of a map."""
+    return *road_map.lights, *road_map.stop_lines, *road_map.lanes, *road_map.walls
+
+
+def in_known_names(road_map: RoadMap, known: Mapping[str, Element]) -> RoadMap:
+    """A map with the names of the `known` elements for those that are the same, and new names for all others."""
+    if not known or all(known.get(each.name) == each for each in elements(road_map)):
+        return road_map
+    own = {each.name for each in elements(road_map)}
+    name: dict[str, str] = {}
+    for each in elements(road_map):
+        alike = (other for found, other in known.items() if found.partition(_NUMBER)[0] == each.name)
+        same = next((other for other in alike if _beside(each, other)), None)
+        if same is not None:
+            name[each.name] = same.name
+    left = [other for other in known.values() if other.name not in name.values()]
+    for each in elements(road_map):
+        if each.name in name:
+            continue
+        same = next((other for other in left if _in_place(each, other)), None)
+        if same is not None:
+            left.remove(same)
+        name[each.name] = _free(each.name, known, own) if same is None else same.name
+    if all(old == new for old, new in name.items()):
+        return road_map
+
+    def named(group: Iterable[E]) -> tuple[E, ...]:
+        return tuple(replace(each, name=name[each.name]) for each in group)
+
+    lines = tuple(replace(line, light=name[line.light]) for line in named(road_map.stop_lines))
+    return replace(
+        road_map,
+        lights=named(road_map.lights),
+        stop_lines=lines,
+        lanes=named(road_map.lanes),
+        walls=named(road_map.walls),
+    )
+
+
+def _free(name: str, *taken: Container[str]) -> str:
+    """The name, if no known element has it, or with the first number with which it is free."""
+    if name not in taken[0]:
+        return name
+    numbered = (f"{name}{_NUMBER}{k})" for k in count(2))
+    return next(each for each in numbered if not any(each in names for names in taken))
+
+
+def _points(of: Element) -> FloatArray:
+    """(k, 2) m."""
+    if isinstance(of, TrafficLight):
+        return np.array([of.position])
+    return of.ends if isinstance(of, StopLine) else np.array(of.centre if isinstance(of, Lane) else of.points)
+
+
+def _in_place(a: Element, b: Element) -> bool:
+    """True if two elements of one class are the same points."""
+    if type(a) is not type(b):
+        return False
+    p, q = _points(a), _points(b)
+    return p.shape == q.shape and bool(np.abs(p - q).max() < SAME)
+
+
+def _beside(a: Element, b: Element) -> bool:
+    """True if two elements are of one class and the middle of each is beside the other."""
+    if type(a) is not type(b):
+        return False
+    p, q = (_dense(_points(each)) for each in (a, b))
+    return all(np.hypot(*(x - y[len(y) // 2]).T).min() < BESIDE for x, y in ((p, q), (q, p)))
+
+
+def _dense(points: FloatArray) -> FloatArray:
+    """Points every metre or so along a line."""
+    if len(points) == 1:
+        return points
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    at = np.linspace(0.0, way[-1], max(3, round(way[-1]) | 1))
+    return np.stack([np.interp(at, way, each) for each in points.T], axis=-1)
+
+
+LONGEST = 1.0  # s between two detections of a vehicle
+
+Rule = TypeVar("Rule")
+
+
+@dataclass(frozen=True, eq=False)
+class FirstVehicles(Columns):
+    """First vehicles before lines as last detected.
+
+    id, line (n,) of the tracks and of the nodes of the lines; time (n,) s; speed (n,) along direction (n, 2), m/s;
+    variance (n,) of the speed; expected (n, 4) accelerations in each state of the light, m/s^2; weight (n,)
+    probability that the track exists; log_likelihood (n, 4) L
+    """
+
+    id: IntArray
+    line: IntArray
+    time: FloatArray
+    speed: FloatArray
+    direction: FloatArray
+    variance: FloatArray
+    expected: FloatArray
+    weight: FloatArray
+    log_likelihood: FloatArray
+
+    @classmethod
+    def none(cls) -> FirstVehicles:
+        """No vehicle."""
+        ids, times, states = np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, len(STATES)))
+        return cls(ids, ids, times, times, np.empty((0, 2)), times, states, times, states)
+
+    def later(self, nodes: NodeTable, rules: Sequence[EdgeRule], detected: BoolArray, time: float) -> FirstVehicles:
+        """First vehicles of a node table: tracks (its first rows) `detected` at `time`, and others seen just before."""
+        stop, go = _first(rules, RedLight), _first(rules, GreenLight)
+        if stop is None:
+            return self
+        first = stop.able(coming_vehicles(nodes, stop.classes, stop.max_distance).first())
+        first = first.select(first.target < len(detected))
+        first = first.select(detected[first.target])
+        v, ids, line = first.speed, nodes.id[first.target], nodes.id[first.source]
+        ramp, braking = stop.brakes(nodes, first)
+        free = np.zeros_like(v) if go is None else go.acceleration(v)
+        closed = ramp * braking + (1 - ramp) * free
+        waiting = np.where(halting(v, first.front), 0.0, free)
+        exists = np.ones(len(nodes)) if nodes.existence is None else nodes.existence
+        same = (ids[:, None] == self.id) & (line[:, None] == self.line)
+        log_likelihood = np.where(same.any(axis=1)[:, None], same.astype(np.float64) @ self.log_likelihood, 0.0)
+        expected = np.column_stack([closed, closed, waiting, free])
+        variance = nodes.velocity_variance[first.target]
+        then = np.full(len(v), time)
+        now = FirstVehicles(
+            ids, line, then, v, first.approach.direction, variance, expected, exists[first.target], log_likelihood
+        )
+        kept = self.select(~np.isin(self.id, nodes.id[: len(detected)][detected]) & (self.time > time - LONGEST))
+        return kept.append(now)
+
+    def updated(
+        self, ids: IntArray, velocity: FloatArray, variance: FloatArray, time: float, settings: SignalSettings
+    ) -> FirstVehicles:
+        """With what tracks `ids` (k,) tell that were detected at `time`: velocity (k, 2), variance (k,) of its
+        components."""
+        mine, row = np.nonzero((self.id[:, None] == ids) & (time > self.time)[:, None])
+        dv = np.einsum("ni,ni->n", velocity[row], self.direction[mine]) - self.speed[mine]
+        T, own = time - self.time[mine], settings.driver_noise * (time - self.time[mine])
+        V = np.maximum(self.variance[mine] + own - variance[row], own)
+        change = self.expected[mine] * T[:, None]
+        log_likelihood = self.log_likelihood.copy()
+        log_likelihood[mine] += (self.weight[mine] / V)[:, None] * change * (dv[:, None] - change / 2)
+        log_likelihood -= log_likelihood.max(axis=1, keepdims=True, initial=-np.inf) if len(log_likelihood) else 0.0
+        return replace(self, log_likelihood=np.maximum(log_likelihood, np.log(settings.non_compliance)))
+
+
+def _first(rules: Sequence[EdgeRule], kind: type[Rule]) -> Rule | None:
+    """The first rule of a kind, None without one; further rules of the kind do not count for the inference."""
+    return next((rule for rule in rules if isinstance(rule, kind)), None)
 
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:

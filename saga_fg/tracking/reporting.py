@@ -1,4 +1,6 @@
-r"""Report: the tracks of sufficient existence that are detected, or whose place is known well enough.
+"""Report and delete: which tracks are told to the user, and which end.
+
+Report: the tracks of sufficient existence that are detected, or whose place is known well enough.
 
 Each has a score and a calibrated covariance:
 
@@ -16,20 +18,27 @@ of the latest detection. A detector that sees one side of a car misjudges its le
 centre along the heading u, in one frame as in the next. No filter averages that away: the position bias b. Both are for
 the report; the filter and the association, which compare detections with detections, do without them. c, b and their
 growth are the sensor's noise settings, see `saga_fg.model.sensor`.
+
+Delete: tracks without detections whose place is no longer known, and those that are not likely to exist.
+
+A track lives on while its place is known to `max_deviation`, as it is then reported, or while it could be re-linked,
+at most for `max_coasting`. Neighbours that are still detected keep its place known for longer. Deleted tracks are
+marginalised, so that their information on their neighbours stays.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
 import numpy as np
 
-from saga_fg.kernels.covariances import biased_covariances
+from saga_fg.kernels.components import biased_covariances
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
-from saga_fg.tracking.class_belief import ClassGroups
+from saga_fg.tracking.initiation import relinkable
 from saga_fg.tracking.settings import ExistenceSettings
-from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.track_table import ClassGroups, TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.track import Tracks
@@ -92,3 +101,26 @@ def reported_score(
     if len(groups):
         evidence = evidence * groups.certainty(table.class_belief.take(rows, 0))
     return np.asarray(evidence * hit_ratio * np.where(coasting, table.existence[rows], 1.0))
+
+
+log = logging.getLogger(__name__)
+
+
+def delete_tracks(state: TrackerState) -> None:
+    """Delete the tracks that have come to their end at the state's time."""
+    table, settings = state.table, state.settings
+    detected = np.zeros(len(table), dtype=bool)
+    detected[table.rows(state.assignment.id)] = True  # perhaps by a late frame
+    deleted = ~(detected | known_places(state) | relinkable(state))
+    deleted |= table.coasting(state.time) > settings.max_coasting
+    deleted |= ~table.confirmed & (table.existence < settings.existence.delete_below)
+    deleted |= untrackable(state)
+    state.remove(deleted)
+
+
+def untrackable(state: TrackerState) -> BoolArray:
+    """(n,) tracks whose states are out of bounds."""
+    deleted = ~state.kinematics().within_limits(state.origin)
+    if deleted.any():
+        log.warning("deleted, since their states are out of bounds: tracks %s", state.table.id[deleted].tolist())
+    return deleted

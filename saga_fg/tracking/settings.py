@@ -9,15 +9,13 @@ from dataclasses import dataclass
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, require_rules, traffic_rules
+from saga_fg.model.lanes import ConeLine, InLane
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.road.cones import ConeLine
-from saga_fg.model.road.lane_keeping import InLane
-from saga_fg.model.road.starting import GreenLight
-from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.stability import require_stable
+from saga_fg.model.stop_lines import GreenLight, RedLight
 from saga_fg.model.turning import Bicycle, CoordinatedTurn
 from saga_fg.settings import (
     Fraction,
@@ -34,11 +32,10 @@ from saga_fg.settings import (
 from saga_fg.tracking.by_name import require_estimator_name
 from saga_fg.tracking.clock import ClockSettings
 from saga_fg.tracking.names import AssociationName
-from saga_fg.tracking.stationarity import StationaritySettings
+from saga_fg.tracking.track_filters import StationaritySettings
 from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types.by_class import DEFAULT, class_settings
-from saga_fg.types.road_map import RoadMap
-from saga_fg.types.signal import SignalSettings
+from saga_fg.types.road_map import RoadMap, SignalSettings
 
 
 @dataclass(frozen=True)
@@ -177,7 +174,7 @@ class ExistenceSettings(Settings):
 
 @dataclass(frozen=True)
 class EgoNodeSettings(Settings):
-    """The ego vehicle as a node of the scene graph, see `saga_fg.tracking.ego_node`."""
+    """The ego vehicle as a node of the scene graph, see `saga_fg.tracking.measurements`."""
 
     estimated: bool = setting(
         False, "true: estimate the ego pose with the objects, by factor providers; false: use that of the frames"

@@ -30,23 +30,17 @@ from saga_fg.tracking.by_name import new_provider
 from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.clock_comparison import compare_clocks, compare_left_out
 from saga_fg.tracking.clock_offsets import SensorTime, sensor_times
-from saga_fg.tracking.deletion import delete_tracks
-from saga_fg.tracking.existence import update_existence
-from saga_fg.tracking.handover import hand_over
-from saga_fg.tracking.initiation import initiate_tracks
-from saga_fg.tracking.lookahead import look_ahead
+from saga_fg.tracking.initiation import hand_over, initiate_tracks, resolve_tracks
+from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
-from saga_fg.tracking.observer import Observer, Stage, TrackerView
-from saga_fg.tracking.prediction import predict
-from saga_fg.tracking.reporting import report_tracks
+from saga_fg.tracking.prediction import look_ahead, predict
+from saga_fg.tracking.reporting import delete_tracks, report_tracks
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
-from saga_fg.tracking.unresolved import resolve_tracks
-from saga_fg.tracking.update import infer_signals, update_tracks
+from saga_fg.tracking.update import infer_signals, update_existence, update_tracks
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
-from saga_fg.types.predicted_tracks import PredictedTracks, checked_horizons
-from saga_fg.types.track import Tracks
+from saga_fg.types.track import PredictedTracks, Tracks, checked_horizons
 
 log = logging.getLogger(__name__)
 

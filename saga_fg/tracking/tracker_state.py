@@ -24,15 +24,14 @@ from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.by_name import new_estimator
-from saga_fg.tracking.class_belief import ClassGroups
 from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
-from saga_fg.tracking.ego_node import EgoNode
 from saga_fg.tracking.joint_state import JointTrackState
-from saga_fg.tracking.kinematics import Kinematics
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
+from saga_fg.tracking.measurements import EgoNode
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
-from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.track_filters import Kinematics
+from saga_fg.tracking.track_table import ClassGroups, TrackTable
 from saga_fg.tracking.traffic import Traffic
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values

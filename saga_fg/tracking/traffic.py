@@ -1,27 +1,57 @@
-"""Memory of traffic: where vehicles went lately and how fast, for the paths and speeds of others.
+"""Memory of traffic: where vehicles went lately and how fast, for paths and speeds of others.
+
+Memory of traffic: where vehicles went lately and how fast, for the paths and speeds of others.
 
 A passage is a place of a track with its heading and speed there: where it was last, and every `SPACING` m. Passages
 outlive their tracks and are forgotten after `memory` s. The passages of those that move make trails, and so do the
 lanes of the road map: they tell where to go, at no speed, and are never forgotten.
 
-`saga_fg.tracking.trails` predicts paths from this memory, `saga_fg.tracking.speed_prior` the speeds of new tracks.
+Paths are predicted from this memory, and the speeds of new tracks.
+
+Predicted paths along the trails of earlier traffic and the lanes of the map.
+
+A trail is the row of passages of one track, or the centre of a lane. A path is predicted
+from a place and a course h in steps of ds, with u the curvature that the vehicle has itself, which fades along the way.
+With the trails j near its next place, of each the nearest point, d_j m away,
+
+    k_j = exp( -d_j^2 / (2 reach^2) - (h_j - h - u ds)^2 / (2 TURN^2) ),   m, s^2: mean and variance of h_j - h
+    h'  = h + c m + (1 - c) u ds,   c = K / (K + PRIOR) / (1 + s^2 / AGREEMENT^2),  K = sum of k_j
+
+Where there are no trails, it goes on as it does; at a fork it keeps to the trail that it turns with; where they part
+and it agrees with both, nothing is known of its course, until it is nearer to one of them. The mean of the speeds under
+k_j is the typical speed at each place; lanes tell none.
+
+Prior of the speed of a new track, from tracks of its class that head, or headed, the same way.
+
+    k_j = weight * max over the passages of j of
+              exp( -ahead^2 / (2 ahead_scale^2) - lateral^2 / (2 lateral_scale^2) - turn^2 / (2 heading_scale^2) )
+    p(speed) ~ N(0, initial_speed_deviation^2) + sum_j k_j N(s_j, sigma_j^2 + spread^2)
+
+Every neighbour j counts once, by its nearest passage within `memory`, with its speed s_j along its heading there
+(parked ones with a speed near 0). The new track takes the mean and the variance of the mixture: as wide as the
+neighbours disagree, and the prior of the class where there are none.
+
+Where stationary objects are modelled (`saga_fg.tracking.track_filters`), neighbour j is stationary with probability b_j
+and an unknown object with b_0. The new one is stationary with the mean of these, weighted by k, and the mixture is that
+of the moving ones, with the weights 1 - b_0 and k_j (1 - b_j).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.covariances import speeds_ahead
-from saga_fg.kernels.trails import points_by_cell
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
-from saga_fg.numerics.columns import Columns
+from saga_fg.kernels.components import speeds_ahead
+from saga_fg.kernels.paths import points_by_cell, trail_paths
+from saga_fg.kernels.tracks import prior_of_traffic
+from saga_fg.model.interactions import Paths
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, distinct, shallow_copy
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
-from saga_fg.tracking.kinematics import Kinematics
+from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.types.road_map import Lane, RoadMap
 
 SPACING = 2.0  # m between the passages of a track
@@ -30,7 +60,7 @@ FIRST_LANE = -2  # ids of lanes count down from here, so that they are never tho
 
 @dataclass(frozen=True)
 class SpeedPriorSettings(Settings):
-    """Prior speed of a new track from traffic that heads the same way, see `saga_fg.tracking.speed_prior`."""
+    """Prior speed of a new track from traffic that heads the same way, see above."""
 
     weight: NonNegative = setting(0.0, "weight of one neighbour against the prior without traffic; 0: off, usual 5")
     ahead_scale: PositiveOrInf = setting(
@@ -46,7 +76,7 @@ class SpeedPriorSettings(Settings):
 
 @dataclass(frozen=True)
 class TrafficSettings(Settings):
-    """Memory of where traffic went and how fast, see `saga_fg.tracking.traffic`."""
+    """Memory of where traffic went and how fast, see above."""
 
     memory: NonNegative = setting(
         0.0,
@@ -179,7 +209,7 @@ class Trails:
         return len(self.points)
 
     def cells(self, size: float) -> tuple[IntArray, IntArray]:
-        """The points by cells of this size, m, see `saga_fg.kernels.trails.points_by_cell`."""
+        """The points by cells of this size, m, see `saga_fg.kernels.paths.points_by_cell`."""
         if self._cells is None or self._cells[0] != size:
             self._cells = size, *points_by_cell(self.points.position, size)
         return self._cells[1:]
@@ -282,3 +312,90 @@ def _moved(passing: Passages, marked: Marks) -> BoolArray:
     at = np.minimum(np.searchsorted(marked.id, passing.id), len(marked) - 1)
     dx, dy = (passing.position - marked.position[at]).T
     return np.asarray((marked.id[at] != passing.id) | (dx * dx + dy * dy >= SPACING**2))
+
+
+STEP = 3.0  # m between the points of a predicted path
+NEAREST = 12  # passages that are compared with a place
+PRIOR = 0.2  # weight of going on as before, against that of one trail right here: few leave the path of others
+TURN = 0.3  # rad, sigma of the kernel on the difference of headings
+AGREEMENT = 0.2  # rad, deviation of the headings of trails from which they say little
+_BEND = 20.0  # m, along which a curvature of one's own fades
+_LEAST = 1e-9
+_NONE = Trails(TrailPoints.empty())
+
+
+def paths(
+    traffic: Traffic, ids: IntArray, position: FloatArray, heading: FloatArray, curvature: FloatArray, steps: int
+) -> Paths:
+    """Predict the paths of n tracks `ids` at `position` (n, 2), world, with a `curvature` (n,) of their own, 1/m.
+
+    Their steps are `STEP` m long, their rows 0 to n - 1.
+    """
+    reach = max(traffic.settings.reach, _LEAST)
+    lanes, trails = (_cell_columns(each, 2 * reach) for each in _found(traffic))
+    tracks, scales = (ids, position, heading, curvature), (reach, STEP, _BEND, TURN, PRIOR, AGREEMENT)
+    return Paths(np.arange(len(ids)), *trail_paths(*lanes, *trails, *tracks, steps, NEAREST, *scales))
+
+
+def _found(traffic: Traffic) -> tuple[Trails, Trails]:
+    """The lanes, and the trails of traffic, that lead others."""
+    return (traffic.lanes, traffic.trails()) if traffic.settings.reach > 0 else (_NONE, _NONE)
+
+
+def _cell_columns(
+    trails: Trails, cell: float
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray, Any, Any]:
+    """Trails as arrays for the kernel: tracks, places, headings, speeds, flags of known speeds, and grid cells."""
+    points = trails.points
+    return points.id, points.position, points.heading, points.speed, points.timed, *trails.cells(cell)
+
+
+_FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
+HEADING_SCALE = 0.3  # sigma of the kernel on the difference of headings, rad
+SPREAD = 2.0  # standard deviation of the difference between the speeds of neighbours, m/s
+
+
+class SpeedPrior(NamedTuple):
+    """Prior of k new tracks, each (k,): probability of being stationary; if moving, speed ahead, and its variance."""
+
+    stationary: FloatArray
+    speed: FloatArray
+    variance: FloatArray
+
+
+def speed_prior(
+    traffic: Traffic,
+    label: StrArray,
+    position: FloatArray,
+    heading: FloatArray,
+    variance: FloatArray,
+    stationary: float = 0.0,
+) -> SpeedPrior:
+    """The prior of new tracks at `position` (k, 2).
+
+    variance (k,) and probability `stationary` of objects without neighbours
+    """
+    settings, sets = traffic.settings.speed_prior, (traffic.left, traffic.latest)
+    if settings.weight == 0 or len(label) == 0 or not any(map(len, sets)):
+        return SpeedPrior(np.full(len(label), stationary), np.zeros(len(label)), variance.copy())
+    number: dict[str, int] = {}
+    left, latest = (_columns(each, number) for each in sets)
+    new = _class_numbers(label, number), position, heading, variance
+    scales = settings.weight, settings.ahead_scale, settings.lateral_scale, HEADING_SCALE, SPREAD
+    limits = settings.max_speed_deviation**2, _FARTHEST
+    return SpeedPrior(*prior_of_traffic(*left, *latest, *new, stationary, *scales, *limits))
+
+
+_Columns = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def _columns(each: Passages, number: dict[str, int]) -> _Columns:
+    """The columns of passages that the prior is made of, their classes by number."""
+    of = _class_numbers(each.label, number)
+    return each.id, of, each.position, each.heading, each.speed, each.variance, each.stationary
+
+
+def _class_numbers(label: StrArray, number: dict[str, int]) -> IntArray:
+    """(n,) numbers of the classes of labels (n,), by `number`, to which new ones are added."""
+    names, of_row = distinct(label)
+    return np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)[of_row]

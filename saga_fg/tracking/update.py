@@ -1,24 +1,72 @@
-"""Update: the matched measurements correct position and velocity, box, stationarity and class of their tracks.
+"""Update: matched measurements correct the state, and existence follows from all that was seen.
+
+Update: the matched measurements correct position and velocity, box, stationarity and class of their tracks.
 
 Where they are, and how fast, is remembered for the paths and speeds of others (`saga_fg.tracking.traffic`).
+
+Update of the probability r that a track is a real object, by Bayes' rule, and of the score of its box.
+
+    miss    r <- r (1 - p_D) / (1 - r p_D) exp(-dt / lifetime)
+    match   r / (1 - r) <- r / (1 - r)  p / (1 - p)  (1 - c) / c
+
+p_D is the chance of a detection at the track (0 outside the field of view), p the detection's probability, and c the
+probability at which a detection is no evidence. Source: Musicki, Evans, Stankovic, Integrated Probabilistic Data
+Association, IEEE Transactions on Automatic Control 39(6), 1994.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from factors import RangeRate
+from saga_fg.kernels.components import existences
 from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.numerics.arrays import IntArray, StrArray
-from saga_fg.numerics.assignment import Matching
-from saga_fg.numerics.chi_square import chi_square_quantile
-from saga_fg.tracking.box_filter import MOVING
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.assignment import CrossCovariances, Matching
+from saga_fg.numerics.gating import chi_square_quantile
+from saga_fg.tracking.joint_state import moved_to_present, past_position
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.out_of_sequence import moved_to_present
-from saga_fg.tracking.retrodiction import past_positions
+from saga_fg.tracking.settings import ExistenceSettings
+from saga_fg.tracking.track_filters import MOVING
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic import Passages
+
+
+def past_positions(state: TrackerState, delay: float) -> tuple[FloatArray, FloatArray]:
+    """Positions (n, 2) of all tracks `delay` s ago and their covariances (n, 2, 2)."""
+    if delay == 0:
+        now = state.kinematics()
+        return now.position, now.P
+    ids, estimator = state.table.id, state.joint.estimator
+    position, P = np.zeros((len(ids), 2)), np.zeros((len(ids), 2, 2))
+    for node_type, rows in state.joint.rows_by_type(state.table.label, moving=True):
+        H, R = moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
+        position[rows] = estimator.mean(ids[rows]) @ H.T
+        P[rows] = H @ estimator.covariance(ids[rows]) @ H.T + R
+    return position, P
+
+
+def past_cross_covariances(state: TrackerState, delay: float) -> CrossCovariances:
+    """Covariances between the positions `delay` s ago of correlated pairs of tracks, by rows."""
+    groups = state.joint.rows_by_type(state.table.label, moving=True)
+    group = np.zeros(len(state), dtype=np.int64)
+    for number, (_, rows) in enumerate(groups):
+        group[rows] = number
+    x = state.joint.estimator.posterior()
+    nodes = x.layout.rows(state.table.id)
+    first, second = x.correlated(nodes)
+    past = [past_position(node_type, delay) for node_type, _ in groups]
+    C = np.zeros((len(first), 2, 2))
+    for a, H_a in enumerate(past):
+        for b, H_b in enumerate(past):
+            pairs = np.flatnonzero((group[first] == a) & (group[second] == b))
+            if len(pairs):
+                C[pairs] = H_a @ x.between(nodes[first[pairs]], nodes[second[pairs]]) @ H_b.T
+    return CrossCovariances(first, second, C)
+
 
 LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 
@@ -106,3 +154,50 @@ def update_range_rates(
         likely = innovation[:, 0] ** 2 <= gate[chosen] * S[:, 0, 0]
         z = innovation + (H @ x[:, :, None])[:, :, 0]
         joint.measure(node_type, ids[chosen][likely], z[likely], H[likely], R[likely], delay)
+
+
+SCORE_MEMORY = 0.15  # time for which the latest detection of each sensor counts in a track's score, s
+
+
+def update_existence(state: TrackerState, measurements: FrameMeasurements, matching: Matching, elapsed: float) -> None:
+    """Update existence, score and confirmation of all tracks; elapsed: time since the latest frame, s."""
+    table, settings = state.table, state.settings.existence
+    if len(table) == 0:
+        return
+    time, t, d = state.time - measurements.delay, matching.track, matching.detection
+    missed = np.ones(len(table), dtype=bool)
+    missed[t] = False
+    now, sensor = state.kinematics(), measurements.sensor
+    visible = sensor.sees(now.position + state.origin, measurements.world_T_ego)
+    table.last_in_view[table.sensors.look(measurements.name, visible)] = state.time
+    p_detect = np.where(visible, sensor.detection_chance(table.label), 0.0)
+    # a track that another sensor has just detected exists, whether this one misses it or not
+    excused = table.sensors.detected_by_others(measurements.name, time, SCORE_MEMORY)
+    p, p_miss, resolved = measurements.probability[d], np.where(excused, 0.0, p_detect), table.unresolved[t] == 0
+    # a detection of an unresolved track may be of the track that it overlaps
+    table.existence = _existence(table.existence, missed, p_miss, t[resolved], p[resolved], elapsed, settings)
+    table.last_existence[t] = table.existence[t]
+    table.confirmed |= table.existence >= settings.confirm_above
+    table.sensors.update(measurements.name, time, t, p, missed & visible, p_detect)
+    fused = table.sensors.probability(state.time, max(SCORE_MEMORY, measurements.delay))
+    table.score = np.where(np.isfinite(fused), fused, table.score)
+    table.best_score = np.maximum(table.best_score, table.score)
+    table.hits, table.opportunities = table.sensors.best_hits()
+    table.covariance_scale[t], table.position_bias[t] = measurements.covariance_scale[d], measurements.position_bias[d]
+    table.last_detected[t] = np.maximum(table.last_detected[t], time)
+    table.last_in_view[t] = state.time
+
+
+def _existence(
+    before: FloatArray,
+    missed: BoolArray,
+    chance: FloatArray,
+    rows: IntArray,
+    probability: FloatArray,
+    elapsed: float,
+    settings: ExistenceSettings,
+) -> FloatArray:
+    """Existence (n,) after a frame in which tracks are `missed` (n,), by the chance (n,) to detect them, and those of
+    `rows` (k,) have detections of a probability (k,)."""
+    survival = math.exp(-elapsed / settings.lifetime)
+    return existences(before, missed, chance, rows, probability, survival, settings.neutral_score)

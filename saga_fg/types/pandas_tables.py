@@ -1,10 +1,13 @@
-"""Detections from tables of pandas, and tracks to them, with the columns of saga-fg's own files.
+"""Tables for notebooks: detections and tracks from and to pandas, and as HTML.
+
+Detections from tables of pandas, and tracks to them, with the columns of saga-fg's own files.
 
 pandas is imported when a table is made; the extra `pandas` brings it.
 """
 
 from __future__ import annotations
 
+import html
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -154,3 +157,21 @@ def _seconds(table: Table) -> FloatArray:
     if column.dtype.kind == "m":
         return np.asarray(column.to_numpy(dtype="timedelta64[ns]").astype(np.int64) / 1e9)
     return numbers(table, "timestamp")
+
+
+LONGEST = 20
+"""Rows that are shown."""
+
+
+def html_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | float | int]]) -> str:
+    """Return a title and the first rows of a table; NaN is left empty."""
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
+    body = "".join(f"<tr>{''.join(f'<td>{_cell(value)}</td>' for value in row)}</tr>" for row in rows[:LONGEST])
+    more = f"<p>and {len(rows) - LONGEST} more</p>" if len(rows) > LONGEST else ""
+    return f"<p>{html.escape(title)}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}"
+
+
+def _cell(value: str | float | int) -> str:
+    if isinstance(value, float):
+        return f"{value:.2f}" if value == value else ""
+    return html.escape(str(value))

@@ -1,4 +1,4 @@
-"""Tracker output: the `Track`s of one moment, as a table (`Tracks`)."""
+"""Tracker output: `Tracks` of one moment, and `PredictedTracks` at future times."""
 
 from __future__ import annotations
 
@@ -7,13 +7,21 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_ids, upper_triangle
-from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.arrays import (
+    BoolArray,
+    Columns,
+    FloatArray,
+    IntArray,
+    StrArray,
+    checked,
+    checked_ids,
+    upper_triangle,
+)
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.html_table import html_table
-from saga_fg.types.pandas_tables import Table, new_table
+from saga_fg.types.pandas_tables import Table, html_table, new_table
 
 KNOWN_SPEED_DEVIATION = 2.0  # m/s; a velocity of a larger standard deviation counts as unknown
 
@@ -161,3 +169,54 @@ class Tracks(Columns):
         rows = list(zip(*(column.tolist() for column in columns), strict=True))
         names = ("id", "class", "x, m", "y, m", "position ±, m", "speed, m/s", "score", "unseen for, s")
         return html_table(f"{len(self)} tracks at {self.timestamp:.3f} s", names, rows)
+
+
+LONGEST_PREDICTION = 60.0  # s; nobody knows where traffic is a minute later, and time runs out before
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedTracks:
+    """The N tracks of one moment at H future times, in world coordinates.
+
+    timestamp            s, of the moment from which they are predicted
+    horizons             (H,)          s after it, increasing
+    id, label            (N,)          of the tracks
+    position             (H, N, 2)     mean, m
+    velocity             (H, N, 2)     mean, m/s
+    yaw                  (H, N)        heading, rad; NaN where it is unknown
+    position_covariance  (H, N, 2, 2)  m^2
+    velocity_covariance  (H, N, 2, 2)  (m/s)^2
+    joint_covariance     (H, 2N, 2N)   of all positions (x_1, y_1, x_2, ...), m^2; None unless it was asked for
+    """
+
+    timestamp: float
+    horizons: FloatArray
+    id: IntArray
+    label: StrArray
+    position: FloatArray
+    velocity: FloatArray
+    yaw: FloatArray
+    position_covariance: FloatArray
+    velocity_covariance: FloatArray
+    joint_covariance: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    @property
+    def times(self) -> FloatArray:
+        """(H,) timestamps of the predictions, s."""
+        return np.asarray(self.timestamp + self.horizons)
+
+
+def checked_horizons(horizons: ArrayLike) -> FloatArray:
+    """Return horizons (H,), s; `InputError` unless they increase, from 0 to `LONGEST_PREDICTION`, one at least."""
+    if np.ndim(horizons) == 0:
+        raise InputError(f"horizons: expected a list of seconds, got {horizons!r:.40}")
+    found = checked("horizons", horizons, (None,))
+    if len(found) == 0 or found[0] < 0 or found[-1] > LONGEST_PREDICTION or (np.diff(found) <= 0).any():
+        raise InputError(
+            f"horizons: expected increasing seconds from 0 to {LONGEST_PREDICTION:g}, at least one, "
+            f"got {found.tolist()}"
+        )
+    return found

@@ -15,14 +15,13 @@ from benchmarks.gaps import rows_of, split_runs, splits_of
 from benchmarks.recording_sets import simulated_set
 from benchmarks.variants import contenders, variants
 from pipelines.config import Family, load_config
-from pipelines.learning.gap_runs import LIFE, GapBenchSettings, judged_run, prepared, run_of, with_life
+from pipelines.learning.gaps import LIFE, GapBenchSettings, judged_run, prepared, run_of, with_life
 from pipelines.learning.interactions import LearnedForms
 from saga_fg import InputError
-from saga_fg.learning.gaps import real_gaps
-from saga_fg.learning.situations import situations_of
-from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.learning.gaps import real_gaps, situations_of
 from saga_fg.model.motion import ConstantVelocity
-from saga_fg.model.road.stopping import RedLight
+from saga_fg.model.stability import LearnedInteractions
+from saga_fg.model.stop_lines import RedLight
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.types.road_map import Lane
 from tests.pipelines.sampled_gaps import HIDDEN, SHORT, labelled, straight, without

@@ -23,7 +23,7 @@ from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.detection_files import TruthFile, read_detections, read_tracks
 from data_tools.datasets.eth_ucy import EthUcy
 from data_tools.datasets.kitti import KittiTracking
-from data_tools.datasets.kitti.scored_sequences import read_scored_sequences
+from data_tools.datasets.kitti.results import read_scored_sequences
 from data_tools.datasets.label_table import read_label_table
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
 from data_tools.lidar import read_scan
@@ -31,7 +31,7 @@ from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from pipelines.config import load_config
 from pipelines.explaining import read_events
-from pipelines.report.run_record import read_run_record
+from pipelines.report.page import read_run_record
 from pipelines.serving import StreamTracker
 from saga_fg.types.dataset import Dataset, Scene
 from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, rows

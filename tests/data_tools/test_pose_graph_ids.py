@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.files.text_tables import TextTable
+from data_tools.files.readers import TextTable
 from data_tools.pose_graphs import city, read_g2o, write_g2o
 from pipelines.cli import app
 from saga_fg import InputError

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from factors import FactorError, PlanarPose, Robust, Vector, calibrated_range_factors, range_factor
-from factors.differences import central_differences
+from factors.manifolds import central_differences
 
 SEEDS = range(4)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from factors import Camera, FactorError, PixelBearing, Vector, detection_factor, detection_factors
-from factors.differences import central_differences
+from factors.manifolds import central_differences
 
 FORWARD = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1.0]])  # along x, 1.5 m above the ground
 

@@ -24,8 +24,8 @@ from factors import (
     prior_factor,
     solve,
 )
-from factors.differences import central_differences
 from factors.gaussian import nonlinear_graph
+from factors.manifolds import central_differences
 
 POSE = (1.0, -2.0, 0.7)
 LINEAR = [position(4), position(7, (2, 6, 0)), position_velocity(6, (0, 3), (1, 4)), box(8, (0, 1, 2), (5, 6, 7), 3)]

@@ -16,8 +16,7 @@ from factors import (
     relative_detection_factors,
     solve,
 )
-from factors.differences import central_differences
-from factors.rotations import cross_matrix, inverse_right_jacobian, rotation_exp, rotation_log
+from factors.manifolds import central_differences, cross_matrix, inverse_right_jacobian, rotation_exp, rotation_log
 
 N = 5
 SEEDS = range(4)

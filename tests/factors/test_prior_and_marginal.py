@@ -16,7 +16,7 @@ from factors import (
     prior_factor,
     prior_factors,
 )
-from factors.marginal import block_covariances
+from factors.gaussian import block_covariances
 
 
 def random_graph(rng, dims, covariance):

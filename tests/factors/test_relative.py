@@ -14,7 +14,7 @@ from factors import (
     relative_factors,
     relative_range_bearing_factors,
 )
-from factors.differences import central_differences
+from factors.manifolds import central_differences
 
 
 @pytest.mark.parametrize("seed", range(5))

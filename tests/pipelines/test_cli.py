@@ -21,7 +21,7 @@ from typer.testing import CliRunner, Result
 from data_tools.datasets.nuscenes.source import sensor_locations
 from data_tools.datasets.source import names
 from pipelines.cli import app
-from pipelines.cli.config import FIRST
+from pipelines.cli.commands import FIRST
 from saga_fg import InputError
 
 SAGA_FG = [sys.executable, "-c", "from pipelines.cli import main; main()"]
@@ -230,7 +230,7 @@ def test_an_interrupt_leaves_an_earlier_result_as_it_was(tmp_path: Path, monkeyp
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipelines.demo.run.compare", interrupted)
+    monkeypatch.setattr("pipelines.demo.compare", interrupted)
     result = saga_fg("demo", "--output", output)
     assert result.exit_code == 130
     assert [(path.name, path.read_text()) for path in output.iterdir()] == [("index.html", "earlier")]
@@ -240,7 +240,7 @@ def test_an_interrupt_leaves_an_earlier_result_as_it_was(tmp_path: Path, monkeyp
 def test_an_output_that_cannot_be_written_is_noticed_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.demo.run.compare", lambda *_, **__: pytest.fail("work was done"))
+    monkeypatch.setattr("pipelines.demo.compare", lambda *_, **__: pytest.fail("work was done"))
     result = saga_fg("demo", "--output", tmp_path / "none" / "out")
     assert result.exit_code == 2
     assert result.stderr.startswith(f"error: {tmp_path / 'none' / 'out'}: not writable")

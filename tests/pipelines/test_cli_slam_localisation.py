@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli import app
-from pipelines.slam.slam_map import SlamMap, read_map, write_map
+from pipelines.slam.submaps import SlamMap, read_map, write_map
 
 POINT = SlamMap([np.ones((1, 3), dtype=np.float32)], np.eye(4)[None])
 

@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.demo.comparison import Comparison, compare, comparison_table
-from pipelines.demo.run import METHODS, hardest_moment, latest_detections, run_demo
+from pipelines.demo import METHODS, Comparison, compare, comparison_table, hardest_moment, latest_detections, run_demo
 from saga_fg import InputError, Scene
 
 SHORT = SimulatorSettings(duration=3.0, warm_up=5.0)
@@ -86,7 +85,7 @@ def test_the_demo_writes_a_picture_and_a_page(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("data_tools.simulator.scenarios.scenario_settings", lambda scenario: SHORT)
+    monkeypatch.setattr("data_tools.simulator.settings.scenario_settings", lambda scenario: SHORT)
     result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["demo", "--output", str(tmp_path / "out"), "--scenes", "1"])
     assert result.exit_code == 0, result.output
     for text in ("occluded position RMSE, m", "ms per frame", *METHODS, "picture: ", "page: "):

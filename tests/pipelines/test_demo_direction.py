@@ -10,8 +10,7 @@ import pytest
 from data_tools.metrics import SceneMetrics
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import load_config
-from pipelines.demo.comparison import compare
-from pipelines.demo.run import METHODS
+from pipelines.demo import METHODS, compare
 
 LENGTH = 8.0  # s
 SEEDS = range(6)

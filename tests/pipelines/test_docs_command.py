@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli import app
-from pipelines.cli.docs import PAGES, location
+from pipelines.cli.commands import PAGES, location
 from saga_fg import InputError
 
 

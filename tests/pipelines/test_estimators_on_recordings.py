@@ -11,7 +11,7 @@ import pytest
 from benchmarks.recording_sets import recording_set
 from pipelines.config import load_config
 from saga_fg.estimators import GraphFilter
-from saga_fg.model.transition import Transition
+from saga_fg.model.discretisation import Transition
 
 
 @pytest.mark.parametrize(("name", "scene", "count"), [("megvii", "scene-0655", 20), ("kitti", "0011", 30)])

@@ -9,8 +9,7 @@ import pytest
 
 from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
-from pipelines.learning.gap_judging import CAP, JudgedRun, Links
-from pipelines.learning.gap_runs import hidden
+from pipelines.learning.gaps import CAP, JudgedRun, Links, hidden
 from saga_fg.learning.gaps import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, real_gaps
 from saga_fg.learning.labelled_scene import LabelledScene
 from tests.pipelines.sampled_gaps import (

@@ -7,7 +7,7 @@ import pytest
 from pipelines.config import TrackConfig
 from pipelines.doubts import Doubts
 from saga_fg import Curvilinear, TrackerSettings
-from saga_fg.model.road.lane_keeping import InLane
+from saga_fg.model.lanes import InLane
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types.road_map import Lane, RoadMap

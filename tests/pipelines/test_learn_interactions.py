@@ -12,7 +12,7 @@ import pipelines.learning.interactions as learned_module
 from pipelines.cli import app
 from pipelines.config import load_config, load_interactions
 from pipelines.configuration import read_settings, write_settings
-from pipelines.learning.gap_runs import Contender, GapBenchSettings, bench_gaps
+from pipelines.learning.gaps import Contender, GapBenchSettings, bench_gaps
 from pipelines.learning.interactions import (
     BASE,
     LEARNED,
@@ -27,7 +27,7 @@ from saga_fg.errors import InputError
 from saga_fg.learning import FittedInteractions, GapSettings, fit_interactions
 from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
 from saga_fg.model.interactions import CarFollowing
-from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.model.stability import LearnedInteractions
 from tests.saga_fg.following_pairs import RATE, following_pairs
 
 run = CliRunner().invoke

@@ -8,11 +8,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from pipelines.slam.loop_agreement import Agreement, deviation
+from pipelines.slam.loop_closures import Agreement, deviation
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, yaw_transform
-from saga_fg.numerics.planar_poses import transform
-from saga_fg.slam.pose_graph.distances import shortest_paths
+from saga_fg.numerics.geometry import inverse_transform, transform, yaw_transform
+from saga_fg.slam.pose_graph.running import shortest_paths
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from data_tools.datasets import registry
+from data_tools.datasets import source
 from data_tools.datasets.source import DatasetSource
 from pipelines.cli import app
 from saga_fg.errors import InputError
@@ -31,7 +31,7 @@ def install(folder: Path, package: str, **datasets: str) -> None:
     metadata.mkdir()
     (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
     entries = "".join(f"{name} = {location}\n" for name, location in datasets.items())
-    (metadata / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{entries}")
+    (metadata / "entry_points.txt").write_text(f"[{source.GROUP}]\n{entries}")
 
 
 @pytest.fixture
@@ -40,9 +40,9 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = tmp_path / "packages"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
-    registry.external_datasets.cache_clear()
+    source.external_datasets.cache_clear()
     yield folder
-    registry.external_datasets.cache_clear()
+    source.external_datasets.cache_clear()
 
 
 @pytest.fixture
@@ -152,11 +152,11 @@ def test_a_name_belongs_to_one_package(packages: Path) -> None:
     install(packages, "one", lidar="a:A", kitti="a:A")
     install(packages, "two", lidar="b:B")
     with pytest.raises(InputError, match="dataset lidar: expected one package to offer it, one and two do"):
-        registry.dataset_source("lidar")
+        source.dataset_source("lidar")
     with pytest.raises(InputError, match="dataset kitti: expected one package to offer it, one and saga-fg do"):
-        registry.dataset_source("kitti")
+        source.dataset_source("kitti")
     with pytest.raises(InputError, match="unknown dataset 'kity'; did you mean 'kitti'"):
-        registry.dataset_source("kity")
+        source.dataset_source("kity")
 
 
 def test_help_lists_what_can_be_evaluated() -> None:
@@ -165,11 +165,11 @@ def test_help_lists_what_can_be_evaluated() -> None:
     assert "mcap" not in listed
 
 
-@pytest.mark.parametrize("name", registry.BUILT_IN)
+@pytest.mark.parametrize("name", source.BUILT_IN)
 def test_those_that_come_along_are_sources(name: str) -> None:
-    source = registry.dataset_source(name)
-    assert issubclass(source, DatasetSource)
-    assert source.name == name
+    found = source.dataset_source(name)
+    assert issubclass(found, DatasetSource)
+    assert found.name == name
 
 
 @pytest.mark.parametrize(

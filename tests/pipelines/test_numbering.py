@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.serving.numbering import Numbering
+from pipelines.serving.frame_order import Numbering
 
 
 def test_what_is_held_is_known_and_not_settled():

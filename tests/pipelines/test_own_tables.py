@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from pipelines.report.run_record import read_run_record
+from pipelines.report.page import read_run_record
 from tests.pipelines.strangers_tables import rows, run_line, saga_fg, write
 
 

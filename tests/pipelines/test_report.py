@@ -29,10 +29,9 @@ from pipelines.report import (
     report_page,
     scene_of_run,
 )
-from pipelines.report.charts import SHARES
-from pipelines.report.run_record import record_path, write_run_record
+from pipelines.report.figures import SHARES, unseen_for
+from pipelines.report.page import record_path, write_run_record
 from pipelines.report.scenes import edges_of_frames, scene_data
-from pipelines.report.unseen import unseen_for
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import Boxes, InputError
 from tests.pipelines.page_in_browser import tried_in_browser

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.evaluation.score_sweep import best_thresholds, score_sweep
+from data_tools.evaluation import best_thresholds, score_sweep
 from data_tools.metrics import SceneBoxes
 from pipelines.report import Report, ReportScene, report_page
-from pipelines.report.thresholds import PLAIN, start_thresholds
+from pipelines.report.scenes import PLAIN, start_thresholds
 from saga_fg import Boxes, Scene
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.dataset import Annotations

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from data_tools.datasets.results import SceneResult
 from data_tools.metrics import SceneBoxes
 from pipelines.cli import app
-from pipelines.report.track_figures import COLUMNS, track_charts, track_figures
+from pipelines.report.figures import COLUMNS, track_charts, track_figures
 from saga_fg import Boxes, Scene
 from tests.pipelines.page_in_browser import tried_in_browser
 from tests.pipelines.test_report import data_of

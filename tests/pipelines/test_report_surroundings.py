@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.area_map import clipped
 from data_tools.datasets.argoverse2.source import ArgoverseSource
 from data_tools.datasets.kitti.source import KittiSource
 from data_tools.datasets.nuscenes import NuScenes
 from data_tools.datasets.nuscenes.source import NuScenesSource
+from data_tools.datasets.source import clipped
 from pipelines.report import Report, report_page
-from pipelines.report.images import thumbnails
-from pipelines.report.scenes import ReportScene, scene_data
+from pipelines.report.scenes import ReportScene, scene_data, thumbnails
 from saga_fg import InputError, Scene
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import VERSION, tables, write_tables

@@ -14,17 +14,7 @@ from data_tools.datasets.detection_file_source import DetectionFileSource
 from data_tools.datasets.parts import HeldScene, Part
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.source import SimulatedScene, SimulatedSource
-from pipelines.scale_out import (
-    Job,
-    LocalPool,
-    Manifest,
-    RunSummary,
-    SceneTask,
-    local_pool,
-    perform,
-    ray_pool,
-    run_scenes,
-)
+from pipelines.scale_out import Job, LocalPool, Manifest, RunSummary, SceneTask, perform, pools, run_scenes
 from pipelines.scale_out.folder import OutputFolder
 from saga_fg.errors import InputError
 from tests.pipelines.scale_out_example import CONFIG, TRACK, Broken, Deadly, InThisProcess, content, write_recordings
@@ -210,15 +200,15 @@ def test_one_process_of_a_node_compiles_kernels_while_the_others_wait(
         happened.append("kernels")
 
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
-    monkeypatch.setattr(ray_pool, "load_kernels", load)
-    monkeypatch.setattr(ray_pool, "perform", lambda job: happened.append(job))
+    monkeypatch.setattr(pools, "load_kernels", load)
+    monkeypatch.setattr(pools, "perform", lambda job: happened.append(job))
     for job in ("first", "second"):
-        ray_pool.perform_on_node(job)  # type: ignore[arg-type]
+        pools.perform_on_node(job)  # type: ignore[arg-type]
     assert happened == ["kernels", "first", "kernels", "second"]
     assert len(set(held)) == 1
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path / "missing"))
-    monkeypatch.setattr(ray_pool, "load_kernels", lambda: happened.append("alone"))
-    ray_pool.perform_on_node("third")  # type: ignore[arg-type]
+    monkeypatch.setattr(pools, "load_kernels", lambda: happened.append("alone"))
+    pools.perform_on_node("third")  # type: ignore[arg-type]
     assert happened[-2:] == ["alone", "third"]
 
 
@@ -233,7 +223,7 @@ def test_kernels_are_loaded_before_workers_begin(monkeypatch: pytest.MonkeyPatch
         def end(self) -> None:
             pass
 
-    monkeypatch.setattr(local_pool, "_Worker", Worker)
-    monkeypatch.setattr(local_pool, "load_kernels", lambda: happened.append("kernels"))
+    monkeypatch.setattr(pools, "_Worker", Worker)
+    monkeypatch.setattr(pools, "load_kernels", lambda: happened.append("kernels"))
     assert list(LocalPool(2).outcomes(iter(()), 2)) == []
     assert happened == ["kernels", "worker", "worker"]

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from pipelines.cli import app
 from pipelines.scale_out import Manifest, RunSummary, run_scenes
 from pipelines.scale_out.folder import OutputFolder, is_inside
-from pipelines.scale_out.manifest import file_name
+from pipelines.scale_out.job import file_name
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 from tests.pipelines.scale_out_example import TRACK, InThisProcess, content, write_recordings

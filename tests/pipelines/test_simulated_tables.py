@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from data_tools.datasets.detection_files import read_detections
 from data_tools.simulator import SimulatedTraffic
-from data_tools.simulator.scenarios import scenario_settings
+from data_tools.simulator.settings import scenario_settings
 from pipelines.cli import app
 from pipelines.config import load_config
 

@@ -7,14 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from pipelines.learning.gap_judging import GapOutcome, JudgedRun, Links, Prediction
-from pipelines.learning.gap_runs import Run
-from pipelines.learning.situation_figures import situation_figures
+from pipelines.learning.gaps import GapOutcome, JudgedRun, Links, Prediction, Run, situation_figures
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
-from saga_fg.learning.gaps import Gap
+from saga_fg.learning.gaps import Gap, Route, situations_of
 from saga_fg.learning.labelled_scene import LabelledScene
-from saga_fg.learning.route import Route
-from saga_fg.learning.situations import situations_of
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.road_map import RoadMap, StopLine, TrafficLight
 

@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 
 from data_tools.lidar import Scan
-from data_tools.simulator.street import SimulatedScans
-from pipelines.slam.between_keyframes import BetweenKeyframes
-from pipelines.slam.drive import RecordedOdometry, motion, shared
+from data_tools.simulator.scanner import SimulatedScans
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings
-from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
+from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep, RecordedOdometry, motion, shared
+from pipelines.slam.vehicle_sensors import BetweenKeyframes
 from saga_fg.errors import InputError
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, WheelSpeed
-from saga_fg.types.frame import Detections
+from saga_fg.types.frame import Detections, EgoMeasurements, GpsFix, WheelSpeed
 from saga_fg.types.landmark import Observation
 
 NOTHING = Scan.of(np.empty((0, 3)))

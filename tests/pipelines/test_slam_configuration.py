@@ -22,7 +22,7 @@ from factors import pose_prior_factor
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.graph import EGO_POSE, Additions
 from saga_fg.types.landmark import Observation
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import PoleLandmark
 
 TRUTH = np.load("{truth}")
 

@@ -11,17 +11,15 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from data_tools.lidar import Scan, Submap, read_scan
-from data_tools.simulator.street import CURB, SimulatedScans, drive
+from data_tools.simulator.scanner import CURB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
-from pipelines.slam.drive import RecordedOdometry
 from pipelines.slam.lidar_results import accumulated_map, covered_spans, metrics, write_lidar_slam
-from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
-from pipelines.slam.lidar_slam_types import LidarSlamResult
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamResult, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
-from pipelines.slam.odometry import OdometrySettings
+from pipelines.slam.odometry import OdometrySettings, RecordedOdometry
 from pipelines.slam.saved_graph import read_graph, write_graph
-from pipelines.slam.scan_landmarks import LINE, POLE
+from pipelines.slam.scan_content import LINE, POLE
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.submaps import LoopClosure, SubmapSettings

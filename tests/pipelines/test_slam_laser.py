@@ -11,12 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.laser import LaserLog
-from data_tools.simulator.laser_drive import LaserKind, laser_drive, write_carmen
+from data_tools.simulator.scanner import LaserKind, laser_drive, write_carmen
 from data_tools.trajectories import read_tum_poses
 from pipelines.cli import app
 from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam
 from saga_fg import InputError
-from saga_fg.numerics.planar_poses import transform, transforms, vectors
+from saga_fg.numerics.geometry import transform, transforms, vectors
 
 
 def test_loops_are_closed_and_the_path_is_right(tmp_path: Path) -> None:

@@ -12,18 +12,18 @@ import pytest
 from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.sensor_logs import SensorLog
-from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans
+from data_tools.simulator.scanner import SENSOR_HEIGHT, SimulatedScans
 from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.localisation import Localiser, LocaliserSettings
 from pipelines.slam.localised_drive import localise, write_localised
 from pipelines.slam.saved_graph import read_graph
-from pipelines.slam.slam_map import SlamMap, read_map, write_map
+from pipelines.slam.submaps import SlamMap, read_map, write_map
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.pose_graph import optimise_poses
 from saga_fg.slam.submaps import SubmapSettings
-from saga_fg.types.ego_measurements import GpsFix, WheelSpeed
+from saga_fg.types.frame import GpsFix, WheelSpeed
 
 PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False, submaps=SubmapSettings(length=20.0))
 

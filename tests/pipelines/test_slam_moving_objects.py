@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 
 from data_tools.lidar import constant_velocity
-from data_tools.simulator.scanner import StaticWorld, simulate_scan
-from data_tools.simulator.street import SMALL, SimulatedScans
+from data_tools.simulator.scanner import SMALL, SimulatedScans, StaticWorld, simulate_scan
 from pipelines.config import load_config
-from pipelines.slam.drive import KeyframeClouds
 from pipelines.slam.joint import path_tracker
 from pipelines.slam.lidar_results import metrics
-from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
-from pipelines.slam.lidar_slam_types import LidarSlamResult
-from pipelines.slam.moving_objects import MovingObjects
+from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
+from pipelines.slam.odometry import KeyframeClouds
+from pipelines.slam.scan_content import MovingObjects
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 

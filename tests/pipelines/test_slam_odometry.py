@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from data_tools.lidar import Scan
-from data_tools.simulator.scanner import ScannerSettings
-from data_tools.simulator.street import drive, scans, street
+from data_tools.simulator.scanner import ScannerSettings, drive, scans, street
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.odometry import LOST_ROTATION, LOST_TRANSLATION, LidarOdometry, OdometrySettings, OdometryStep
 from saga_fg.errors import InputError

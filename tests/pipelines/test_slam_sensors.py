@@ -11,15 +11,14 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.sensor_logs import SensorLog
-from data_tools.simulator.scanner import ScannerSettings, StaticWorld
-from data_tools.simulator.street import SENSOR_HEIGHT, SimulatedScans, drive
+from data_tools.simulator.scanner import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, drive
 from pipelines.cli import app
+from pipelines.slam.configuration import sensor_log
 from pipelines.slam.lidar_results import degenerate_spans, metrics
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
-from pipelines.slam.sensor_options import sensor_log
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.ego_measurements import WheelSpeed
+from saga_fg.types.frame import WheelSpeed
 from tests.data_tools.featureless import open_field, tunnel
 
 PERIOD = 0.1

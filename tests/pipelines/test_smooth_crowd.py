@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.nuscenes import NuScenes
-from data_tools.evaluation.placed_detections import placed_detections
+from data_tools.evaluation import placed_detections
 from data_tools.metrics import ErrorSample, LabelErrors, SceneBoxes, error_summary, label_errors
 from pipelines.smoothing import SmoothConfig, load_smooth_config, smooth_scene
 from pipelines.tracking import track_scene

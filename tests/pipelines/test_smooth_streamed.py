@@ -13,8 +13,8 @@ from data_tools.datasets.detection_files import read_detections, read_scenes_in_
 from data_tools.datasets.label_table import read_label_table
 from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
-from pipelines.smoothing.chunks import Backlog, TrackedFrame
-from pipelines.smoothing.object_summaries import Identities, ObjectSummaries
+from pipelines.smoothing.labelling import Identities, ObjectSummaries
+from pipelines.smoothing.streaming import Backlog, TrackedFrame
 from saga_fg import Detections, Frame, InputError
 
 HEADER = "timestamp,label,x,y,length,width,height,yaw,score"

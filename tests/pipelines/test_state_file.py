@@ -13,7 +13,7 @@ import pytest
 from pipelines.config import load_config
 from pipelines.serving import StateKeeper, StreamTracker
 from pipelines.serving.messages import encode
-from pipelines.serving.state_file import read_state, write_state
+from pipelines.serving.state import read_state, write_state
 from saga_fg import InputError
 
 HEADER = {"version": "1", "configuration": "a: 1\nb: 2\n"}

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from data_tools.datasets.kitti import local_kitti
 from data_tools.datasets.kitti.source import KittiPart, KittiSource
-from data_tools.files.remote_files import local_tree
+from data_tools.files.input_files import local_tree
 from pipelines.cli import app
 from saga_fg.errors import InputError
 from tests.data_tools.kitti_example import write_sequence

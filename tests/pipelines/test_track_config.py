@@ -10,7 +10,7 @@ import pytest
 from data_tools.simulator import SimulatorSettings
 from pipelines.config import Family, TrackConfig, load_config
 from pipelines.configuration import read_settings, settings_reference, write_settings
-from pipelines.configuration.schema import settings_of
+from pipelines.configuration.reading import settings_of
 from saga_fg import InputError, Tracker
 from saga_fg.providers import Gps, Landmarks, Odometry, StartSettings
 

@@ -8,10 +8,9 @@ pytest.importorskip("mcap_ros2")
 pytest.importorskip("rosbags")
 
 from data_tools.datasets.mcap.dataset import McapRecording
-from data_tools.datasets.mcap.results import TOPIC, read_track_messages
-from data_tools.datasets.mcap.source import McapSource
+from data_tools.datasets.mcap.source import TOPIC, McapSource, read_track_messages
 from pipelines.cli import app
-from pipelines.report.run_record import read_run_record
+from pipelines.report.page import read_run_record
 from tests.data_tools import mcap_example as example
 from tests.data_tools.mcap_example import ARRAY, LIDAR, MOMENTS, START, STEP
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from factors import PlanarPose, RangeBearing, Robust
 from pipelines.config import load_config
-from pipelines.serving.value_tree import TreeWriter, read_tree
+from pipelines.serving.state import TreeWriter, read_tree
 from saga_fg import Detection, Detections, Frame, InputError, SceneGraph
 from saga_fg.estimators import GraphFilter, Measurements, Observations
 from saga_fg.graph import OBJECT, GraphError, NewVariable, SceneFactorGraph
@@ -26,7 +26,7 @@ from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.nonlinear_interactions import SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
 from saga_fg.tracking.settings import TrackerSettings
-from saga_fg.tracking.speed_prior import SpeedPrior
+from saga_fg.tracking.traffic import SpeedPrior
 
 
 def again(value: Any) -> Any:

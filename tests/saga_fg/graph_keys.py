@@ -1,7 +1,7 @@
 """Keys of an estimator's graph by node."""
 
 from saga_fg.graph import OBJECT
-from saga_fg.graph.keys import node_kind
+from saga_fg.graph.variables import node_kind
 
 
 def keys_of(graph, epoch):

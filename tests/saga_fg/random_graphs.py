@@ -1,3 +1,3 @@
 """Random scene graphs, as the package has them for users' own tests."""
 
-from saga_fg.conformance.random_graphs import *  # noqa: F403
+from saga_fg.conformance.programs import *  # noqa: F403

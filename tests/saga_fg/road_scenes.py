@@ -6,16 +6,13 @@ import numpy as np
 
 from saga_fg import ConstantVelocity, NodeType, RandomWalk
 from saga_fg.estimators import Measurements
-from saga_fg.model.cone_geometry import ConeGeometry
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following
+from saga_fg.model.edge_rules import ConeGeometry, Following
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
+from saga_fg.model.lanes import ConeLine, InLane
 from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.road.cones import ConeLine
-from saga_fg.model.road.lane_keeping import InLane
-from saga_fg.model.road.starting import GreenLight
-from saga_fg.model.road.stopping import RedLight
+from saga_fg.model.stop_lines import GreenLight, RedLight
 from tests.saga_fg.estimator_programs import Add, Marginalise, Predict, Update
 
 CAR = NodeType("vehicle", ConstantVelocity(acceleration_noise=0.5))

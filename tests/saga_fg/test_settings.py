@@ -11,8 +11,7 @@ import pytest
 from saga_fg import ConstantAcceleration, ConstantVelocity, GreedyTracker, InputError, RandomWalk, Sensor
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
-from saga_fg.model.sensor import NoiseModel
-from saga_fg.model.sensor_geometry import Extrinsics, FieldOfView
+from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
 from saga_fg.settings import Finite, Positive, PositiveOrInf, Range, Settings, setting, settings_group
 from saga_fg.tracking import ClassSettings, ExistenceSettings, GreedySettings, TrackerSettings
 

@@ -1,29 +1,227 @@
-"""Argoverse 2 as a dataset of the command."""
+"""Argoverse 2 as a dataset of the command, and results in its formats.
+
+Tracks in Argoverse's formats, and read back.
+
+.feather   the columns of the detection task and `track_id`: a row for each box, in the frame of the vehicle; and the
+           velocity `vx_m`, `vy_m` in the city's frame, m/s, null where unknown
+.pkl       what the official evaluation of tracking reads: {log: [frame, ...]}, a frame being a dictionary of arrays
+           (track_id, score, label, name, translation_m, size, yaw, velocity_m_per_s) in the city's frame, with
+           timestamp_ns, seq_id and ego_translation_m; only the 26 categories that are scored
+
+A track's category is the one that the detections near it have said most, weighted with their scores. Only .feather
+files are read: to read a .pkl is to run what is in it.
+
+Source: https://github.com/argoverse/av2-api, src/av2/evaluation/tracking/SUBMISSION_FORMAT.md and eval.py.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import pickle
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from data_tools.datasets.annotated import AnnotatedSource
-from data_tools.datasets.area_map import AreaMap
-from data_tools.datasets.argoverse2.detections import AnnotatedLogs, DetectedLogs, is_feather
-from data_tools.datasets.argoverse2.logs import FILES, ArgoverseLogs
-from data_tools.datasets.argoverse2.results import (
-    merge_feather_tracks,
-    read_feather_tracks,
-    write_feather_tracks,
-    write_submission,
+from data_tools.datasets.argoverse2.logs import (
+    CLASSES,
+    FILES,
+    POSE,
+    SIZE,
+    AnnotatedLogs,
+    ArgoverseLogs,
+    ArgoverseScene,
+    DetectedLogs,
+    argoverse_maps,
+    class_names,
+    columns_of,
+    is_feather,
+    transforms,
 )
-from data_tools.datasets.argoverse2.vector_maps import argoverse_maps
-from data_tools.datasets.detection_files import read_detections
+from data_tools.datasets.detection_files import TrackRows, read_detections
 from data_tools.datasets.results import SceneResult, scene_result
-from data_tools.datasets.source import ChosenScenes, TrackedScenes, option
-from data_tools.files.remote_files import is_url, local_copy, local_tree
+from data_tools.datasets.source import AreaMap, ChosenScenes, TrackedScenes, option
+from data_tools.files.atomic_files import atomic_file
+from data_tools.files.input_files import error_context, is_url, local_copy, local_tree
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import (
+    inverse_transform,
+    quaternion_rotation,
+    rotation_quaternion,
+    yaw_of,
+    yaw_quaternion,
+)
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.track import Tracks, known_velocities
+
+SCORED = (
+    *("ARTICULATED_BUS", "BICYCLE", "BICYCLIST", "BOLLARD", "BOX_TRUCK", "BUS", "CONSTRUCTION_BARREL"),
+    *("CONSTRUCTION_CONE", "DOG", "LARGE_VEHICLE", "MESSAGE_BOARD_TRAILER", "MOBILE_PEDESTRIAN_CROSSING_SIGN"),
+    *("MOTORCYCLE", "MOTORCYCLIST", "PEDESTRIAN", "REGULAR_VEHICLE", "SCHOOL_BUS", "SIGN", "STOP_SIGN", "STROLLER"),
+    *("TRUCK", "TRUCK_CAB", "VEHICULAR_TRAILER", "WHEELCHAIR", "WHEELED_DEVICE", "WHEELED_RIDER"),
+)
+COLUMNS = ("log_id", "timestamp_ns", "track_id", "score", "category", *SIZE, *POSE)
+_VELOCITY = ("vx_m", "vy_m")
+_NEAR = 2.0  # m between a track and a detection that tells its category
+_CATEGORY = {ours: theirs for theirs, ours in reversed(CLASSES.items())}
+TrackedLogs = Iterable[tuple[Scene, Sequence[Tracks]]]
+
+
+def write_feather_tracks(path: Path, scenes: TrackedLogs) -> None:
+    """Write the tracks of some logs as .feather. Raises `InputError` where that is not possible."""
+    import pyarrow
+    from pyarrow import ipc
+
+    numbers = dict.fromkeys((*SIZE, *POSE, *_VELOCITY, "score"), pyarrow.float64())
+    whole = dict.fromkeys(("timestamp_ns", "track_id"), pyarrow.int64())
+    kinds = {**numbers, **whole, "log_id": pyarrow.string(), "category": pyarrow.string()}
+    schema = pyarrow.schema([(name, kinds[name]) for name in (*COLUMNS, *_VELOCITY)])
+    with atomic_file(path) as file, ipc.new_file(file, schema) as writer:
+        for scene, moments in scenes:
+            columns = _columns(scene, moments)
+            writer.write_table(pyarrow.table({name: columns[name] for name in schema.names}, schema=schema))
+
+
+def write_submission(path: Path, scenes: TrackedLogs) -> None:
+    """Write the tracks of some logs as .pkl. Raises `InputError` for a path that is not writable."""
+    logs = {scene.name: list(_frames(scene, moments)) for scene, moments in scenes}
+    with atomic_file(path) as file:
+        pickle.dump(logs, file)
+
+
+def merge_feather_tracks(path: Path, parts: Iterable[Path]) -> None:
+    """Join several files of tracks to one."""
+    from pyarrow import feather, ipc
+
+    with atomic_file(path) as file:
+        tables = (feather.read_table(part, memory_map=False) for part in parts)
+        first = next(tables, None)
+        if first is None:
+            return
+        with ipc.new_file(file, first.schema) as writer:
+            writer.write_table(first)
+            for table in tables:
+                writer.write_table(table)
+
+
+def read_feather_tracks(path: Path, scenes: Mapping[str, Scene]) -> TrackRows:
+    """Tracks of some logs, in world coordinates. Raises `InputError` for a missing column and an unknown time."""
+    rows = columns_of(path, COLUMNS, may_lack=_VELOCITY)
+    log: StrArray = rows["log_id"].astype(np.str_)
+    kept = np.flatnonzero(np.isin(log, list(scenes)))
+    rows, log = {name: values[kept] for name, values in rows.items()}, log[kept]
+    stamp: IntArray = rows["timestamp_ns"].astype(np.int64)
+    time, poses = np.zeros(len(log)), np.tile(np.eye(4), (len(log), 1, 1))
+    for name, scene in scenes.items():
+        mine = np.flatnonzero(log == name)
+        known: IntArray = np.array(scene.tokens, dtype=np.int64)
+        at = np.minimum(np.searchsorted(known, stamp[mine]), len(known) - 1)
+        if (known[at] != stamp[mine]).any():
+            strange = stamp[mine][known[at] != stamp[mine]][0]
+            raise InputError(f"{path}: log {name}: timestamp_ns: expected times of the log, it has none at {strange}")
+        time[mine], poses[mine] = scene.timestamps[at], scene.world_T_ego[at]
+    with error_context(str(path)):
+        world_T_box = poses @ transforms(rows)
+        size = np.stack([rows[name] for name in SIZE], axis=1).astype(np.float64)
+        label = class_names(rows["category"].astype(np.str_))
+        boxes = Boxes.of(label, world_T_box[:, :3, 3], size, yaw_of(world_T_box[:, :3, :3]))
+        score = rows["score"].astype(np.float64)
+        if not np.isfinite(score).all():
+            raise InputError("score: expected finite numbers")
+    if all(name in rows for name in _VELOCITY):
+        velocity = np.stack([rows[name] for name in _VELOCITY], axis=1).astype(np.float64)
+        boxes = replace(boxes, velocity=velocity)
+    unknown = np.full((len(log), 2, 2), np.nan)
+    id_ = rows["track_id"].astype(np.str_)
+    return TrackRows(log, time, id_, boxes, score, unknown, unknown, np.full(len(log), np.nan))
+
+
+def track_categories(scene: Scene, moments: Sequence[Tracks]) -> dict[int, str]:
+    """The category of each track by id."""
+    votes: dict[int, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+    labels = {
+        id_: label
+        for tracks in moments
+        for id_, label in zip(tracks.id.tolist(), tracks.boxes.label.tolist(), strict=True)
+    }
+    at_time = dict(zip(scene.timestamps.tolist(), moments, strict=True))
+    categories = scene.categories if isinstance(scene, ArgoverseScene) else ()
+    for frame, category in zip(scene.frames, categories, strict=False):
+        tracks = at_time.get(frame.timestamp)
+        if tracks is None or not len(tracks) or not len(frame):
+            continue
+        found = frame.detections
+        if frame.coordinates == "ego":
+            assert frame.world_T_ego is not None
+            found = found.transformed(frame.world_T_ego)
+        offset = tracks.boxes.position[:, None, :2] - found.boxes.position[None, :, :2]
+        distance = np.hypot(offset[..., 0], offset[..., 1])
+        distance[tracks.boxes.label[:, None] != found.boxes.label[None, :]] = np.inf
+        nearest = distance.argmin(axis=1)
+        for row in np.flatnonzero(distance.min(axis=1) < _NEAR).tolist():
+            column = int(nearest[row])
+            votes[int(tracks.id[row])][str(category[column])] += max(float(found.score[column]), 1e-9)
+    voted = {id_: max(of, key=lambda name: of[name]) for id_, of in votes.items()}
+    names = {id_: voted.get(id_, label) for id_, label in labels.items()}
+    return {id_: name if name.isupper() else _CATEGORY.get(name, name.upper()) for id_, name in names.items()}
+
+
+def _columns(scene: Scene, moments: Sequence[Tracks]) -> dict[str, Any]:
+    """The columns of `COLUMNS` of a log, in the frame of the vehicle."""
+    category_of, counts = track_categories(scene, moments), [len(tracks) for tracks in moments]
+    moment = np.repeat(np.arange(len(scene)), counts)
+    boxes = Boxes.concatenate([tracks.boxes for tracks in moments])
+    id_ = np.concatenate([np.empty(0, dtype=np.int64), *(tracks.id for tracks in moments)])
+    if not np.isfinite(boxes.yaw).all() or not np.isfinite(boxes.size).all():
+        raise InputError(f"log {scene.name}: expected tracks with sizes and headings, some have none")
+    world_T_box = np.tile(np.eye(4), (len(boxes), 1, 1))
+    world_T_box[:, :3, :3] = quaternion_rotation(yaw_quaternion(boxes.yaw))
+    world_T_box[:, :3, 3] = boxes.position
+    ego_T_box = inverse_transform(scene.world_T_ego[moment]) @ world_T_box
+    spread = np.concatenate([np.empty((0, 2, 2)), *(tracks.velocity_covariance for tracks in moments)])
+    velocity = known_velocities(boxes.velocity, spread)
+    columns = {
+        "log_id": [scene.name] * len(boxes),
+        "timestamp_ns": np.array(scene.tokens, dtype=np.int64)[moment],
+        "track_id": id_,
+        "score": np.concatenate([np.empty(0), *(tracks.score for tracks in moments)]),
+        **dict(zip(_VELOCITY, velocity.T, strict=True)),
+        "category": [category_of[each] for each in id_.tolist()],
+        **dict(zip(SIZE, boxes.size.T, strict=True)),
+        **dict(zip(POSE[4:], ego_T_box[:, :3, 3].T, strict=True)),
+    }
+    quaternion = rotation_quaternion(ego_T_box[:, :3, :3]) if len(boxes) else np.empty((0, 4))
+    return {**columns, **dict(zip(POSE[:4], quaternion.T, strict=True))}
+
+
+def _frames(scene: Scene, moments: Sequence[Tracks]) -> Iterator[dict[str, Any]]:
+    """The frames of a log for the official evaluation."""
+    category_of = track_categories(scene, moments)
+    for token, pose, tracks in zip(scene.tokens, scene.world_T_ego, moments, strict=True):
+        names = np.array([category_of[id_] for id_ in tracks.id.tolist()], dtype="<U31")
+        kept = np.flatnonzero(np.isin(names, SCORED))
+        boxes = tracks.boxes.select(kept)
+        velocity: FloatArray = np.column_stack([np.nan_to_num(boxes.velocity), np.zeros(len(kept))])
+        yield {
+            "seq_id": scene.name,
+            "timestamp_ns": int(token),
+            "ego_translation_m": pose[:3, 3].tolist(),  # the evaluation masks all arrays of a frame
+            "track_id": tracks.id[kept],
+            "score": tracks.score[kept],
+            "label": np.array([SCORED.index(name) for name in names[kept].tolist()], dtype=np.int64),
+            "name": names[kept],
+            "translation_m": np.array(boxes.position),
+            "size": np.array(boxes.size),
+            "yaw": np.array(boxes.yaw),
+            "velocity_m_per_s": velocity,
+            "velocity": velocity,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,18 +54,22 @@ position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2), coastin
 and settled (0 where the solver found no minimum of a nonlinear graph, else 1).
 """
 
+from data_tools.datasets.detection_files.column_names import TableImport
 from data_tools.datasets.detection_files.dataset import DetectionFile, read_detections, read_scenes_in_parts
-from data_tools.datasets.detection_files.predictions import (
+from data_tools.datasets.detection_files.tracks import (
     PREDICTION_COLUMNS,
+    TRACK_COLUMNS,
     PredictionRows,
+    TrackRows,
+    TruthFile,
     prediction_writer,
     predictions_path,
     read_predictions,
+    read_tracks,
+    track_rows,
+    write_rows,
+    write_tracks,
 )
-from data_tools.datasets.detection_files.table_import import TableImport
-from data_tools.datasets.detection_files.track_rows import TrackRows, read_tracks
-from data_tools.datasets.detection_files.tracks import TRACK_COLUMNS, track_rows, write_rows, write_tracks
-from data_tools.datasets.detection_files.truth import TruthFile
 
 __all__ = [
     "PREDICTION_COLUMNS",

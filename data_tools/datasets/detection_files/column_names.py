@@ -1,4 +1,6 @@
-"""Columns by the names that files of others give them: aliases, units at the end of a name, and misspelt names.
+"""Options for reading foreign tables: names of columns and classes, units, coordinates, order of length.
+
+Columns by the names that files of others give them: aliases, units at the end of a name, and misspelt names.
 
 A name is compared without case, and with `_` for spaces, dots and dashes. Its end may be a unit of what it holds:
 `pos_x_m`, `timestamp_ns`, `yaw_deg`, `speed_x_kmh`. Where two columns could have one meaning, neither is taken.
@@ -7,13 +9,149 @@ A name is compared without case, and with `_` for spaces, dots and dashes. Its e
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+import shlex
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import UTC, datetime
 from difflib import get_close_matches
+from functools import cache
+from math import pi
 from types import MappingProxyType
+from typing import Any, Literal
 
-from data_tools.datasets.detection_files.units import UNITS, kind_of
-from data_tools.plausibility import FILL_IN
+import numpy as np
+
+from data_tools.plausibility import FILL_IN, Mend
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.settings import Settings, setting, settings_group
+
+Kind = Literal["time", "length", "speed", "angle", "score"]
+FACTORS: Mapping[Kind, Mapping[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "length": {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048},
+    "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": 0.3048},
+    "angle": {"rad": 1.0, "deg": pi / 180},
+    "score": {"share": 1.0, "percent": 0.01},
+}
+ISO = "iso8601"
+UNITS: Mapping[str, Mapping[str, str]] = {
+    "time": {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "millis": "ms"}
+    | {"us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "nanos": "ns", "utc": "s"},
+    "length": {name: name for name in FACTORS["length"]} | {"meters": "m", "metres": "m", "feet": "ft"},
+    "speed": {"mps": "m/s", "ms": "m/s", "m_s": "m/s", "kmh": "km/h", "kph": "km/h", "mph": "mph", "fps": "ft/s"},
+    "angle": {"rad": "rad", "radians": "rad", "deg": "deg", "degrees": "deg", "degree": "deg"},
+    "score": {"percent": "percent", "pct": "percent"},
+}
+"""Ends of the names of columns, by kind."""
+
+_KINDS: dict[str, Kind] = {
+    "timestamp": "time",
+    **dict.fromkeys(("x", "y", "z", "length", "width", "height", "ego_x", "ego_y", "ego_z"), "length"),
+    **dict.fromkeys(("gps_x", "gps_y", "gps_z", "odometry_x", "odometry_y"), "length"),
+    **dict.fromkeys(("vx", "vy", "range_rate"), "speed"),
+    **dict.fromkeys(("yaw", "ego_yaw", "odometry_yaw"), "angle"),
+    "score": "score",
+}
+kind_of: Mapping[str, Kind] = MappingProxyType(_KINDS)
+"""The quantity that the numbers of a column measure, by our name."""
+
+_PER_SECOND = {"m": "m/s", "km": "km/h", "ft": "ft/s"}
+_LARGEST_SECONDS = 1e11  # beyond, numbers are no seconds
+_LONGEST_STEP = 10.0  # s between frames, beyond which a finer unit is likelier
+_ISO_DAY = re.compile(r"\s*\d{4}-\d\d-\d\d\s*$")
+_ISO_DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[T ]\d\d")
+
+
+def factor(name: str, unit: str) -> float:
+    """Factor from a unit to ours, for a column of ours."""
+    return FACTORS[kind_of[name]][unit]
+
+
+def unit_of_speed(length: str) -> str:
+    """Unit of speeds where only that of lengths is given: the same per second."""
+    return _PER_SECOND.get(length, "m/s") if length != "km" else "m/s"
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The clock of a column of times: its `unit` (s, ms, us, ns, iso8601, or frames at a rate such as 10Hz).
+
+    guessed  True if the unit is neither given nor part of the column's name, and not s
+    """
+
+    unit: str = "s"
+    guessed: bool = False
+
+    def seconds(self, numbers: FloatArray) -> FloatArray:
+        """Times (n,) as seconds."""
+        if self.unit == ISO:
+            return numbers
+        rate = frame_rate(self.unit)
+        if rate is not None:
+            return numbers / rate
+        return numbers if self.unit == "s" else numbers / round(1 / FACTORS["time"][self.unit])
+
+    @classmethod
+    def of(cls, numbers: FloatArray) -> Clock:
+        """The clock that fits times (n,), NaN where there is none: s, unless they are too large for it.
+
+        Of the finer units, that of times since 1970, or the first in which frames are not apart by 10 s and more.
+        """
+        known = np.unique(numbers[np.isfinite(numbers)])
+        largest = float(np.abs(known).max(initial=0.0))
+        if largest <= _LARGEST_SECONDS:
+            return cls()
+        with np.errstate(over="ignore"):  # damaged numbers
+            step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+        likely = [unit for unit, most in (("ms", 1e14), ("us", 1e17), ("ns", np.inf)) if largest < most]
+        fitting = [unit for unit in likely if step * FACTORS["time"][unit] <= _LONGEST_STEP]
+        return cls((fitting or likely)[0], guessed=True)
+
+
+def frame_rate(unit: str) -> float | None:
+    """Frames per second of a unit such as 10Hz, None for another unit."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*[hH][zZ]", unit)
+    return float(found[1]) if found and float(found[1]) > 0 else None
+
+
+def checked_unit(kind: str, unit: str) -> str:
+    """A unit of a kind. Raises `InputError` for another."""
+    if kind == "time" and (frame_rate(unit) is not None or unit == ISO):
+        return unit
+    known = FACTORS[kind]  # type: ignore[index]
+    unit = UNITS.get(kind, {}).get(unit, unit)
+    if unit not in known:
+        rates = ", iso8601, or frames at a rate such as 10Hz" if kind == "time" else ""
+        raise InputError(f"{kind}: expected one of {', '.join(known)}{rates}, got {unit[:40]!r}")
+    return unit
+
+
+def is_date(value: Any, to: Literal["day", "minute"] = "minute") -> bool:
+    """True for a text that begins like a date with a time of ISO 8601, or is one without a time (`to` the day)."""
+    return isinstance(value, str) and (_ISO_DATE if to == "minute" else _ISO_DAY).match(value) is not None
+
+
+def seconds_of_dates(values: Sequence[Any]) -> FloatArray:
+    """Seconds (n,) since 1970 of texts in ISO 8601, UTC where none says otherwise; NaN for None.
+
+    Raises `ValueError` with the number of the row as its argument.
+    """
+    seconds = np.full(len(values), np.nan)
+    for row, value in enumerate(values):
+        if value is not None:
+            try:
+                seconds[row] = _seconds(value)
+            except (TypeError, ValueError) as error:
+                raise ValueError(row) from error
+    return seconds
+
+
+@cache
+def _seconds(text: str) -> float:
+    date = datetime.fromisoformat(text.strip())
+    return (date if date.tzinfo is not None else date.replace(tzinfo=UTC)).timestamp()
+
 
 _PLACE = (
     "pos_# position_# #_position #_pos p# t# c# center_# #_center centre_# #_centre translation_# location_# #_world "
@@ -155,3 +293,114 @@ def understood(
 
 def _plain(name: str) -> str:
     return re.sub(r"[^0-9a-z]+", "_", name.strip().lower()).strip("_")
+
+
+KINDS = ("time", "length", "speed", "angle", "score")
+
+
+@dataclass(frozen=True)
+class TableImport(Settings):
+    """Options for reading a table. Those left out follow from the names of the columns; units are s, m, m/s and rad.
+
+    Raises `InputError` for a column that has no meaning and a unit that does not exist.
+    """
+
+    columns: Mapping[str, str] = settings_group(
+        dict, "the file's name of a column, by ours; an empty text: leave it out"
+    )
+    classes: Mapping[str, str] = settings_group(
+        dict, "our name of a class, by the file's; an empty text: leave the objects of the class out"
+    )
+    units: Mapping[str, str] = settings_group(
+        dict, "units of time (s, ms, us, ns, iso8601, 10Hz), length (m, cm, mm, km, ft), speed, angle (rad, deg), score"
+    )
+    coordinates: Literal["", "world", "ego", "sensor"] = setting(
+        "", "coordinates of rows that say none: world, ego or sensor; empty: world"
+    )
+    sort: bool = setting(False, "true: sort the rows of each scene by time; the whole table is then held in memory")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        columns = {}
+        for name, column in self.columns.items():
+            ours = canonical(name)
+            if ours is None:
+                known = (*ALIASES, *kind_of)
+                nearest = get_close_matches(name, known, n=1, cutoff=0.6)
+                hint = (
+                    f"did you mean {nearest[0]!r}?" if nearest else f"expected one of {', '.join(dict.fromkeys(known))}"
+                )
+                raise InputError(f"columns.{name[:40]}: unknown column, {hint}")
+            columns[ours] = column
+        for kind in self.units:
+            if kind not in KINDS:
+                raise InputError(f"units.{kind[:40]}: expected one of {', '.join(KINDS)}")
+        units = {kind: checked_unit(kind, unit) for kind, unit in self.units.items()}
+        vars(self).update(columns=columns, units=units)
+
+    def unit(self, name: str, by_name: str | None) -> str | None:
+        """The unit of a column of ours, where its name in the file says `by_name`; None: ours."""
+        kind = kind_of.get(name, "")
+        if kind in self.units:
+            return self.units[kind]
+        if by_name is not None:
+            return by_name
+        return unit_of_speed(self.units["length"]) if kind == "speed" and "length" in self.units else None
+
+    def over(self, other: TableImport) -> TableImport:
+        """These ways of reading, over others."""
+        return TableImport(
+            {**other.columns, **self.columns},
+            {**other.classes, **self.classes},
+            {**other.units, **self.units},
+            self.coordinates or other.coordinates,
+            self.sort or other.sort,
+        )
+
+    def mended(self, mend: Mend, names: Mapping[str, str]) -> TableImport:
+        """A copy with the entries that mend a suspicion; `names`: the file's name of each column of ours."""
+        classes = {theirs: mend.classes.get(ours, ours) for theirs, ours in self.classes.items()}
+        return replace(
+            self,
+            columns={**self.columns, **{ours: names.get(other, other) for ours, other in mend.columns.items()}},
+            classes={**classes, **{name: ours for name, ours in mend.classes.items() if name not in classes}},
+            units={**self.units, **mend.units},
+            coordinates=mend.coordinates or self.coordinates,
+        )
+
+    def option_for(self, mend: Mend | None, names: Mapping[str, str]) -> str:
+        """The options that mend a suspicion, in place of those of the same name; "" for none."""
+        if mend is None:
+            return ""
+        mended = self.mended(mend, names)
+        changed = {field.name: getattr(mended, field.name) for field in fields(Mend) if getattr(mend, field.name)}
+        return TableImport(**changed).options().strip()
+
+    def options(self) -> str:
+        """The options of the command that say the same, with a space before each; empty if there are none."""
+        text = ""
+        for name in ("columns", "classes", "units"):
+            pairs = ",".join(f"{ours}={theirs}" for ours, theirs in getattr(self, name).items())
+            text += f" --{name} {shlex.quote(pairs)}" if pairs else ""
+        return text + (f" --coordinates {self.coordinates}" if self.coordinates else "") + " --sort" * self.sort
+
+    def values(self) -> dict[str, Any]:
+        """The values that differ from the default, for a record."""
+        return {name: value for name, value in asdict(self).items() if value}
+
+
+def pairs(option: str, text: str | None) -> dict[str, str]:
+    """The entries of an option `a=b,c=d`. Raises `InputError` for an invalid entry, and one that occurs twice."""
+    found: dict[str, str] = {}
+    for entry in (text or "").split(","):
+        name, equals, value = (part.strip() for part in entry.partition("="))
+        if not entry.strip():
+            continue
+        if not equals or not name:
+            raise InputError(f"{option}: expected NAME=VALUE with commas between them, got {entry.strip()[:40]!r}")
+        if name in found:
+            raise InputError(f"{option}: expected {name[:40]!r} once")
+        if value == FILL_IN:
+            raise InputError(f"{option}: {name[:40]}={FILL_IN}: expected a name in place of the dots")
+        found[name] = value
+    return found

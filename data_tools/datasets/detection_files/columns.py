@@ -1,4 +1,4 @@
-"""The columns of a table of detections, from whatever a format gives to checked arrays."""
+"""The columns of a table of detections and of the vehicle's motion, as checked arrays."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.detection_files.column_names import Columns
-from data_tools.datasets.detection_files.table_import import TableImport
-from data_tools.datasets.detection_files.units import ISO, Clock, factor, is_date, seconds_of_dates
+from data_tools.datasets.detection_files.column_names import (
+    ISO,
+    Clock,
+    Columns,
+    TableImport,
+    factor,
+    is_date,
+    seconds_of_dates,
+)
 from data_tools.plausibility import FILL_IN, Doubt, days_taken_for_times, frames_taken_for_seconds, headings_in_degrees
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
 from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED
-from saga_fg.types.frame import LATEST
+from saga_fg.types.frame import LATEST, EgoMeasurements, GpsFix, OdometryIncrement
 
 log = logging.getLogger(__name__)
 
@@ -308,3 +314,48 @@ def _is_number(value: Any, kinds: tuple[type, ...]) -> bool:
     except (TypeError, ValueError, OverflowError):
         return False
     return type(value) in kinds
+
+
+@dataclass(frozen=True, eq=False)
+class EgoColumns:
+    """Odometry (N, 4), x, y, yaw and the time they took, and gps (N, 3) of N rows; NaN where nothing was measured."""
+
+    odometry: FloatArray
+    gps: FloatArray
+
+    @classmethod
+    def of(cls, raw: RawTable) -> EgoColumns | None:
+        """Read those of a table, None where it has none. Raises `InputError` for a row with a part of them."""
+        columns = []
+        for names, least in ((ODOMETRY, 4), (GPS, 2)):
+            values = np.stack([raw.numbers(name) for name in names], axis=-1)
+            given = np.isfinite(values)
+            part = given.any(axis=1) & ~given[:, :least].all(axis=1)
+            if part.any():
+                row = int(np.argmax(part))
+                missing = names[int(np.argmin(given[row]))]
+                raise raw.fault(
+                    row, f"{missing}: expected a number, since {names[int(np.argmax(given[row]))]} is given"
+                )
+            columns.append(values)
+        short = columns[0][:, 3] <= 0
+        if short.any():
+            row = int(np.argmax(short))
+            raise raw.fault(row, f"odometry_dt: expected seconds > 0, got {columns[0][row, 3]:g}")
+        return cls(*columns) if any(np.isfinite(values).any() for values in columns) else None
+
+    def measured(self, rows: IntArray) -> EgoMeasurements:
+        """Return what the rows of a frame measured, by the first of them that did."""
+        odometry, gps = (_first(column[rows]) for column in (self.odometry, self.gps))
+        fix = None if gps is None else GpsFix(gps[np.isfinite(gps)])
+        return EgoMeasurements(None if odometry is None else _increment(*odometry.tolist()), fix)
+
+
+def _increment(x: float, y: float, yaw: float, dt: float) -> OdometryIncrement:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return OdometryIncrement(np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]]), dt)
+
+
+def _first(values: FloatArray) -> FloatArray | None:
+    given = np.isfinite(values[:, 0])
+    return values[int(np.argmax(given))] if given.any() else None

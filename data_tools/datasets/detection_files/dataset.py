@@ -9,11 +9,10 @@ from typing import cast
 
 import numpy as np
 
-from data_tools.datasets.detection_files.columns import BOX, GPS, ODOMETRY, POSE, RawTable
-from data_tools.datasets.detection_files.ego_columns import EgoColumns
+from data_tools.datasets.detection_files.column_names import TableImport
+from data_tools.datasets.detection_files.columns import BOX, GPS, ODOMETRY, POSE, EgoColumns, RawTable
 from data_tools.datasets.detection_files.formats import ROWS, read_raw_parts, read_raw_table
-from data_tools.datasets.detection_files.table_import import TableImport
-from data_tools.files.error_messages import error_context, unknown_name
+from data_tools.files.input_files import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_transform

@@ -14,14 +14,10 @@ from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from data_tools.datasets.detection_files.column_names import Columns, meaning, understood
+from data_tools.datasets.detection_files.column_names import Clock, Columns, TableImport, meaning, understood
 from data_tools.datasets.detection_files.columns import COLUMNS, POSE, REQUIRED, RawTable, Values, clock_of
-from data_tools.datasets.detection_files.table_import import TableImport
-from data_tools.datasets.detection_files.units import Clock
-from data_tools.files.arrow_tables import SUFFIXES, read_arrow_columns
 from data_tools.files.input_files import open_bytes, open_text
-from data_tools.files.json_stream import parsed_json
-from data_tools.files.numpy_files import load_archive
+from data_tools.files.readers import SUFFIXES, load_archive, parsed_json, read_arrow_columns
 from saga_fg.errors import InputError
 
 log = logging.getLogger(__name__)

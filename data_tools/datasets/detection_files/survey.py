@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.datasets.detection_files.column_names import TableImport
 from data_tools.datasets.detection_files.columns import BOX, COLUMNS, POSE, QUATERNION, REQUIRED, ROTATIONS, RawTable
 from data_tools.datasets.detection_files.dataset import DetectionFile
 from data_tools.datasets.detection_files.formats import ROWS, Layout, read_raw_table, sorted_by_time
-from data_tools.datasets.detection_files.table_import import TableImport
 from data_tools.datasets.detection_files.tracks import SETTLED, TRACK_COLUMNS
 from data_tools.plausibility import Doubt, Sample, doubts_of
 from saga_fg.errors import InputError

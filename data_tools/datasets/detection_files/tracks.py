@@ -1,4 +1,18 @@
-"""Tracks written as a table, a row per track and moment: CSV or newline-delimited JSON. Columns: see the package."""
+"""Tables of tracks, predicted tracks and true objects, written and read back.
+
+Tables of true objects: a row per object and moment, with the columns of tracks and `visible`, 0 where hidden.
+
+The moments of a scene are the times of its rows. Velocities that are not there are central differences of positions
+over about half a second; positions in coordinates of the vehicle are moved to the world by its pose.
+
+Predicted tracks as a table beside the tracks: a row per track, moment and horizon, CSV.
+
+scene, timestamp      of the moment from which the track is predicted, as in the table of tracks
+horizon               s after it
+id, label             of the track
+x, y, yaw, vx, vy     predicted mean, world: m, rad, m/s
+cov_xx, ..., cov_vyvy covariances of position, m^2, and velocity, (m/s)^2
+"""
 
 from __future__ import annotations
 
@@ -6,19 +20,35 @@ import csv
 import io
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
+from data_tools.datasets.central_differences import central_differences
+from data_tools.datasets.detection_files.column_names import TableImport
+from data_tools.datasets.detection_files.columns import POSE, QUATERNION, ROTATIONS, RawTable
+from data_tools.datasets.detection_files.dataset import box_columns
+from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.files.atomic_files import atomic_file
-from data_tools.files.error_messages import error_context
-from data_tools.files.input_files import open_bytes
+from data_tools.files.input_files import error_context, open_bytes, unknown_name
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import upper_triangle
-from saga_fg.types.dataset import Scene
-from saga_fg.types.track import Tracks
+from saga_fg.numerics.arrays import (
+    BoolArray,
+    Columns,
+    FloatArray,
+    IntArray,
+    StrArray,
+    from_upper_triangle,
+    upper_triangle,
+)
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.track import PredictedTracks, Tracks
 
 TRACK_COLUMNS = (
     *("scene", "timestamp", "id", "label", "x", "y", "z", "length", "width", "height", "yaw", "vx", "vy", "score"),
@@ -91,3 +121,274 @@ def _result_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) ->
         settled = np.concatenate([np.empty(0, dtype=bool), *(tracks.settled for tracks in moments)])
         rows = track_rows(path, [(scene, moments)])
         yield from ([*row, value] for row, value in zip(rows, settled.astype(int).tolist(), strict=True))
+
+
+REQUIRED = ("timestamp", "id", "x", "y")
+OWN = frozenset({"timestamp", "id", "x", "y", "cov_xx", "coasting"})  # columns of a table that saga-fg wrote
+NUMBERS = tuple(name for name in TRACK_COLUMNS if name not in ("scene", "id", "label"))
+
+
+@dataclass(frozen=True, eq=False)
+class TrackRows:
+    """N rows of a table of tracks, in the order of the file; NaN in covariances and coasting for what is left out.
+
+    scene (N,), timestamp (N,) in s, id (N,), boxes in world coordinates, score (N,), position_covariance (N, 2, 2) in
+    m^2, velocity_covariance (N, 2, 2) in (m/s)^2, coasting (N,) in s; named: whether the table names its scenes
+    """
+
+    scene: StrArray
+    timestamp: FloatArray
+    id: StrArray
+    boxes: Boxes
+    score: FloatArray
+    position_covariance: FloatArray
+    velocity_covariance: FloatArray
+    coasting: FloatArray
+    named: bool = True
+
+    def select(self, rows: IntArray) -> TrackRows:
+        """Some of the rows."""
+        return replace(
+            self,
+            **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("boxes", "named")},
+            boxes=self.boxes.select(rows),
+        )
+
+
+def read_tracks(path: str | Path, how: TableImport | None = None, lenient: bool = False) -> TrackRows:
+    """Read a table of tracks in any of the formats of detections. Raises `InputError` naming file, row and column.
+
+    how      what it takes to understand it, without effect on a table that saga-fg wrote
+    lenient  columns that `how` names need not be there
+    """
+    layout = Layout((*TRACK_COLUMNS, SETTLED, *QUATERNION), REQUIRED, lenient)
+    return track_rows_of(read_raw_table(Path(path), layout, how, own=OWN))
+
+
+def track_rows_of(raw: RawTable) -> TrackRows:
+    """The tracks in a table that may have further columns; without those of classes that are to be left out."""
+    raw.check_numbers(NUMBERS)
+    _, left_out = raw.labels()
+    kept = np.flatnonzero(~left_out)
+    found = box_columns(raw, left_out)
+    raw.warn_of_doubts()
+    timestamp = raw.numbers("timestamp")
+    if np.isnan(timestamp).any():
+        row = int(np.argmax(np.isnan(timestamp)))
+        raise raw.fault(row, f"{raw.title('timestamp')}: expected a number, got none")
+    return TrackRows(
+        raw.texts("scene", raw.path.stem)[kept],
+        timestamp[kept],
+        raw.identities("id")[kept],
+        found.boxes.select(kept),
+        found.score[kept],
+        _covariance(raw, ("cov_xx", "cov_xy", "cov_yy"))[kept],
+        _covariance(raw, ("cov_vxvx", "cov_vxvy", "cov_vyvy"))[kept],
+        raw.numbers("coasting")[kept],
+        "scene" in raw.columns,
+    )
+
+
+def _covariance(raw: RawTable, names: tuple[str, str, str]) -> FloatArray:
+    return from_upper_triangle(np.stack([raw.numbers(name) for name in names], axis=-1))
+
+
+LAYOUT = Layout(
+    (*TRACK_COLUMNS, SETTLED, *QUATERNION, "coordinates", *POSE, *ROTATIONS["ego_yaw"], "visible"),
+    REQUIRED,
+    lenient=True,
+)
+REACH = 0.25  # s to either side, for a velocity
+LONGEST_GAP = 2.5  # steps between rows of an object, for a velocity
+
+
+class TruthFile:
+    """The scenes of one table of true objects, with ground truth alone. `named`: whether the table names its scenes."""
+
+    def __init__(self, path: str | Path, how: TableImport | None = None) -> None:
+        """Read and check everything. Raises `InputError` naming file, row and column."""
+        raw = read_raw_table(Path(path), LAYOUT, how)
+        self.path = raw.path
+        self.rows = track_rows_of(raw)
+        if not len(self.rows.id):
+            raise InputError(f"{path}: expected at least one row, the table is empty")
+        kept = np.flatnonzero(~raw.labels()[1])
+        self._visible = _visible(raw)[kept]
+        self._pose = _poses(raw)[kept]
+        self._in_ego = (raw.texts("coordinates", raw.how.coordinates or "world") == "ego")[kept]
+        self._in_ego &= np.isfinite(self._pose).all(axis=1)
+        self._with_velocity = {"vx", "vy"} <= raw.columns.keys()
+        self.named = self.rows.named
+        _, first = np.unique(self.rows.scene, return_index=True)
+        self.scenes: tuple[str, ...] = tuple(self.rows.scene[np.sort(first)].tolist())
+
+    def scene(self, name: str) -> Scene:
+        """One of the scenes; raises `InputError` for an unknown name and an object that is there twice at a time."""
+        if name not in self.scenes:
+            raise InputError(f"{self.path}: {unknown_name('scene', name, self.scenes)}")
+        rows = np.flatnonzero(self.rows.scene == name)
+        times, moment = np.unique(self.rows.timestamp[rows], return_inverse=True)
+        poses = _scene_poses(self.rows, rows, moment, self._pose)
+        boxes = _in_world(self.rows.boxes.select(rows), self._in_ego[rows], poses[moment])
+        if not self._with_velocity and len(times) > 1:
+            step = float(np.median(np.diff(times)))
+            reach = max(1, round(REACH / step))
+            ids = self.rows.id[rows]
+            velocity = central_differences(ids, times[moment], boxes.position[:, :2], LONGEST_GAP * step, reach)
+            boxes = replace(boxes, velocity=velocity)
+        truth = []
+        for k, at in enumerate(np.split(np.argsort(moment, kind="stable"), np.cumsum(np.bincount(moment))[:-1])):
+            with error_context(f"{self.path}: scene {name}: {times[k]} s"):
+                truth.append(Annotations(self.rows.id[rows][at], boxes.select(at), self._visible[rows][at]))
+        return Scene(name, times, poses, ("",) * len(times), (), truth)
+
+
+def _scene_poses(rows: TrackRows, at: Sequence[int] | np.ndarray, moment: np.ndarray, pose: FloatArray) -> FloatArray:
+    """world_T_ego (K, 4, 4): those of the table, else an upright vehicle amid all objects."""
+    _, first = np.unique(moment, return_index=True)
+    if np.isfinite(pose[at]).all():
+        return np.array([yaw_transform(*each) for each in pose[at][first].tolist()])
+    poses = np.tile(np.eye(4), (len(first), 1, 1))
+    poses[:, :2, 3] = np.median(rows.boxes.position[at, :2], axis=0)
+    return poses
+
+
+def _in_world(boxes: Boxes, in_ego: BoolArray, world_T_ego: FloatArray) -> Boxes:
+    """Boxes (N) with those in coordinates of the vehicle moved to the world; poses (N, 4, 4) of their moments."""
+    if not in_ego.any():
+        return boxes
+    R, t = world_T_ego[:, :3, :3], world_T_ego[:, :3, 3]
+    turn = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    position = np.einsum("nij,nj->ni", R, boxes.position) + t
+    velocity = np.einsum("nij,nj->ni", R[:, :2, :2], boxes.velocity)
+    return replace(
+        boxes,
+        position=np.where(in_ego[:, None], position, boxes.position),
+        velocity=np.where(in_ego[:, None], velocity, boxes.velocity),
+        yaw=np.where(in_ego, boxes.yaw + turn, boxes.yaw),
+    )
+
+
+def _poses(raw: RawTable) -> FloatArray:
+    """x, y, z, yaw (N, 4) of the vehicle, NaN where the table has none."""
+    return np.stack([raw.numbers(name, 0.0 if name == "ego_z" else np.nan) for name in POSE], axis=-1)
+
+
+def _visible(raw: RawTable) -> BoolArray:
+    """Mask (N,) of the objects that can be seen: all that no column `visible` calls 0 or false."""
+    values = raw.columns.get("visible", ())
+    if not len(values):
+        return np.ones(raw.length, dtype=np.bool_)
+    listed = values.tolist() if isinstance(values, np.ndarray) else values
+    return np.array([str(value).strip().lower() not in ("0", "0.0", "false") for value in listed], dtype=np.bool_)
+
+
+_NAMES = ("scene", "timestamp", "horizon", "id", "label")
+_POSITION_COVARIANCE = ("cov_xx", "cov_xy", "cov_yy")
+PREDICTION_COLUMNS = (
+    *(*_NAMES, "x", "y", "yaw", "vx", "vy", *_POSITION_COVARIANCE),
+    *("cov_vxvx", "cov_vxvy", "cov_vyvy"),
+)
+SUFFIX = ".predictions.csv"
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionRows(Columns):
+    """R predicted positions.
+
+    timestamp (R,) of the moment, s; horizon (R,), s; id (R,); position (R, 2), m; covariance (R, 2, 2), m^2
+    """
+
+    timestamp: FloatArray
+    horizon: FloatArray
+    id: StrArray
+    position: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, moments: Sequence[PredictedTracks]) -> Self:
+        """The rows of what was predicted at several moments."""
+        each = [cls._of_moment(predicted) for predicted in moments]
+        none = np.empty(0)
+        empty = cls(none, none, np.empty(0, dtype=np.str_), np.empty((0, 2)), np.empty((0, 2, 2)))
+        return cls(
+            *(
+                np.concatenate([getattr(rows, name) for rows in (empty, *each)])
+                for name in ("timestamp", "horizon", "id", "position", "covariance")
+            )
+        )
+
+    @classmethod
+    def _of_moment(cls, predicted: PredictedTracks) -> Self:
+        h, n = len(predicted.horizons), len(predicted)
+        return cls(
+            np.full(h * n, predicted.timestamp),
+            np.repeat(predicted.horizons, n),
+            np.tile(predicted.id.astype(np.str_), h),
+            predicted.position.reshape(-1, 2),
+            predicted.position_covariance.reshape(-1, 2, 2),
+        )
+
+
+@contextmanager
+def prediction_writer(path: Path) -> Iterator[Callable[[str, Sequence[PredictedTracks]], None]]:
+    """Yield a function that appends what was predicted in a scene; the file appears at the end of the block.
+
+    Raises `InputError` for a path that is not writable.
+    """
+    with atomic_file(path) as binary:
+        file = io.TextIOWrapper(binary, encoding="utf-8", newline="", write_through=True)
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(PREDICTION_COLUMNS)
+        yield lambda scene, moments: writer.writerows(row for each in moments for row in _rows(scene, each))
+        file.detach()
+
+
+def _rows(scene: str, predicted: PredictedTracks) -> Iterator[list[Any]]:
+    names = list(zip(predicted.id.tolist(), predicted.label.tolist(), strict=True))
+    for k, horizon in enumerate(predicted.horizons.tolist()):
+        covariances = (predicted.position_covariance[k], predicted.velocity_covariance[k])
+        numbers = np.column_stack(
+            [
+                *(predicted.position[k], predicted.yaw[k], predicted.velocity[k]),
+                *(upper_triangle(P) for P in covariances),
+            ]
+        )
+        for (id_, label), row in zip(names, numbers.tolist(), strict=True):
+            yield [scene, predicted.timestamp, horizon, id_, label, *(None if x != x else round(x, 4) for x in row)]
+
+
+def predictions_path(result: Path) -> Path:
+    """The table of predictions beside a result, a file or a folder."""
+    return result.with_name(f"{result.name}{SUFFIX}")
+
+
+def read_predictions(result: Path) -> dict[str, PredictionRows]:
+    """The predictions kept with a result, by scene; none where the run kept none.
+
+    They are in one table, or after a parallel run in a table for each part. Raises `InputError` for a broken table.
+    """
+    whole = predictions_path(result)
+    parts = [whole] if whole.is_file() else sorted(result.with_suffix("").glob(f"*{SUFFIX}"))
+    found: dict[str, PredictionRows] = {}
+    for path in parts:
+        found |= _read_table(path)
+    return found
+
+
+def _read_table(path: Path) -> dict[str, PredictionRows]:
+    numbers = ("timestamp", "horizon", "id", "x", "y")
+    raw = read_raw_table(path, Layout(PREDICTION_COLUMNS, numbers))
+    columns = {name: raw.numbers(name) for name in (*numbers, *_POSITION_COVARIANCE)}
+    for name in numbers:
+        if np.isnan(columns[name]).any():
+            raise raw.fault(int(np.argmax(np.isnan(columns[name]))), f"{name}: expected a number, got none")
+    rows = PredictionRows(
+        columns["timestamp"],
+        columns["horizon"],
+        columns["id"].astype(np.int64).astype(np.str_),
+        np.stack([columns["x"], columns["y"]], axis=-1),
+        from_upper_triangle(np.stack([columns[name] for name in _POSITION_COVARIANCE], axis=-1)),
+    )
+    scene = raw.texts("scene", Path(path.name.removesuffix(SUFFIX)).stem)
+    return {str(name): rows.select(np.flatnonzero(scene == name)) for name in np.unique(scene)}

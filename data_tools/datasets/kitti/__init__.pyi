@@ -1,10 +1,6 @@
-from .calibration import Calibration, read_calibration
-from .dataset import KittiTracking, local_kitti
-from .image_boxes import image_boxes, observation_angles
-from .labels import read_kitti_labels
-from .oxts import read_poses
-from .tracking_results import kitti_result_text, write_kitti_results
-from .velodyne import KittiScans
+from .dataset import Calibration, KittiScans, KittiTracking, local_kitti, read_calibration, read_poses
+from .labels import image_boxes, observation_angles, read_kitti_labels
+from .results import kitti_result_text, write_kitti_results
 
 __all__ = [
     "Calibration",

@@ -1,4 +1,6 @@
-"""The KITTI tracking dataset: official poses, calibration and labels, and detections as text, in; `Scene`s out.
+"""The KITTI tracking dataset: poses, calibration, labels, detections, scans and images.
+
+The KITTI tracking dataset: official poses, calibration and labels, and detections as text, in; `Scene`s out.
 
 A sequence has a moment for every record of its GPS/IMU (10 Hz; times count from 0). World coordinates are east, north,
 up from the place of the first record; the ego frame is the IMU's (x ahead, y left, z up). Every moment has a frame of
@@ -7,30 +9,198 @@ detections, which may be empty. Classes are KITTI's in lower case: car, pedestri
 Ground truth leaves out `DontCare` regions. An object counts as visible if it is labelled as fully visible or partly
 occluded (0, 1), not as largely occluded or unknown (2, 3). Its velocity is the central difference of its positions two
 frames (0.2 s) to either side; the poses it rests on jump by decimetres in places, so it is good to some 0.5 m/s.
+
+The calibration of a KITTI sequence: what leads from the vehicle to the camera and on to the image.
+
+    x_camera = R_rect Tr_velo_cam Tr_imu_velo x_imu         rectified camera 0: x right, y down, z ahead
+    (u w, v w, w) = P2 (x_camera, 1)                        pixel (u, v) of the left colour image
+
+A calibration file holds one `key: numbers` a line, row-major. The tracking benchmark's own files leave out some colons
+and shorten some keys; both spellings are read. Source: development kit of https://www.cvlibs.net/datasets/kitti
+(tracking) and Geiger et al., Vision meets robotics: the KITTI dataset, IJRR 2013.
+
+Poses of the vehicle from KITTI's GPS/IMU records (oxts).
+
+A record gives latitude, longitude (degrees), altitude (m) and roll, pitch, yaw (rad) first, then velocities and more.
+As in the official development kit, positions come from the Mercator projection scaled at the first latitude, and
+rotations are R = Rz(yaw) Ry(pitch) Rx(roll):
+
+    s = cos(lat_0),  x = s r lon,  y = s r ln tan(pi/4 + lat/2),  z = alt,      r = 6378137 m
+
+World coordinates have their axes east, north, up and their origin at the first record: unlike the kit's, which are
+turned into the first vehicle frame, they are level, so that z is up. The ego frame is the IMU's: x ahead, y left, z up.
+Source: Geiger et al., Vision meets robotics: the KITTI dataset, IJRR 2013.
+
+The LiDAR scans of a KITTI tracking sequence: velodyne/NNNN/KKKKKK.bin, one for each frame that has one.
+
+The Velodyne turns clockwise, ten times a second, and looks ahead when the cameras are triggered, which is the time of
+the frame. Its points carry no times; those of their azimuths are given here, for scans that are not compensated for the
+vehicle's motion. A copy of the dataset does not say whether its scans are: `timed=False` leaves the times out. Sources:
+Geiger et al., Vision meets robotics: the KITTI dataset, IJRR 2013; KISS-ICP, which takes azimuths for times as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
-from data_tools.datasets.kitti.calibration import Calibration, read_calibration
-from data_tools.datasets.kitti.detections import CLASS_CODES, detection_files, read_kitti_detections
-from data_tools.datasets.kitti.labels import lower_case_classes, read_kitti_labels
-from data_tools.datasets.kitti.oxts import read_poses
-from data_tools.files.error_messages import error_context, unknown_name
-from data_tools.files.remote_files import local_tree
+from data_tools.datasets.kitti.labels import (
+    CLASS_CODES,
+    detection_files,
+    lower_case_classes,
+    read_kitti_detections,
+    read_kitti_labels,
+)
+from data_tools.datasets.source import Images
+from data_tools.files.input_files import error_context, local_tree, unknown_name
+from data_tools.files.readers import TextTable, read_lines, read_table
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
+from data_tools.lidar import Scan, azimuth_times, read_scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.numerics.geometry import inverse_transform, is_rotation
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame
+
+_KEYS: dict[str, tuple[tuple[int, int], tuple[str, ...]]] = {
+    "P2": ((3, 4), ("P2",)),
+    "R_rect": ((3, 3), ("R_rect", "R0_rect")),
+    "Tr_velo_cam": ((3, 4), ("Tr_velo_cam", "Tr_velo_to_cam")),
+    "Tr_imu_velo": ((3, 4), ("Tr_imu_velo", "Tr_imu_to_velo")),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """camera_T_velodyne (4, 4) and camera_T_imu (4, 4), rigid, to the rectified camera; projection (3, 4) = P2."""
+
+    camera_T_velodyne: FloatArray
+    camera_T_imu: FloatArray
+    projection: FloatArray
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a calibration file. Raises `InputError` for missing keys, missing numbers, rotations that are none."""
+    path = Path(path)
+    found: dict[str, tuple[int, list[str]]] = {}
+    for number, line in enumerate(read_lines(path), start=1):
+        key, *values = line.split() or [""]
+        found[key.rstrip(":")] = (number, values)
+    matrices = {name: _matrix(path, found, name) for name in _KEYS}
+    camera_T_velodyne = _rigid(matrices["R_rect"]) @ _rigid(matrices["Tr_velo_cam"])
+    return Calibration(
+        camera_T_velodyne=camera_T_velodyne,
+        camera_T_imu=camera_T_velodyne @ _rigid(matrices["Tr_imu_velo"]),
+        projection=matrices["P2"],
+    )
+
+
+def _matrix(path: Path, found: dict[str, tuple[int, list[str]]], name: str) -> FloatArray:
+    shape, spellings = _KEYS[name]
+    key = next((spelling for spelling in spellings if spelling in found), None)
+    if key is None:
+        there = ", ".join(k for k in found if k) or "none"
+        raise InputError(f"{path}: expected the key {' or '.join(spellings)}, the keys there are {there}")
+    line, values = found[key]
+    count = shape[0] * shape[1]
+    try:
+        numbers = np.array([float(value) for value in values])
+    except ValueError as error:
+        raise InputError(f"{path}: line {line}: {key}: expected {count} numbers: {error}") from error
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f"{path}: line {line}: {key}: expected {count} finite numbers, got {len(numbers)} values")
+    matrix = numbers.reshape(shape)
+    R = matrix[:, :3]
+    if name != "P2" and not is_rotation(R, 1e-4):
+        raise InputError(f"{path}: line {line}: {key}: expected a rotation in the first three columns")
+    return matrix
+
+
+def _rigid(matrix: FloatArray) -> FloatArray:
+    """(4, 4) transform with the rotation nearest to that of the file, which is rounded to seven digits."""
+    U, _, Vt = np.linalg.svd(matrix[:, :3])
+    transform = np.eye(4)
+    transform[:3, :3] = U @ Vt
+    transform[:3, 3] = matrix[:, 3] if matrix.shape[1] == 4 else 0.0
+    return transform
+
+
+EARTH_RADIUS = 6378137.0  # m
+_COLUMNS = ("latitude", "longitude", "altitude", "roll", "pitch", "yaw")
+
+
+def read_origin(path: str | Path) -> tuple[float, float, float]:
+    """Latitude, longitude (deg) and altitude (m) of the first record. Raises `InputError` as `read_poses` does."""
+    read_poses(path)
+    latitude, longitude, altitude = _records(path).numbers(slice(0, 3), _COLUMNS[:3])[0].tolist()
+    return latitude, longitude, altitude
+
+
+def read_poses(path: str | Path) -> FloatArray:
+    """world_T_imu (K, 4, 4) of the K records of a sequence. Raises `InputError` for records that are not as above."""
+    table = _records(path)
+    if not len(table):
+        raise InputError(f"{path}: expected a record per frame, the file is empty")
+    latitude, longitude, altitude, roll, pitch, yaw = table.numbers(slice(0, 6), _COLUMNS).T
+    for name, angle, largest in (("latitude", latitude, 85.0), ("longitude", longitude, 180.0)):
+        if (np.abs(angle) > largest).any():
+            row = int(np.argmax(np.abs(angle) > largest))
+            raise table.fault(row, f"{name}: expected degrees within {largest:g} of 0, got {angle[row]:g}")
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, :3] = _turn(yaw, 0, 1) @ _turn(pitch, 2, 0) @ _turn(roll, 1, 2)
+    poses[:, :3, 3] = world_position(latitude, longitude, altitude, np.array([latitude[0], longitude[0], altitude[0]]))
+    return poses
+
+
+def world_position(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray, origin: FloatArray) -> FloatArray:
+    """Positions (K, 3) east, north and up of an origin (3,), m; latitudes and longitudes in degrees, altitudes in m."""
+    scale = EARTH_RADIUS * np.cos(np.radians(origin[0]))
+    above = [np.log(np.tan(np.radians(90 + angle) / 2)) for angle in (latitude, origin[0])]
+    return np.stack(
+        [scale * np.radians(longitude - origin[1]), scale * (above[0] - above[1]), altitude - origin[2]], axis=1
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SensorRecords:
+    """K records in the vehicle's axes, without the poses.
+
+    position (K, 3) as in `read_poses`, m; speed (K,) ahead, m/s; acceleration (K, 3) specific force, m/s^2;
+    angular_rate (K, 3), rad/s
+    """
+
+    position: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
+    angular_rate: FloatArray
+
+
+def read_sensors(path: str | Path) -> SensorRecords:
+    """Read what the records say of velocity, acceleration and turn rate. Raises `InputError` as `read_poses` does."""
+    position = read_poses(path)[:, :3, 3]
+    table = _records(path)
+    names = ("vf", "ax", "ay", "az", "wx", "wy", "wz")
+    numbers = table.numbers([8, 11, 12, 13, 17, 18, 19], names)
+    return SensorRecords(position, numbers[:, 0], numbers[:, 1:4], numbers[:, 4:])
+
+
+def _records(path: str | Path) -> TextTable:
+    return read_table(Path(path), (30,), "latitude, longitude, altitude, roll, pitch, yaw, ...")
+
+
+def _turn(angle: FloatArray, from_axis: int, to_axis: int) -> FloatArray:
+    """Rotations (K, 3, 3) that turn one axis towards another."""
+    R = np.tile(np.eye(3), (len(angle), 1, 1))
+    R[:, from_axis, from_axis] = R[:, to_axis, to_axis] = np.cos(angle)
+    R[:, to_axis, from_axis] = np.sin(angle)
+    R[:, from_axis, to_axis] = -np.sin(angle)
+    return R
+
 
 FRAME_PERIOD = 0.1  # s
 _LONGEST_GAP = 0.5  # s between labels of an object, for a velocity
@@ -155,3 +325,72 @@ def local_kitti(
         root = stack.enter_context(local_tree(dataroot, files))
         boxes = None if detections is None else stack.enter_context(local_tree(detections, found))
         yield KittiTracking(root, boxes, sequences, ground_truth)
+
+
+class KittiScans:
+    """The scans of a sequence, the first `most` or all of them, read one at a time; `timed`: with times of points.
+
+    With `blind` there is one for each GPS/IMU record, without any points, for what needs none.
+
+    frames         (K,) their frame numbers, in order; timestamps (K,) s
+    ego_T_lidar    (4, 4) place of the sensor on the vehicle
+    world_T_ego    (K, 4, 4) pose of the vehicle by GPS/IMU at each scan
+
+    Raises `InputError` where there are none, and for a scan without a GPS/IMU record.
+    """
+
+    def __init__(
+        self, dataroot: str | Path, sequence: str, timed: bool = True, most: int | None = None, blind: bool = False
+    ) -> None:
+        root = Path(dataroot)
+        root = root / "training" if (root / "training").is_dir() else root
+        dataset = KittiTracking(dataroot, sequences=[sequence])
+        calibration = dataset.calibration(sequence)
+        poses = dataset.scene(sequence).world_T_ego
+        self._files = () if blind else _files(root / "velodyne" / sequence, len(poses))[:most]
+        frames = range(len(poses))[:most] if blind else [int(path.stem) for path in self._files]
+        self.frames = np.array(frames, dtype=np.int64)
+        self.timestamps: FloatArray = self.frames.astype(np.float64) * FRAME_PERIOD
+        self.world_T_ego: FloatArray = poses[self.frames]
+        self.ego_T_lidar: FloatArray = inverse_transform(calibration.camera_T_imu) @ calibration.camera_T_velodyne
+        self._timed = timed
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, row: int) -> Scan:
+        if not self._files:
+            return Scan(np.empty((0, 3)), np.empty(0))
+        scan = read_scan(self._files[row])
+        return replace(scan, time=azimuth_times(scan.points, FRAME_PERIOD)) if self._timed else scan
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self[row] for row in range(len(self)))
+
+
+def _files(folder: Path, records: int) -> tuple[Path, ...]:
+    """The scans in a folder, in order."""
+    files = tuple(sorted(path for path in folder.glob("*.bin") if path.stem.isdigit()))
+    if not files:
+        raise InputError(f"{folder}: expected LiDAR scans KKKKKK.bin, there are none")
+    if int(files[-1].stem) >= records:
+        raise InputError(f"{files[-1]}: expected frames 0 to {records - 1}, as there are GPS/IMU records")
+    return files
+
+
+FOLDERS = {"image_02": "left", "image_03": "right"}
+
+
+def kitti_images(root: Path, scenes: Mapping[str, Scene]) -> dict[str, Images]:
+    """Return the images of each sequence by camera, one or None for each moment; sequences without any are left out."""
+    found: dict[str, Images] = {}
+    for name, scene in scenes.items():
+        images: dict[str, list[Path | None]] = {}
+        for folder, camera in FOLDERS.items():
+            files = [root / folder / name / f"{k:06d}.png" for k in range(len(scene))]
+            if any(there := [file.is_file() for file in files]):
+                images[camera] = [file if is_there else None for file, is_there in zip(files, there, strict=True)]
+                break  # the other eye sees the same
+        if images:
+            found[name] = images
+    return found

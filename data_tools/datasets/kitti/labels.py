@@ -1,22 +1,41 @@
-"""KITTI tracking labels and results: one object a line,
+"""KITTI's text formats: labels, detections, and boxes in the image.
+
+KITTI tracking labels and results: one object a line,
 
     frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z rotation_y [score]
 
 2D boxes in pixels, sizes and positions in m in the rectified camera frame (bottom centre), angles in rad. `DontCare`
 lines mark regions of the image and have id -1. `Person` is a person that sits, `Person_sitting` in KITTI's other
 benchmarks. Source: development kit of the tracking benchmark, https://www.cvlibs.net/datasets/kitti/eval_tracking.php.
+
+Detections in the text format of AB3DMOT: a folder for each class, in it a file for each sequence, one box a line,
+
+    frame, type, x1, y1, x2, y2, score, h, w, l, x, y, z, rotation_y, alpha
+
+type is 1 for pedestrians, 2 for cars, 3 for cyclists; boxes are as in KITTI's labels. The score is the detector's
+own, for PointRCNN a logit, any real number. Source: Weng et al., 3D multi-object tracking: a baseline and new
+evaluation metrics, IROS 2020, and https://github.com/xinshuoweng/AB3DMOT.
+
+Boxes of the camera frame in the image: 2D boxes and observation angles.
+
+The 2D box encloses the projection of the twelve edges, cut at a plane just before the camera, and is clipped to the
+image. The observation angle is alpha = rotation_y - atan2(x, z). Pixels count from 0.
 """
 
 from __future__ import annotations
 
+import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.error_messages import unknown_name
-from data_tools.files.text_tables import TextTable, read_table
+from data_tools.files.input_files import unknown_name
+from data_tools.files.readers import TextTable, read_table
 from data_tools.kitti_objects import CameraBoxes, KittiObjects, has_box
-from saga_fg.numerics.arrays import StrArray
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import wrap_angle
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 
@@ -66,3 +85,100 @@ def _check(table: TextTable, objects: KittiObjects) -> None:
         row = int(np.setdiff1d(np.arange(len(tracked)), first)[0])
         frame, id_ = pairs[row].tolist()
         raise table.fault(int(tracked[row]), f"id: expected each track once a frame, {id_} is in frame {frame} again")
+
+
+log = logging.getLogger(__name__)
+
+CLASS_CODES = {"Pedestrian": 1, "Car": 2, "Cyclist": 3}
+
+_NUMBERS = ("x1", "y1", "x2", "y2", "score", "h", "w", "l", "x", "y", "z", "rotation_y", "alpha")
+
+
+@dataclass(frozen=True, eq=False)
+class KittiDetections:
+    """Detections of a sequence, sorted by frame: frame (N,), type (N,) as KITTI names it, boxes (N), score (N,)."""
+
+    frame: IntArray
+    type: StrArray
+    boxes: CameraBoxes
+    score: FloatArray
+
+
+def read_kitti_detections(folder: str | Path, sequence: str, frames: int) -> KittiDetections:
+    """The detections of all classes of one sequence of so many frames.
+
+    Raises `InputError` if no class has a file for the sequence, and for lines that are not as above.
+    """
+    present = detection_files(Path(folder), sequence)
+    for name in CLASS_CODES.keys() - present.keys():
+        log.warning("%s: no detections of class %s in sequence %s", folder, name, sequence)
+    tables = [_read(path, name, frames) for name, path in present.items()]
+    frame = np.concatenate([table[0] for table in tables])
+    numbers = np.concatenate([table[1] for table in tables])
+    type_ = np.repeat(np.array(list(present)), [len(table[0]) for table in tables])
+    order = np.argsort(frame, kind="stable")
+    numbers = numbers[order]
+    boxes = CameraBoxes(numbers[:, 5:8], numbers[:, 8:11], numbers[:, 11])
+    return KittiDetections(frame[order], type_[order], boxes, numbers[:, 4])
+
+
+def detection_files(folder: Path, sequence: str) -> dict[str, Path]:
+    """The files of a sequence by class. Raises `InputError` if there is none."""
+    paths = {name: folder / name / f"{sequence}.txt" for name in CLASS_CODES}
+    present = {name: path for name, path in paths.items() if path.is_file()}
+    if not present:
+        raise InputError(f"{folder}: expected {' or '.join(f'{name}/{sequence}.txt' for name in CLASS_CODES)}")
+    return present
+
+
+def _read(path: Path, name: str, frames: int) -> tuple[IntArray, FloatArray]:
+    table: TextTable = read_table(path, (15,), "frame, type, x1, y1, x2, y2, score, h, w, l, x, y, z, ...", ",")
+    frame = table.integers(0, "frame", 0, frames - 1)
+    code = table.integers(1, "type", 0)
+    if (code != CLASS_CODES[name]).any():
+        row = int(np.argmax(code != CLASS_CODES[name]))
+        raise table.fault(row, f"type: expected {CLASS_CODES[name]} in a file of class {name}, got {code[row]}")
+    numbers = table.numbers(slice(2, None), _NUMBERS)
+    flat = (numbers[:, 5:8] <= 0).any(axis=1)
+    if flat.any():
+        row = int(np.argmax(flat))
+        raise table.fault(row, f"h w l: expected a positive size in m, got {numbers[row, 5:8].tolist()}")
+    return frame, numbers
+
+
+NEAREST = 0.1  # m ahead of the camera where edges are cut
+
+_FROM = np.array([0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3])
+_TO = np.array([1, 2, 3, 0, 5, 6, 7, 4, 4, 5, 6, 7])
+
+
+def image_boxes(boxes: CameraBoxes, projection: FloatArray, image_size: tuple[int, int]) -> FloatArray:
+    """2D boxes (N, 4): left, top, right, bottom in pixels; NaN for a box that does not show.
+
+    projection (3, 4) is P2; image_size is width, height in pixels.
+    """
+    corners = boxes.corners()
+    start, end = corners[:, _FROM], corners[:, _TO]  # (N, 12, 3)
+    depth_start, depth_end = start[..., 2], end[..., 2]
+    span = depth_end - depth_start
+    crossing = (NEAREST - depth_start) / np.where(span == 0, 1.0, span)
+    cut = start + crossing[..., None] * (end - start)
+    visible = (depth_start >= NEAREST) | (depth_end >= NEAREST)
+    start = np.where((depth_start < NEAREST)[..., None], cut, start)
+    end = np.where((depth_end < NEAREST)[..., None], cut, end)
+    points = np.concatenate([start, end], axis=1)  # (N, 24, 3)
+    ahead = np.concatenate([visible, visible], axis=1)[..., None]
+    image = points @ projection[:, :3].T + projection[:, 3]
+    pixels = image[..., :2] / np.where(ahead, image[..., 2:], 1.0)
+    low = np.where(ahead, pixels, np.inf).min(axis=1)
+    high = np.where(ahead, pixels, -np.inf).max(axis=1)
+    last = np.array(image_size) - 1.0
+    shows = ((high > 0) & (low < last)).all(axis=1)
+    result = np.concatenate([np.clip(low, 0, last), np.clip(high, 0, last)], axis=1)
+    result[~shows] = np.nan
+    return result
+
+
+def observation_angles(boxes: CameraBoxes) -> FloatArray:
+    """alpha (N,), rad, in [-pi, pi)."""
+    return wrap_angle(boxes.rotation_y - np.arctan2(boxes.location[:, 0], boxes.location[:, 2]))

@@ -9,10 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from data_tools.datasets.detection_files.tracks import merge_tables
-from data_tools.datasets.kitti.dataset import KittiTracking, local_kitti
-from data_tools.datasets.kitti.images import kitti_images
-from data_tools.datasets.kitti.scored_sequences import ScoredSequence, result_sequences, scored_sequences
-from data_tools.datasets.kitti.tracking_results import TRACK_TABLE, write_kitti_labels, write_kitti_results
+from data_tools.datasets.kitti.dataset import KittiTracking, kitti_images, local_kitti
+from data_tools.datasets.kitti.results import (
+    TRACK_TABLE,
+    ScoredSequence,
+    result_sequences,
+    scored_sequences,
+    write_kitti_labels,
+    write_kitti_results,
+)
 from data_tools.datasets.parts import OpenedPart, Parts, file_digest
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
@@ -27,12 +32,12 @@ from data_tools.datasets.source import (
     tracks_of,
 )
 from data_tools.files.atomic_files import write_zip
-from data_tools.files.remote_files import is_url
+from data_tools.files.input_files import is_url
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
-    from data_tools.datasets.kitti.velodyne import KittiScans
+    from data_tools.datasets.kitti.dataset import KittiScans
     from data_tools.evaluation import Evaluation
 
 
@@ -82,7 +87,7 @@ class KittiSource(DatasetSource):
         yield Parts(scenes, (KittiPart(self.restricted([name]), name) for name in scenes))
 
     def scans(self, scenes: Collection[str]) -> Mapping[str, KittiScans]:
-        from data_tools.datasets.kitti.velodyne import KittiScans
+        from data_tools.datasets.kitti.dataset import KittiScans
 
         if is_url(self.dataroot):
             return {}
@@ -131,7 +136,7 @@ class KittiSource(DatasetSource):
         hota: bool = False,
         innovations: Innovations | None = None,
     ) -> Evaluation:
-        from data_tools.datasets.kitti.evaluation import evaluate_kitti
+        from data_tools.datasets.kitti.results import evaluate_kitti
 
         scored = {name: each for name, each in results.items() if isinstance(each, ScoredSequence)}
         classes, exempt = names("--classes", self.classes), self.persons == "exempt"

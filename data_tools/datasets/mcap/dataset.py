@@ -18,12 +18,13 @@ from data_tools.datasets.mcap.messages import (
     OBJECT_TYPES,
     ODOMETRY_TYPES,
     TRANSFORM_TYPES,
+    TransformRecord,
+    TransformTree,
     recorded_messages,
 )
 from data_tools.datasets.mcap.objects import MessageObjects, MessageType, message_objects
 from data_tools.datasets.mcap.recording import LoggedMessage, Recording
-from data_tools.datasets.mcap.transforms import TransformRecord, TransformTree
-from data_tools.files.error_messages import error_context, unknown_name
+from data_tools.files.input_files import error_context, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Scene

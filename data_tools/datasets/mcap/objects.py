@@ -1,4 +1,6 @@
-"""Objects of a message, whatever its type: raw rows, checked field by field, and as detections.
+"""Objects of a message, whatever its type, as checked rows and back.
+
+Objects of a message, whatever its type: raw rows, checked field by field, and as detections.
 
 A type of message is a module with the functions of `MessageType`.
 """
@@ -13,7 +15,7 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, StrArray
-from saga_fg.numerics.geometry import checked_quaternions, quaternion_norms, quaternion_rotation, yaw_of
+from saga_fg.numerics.geometry import checked_quaternions, quaternion_norms, quaternion_rotation, yaw_of, yaw_quaternion
 from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED, Boxes
 from saga_fg.types.frame import Detections
 from saga_fg.types.track import Tracks
@@ -176,3 +178,31 @@ def xyz(vector: Any) -> tuple[float, float, float]:
 def wxyz(quaternion: Any) -> tuple[float, float, float, float]:
     """Components of a quaternion, the scalar first."""
     return (quaternion.w, quaternion.x, quaternion.y, quaternion.z)
+
+
+Fields = dict[str, Any]
+
+
+def header(stamp: int, frame: str) -> Fields:
+    """A std_msgs/Header; stamp in ns."""
+    seconds, nanoseconds = divmod(stamp, 10**9)
+    return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
+
+
+def vector(values: FloatArray) -> Fields:
+    """A vector or point (3,); unknown entries are 0."""
+    x, y, z = np.nan_to_num(values).tolist()
+    return {"x": x, "y": y, "z": z}
+
+
+def pose(position: FloatArray, yaw: float) -> Fields:
+    """A geometry_msgs/Pose; an unknown yaw is 0."""
+    w, x, y, z = yaw_quaternion(float(np.nan_to_num(yaw))).tolist()
+    return {"position": vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+
+
+def covariance(P: FloatArray) -> list[float]:
+    """36 entries of a 6 x 6 covariance with a horizontal part (2, 2) alone; unknown is 0."""
+    whole = np.zeros((6, 6))
+    whole[:2, :2] = np.nan_to_num(P)
+    return whole.ravel().tolist()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.mcap import ros_fields as ros
+from data_tools.datasets.mcap import objects as ros
 from data_tools.datasets.mcap.objects import NAN, NO_COVARIANCE, ObjectRows, frame_name, nanoseconds, wxyz, xyz
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import upper_triangle

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from data_tools.datasets.mcap import ros_fields as ros
+from data_tools.datasets.mcap import objects as ros
 from data_tools.datasets.mcap.objects import NO_COVARIANCE, ObjectRows, frame_name, nanoseconds, wxyz, xyz
 from saga_fg.types.track import Tracks
 

@@ -1,17 +1,15 @@
-from .classes import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES
-from .dataset import NuScenes
-from .result_files import ResultMeta
-from .scans import NuScenesScans, nuscenes_scans
-from .scene_writer import write_nuscenes
-from .scored_scenes import ScoredScene, read_scored_scenes
-from .splits import split_scenes
-from .tracking_results import (
+from .dataset import NuScenes, NuScenesScans, nuscenes_scans
+from .evaluation import ScoredScene, read_scored_scenes
+from .results import (
+    ResultMeta,
     TrackedBoxes,
     TrackingResults,
     merge_tracking_results,
     read_tracking_results,
     write_tracking_results,
 )
+from .tables import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES, split_scenes
+from .writer import write_nuscenes
 
 __all__ = [
     "CATEGORY_TO_TRACKING_CLASS",

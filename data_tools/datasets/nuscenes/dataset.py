@@ -1,22 +1,42 @@
-"""The nuScenes dataset: official tables and detection results in, `Scene`s out.
+"""The nuScenes dataset: tables, detections, scans, images and maps in; `Scene`s out.
+
+The nuScenes dataset: official tables and detection results in, `Scene`s out.
 
 World coordinates are the global frame of the recording's map (z up), the vehicle's frame is the tables' ego frame
 (origin below the rear axle, x ahead, y left). The frames carry detections in world coordinates, one frame a sample and
 sensor, at the sample's time.
+
+The LiDAR scans of nuScenes keyframes: samples/LIDAR_TOP/*.pcd.bin, named by `sample_data`.
+
+Many copies of the tables come without the files; a keyframe whose file is not there has no scan.
+
+The vector maps of nuScenes, where the map expansion lies below the dataroot: maps/expansion/LOCATION.json.
+
+    {"node": [{"token", "x", "y"}], "line": [{"token", "node_tokens"}],
+     "polygon": [{"token", "exterior_node_tokens", "holes": [{"node_tokens"}]}],
+     "drivable_area": [{"polygon_tokens"}], "ped_crossing" and "walkway": [{"polygon_token"}],
+     "road_divider" and "lane_divider": [{"line_token"}]}
+
+Format: https://github.com/nutonomy/nuscenes-devkit/blob/master/docs/schema_nuscenes.md and its map API.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
 
-from data_tools.datasets.nuscenes.annotations import read_annotations
-from data_tools.datasets.nuscenes.result_files import ResultFile, ResultMeta, read_result_file
-from data_tools.datasets.nuscenes.scenes import SceneRecord, read_scenes
-from data_tools.datasets.nuscenes.splits import split_scenes
-from data_tools.datasets.nuscenes.tables import table_folder
-from data_tools.files.error_messages import error_context, unknown_name
+import numpy as np
+
+from data_tools.datasets.nuscenes.results import ResultFile, ResultMeta, read_result_file
+from data_tools.datasets.nuscenes.scenes import LIDAR, SceneRecord, read_annotations, read_scenes, rigid_transform
+from data_tools.datasets.nuscenes.tables import read_table, split_scenes, table_folder
+from data_tools.datasets.source import AreaMap, Images, Kind
+from data_tools.files.input_files import error_context, read_bytes, unknown_name
+from data_tools.files.readers import parsed_json
+from data_tools.lidar import Scan, read_scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Annotations, Scene
@@ -113,3 +133,181 @@ class NuScenes:
                 raise InputError(
                     f"{self._paths[sensor]}: expected detections of scene {name}, the file lists none of its samples"
                 )
+
+
+@dataclass(frozen=True, eq=False)
+class NuScenesScans:
+    """The K scans of a scene, read one at a time.
+
+    timestamps   (K,) s; world_T_ego (K, 4, 4) poses of the vehicle at them
+    ego_T_lidar  (4, 4) place of the sensor on the vehicle
+    """
+
+    files: Sequence[Path]
+    timestamps: FloatArray
+    world_T_ego: FloatArray
+    ego_T_lidar: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, row: int) -> Scan:
+        return read_scan(self.files[row])
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self[row] for row in range(len(self)))
+
+
+def nuscenes_scans(dataset: NuScenes, dataroot: str | Path) -> dict[str, NuScenesScans]:
+    """The scans of the dataset's scenes, by name; scenes without any are left out.
+
+    Raises `InputError` for broken tables, and for names of files outside the dataroot.
+    """
+    lidars = {
+        token for token, channel in read_table(dataset.folder, "sensor", ("token", "channel")) if channel == LIDAR
+    }
+    wanted = {token for record in dataset.records.values() for token in record.tokens}
+    fields = ("sample_token", "calibrated_sensor_token", "is_key_frame", "filename")
+    mounted = {
+        token: (translation, rotation)
+        for token, sensor, translation, rotation in read_table(
+            dataset.folder, "calibrated_sensor", ("token", "sensor_token", "translation", "rotation")
+        )
+        if sensor in lidars
+    }
+    taken: dict[str, tuple[Path, str]] = {}
+    for sample, sensor, key, name in read_table(dataset.folder, "sample_data", fields):
+        if key and sensor in mounted and sample in wanted:
+            file = file_below(Path(dataroot), dataset.folder, sample, name)
+            if file.is_file():
+                taken[sample] = (file, sensor)
+    scans = {}
+    for scene, record in dataset.records.items():
+        rows = [k for k, token in enumerate(record.tokens) if token in taken]
+        if not rows:
+            continue
+        sensor = taken[record.tokens[rows[0]]][1]
+        with error_context(f"{dataset.folder / 'calibrated_sensor.json'}: record {sensor}"):
+            ego_T_lidar = rigid_transform(*mounted[sensor])
+        files = [taken[record.tokens[k]][0] for k in rows]
+        scans[scene] = NuScenesScans(files, record.timestamps[rows], record.world_T_ego[np.array(rows)], ego_T_lidar)
+    return scans
+
+
+def file_below(dataroot: Path, folder: Path, sample: str, name: object) -> Path:
+    """The file that `sample_data` in `folder` names. Raises `InputError` for one outside the dataroot."""
+    path = PurePosixPath(name) if isinstance(name, str) else PurePosixPath("..")
+    if path.is_absolute() or ".." in path.parts:
+        where = f"{folder / 'sample_data.json'}: sample {sample}: filename"
+        raise InputError(f"{where}: expected a file below the dataroot, got {name!r}")
+    return dataroot / path
+
+
+FRONT_FIRST = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT")
+
+
+def nuscenes_images(dataroot: Path, folder: Path, scenes: Mapping[str, Scene]) -> dict[str, Images]:
+    """Return the images of each scene by camera, one or None for each moment; scenes without any are left out.
+
+    Raises `InputError` for broken tables, and for names of files outside the dataroot.
+    """
+    if not any((dataroot / "samples" / camera).is_dir() for camera in FRONT_FIRST):
+        return {}
+    channels = dict(read_table(folder, "sensor", ("token", "channel")))
+    cameras = {
+        token: channels[sensor]
+        for token, sensor in read_table(folder, "calibrated_sensor", ("token", "sensor_token"))
+        if channels.get(sensor) in FRONT_FIRST
+    }
+    wanted = {token: (name, k) for name, scene in scenes.items() for k, token in enumerate(scene.tokens)}
+    found: dict[str, dict[str, list[Path | None]]] = {}
+    fields = ("sample_token", "calibrated_sensor_token", "is_key_frame", "filename")
+    for sample, mounted, key, name in read_table(folder, "sample_data", fields):
+        if key and mounted in cameras and sample in wanted:
+            file = file_below(dataroot, folder, sample, name)
+            if file.is_file():
+                scene, k = wanted[sample]
+                of_scene = found.setdefault(scene, {})
+                of_scene.setdefault(cameras[mounted], [None] * len(scenes[scene]))[k] = file
+    return {name: {camera: each[camera] for camera in FRONT_FIRST if camera in each} for name, each in found.items()}
+
+
+AREAS: tuple[tuple[str, Kind], ...] = (
+    ("drivable_area", "drivable"),
+    ("walkway", "walkway"),
+    ("ped_crossing", "crossing"),
+)
+LINES = ("road_divider", "lane_divider")
+LOCATIONS = ("boston-seaport", "singapore-hollandvillage", "singapore-onenorth", "singapore-queenstown")
+
+
+def nuscenes_maps(dataroot: Path, folder: Path, scenes: Mapping[str, Scene]) -> dict[str, AreaMap]:
+    """Return the maps of scenes whose place has a file; the tables are in `folder`.
+
+    Raises `InputError` for broken tables and maps.
+    """
+    if not any((dataroot / "maps" / "expansion" / f"{place}.json").is_file() for place in LOCATIONS):
+        return {}
+    places = dict(read_table(folder, "log", ("token", "location")))
+    scene_places = {name: places.get(log) for name, log in read_table(folder, "scene", ("name", "log_token"))}
+    opened: dict[Path, _Layers] = {}
+    found = {}
+    for name, scene in scenes.items():
+        place = scene_places.get(name)
+        path = dataroot / "maps" / "expansion" / f"{place}.json"
+        if place in LOCATIONS and path.is_file():
+            if path not in opened:
+                opened = {path: _Layers(path)}  # one at a time: a map has tens of megabytes
+            found[name] = AreaMap.around(scene, opened[path].areas(), opened[path].lines())
+    return found
+
+
+class _Layers:
+    """The layers of a file. Raises `InputError` where it is broken."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._raw = path, parsed_json(read_bytes(path), str(path))
+        self._nodes = {row["token"]: (row["x"], row["y"]) for row in self._rows("node", ("token", "x", "y"))}
+        self._lines = {row["token"]: row["node_tokens"] for row in self._rows("line", ("token", "node_tokens"))}
+        self._polygons = {
+            row["token"]: row for row in self._rows("polygon", ("token", "exterior_node_tokens", "holes"))
+        }
+
+    def areas(self) -> Iterator[tuple[Kind, Sequence[FloatArray]]]:
+        for layer, kind in AREAS:
+            for row in self._rows(layer, ()):
+                for token in row.get("polygon_tokens", [row.get("polygon_token")]):
+                    polygon = self._known(self._polygons, layer, token)
+                    holes = [self._points(layer, hole["node_tokens"]) for hole in polygon["holes"]]
+                    yield kind, [self._points(layer, polygon["exterior_node_tokens"]), *holes]
+
+    def lines(self) -> Iterator[FloatArray]:
+        for layer in LINES:
+            for row in self._rows(layer, ("line_token",)):
+                yield self._points(layer, self._known(self._lines, layer, row["line_token"]))
+
+    def _rows(self, layer: str, fields: tuple[str, ...]) -> list[dict[str, Any]]:
+        rows = self._raw.get(layer) if isinstance(self._raw, dict) else None
+        if not isinstance(rows, list):
+            raise InputError(f"{self._path}: expected a map with the layer {layer}")
+        for number, row in enumerate(rows):
+            missing = None if isinstance(row, dict) else "an object"
+            missing = missing or next((field for field in fields if field not in row), None)
+            if missing:
+                raise InputError(f"{self._path}: {layer}: record {number}: expected {missing}")
+        return rows
+
+    def _known(self, table: Mapping[str, Any], layer: str, token: Any) -> Any:
+        if not isinstance(token, str) or token not in table:
+            raise InputError(f"{self._path}: {layer}: unknown token {token!r}")
+        return table[token]
+
+    def _points(self, layer: str, tokens: Sequence[str]) -> FloatArray:
+        points = [self._known(self._nodes, layer, token) for token in tokens]
+        try:
+            array = np.array(points, dtype=np.float64).reshape(-1, 2)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{self._path}: node: expected numbers: {error}") from error
+        if not np.isfinite(array).all():
+            raise InputError(f"{self._path}: node: expected finite numbers")
+        return array

@@ -9,19 +9,15 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from data_tools.datasets.area_map import AreaMap
-from data_tools.datasets.nuscenes.dataset import NuScenes
-from data_tools.datasets.nuscenes.images import nuscenes_images
-from data_tools.datasets.nuscenes.labels import merge_label_parts, write_label_part, write_nuscenes_labels
-from data_tools.datasets.nuscenes.map_expansion import nuscenes_maps
-from data_tools.datasets.nuscenes.result_files import ResultMeta
-from data_tools.datasets.nuscenes.scans import NuScenesScans, nuscenes_scans
-from data_tools.datasets.nuscenes.splits import split_scenes
-from data_tools.datasets.nuscenes.tracking_results import merge_tracking_results, write_tracking_results
+from data_tools.datasets.nuscenes.dataset import NuScenes, NuScenesScans, nuscenes_images, nuscenes_maps, nuscenes_scans
+from data_tools.datasets.nuscenes.results import ResultMeta, merge_tracking_results, write_tracking_results
+from data_tools.datasets.nuscenes.tables import split_scenes
+from data_tools.datasets.nuscenes.writer import merge_label_parts, write_label_part, write_nuscenes_labels
 from data_tools.datasets.parts import HeldScene, OpenedPart, Parts, scene_digests
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
     TRACKING,
+    AreaMap,
     DatasetSource,
     Images,
     Innovations,
@@ -32,7 +28,7 @@ from data_tools.datasets.source import (
     tracks_of,
 )
 from data_tools.files.atomic_files import write_zip
-from data_tools.files.remote_files import is_url, local_copy, local_tree
+from data_tools.files.input_files import is_url, local_copy, local_tree
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 
@@ -126,7 +122,7 @@ class NuScenesSource(DatasetSource):
         merge_label_parts(output, dataset.dataroot, dataset.version, objects)
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
-        from data_tools.datasets.nuscenes.scored_scenes import read_scored_scenes
+        from data_tools.datasets.nuscenes.evaluation import read_scored_scenes
 
         with self._local() as (root, files):
             return read_scored_scenes(result, root, self.version, self._chosen(root), files)
@@ -137,8 +133,7 @@ class NuScenesSource(DatasetSource):
         hota: bool = False,
         innovations: Innovations | None = None,
     ) -> Evaluation:
-        from data_tools.datasets.nuscenes.evaluation import evaluate_nuscenes
-        from data_tools.datasets.nuscenes.scored_scenes import ScoredScene
+        from data_tools.datasets.nuscenes.evaluation import ScoredScene, evaluate_nuscenes
 
         scored = {name: each for name, each in results.items() if isinstance(each, ScoredScene)}
         return evaluate_nuscenes(scored, hota, innovations)

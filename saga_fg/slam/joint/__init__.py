@@ -1,12 +1,11 @@
 """Joint estimation of the vehicle's path and the objects around it."""
 
+from saga_fg.slam.joint.association import Observations
 from saga_fg.slam.joint.batch import estimate_jointly
-from saga_fg.slam.joint.estimate import JointEstimate, ObjectStates
-from saga_fg.slam.joint.landmarks import Observations
+from saga_fg.slam.joint.graph import JointEstimate, ObjectStates
 from saga_fg.slam.joint.lanes import lane_key
-from saga_fg.slam.joint.odometry import OdometryIncrements, OdometryNoise
 from saga_fg.slam.joint.online import OnlineEstimate, OnlineEstimator, OnlineStep, estimate_online
-from saga_fg.slam.joint.settings import JointSettings
+from saga_fg.slam.joint.record import JointSettings, OdometryIncrements, OdometryNoise
 
 __all__ = [
     "JointEstimate",

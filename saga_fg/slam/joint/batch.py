@@ -17,16 +17,17 @@ from factors import SolverSettings
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.joint.estimate import JointEstimate, read_estimate
-from saga_fg.slam.joint.graph import Record, detections, stationary_factors
-from saga_fg.slam.joint.identity import with_all_identities
-from saga_fg.slam.joint.landmarks import Observations, nearest_landmarks
+from saga_fg.slam.joint.association import (
+    Observations,
+    SlowErrors,
+    nearest_landmarks,
+    stationary_probabilities,
+    with_all_identities,
+)
+from saga_fg.slam.joint.graph import JointEstimate, Record, detections, read_estimate, stationary_factors
 from saga_fg.slam.joint.lanes import LaneAssociation
-from saga_fg.slam.joint.odometry import OdometryIncrements
 from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects, detections_name
-from saga_fg.slam.joint.record import record_epochs
-from saga_fg.slam.joint.settings import MAX_ITERATIONS, JointSettings
-from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
+from saga_fg.slam.joint.record import MAX_ITERATIONS, JointSettings, OdometryIncrements, record_epochs
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 

@@ -1,21 +1,36 @@
-"""Factors of a record: poses of the vehicle, errors of its odometry, and states of objects, over time.
+"""Factors of a record of the vehicle and objects around it, and the estimate read from their solution.
+
+Factors of a record: poses of the vehicle, errors of its odometry, and states of objects, over time.
 
     prior        first pose; first errors; velocity of a new object
-    odometry     poses and errors of two epochs            (`factors.odometry`)
-    interaction  an object's next state and the states of all that act on it (`saga_fg.slam.joint.motion`)
+    odometry     poses and errors of two epochs            (`factors.between`)
+    interaction  an object's next state and the states of all that act on it
     detection    a pose and an object's state              (`factors.relative`), robust
     stationary   p' - p ~ N(0, stationary_drift^2 dt),  v' ~ N(0, stationary_speed^2)     with probability P
 
-The last two are the hybrid part of the model. With the probability P (`saga_fg.slam.joint.stationarity`) an object is
+The last two are the hybrid part of the model. With the probability P (`saga_fg.slam.joint.association`) an object is
 stationary and a landmark, else it moves as its class does and the factor is silent: a mixture (`factors.Mixture`). With
-the probability p (`saga_fg.slam.joint.identity`) a detection is of the object that it is assigned to: it counts for a
-share p of its information. A variable is a `gtsam.Pose3` for the vehicle and a vector for everything else.
+the probability p (`saga_fg.slam.joint.association`) a detection is of the object that it is assigned to: it counts for
+a share p of its information. A variable is a `gtsam.Pose3` for the vehicle and a vector for everything else.
+
+Motion of objects over an interval, with noise that traffic has in common.
+
+A tracker's motion model says how one object moves, x' = F x + b + q, q ~ N(0, Q), and takes the noise of different
+objects for independent. Beside a vehicle whose path is unknown that is wrong: traffic brakes, and follows a bend, as
+one. Twenty cars that do so by chance are less likely than an error of the vehicle's odometry, and would bend its path.
+So vehicles that head the same way, a stream, share a part of their noise,
+
+    x_i' = sum_j F_ij x_j + b_i + sqrt(rho) Q_i^(1/2) c + q_i,     c ~ N(0, I),   q_i ~ N(0, (1 - rho) Q_i)
+
+with one variable c a stream and interval, and the symmetric root, so that c has the same directions for all. Each
+object alone moves exactly as in the tracker; only what all do at once is no news of the path.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import gtsam
@@ -27,18 +42,24 @@ from factors import (
     Mixture,
     ResidualFactors,
     Robust,
+    Solution,
     gaussian_factors,
+    interaction_factor,
     odometry_factors,
     prior_factor,
     relative_detection_factors,
 )
-from saga_fg.graph import EGO_ERROR, OBJECT, key_of
+from saga_fg.errors import InputError
+from saga_fg.estimators.graph_window import GraphSolution
+from saga_fg.graph import EGO_ERROR, OBJECT, NewVariable, VariableKind, key_of
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.motion import NodeType
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.joint.record import RecordedEpoch, RecordedObjects, motion_covariances
-from saga_fg.slam.joint.settings import JointSettings
-from saga_fg.slam.mapping import pose_key
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import Assignment
+from saga_fg.slam.joint.association import SlowErrors
+from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, RecordedObjects, motion_covariances
+from saga_fg.slam.mapping import LandmarkObservations, pose_key
+from saga_fg.types.landmark import Landmark
 
 _START_NOISE = 1e-3  # standard deviation of the first pose, m and rad
 _LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
@@ -177,3 +198,158 @@ def by_type(types: Sequence[NodeType]) -> list[tuple[NodeType, np.ndarray[tuple[
     for row, node_type in enumerate(types):
         rows.setdefault(node_type, []).append(row)
     return [(node_type, np.array(mine, dtype=np.int64)) for node_type, mine in rows.items()]
+
+
+STREAM = VariableKind("traffic stream", "s")
+_SHARE = 0.9  # rho
+_SECTORS = 4  # of headings beside the vehicle's: the same way, to the left, towards it, to the right
+
+
+def new_streams(now: RecordedEpoch) -> list[NewVariable]:
+    """The variables c of the interval that ends at an epoch."""
+    return [NewVariable(STREAM, number, np.zeros(number // _SECTORS), label="stream") for number in _streams(now)]
+
+
+def stream_keys(now: RecordedEpoch) -> list[int]:
+    """Their keys."""
+    return [key_of(STREAM, number, now.epoch) for number in _streams(now)]
+
+
+def motion_factors(now: RecordedEpoch) -> list[gtsam.JacobianFactor]:
+    """Motion and interactions from the epoch before, and the priors of c.
+
+    Raises `InputError` for motions and interactions that are not linear.
+    """
+    transition, k = now.transition, now.epoch
+    if transition is None:
+        return []
+    if transition.graph.nonlinear or any(node_type.flow is not None for node_type in transition.graph.types):
+        raise InputError("motion: expected linear motion and interactions of objects beside a vehicle's path")
+    streams = _streams(now)
+    dims = [number // _SECTORS for number in streams]
+    factors = [prior_factor(key, np.zeros(d), np.eye(d)) for key, d in zip(stream_keys(now), dims, strict=True)]
+    members = {name: number for number, names in streams.items() for name in names}
+    names = transition.nodes.tolist()
+    sources: list[list[tuple[int, FloatArray]]] = [[] for _ in names]
+    for blocks in transition.F:
+        for i, j, F in zip(blocks.target.tolist(), blocks.source.tolist(), blocks.values, strict=True):
+            sources[i].append((object_key(k - 1, names[j]), F))
+    for blocks in transition.Q:
+        roots = _roots(blocks.values)
+        for i, Q, root in zip(blocks.target.tolist(), blocks.values, roots, strict=True):
+            keys, F, number = [key for key, _ in sources[i]], [one for _, one in sources[i]], members.get(names[i])
+            if number is not None:
+                keys, F, Q = [*keys, key_of(STREAM, number, k)], [*F, np.sqrt(_SHARE) * root], (1 - _SHARE) * Q
+            b = transition.b[transition.offsets[i] : transition.offsets[i + 1]]
+            factors.append(interaction_factor(object_key(k, names[i]), keys, F, b, Q))
+    return factors
+
+
+def _streams(now: RecordedEpoch) -> dict[int, list[int]]:
+    """Objects of each stream of two and more, by its number: size of a state times the sectors, plus the sector."""
+    found: dict[int, list[int]] = {}
+    if now.transition is not None:
+        for name, d in zip(now.transition.nodes.tolist(), now.transition.graph.dims.tolist(), strict=True):
+            heading = now.headings.get(name)
+            if heading is not None:
+                sector = round(heading / (2 * np.pi / _SECTORS)) % _SECTORS
+                found.setdefault(d * _SECTORS + sector, []).append(name)
+    return {number: names for number, names in found.items() if len(names) > 1}
+
+
+def _roots(Q: FloatArray) -> FloatArray:
+    """Symmetric square roots of covariances (n, d, d)."""
+    values, vectors = np.linalg.eigh(Q)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ vectors.swapaxes(1, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectStates:
+    """Objects of an epoch: id (n,), n classes, position (n, 2), m, and velocity (n, 2), m/s, in the world.
+
+    stationary  (n,) probability of being at rest
+    """
+
+    id: IntArray
+    label: tuple[str, ...]
+    position: FloatArray
+    velocity: FloatArray
+    stationary: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class JointEstimate:
+    """Estimate at n epochs.
+
+    timestamps    (n,) s
+    world_T_ego   (n, 4, 4)
+    errors        (n, 3) of the odometry: scale, bias of the yaw rate (rad/s), course (rad)
+    objects       n tables
+    converged     whether the last step was short enough
+    solution      of the graph, with the keys of this module
+    observations  of landmarks, associated along the path
+    """
+
+    timestamps: FloatArray
+    world_T_ego: FloatArray
+    errors: FloatArray
+    objects: tuple[ObjectStates, ...]
+    converged: bool
+    solution: Solution | GraphSolution
+    _record: Record
+    observations: LandmarkObservations | None = None
+
+    @cached_property
+    def pose_covariances(self) -> FloatArray:
+        """(n, 6, 6) of each pose, in its own frame: rotation vector (rad), translation (m)."""
+        return np.stack([self.solution.marginal(pose_key(now.epoch)) for now in self._record])
+
+    def object_covariances(self, row: int) -> FloatArray:
+        """(n, 4, 4) of position and velocity of the objects of a row of the estimate."""
+        now = self._record[row]
+        result = np.empty((len(now.objects.id), 4, 4))
+        for k, (name, node_type) in enumerate(zip(now.objects.id.tolist(), now.objects.types, strict=True)):
+            at = node_type.index(POSITION + VELOCITY)
+            result[k] = self.solution.marginal(object_key(now.epoch, name))[at[:, None], at]
+        return result
+
+    def assignment(self, row: int) -> Assignment:
+        """Objects and their detections at a row of the estimate."""
+        seen = self._record[row].seen
+        return Assignment(seen.id, seen.row)
+
+    @cached_property
+    def landmarks(self) -> list[Landmark]:
+        """Landmarks that were associated along the path."""
+        return [] if self.observations is None else self.observations.landmarks(self.solution)
+
+    @cached_property
+    def slow_errors(self) -> SlowErrors:
+        """Deviations of the odometry's slow errors: mean over the first, the middle and the last epoch."""
+        n = len(self._record)
+        P = np.stack([self.solution.marginal(error_key(self._record[row].epoch)) for row in (0, n // 2, n - 1)])
+        return SlowErrors(*np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)).tolist())
+
+
+def read_estimate(
+    record: Record, solution: Solution | GraphSolution, stationary: Sequence[FloatArray]
+) -> JointEstimate:
+    """The estimate at the epochs of a record; stationary: probabilities (n,) of the objects of each."""
+    values = solution.values
+    return JointEstimate(
+        timestamps=np.array([now.time for now in record]),
+        world_T_ego=np.stack([values.atPose3(pose_key(now.epoch)).matrix() for now in record]),
+        errors=np.stack([values.atVector(error_key(now.epoch)) for now in record]),
+        objects=tuple(_objects(now, values, p) for now, p in zip(record, stationary, strict=True)),
+        converged=solution.converged,
+        solution=solution,
+        _record=record,
+    )
+
+
+def _objects(now: RecordedEpoch, values: gtsam.Values, stationary: FloatArray) -> ObjectStates:
+    objects = now.objects
+    state = np.zeros((len(objects.id), 4))
+    for row, (name, node_type) in enumerate(zip(objects.id.tolist(), objects.types, strict=True)):
+        state[row] = values.atVector(object_key(now.epoch, name))[node_type.index(POSITION + VELOCITY)]
+    return ObjectStates(objects.id, objects.label, state[:, :2], state[:, 2:], stationary)

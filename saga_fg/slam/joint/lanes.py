@@ -9,7 +9,7 @@ stays off the centre for a while: with an offset that is correlated over `memory
 information of a single independent one. P is the probability of driving along the lane, known from the estimate so far:
 of all lanes in its direction, with the offset e_j from each and its variance S = spread^2 + deviation^2 + n^T P_p n
 (P_p: of the pose of the observing vehicle), the speed v across the lane, and P(stationary) as in
-`saga_fg.slam.joint.stationarity`,
+`saga_fg.slam.joint.association`,
 
     P(j) = q_j / (sum_i q_i + elsewhere / width),      q_j = N(e_j; 0, S)
     P    = (1 - P(stationary)) P(j) exp( -v^2 / (2 (drift^2 + sigma_v^2)) ),   sigma_v = speed * deviation of heading
@@ -32,16 +32,14 @@ import gtsam
 import numpy as np
 
 from factors import Linearisable, Robust, lane_keeping_factors, prior_factor
-from factors.rotations import cross_matrix
+from factors.manifolds import cross_matrix
 from saga_fg.graph import MAP_NODE, Additions, GraphView, NewVariable, key_of
 from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.model.interactions import POSITION
 from saga_fg.model.motion import NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
-from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.numerics.polyline import feet, on_it
-from saga_fg.slam.joint.estimate import JointEstimate, ObjectStates
-from saga_fg.slam.joint.graph import Record, by_type, object_key
+from saga_fg.numerics.geometry import feet, on_it, yaw_transform
+from saga_fg.slam.joint.graph import JointEstimate, ObjectStates, Record, by_type, object_key
 from saga_fg.types.road_map import RoadMap
 
 _LIKELY = 0.9  # a vehicle that drives along a lane with less than this probability gets no factor

@@ -4,8 +4,8 @@ Each frame adds an epoch to the window. The stationarity of objects follows from
 from the objects after it, landmarks are associated by
 the joint Gaussian of the new pose and the landmarks (`saga_fg.slam.mapping.associate`), vehicles are assigned to lanes
 by the present pose (`saga_fg.slam.joint.lanes`), and iSAM2 solves the window with the new factors. Epochs older than
-`lag` leave, and landmarks last observed from them (`saga_fg.slam.joint.window`). With a lag longer than the recording
-this is the batch estimate, but for associations made online.
+`lag` leave, and landmarks last observed from them (`saga_fg.slam.joint.providers`). With a lag longer than the
+recording this is the batch estimate, but for associations made online.
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.estimators.graph_solution import GraphSolution
+from saga_fg.estimators.graph_window import GraphSolution
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform
+from saga_fg.slam.joint.association import (
+    Observations,
+    SlowErrors,
+    WindowLandmarks,
+    stationary_probabilities,
+    with_identities,
+)
 from saga_fg.slam.joint.batch import checked_landmarks
-from saga_fg.slam.joint.estimate import JointEstimate, read_estimate
-from saga_fg.slam.joint.identity import with_identities
-from saga_fg.slam.joint.landmarks import Observations, WindowLandmarks
+from saga_fg.slam.joint.graph import JointEstimate, read_estimate
 from saga_fg.slam.joint.lanes import LaneAssociation
-from saga_fg.slam.joint.odometry import OdometryIncrements
-from saga_fg.slam.joint.record import EpochRecorder, RecordedEpoch
-from saga_fg.slam.joint.settings import JointSettings
-from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
-from saga_fg.slam.joint.window import Window
+from saga_fg.slam.joint.providers import Window
+from saga_fg.slam.joint.record import EpochRecorder, JointSettings, OdometryIncrements, RecordedEpoch
 from saga_fg.slam.mapping import LandmarkSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame

@@ -1,9 +1,15 @@
-from .association import LandmarkSettings, associate, log_odds
+from .association import LandmarkSettings, NearbyLandmarks, associate, duplicates, log_odds, place_of
 from .local_map import Innovation, LocalMap
-from .mapper import AssociatedObservation, LandmarkMap, LandmarkMapper, MapperSettings
-from .merging import duplicates
-from .nearby import NearbyLandmarks, place_of
-from .providers import LandmarkObservations, MeasuredMotion, landmark_key, pose_key
+from .mapper import (
+    AssociatedObservation,
+    LandmarkMap,
+    LandmarkMapper,
+    LandmarkObservations,
+    MapperSettings,
+    MeasuredMotion,
+    landmark_key,
+    pose_key,
+)
 
 __all__ = [
     "AssociatedObservation",

@@ -1,16 +1,16 @@
 """Pose graphs: the type, a start that needs no guess, their optimisation and its proof."""
 
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
-from saga_fg.slam.pose_graph.chordal import chordal_poses, nearest_rotations
-from saga_fg.slam.pose_graph.chordal_cost import ChordalCost
+from saga_fg.slam.pose_graph.chordal import ChordalCost, chordal_poses, nearest_rotations
 from saga_fg.slam.pose_graph.consensus import Consensus, consensus
-from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
-from saga_fg.slam.pose_graph.landmarks import (
+from saga_fg.slam.pose_graph.graph import (
     LandmarkObservations,
     ObservationKind,
     PointLandmarks,
+    PoseGraph,
     PosePriors,
     PositionPriors,
+    trusted,
 )
 from saga_fg.slam.pose_graph.optimisation import (
     OptimisedPoses,

@@ -1,4 +1,6 @@
-"""A pose graph in the plane that grows pose by pose, its estimate by iSAM2; loops are under a robust loss.
+"""A pose graph that grows pose by pose, with loops that must agree with the way between their ends.
+
+A pose graph in the plane that grows pose by pose, its estimate by iSAM2; loops are under a robust loss.
 
 The loss bounds what a false loop can do while the graph runs. `settled` decides which loops are false, by consensus of
 all of them.
@@ -14,9 +16,24 @@ import numpy as np
 from factors import Robust, between_factor, pose_prior_factor
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.pose_graph.consensus import Consensus, consensus
-from saga_fg.slam.pose_graph.distances import shortest_paths
 from saga_fg.slam.pose_graph.graph import PoseGraph
 from saga_fg.slam.pose_graph.optimisation import HELD
+
+_SHORTEST = 1e-6  # m: a sparse matrix takes 0 for no measurement
+
+
+def shortest_paths(first: IntArray, second: IntArray, length: FloatArray, poses: int, row: int) -> FloatArray:
+    """Lengths (poses,) of shortest paths from a pose along measurements (M,) of these lengths; infinite without one."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra
+
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    order = np.lexsort((length, high, low))  # the shortest of several between the same two
+    _, once = np.unique(low[order] * poses + high[order], return_index=True)
+    kept = order[once]
+    joined = csr_array((np.maximum(length[kept], _SHORTEST), (low[kept], high[kept])), shape=(poses, poses))
+    return np.asarray(dijkstra(joined, directed=False, indices=row))
+
 
 _LOSS = Robust("cauchy", 3.0)
 _RADIAN = 1.0  # m of way that a radian of turning counts as

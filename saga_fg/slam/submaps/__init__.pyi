@@ -1,8 +1,6 @@
-from .graph import SubmapGraph
-from .loop_selection import LoopSelection, select_loops
-from .loops import LoopClosure, Loops, loop_factors
-from .settings import SubmapSettings
-from .whole_drive import SolvedDrive, measurement_graph, solve_drive
+from .condensing import SolvedDrive, measurement_graph, solve_drive
+from .graph import SubmapGraph, SubmapSettings
+from .loops import LoopClosure, Loops, LoopSelection, loop_factors, select_loops
 
 __all__ = [
     "LoopClosure",

@@ -28,7 +28,7 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import assign, gate
 from saga_fg.numerics.geometry import carried_covariance, inverse_transform
 from saga_fg.slam.mapping.association import log_odds
-from saga_fg.slam.mapping.jacobians import whitened_jacobians
+from saga_fg.slam.mapping.local_map import whitened_jacobians
 from saga_fg.types.landmark import LandmarkType, Observation
 
 _GAP = 3.0  # m

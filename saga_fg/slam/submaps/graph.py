@@ -1,4 +1,6 @@
-"""Incremental SLAM in submaps: one running graph of bounded size.
+"""Incremental SLAM in submaps: one running graph of bounded size, and the record to solve it whole.
+
+Incremental SLAM in submaps: one running graph of bounded size.
 
     keyframes and landmarks of the running submap      as they come, in iSAM2
     closed submaps                                     one factor each, between its anchor and the next
@@ -20,28 +22,112 @@ together, nothing condensed, from the running estimate.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
 
-from factors import pose, pose_prior_factor
+from factors import Robust, pose, pose_prior_factor
 from saga_fg.errors import InputError
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import EGO_POSE, Additions, FactorProvider, NewVariable, SceneFactorGraph
+from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView, NewVariable, SceneFactorGraph
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, landmark_key, pose_key
 from saga_fg.slam.submaps.association import SubmapLandmarks
-from saga_fg.slam.submaps.condensing import CondensedSubmap
-from saga_fg.slam.submaps.loop_selection import LoopSelection, Motion, select_loops
-from saga_fg.slam.submaps.loops import LoopClosure, Loops, loop_factors
-from saga_fg.slam.submaps.recording import Given, recorded
-from saga_fg.slam.submaps.settings import GATE, SubmapSettings
-from saga_fg.slam.submaps.whole_drive import SolvedDrive, measurement_graph, solve_drive
+from saga_fg.slam.submaps.condensing import CondensedSubmap, SolvedDrive, measurement_graph, solve_drive
+from saga_fg.slam.submaps.loops import LoopClosure, Loops, LoopSelection, Motion, loop_factors, select_loops
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Provider of what is known already."""
+
+    added: Additions
+    name: str
+
+    def factors(self, view: GraphView) -> Additions:
+        return self.added
+
+
+@dataclass(eq=False)
+class Recorded:
+    """A provider whose additions are kept, by epoch."""
+
+    provider: FactorProvider
+    additions: dict[int, list[Additions]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return str(getattr(self.provider, "name", type(self.provider).__name__))
+
+    def factors(self, view: GraphView) -> Additions:
+        return self._kept(view, self.provider.factors(view))
+
+    def again(self, epoch: int) -> list[FactorProvider]:
+        """Providers of what this one gave at an epoch."""
+        return [Given(one, self.name) for one in self.additions.get(epoch, ())]
+
+    def _kept(self, view: GraphView, added: Additions) -> Additions:
+        if isinstance(added, Additions) and (added.variables or len(_list(added.factors)) or added.named):
+            self.additions.setdefault(view.epoch, []).append(added)
+        return added
+
+
+@dataclass(eq=False)
+class RecordedPredictor(Recorded):
+    """One with a `predict`."""
+
+    def predict(self, view: GraphView) -> Additions:
+        predict: Any = self.provider
+        return self._kept(view, predict.predict(view))
+
+
+def recorded(providers: Iterable[FactorProvider]) -> list[Recorded]:
+    """Wrap providers."""
+    return [
+        (RecordedPredictor if callable(getattr(provider, "predict", None)) else Recorded)(provider)
+        for provider in providers
+    ]
+
+
+def _list(factors: Any) -> Sequence[Any]:
+    return factors if isinstance(factors, Sequence) else [factors]
+
+
+GATE = 0.999  # gate probability of association
+
+
+@dataclass(frozen=True)
+class SubmapSettings(Settings):
+    """Size of submaps, association and confirmation of landmarks."""
+
+    length: Positive = setting(30.0, "way after which the next submap begins, m; usual 20 to 50; higher: slower")
+    confirm_after: Annotated[int, Range(1, 10**9)] = setting(4, "observations that confirm a landmark")
+    relinearise_above: Positive = setting(
+        0.5, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
+    )
+    robust_scale: Positive = setting(
+        3.0,
+        "residual from which losses discount poles and curbs (Geman-McClure) and loops (Cauchy, which pulls from far), "
+        "standard deviations",
+    )
+
+    @property
+    def robust(self) -> Robust:
+        """The loss of landmarks."""
+        return Robust("geman-mcclure", self.robust_scale)
+
+    @property
+    def robust_loops(self) -> Robust:
+        """The loss of loops."""
+        return Robust("cauchy", self.robust_scale)
+
 
 _AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
 MAX_KEYFRAMES = 80  # keyframes after which the next submap begins, on a shorter way

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.recordings.traffic import SHARED_MOMENTS, RecordedTraffic, overlapping
-from data_tools.simulator.trajectories import SimulatedTrajectories
+from data_tools.simulator.road_users import SimulatedTrajectories
 from saga_fg.numerics.arrays import FloatArray
 
 

@@ -11,7 +11,7 @@ from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
 from benchmarks.recordings.sensed import sensed_scene, true_scene
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings
-from saga_fg.numerics.polyline import feet, on_it
+from saga_fg.numerics.geometry import feet, on_it
 
 
 @pytest.fixture(scope="module")

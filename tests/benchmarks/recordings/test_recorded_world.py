@@ -17,8 +17,8 @@ from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from pipelines.config import load_config
 from pipelines.tracking import track_scene
 from saga_fg.errors import InputError
-from saga_fg.model.road.lane_keeping import InLane
-from saga_fg.model.road.stopping import RedLight
+from saga_fg.model.lanes import InLane
+from saga_fg.model.stop_lines import RedLight
 from saga_fg.types.dataset import Scene
 from tests.benchmarks.recordings.ngsim_example import crossing, rows, write_ngsim
 

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.datasets.argoverse2 import ArgoverseLogs
-from data_tools.datasets.argoverse2.detections import DetectedLogs
-from data_tools.datasets.argoverse2.results import (
+from data_tools.datasets.argoverse2.logs import DetectedLogs
+from data_tools.datasets.argoverse2.source import (
     SCORED,
     read_feather_tracks,
     write_feather_tracks,

@@ -10,7 +10,7 @@ import pytest
 
 from data_tools.datasets.label_table import LABEL_COLUMNS, read_label_table, write_label_table
 from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
-from data_tools.datasets.nuscenes.labels import write_nuscenes_labels
+from data_tools.datasets.nuscenes.writer import write_nuscenes_labels
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from saga_fg.errors import InputError
 from saga_fg.smoothing import Labels

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
-from data_tools.datasets.nuscenes.scene_writer import BLACK_PIXEL
+from data_tools.datasets.nuscenes.writer import BLACK_PIXEL
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, lidar
 from data_tools.simulator.settings import TrafficSettings
 from saga_fg.errors import InputError

@@ -19,9 +19,7 @@ from data_tools.datasets.detection_files import (
     read_scenes_in_parts,
     read_tracks,
 )
-from data_tools.datasets.detection_files.column_names import ALIASES, canonical, meaning
-from data_tools.datasets.detection_files.table_import import pairs
-from data_tools.datasets.detection_files.units import FACTORS, Clock
+from data_tools.datasets.detection_files.column_names import ALIASES, FACTORS, Clock, canonical, meaning, pairs
 from saga_fg.errors import InputError
 
 T0 = 1_700_000_000

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.detection_files import TableImport, read_detections
-from data_tools.files.arrow_tables import all_of, read_arrow_columns
+from data_tools.files.readers import all_of, read_arrow_columns
 from saga_fg.errors import InputError
 
 pa = pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")

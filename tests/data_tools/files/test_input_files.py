@@ -17,9 +17,8 @@ from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.label_table import read_label_table
 from data_tools.datasets.nuscenes import read_tracking_results
-from data_tools.files.input_files import open_bytes, read_text
-from data_tools.files.json_stream import open_json, parsed_json
-from data_tools.files.remote_files import expanded
+from data_tools.files.input_files import expanded, open_bytes, read_text
+from data_tools.files.readers import open_json, parsed_json
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import read_kitti_poses, read_tum_poses

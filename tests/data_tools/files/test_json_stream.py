@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.files.json_stream import JsonStream, open_json
+from data_tools.files.readers import JsonStream, open_json
 from saga_fg.errors import InputError
 
 values = st.recursive(

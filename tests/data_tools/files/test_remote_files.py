@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from data_tools.files.remote_files import PROTOCOLS, expanded, local_copy, local_tree, name_of
+from data_tools.files.input_files import PROTOCOLS, expanded, local_copy, local_tree, name_of
 from saga_fg.errors import InputError, MissingExtraError
 
 

@@ -15,8 +15,7 @@ from data_tools.lidar import (
     voxel_downsample,
 )
 from data_tools.lidar.registration import Undetermined
-from data_tools.simulator.scanner import StaticWorld
-from data_tools.simulator.street import drive, scans, street
+from data_tools.simulator.scanner import StaticWorld, drive, scans, street
 from saga_fg.numerics.geometry import yaw_transform
 from tests.data_tools.featureless import open_field, tunnel
 

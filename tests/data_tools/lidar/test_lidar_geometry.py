@@ -19,10 +19,9 @@ from data_tools.lidar import (
     straight_lines,
 )
 from data_tools.lidar.clusters import l_shape_heading
-from data_tools.lidar.curbs import BIAS
-from data_tools.lidar.voxels import clusters_from_above
-from data_tools.simulator.scanner import ScannerSettings, StaticWorld, simulate_scan
-from data_tools.simulator.street import CURB, SENSOR_HEIGHT, street
+from data_tools.lidar.landmarks import BIAS
+from data_tools.lidar.scan import clusters_from_above
+from data_tools.simulator.scanner import CURB, SENSOR_HEIGHT, ScannerSettings, StaticWorld, simulate_scan, street
 from saga_fg.numerics.geometry import transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes
 

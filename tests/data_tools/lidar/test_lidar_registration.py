@@ -22,8 +22,7 @@ from data_tools.lidar import (
     voxel_downsample,
     voxel_keys,
 )
-from data_tools.simulator.scanner import StaticWorld
-from data_tools.simulator.street import drive, scans, street
+from data_tools.simulator.scanner import StaticWorld, drive, scans, street
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data_tools.lidar.moving import on_moving_objects
+from data_tools.lidar.scan import on_moving_objects
 from saga_fg import Boxes, InputError
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.course import SimulatedCourse
-from data_tools.lidar.overlap import Structure
-from data_tools.lidar.places import PlaceImage, PlaceIndex
+from data_tools.lidar.places import PlaceImage, PlaceIndex, Structure
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_of, yaw_transform

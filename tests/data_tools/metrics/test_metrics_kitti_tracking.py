@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.kitti_objects import CameraBoxes, KittiObjects
 from data_tools.metrics import KittiTrackingSequence, kitti_tracking_metrics
-from data_tools.metrics.kitti_tracking.track_scores import track_scores
-from data_tools.metrics.kitti_tracking.trajectory_counts import trajectory_counts
+from data_tools.metrics.kitti_tracking import track_scores, trajectory_counts
 
 BOX = {"type": "Car", "z": 10.0, "score": math.nan, "truncated": 0, "occluded": 0, "bbox": (100, 100, 200, 200)}
 LOW = {"bbox": (100, 100, 200, 120)}

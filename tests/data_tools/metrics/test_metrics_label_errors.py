@@ -20,7 +20,7 @@ from data_tools.metrics import (
     label_errors,
     label_velocities,
 )
-from data_tools.metrics.nearest_pairs import nearest_pairs
+from data_tools.metrics.scene_boxes import nearest_pairs
 from saga_fg import Boxes
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.metrics.pairwise_agreement import pairwise_agreement
+from data_tools.metrics.matching import pairwise_agreement
 from saga_fg import InputError
 
 GROUPS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=20)

@@ -9,7 +9,7 @@ import pytest
 
 from data_tools.metrics import SceneBoxes, WholeTracks, track_summaries, whole_tracks
 from saga_fg import Boxes
-from saga_fg.types.overlap import bev_iou
+from saga_fg.types.boxes import bev_iou
 
 
 def table(*tracks, size=(4.0, 2.0, 1.5)):

@@ -21,10 +21,10 @@ from data_tools.plausibility import (
     settings_without_data,
     strange_time_steps,
     unlikely_sizes,
+    usual_class,
     usual_classes,
     within_a_metre,
 )
-from data_tools.plausibility.class_names import usual_class
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.numerics.geometry import yaw_transform
 

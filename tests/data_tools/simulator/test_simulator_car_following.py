@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.simulator.disturbances import ClosingLine, SlowZone, sample_intervals
-from data_tools.simulator.driver_models import (
+from data_tools.simulator.fleet import (
+    CAR,
     HARDEST_BRAKING,
+    KINDS,
     Drivers,
+    Fleet,
     equilibrium_gap,
     following_acceleration,
     free_acceleration,
 )
-from data_tools.simulator.fleet import CAR, KINDS, Fleet
-from data_tools.simulator.lanes import Lanes
-from data_tools.simulator.road import curved_road
-from data_tools.simulator.scene_layout import SceneLayout
+from data_tools.simulator.road import Lanes, curved_road
+from data_tools.simulator.scene_layout import ClosingLine, SceneLayout, SlowZone, sample_intervals
 from data_tools.simulator.settings import DriverSettings
 from data_tools.simulator.traffic import Traffic, record_traffic
 from saga_fg.numerics.arrays import FloatArray

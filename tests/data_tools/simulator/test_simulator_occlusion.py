@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from data_tools.simulator.occlusion import visible_share
+from data_tools.simulator.sensors import visible_share
 from saga_fg.types.boxes import Boxes
 
 EYE = np.array([0.0, 0.0, 2.0])

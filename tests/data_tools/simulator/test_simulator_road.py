@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from data_tools.simulator.lanes import LaneOrder, Lanes, smooth_step, smooth_step_slope
-from data_tools.simulator.road import Road, curved_road
+from data_tools.simulator.road import LaneOrder, Lanes, Road, curved_road, smooth_step, smooth_step_slope
 
 
 def winding_road() -> Road:

@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 
 from data_tools.simulator import SimulatorSettings
-from data_tools.simulator.scenarios import SCENARIOS, ScenarioName, scenario_settings
-from data_tools.simulator.scene import scene_from_world
 from data_tools.simulator.settings import (
+    SCENARIOS,
     CyclistSettings,
     RoadworkSettings,
+    ScenarioName,
     SensorSettings,
     TrafficSettings,
+    scenario_settings,
 )
-from data_tools.simulator.world import World, build_world
+from data_tools.simulator.world import World, build_world, scene_from_world
 from saga_fg.errors import InputError
-from saga_fg.types.signal import COLOUR_LABELS
+from saga_fg.types.road_map import COLOUR_LABELS
 
 SHORT = 6.0  # s
 

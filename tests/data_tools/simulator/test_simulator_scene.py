@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, camera, lidar, simulate_scene
-from data_tools.simulator.annotation import recently_visible, without_short_runs
+from data_tools.simulator.sensed_world import recently_visible, without_short_runs
 from data_tools.simulator.world import build_world
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene

@@ -8,11 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from data_tools.simulator.pedestrians import simulate_pedestrians
 from data_tools.simulator.road import curved_road
+from data_tools.simulator.road_users import SimulatedTrajectories, simulate_pedestrians, static_objects
 from data_tools.simulator.scene_layout import sample_layout
 from data_tools.simulator.settings import PedestrianSettings, RoadSettings, SimulatorSettings
-from data_tools.simulator.trajectories import SimulatedTrajectories, static_objects
 from data_tools.simulator.world import World, build_world, simulate_traffic
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray

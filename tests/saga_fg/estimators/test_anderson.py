@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from saga_fg.estimators.anderson import AndersonAcceleration
+from saga_fg.estimators.backward import AndersonAcceleration
 
 
 def iterate(g, x, accelerated, steps):

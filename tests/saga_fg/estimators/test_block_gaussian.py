@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.partition import Partition, regrouped
+from saga_fg.estimators.partition import Partition, StateLayout, regrouped
 
 
 def random_gaussian(rng, nodes, dims, label):

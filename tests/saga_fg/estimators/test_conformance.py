@@ -16,9 +16,9 @@ from saga_fg import Edges, SagaError, SceneGraph
 from saga_fg.conformance import TOLERANCE, assert_equal
 from saga_fg.estimators import BatchSolver, JointKalmanFilter, Measurements
 from saga_fg.graph import SceneFactorGraph
-from saga_fg.graph.keys import node_key
+from saga_fg.graph.variables import node_key
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.known_course import KnownCourses
+from saga_fg.model.turning import KnownCourses
 from tests.saga_fg.estimator_programs import (
     Add,
     Marginalise,

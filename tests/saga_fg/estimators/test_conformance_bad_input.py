@@ -10,8 +10,7 @@ import pytest
 
 from saga_fg import InputError, UnknownNodeError
 from saga_fg.estimators import Measurements
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.transition import Blocks
+from saga_fg.model.discretisation import Blocks, discretise
 from tests.saga_fg.estimator_programs import new_nodes
 from tests.saga_fg.every_estimator import ESTIMATORS, maker
 from tests.saga_fg.random_graphs import BUS, CAR, CONE, TRAM, random_graph

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.covariance_floor import missing_covariance, not_smaller
-from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.partition import Partition
+from saga_fg.estimators.block_gaussian import BlockGaussian, missing_covariance, not_smaller
+from saga_fg.estimators.partition import Partition, StateLayout
 from saga_fg.numerics.arrays import FloatArray
 
 

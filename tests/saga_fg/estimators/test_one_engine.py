@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, NodeType, SceneGraph
-from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements, correction, dynamics, filter_steps
+from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements, correction, dynamics
 from saga_fg.graph import OBJECT
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.motion import ConstantVelocity
@@ -19,7 +19,7 @@ from tests.saga_fg.estimator_scenario import Textbook, assert_newest, random_cov
 from tests.saga_fg.estimators.soak import LAGS, drive
 from tests.saga_fg.random_graphs import CAR, random_graph
 
-JOINT_STEPS = (filter_steps.predicted, filter_steps.corrected, dynamics.predict, correction.correct)
+JOINT_STEPS = (correction.predicted, correction.corrected, dynamics.predict, correction.correct)
 
 
 def replace_everywhere(monkeypatch, functions, by):

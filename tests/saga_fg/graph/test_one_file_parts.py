@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factors import interaction_factor, prior_factor, relative_factors
-from factors.differences import stacked_differences
+from factors.manifolds import stacked_differences
 from saga_fg import ConstantVelocity, Detection, Detections, Frame, NodeType, SceneGraph, Tracker, TrackerSettings
 from saga_fg.estimators import (
     BatchSmoother,

@@ -23,7 +23,7 @@ from saga_fg.graph import (
     key_id,
     key_of,
 )
-from saga_fg.graph.keys import LARGEST, described
+from saga_fg.graph.variables import LARGEST, described
 
 
 class Once:

@@ -104,6 +104,6 @@ def test_on_a_full_disk_kernels_are_compiled_once_and_not_kept(tmp_path):
 def test_all_kernels_can_be_loaded_before_the_first_frame(monkeypatch):
     load_kernels()
     sources = [each.source for each in compilation._kernels]
-    assert {source.__module__.split(".")[-1] for source in sources} >= {"filtering", "labels", "pairs", "trails"}
+    assert {source.__module__.split(".")[-1] for source in sources} >= {"filtering", "components", "pairs", "paths"}
     monkeypatch.setattr(compilation, "_compiled", None)  # nothing is left to compile
     load_kernels()

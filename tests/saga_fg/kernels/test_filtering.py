@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from saga_fg.errors import InputError
 from saga_fg.estimators import JointKalmanFilter, Measurements
-from saga_fg.estimators.layout import StateLayout
-from saga_fg.estimators.partition import Partition, flattened, regrouped, unflattened, zeros
+from saga_fg.estimators.partition import Partition, StateLayout, flattened, regrouped, unflattened, zeros
 
 
 def played(scenario, bounds):

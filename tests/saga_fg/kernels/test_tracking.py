@@ -5,9 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from saga_fg.numerics.arrays import distinct
-from saga_fg.types.boxes import Boxes
+from saga_fg.types.boxes import Boxes, bev_iou, paired_bev_iou
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.overlap import bev_iou, paired_bev_iou
 
 CLASSES = ("car", "truck", "pedestrian", "bicycle", "construction_vehicle")
 

@@ -8,10 +8,10 @@ import pytest
 from saga_fg import ConstantVelocity, Curvilinear, NodeType, SceneGraph
 from saga_fg.estimators import Gaussian, kalman_predict, kalman_update
 from saga_fg.learning import MeasuredTrajectory, fit_curvilinear, fit_curvilinear_by_class
-from saga_fg.learning import curvilinear_motion as learning
-from saga_fg.learning.curvilinear_motion import CurvilinearLikelihood
+from saga_fg.learning import process_noise as learning
+from saga_fg.learning.process_noise import CurvilinearLikelihood
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.known_course import KnownCourses
+from saga_fg.model.turning import KnownCourses
 
 DT, NOISE, YAW_NOISE = 0.1, 0.1, 0.01
 TRUTH = Curvilinear(acceleration_noise=0.3, lateral_acceleration_noise=0.02, jerk_noise=0.5, fading_time=2.0)

@@ -7,14 +7,13 @@ import pytest
 
 from saga_fg import InputError
 from saga_fg.learning import GapSettings, HiddenObjects, hidden_objects
-from saga_fg.model.edge_information import EdgeInformation
-from saga_fg.model.edge_rules import Following, Neighbours, Repulsion
+from saga_fg.model.edge_rules import EdgeInformation, Following, Neighbours, Repulsion
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.tracking import ClassSettings, Tracker, TrackerSettings
-from saga_fg.tracking.stationarity import StationaritySettings
+from saga_fg.tracking.track_filters import StationaritySettings
 from tests.saga_fg.following_pairs import GAP, following_pairs, scene_of
 
 SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.02, yaw=0.02)})}

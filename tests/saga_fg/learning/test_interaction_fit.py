@@ -10,9 +10,9 @@ from saga_fg import InputError
 from saga_fg.learning import GapSettings, HiddenObjects, fit_interactions, hidden_objects, negative_log_likelihood
 from saga_fg.learning.interaction_fit import RuleParameters
 from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.intelligent_driver import IntelligentDriver
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model.nonlinear_interactions import IntelligentDriver
 from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.tracking import ClassSettings, TrackerSettings
 from tests.saga_fg.following_pairs import GAP, RATE, following_pairs

@@ -19,8 +19,7 @@ from saga_fg.learning import (
     sample_with_truth,
 )
 from saga_fg.learning.sensor_fit import fit_field_of_view
-from saga_fg.model.sensor import NoiseModel, ScoreCalibration
-from saga_fg.model.sensor_geometry import Extrinsics, FieldOfView
+from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 
 
 def errors(rng, noise, n, wrong=0.0, gate=4.0):

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from saga_fg.model.interactions import NodeTable
-from saga_fg.model.paths import Paths
+from saga_fg.model.interactions import NodeTable, Paths
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.random_graphs import CAR
 

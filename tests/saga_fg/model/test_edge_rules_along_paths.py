@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from saga_fg.kernels.lanes import pairs_ahead
+from saga_fg.kernels.edges import pairs_ahead
 from saga_fg.model.edge_rules import Following
-from saga_fg.model.intelligent_driver import IntelligentDriver
-from saga_fg.model.interactions import CarFollowing, SharedVelocity
-from saga_fg.model.paths import SHARP, Paths
-from saga_fg.numerics.polyline import Polylines
+from saga_fg.model.interactions import SHARP, CarFollowing, Paths, SharedVelocity
+from saga_fg.model.nonlinear_interactions import IntelligentDriver
+from saga_fg.numerics.geometry import Polylines
 from tests.saga_fg.model.drawn_traffic import bend, edges, leaders, random_traffic, table, with_path
 
 

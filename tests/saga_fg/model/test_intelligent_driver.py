@@ -11,9 +11,9 @@ from saga_fg import InputError
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.graph_building import build_graph
-from saga_fg.model.intelligent_driver import IntelligentDriver
-from saga_fg.model.road.stopping import DriverStopping, RedLight
+from saga_fg.model.nonlinear_interactions import IntelligentDriver
 from saga_fg.model.stability import require_stable
+from saga_fg.model.stop_lines import DriverStopping, RedLight
 from tests.saga_fg.road_scenes import queue, table
 
 DRIVER = IntelligentDriver(

@@ -8,9 +8,8 @@ import pytest
 from saga_fg import ConstantAcceleration, Curvilinear, NodeType, SceneGraph
 from saga_fg.model.discretisation import discretise, linear_motions
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.known_course import RATE_CORRELATION, KnownCourses, turning_time
 from saga_fg.model.scene_graph import Edges
-from saga_fg.model.turning import CoordinatedTurn
+from saga_fg.model.turning import RATE_CORRELATION, CoordinatedTurn, KnownCourses, turning_time
 from tests.saga_fg.random_graphs import node_table
 
 LONG = 1e9  # s, as good as no fading

@@ -13,7 +13,7 @@ from saga_fg import InputError
 from saga_fg.learning import TEMPLATE
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedCourse, SharedVelocity, velocity_triples
-from saga_fg.model.learned_interactions import LearnedInteractions
+from saga_fg.model.stability import LearnedInteractions
 
 
 def test_what_is_written_is_read_again():

@@ -3,11 +3,16 @@
 import numpy as np
 import pytest
 
-from factors.differences import stacked_differences
+from factors.manifolds import stacked_differences
 from saga_fg import InputError
-from saga_fg.model.intelligent_driver import IntelligentDriver
-from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, interaction, smooth_acceleration
-from saga_fg.model.road.stopping import SmoothStopping
+from saga_fg.model.nonlinear_interactions import (
+    IntelligentDriver,
+    SmoothDriver,
+    SocialForce,
+    interaction,
+    smooth_acceleration,
+)
+from saga_fg.model.stop_lines import SmoothStopping
 
 
 def test_the_round_corners_are_close_to_the_model_away_from_them():

@@ -9,19 +9,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import InputError
-from saga_fg.model.cone_geometry import ConeGeometry, anticipated
-from saga_fg.model.edge_rules import Following
+from saga_fg.model.edge_rules import ConeGeometry, Following, anticipated
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.lanes import ConeLine, InLane, KeepLane
 from saga_fg.model.rigid_coupling import Attached, RigidCoupling
-from saga_fg.model.road.cones import ConeLine
-from saga_fg.model.road.lane_keeping import InLane, KeepLane
-from saga_fg.model.road.starting import GreenLight, Starting
-from saga_fg.model.road.stopping import RedLight, Stopping
-from saga_fg.numerics.polyline import direction_at, feet
-from saga_fg.types.lanes_across import LanesAcross
-from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
-from saga_fg.types.signal import STATES, SignalSettings, colour_updated, colours
+from saga_fg.model.stop_lines import GreenLight, RedLight, Starting, Stopping
+from saga_fg.numerics.geometry import direction_at, feet
+from saga_fg.types.road_map import (
+    STATES,
+    Lane,
+    LanesAcross,
+    RoadMap,
+    SignalSettings,
+    StopLine,
+    TrafficLight,
+    colour_updated,
+    colours,
+)
 from tests.saga_fg.road_scenes import bent_lane, queue, table, taper
 
 

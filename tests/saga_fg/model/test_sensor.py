@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import InputError, Sensor
-from saga_fg.model.sensor import NoiseModel, ScoreCalibration
-from saga_fg.model.sensor_geometry import Extrinsics, FieldOfView
+from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 from saga_fg.numerics.geometry import transform_points, yaw_transform
 
 metres = st.floats(-200, 200)

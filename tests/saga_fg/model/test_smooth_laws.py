@@ -33,8 +33,8 @@ from factors import (
     relative_detection_factors,
     relative_factors,
 )
-from factors.differences import stacked_differences, wrap_angles
-from factors.soft_distance import soft_distance
+from factors.manifolds import stacked_differences, wrap_angles
+from factors.measurement import soft_distance
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce
 
 DISTANCES = np.array([0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-3, 0.1, 0.3, 1.0, 5.0])  # m

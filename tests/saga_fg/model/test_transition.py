@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, InputError, SceneGraph
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.transition import Blocks, Transition
+from saga_fg.model.discretisation import Blocks, Transition, discretise
 from tests.saga_fg.random_graphs import BUS, CAR, CONE
 
 GRAPH = SceneGraph([4, 9, 2], (CAR, BUS, CONE))

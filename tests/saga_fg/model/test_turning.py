@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 
-from factors.differences import stacked_differences
+from factors.manifolds import stacked_differences
 from saga_fg import ConstantVelocity, InputError, NodeType, SceneGraph
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.turning import Bicycle, CoordinatedTurn

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from saga_fg.numerics import near_pairs as module
-from saga_fg.numerics.near_pairs import near_pairs
+from saga_fg.numerics import gating as module
+from saga_fg.numerics.gating import near_pairs
 
 
 def by_distances(a, b, reach, further):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from saga_fg.numerics.pairwise_costs import CrossCovariances, pair_costs, tree_edges
+from saga_fg.numerics.assignment import CrossCovariances, pair_costs, tree_edges
 
 
 def drawn(seed, n=3, common=2.0, own=1.0, noise=0.3, ties=None):

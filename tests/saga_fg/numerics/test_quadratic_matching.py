@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from saga_fg.numerics import quadratic_matching
-from saga_fg.numerics.assignment import assign
-from saga_fg.numerics.quadratic_matching import PairCosts, QuadraticMatching
+from saga_fg.numerics import assignment
+from saga_fg.numerics.assignment import PairCosts, QuadraticMatching, assign
 
 
 def drawn(seed, tracks=5, detections=5, most=10, coupling=2.0):
@@ -59,7 +58,7 @@ def test_without_costs_of_pairs_it_is_the_hungarian_assignment(seed):
 
 
 def test_a_large_component_is_no_worse_than_the_hungarian_assignment(monkeypatch):
-    monkeypatch.setattr(quadratic_matching, "LARGEST_FRONTIER", 500)
+    monkeypatch.setattr(assignment, "LARGEST_FRONTIER", 500)
     for seed in range(5):
         problem = drawn(seed, tracks=30, detections=30, most=200)
         gain = np.zeros((3 * 30, 30))

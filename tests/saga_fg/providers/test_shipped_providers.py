@@ -23,11 +23,11 @@ from saga_fg.graph import (
     GraphError,
     NewVariable,
 )
-from saga_fg.model.landmarks.point import PointLandmark
+from saga_fg.model.landmarks import PointLandmark
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StartSettings, StationaryObjects
 from saga_fg.tracking import ClassSettings
-from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, ImuSamples, OdometryIncrement
+from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, OdometryIncrement
 from saga_fg.types.landmark import Observation
 from saga_fg.types.road_map import Lane
 

@@ -19,8 +19,7 @@ from saga_fg.slam.pose_graph import (
     chordal_poses,
     optimise_poses,
 )
-from saga_fg.slam.pose_graph.certificate import descend, lowest_eigenvalue, rounded_rotations
-from saga_fg.slam.pose_graph.stiefel import nearest_frames
+from saga_fg.slam.pose_graph.certificate import descend, lowest_eigenvalue, nearest_frames, rounded_rotations
 from tests.saga_fg.loops import loop, moved
 
 

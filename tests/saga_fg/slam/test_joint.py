@@ -5,11 +5,11 @@ import pytest
 from scipy.stats import chi2
 
 from saga_fg import Boxes, Detections, Frame, InputError
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import PoleLandmark
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise, estimate_jointly
+from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
 from saga_fg.slam.joint.record import record_epochs
-from saga_fg.slam.joint.stationarity import SlowErrors, stationary_probabilities
 from saga_fg.types.landmark import Observation
 from tests.saga_fg.ego_drive import drive, new_tracker
 

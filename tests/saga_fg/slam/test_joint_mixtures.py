@@ -11,8 +11,8 @@ from saga_fg.model.sensor import NoiseModel
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise, OnlineEstimator, estimate_jointly
-from saga_fg.slam.joint.identity import with_identities
-from saga_fg.slam.joint.motion import motion_factors, new_streams
+from saga_fg.slam.joint.association import with_identities
+from saga_fg.slam.joint.graph import motion_factors, new_streams
 from saga_fg.slam.joint.record import RecordedDetections, RecordedEpoch, RecordedObjects, record_epochs
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from tests.saga_fg.ego_drive import NOISE, drive, new_tracker

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from factors import prior_factor
 from saga_fg import InputError
 from saga_fg.graph import EGO_VELOCITY, Additions, GraphView, NewVariable
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import PoleLandmark
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import JointSettings, OnlineEstimator, estimate_jointly, estimate_online
 from saga_fg.types.by_class import DEFAULT

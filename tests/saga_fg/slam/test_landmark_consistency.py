@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from saga_fg.model.landmarks.line import LineLandmark
-from saga_fg.model.landmarks.plane import PlaneLandmark
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LandmarkMapper, MapperSettings
 from saga_fg.types.landmark import Observation

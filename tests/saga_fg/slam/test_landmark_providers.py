@@ -9,7 +9,7 @@ import pytest
 from factors import Robust
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import GraphError, SceneFactorGraph, ask_all
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import PoleLandmark
 from saga_fg.slam.mapping import LandmarkObservations, MeasuredMotion, landmark_key, pose_key
 from saga_fg.types.landmark import Observation
 

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 
 from saga_fg import InputError
-from saga_fg.model.landmarks.line import LineLandmark
-from saga_fg.model.landmarks.plane import PlaneLandmark
-from saga_fg.model.landmarks.point import PointLandmark
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PointLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import gate
 from saga_fg.slam.mapping import (

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from saga_fg import InputError
-from saga_fg.model.landmarks.plane import PlaneLandmark
-from saga_fg.model.landmarks.point import PointLandmark
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import PlaneLandmark, PointLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LandmarkMapper, LocalMap, MapperSettings, NearbyLandmarks, place_of
 from saga_fg.types.landmark import Observation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from saga_fg.slam.submaps.loop_misfits import Misfits
+from saga_fg.slam.submaps.loops import Misfits
 
 STEPS, LOOPS = 6, 5
 

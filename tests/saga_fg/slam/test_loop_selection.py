@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from saga_fg.slam.submaps import LoopClosure
-from saga_fg.slam.submaps.loop_selection import LoopSelection, select_loops
+from saga_fg.slam.submaps.loops import LoopSelection, select_loops
 
 PER_LAP, STEPS, EVERY = 100, 200, 5
 STATED = np.array([1e-3] * 3 + [0.03] * 3)

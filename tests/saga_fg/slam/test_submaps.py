@@ -12,16 +12,14 @@ import pytest
 
 from factors import SolverSettings, pose_prior_factor
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch_solver import BatchSolver
+from saga_fg.estimators.batch import BatchSolver
 from saga_fg.graph import EGO_POSE, Additions, GraphView
-from saga_fg.model.landmarks.plane import PlaneLandmark
-from saga_fg.model.landmarks.pole import PoleLandmark
+from saga_fg.model.landmarks import PlaneLandmark, PoleLandmark
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
-from saga_fg.providers.gps import Gps
+from saga_fg.providers.navigation import Gps
 from saga_fg.slam.mapping import pose_key
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings
-from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix
 from saga_fg.types.landmark import Observation
 
 FIRST = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2

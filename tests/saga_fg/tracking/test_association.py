@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, Sensor, TrackerSettings
-from saga_fg.numerics.assignment import cheapest_first, least_total
-from saga_fg.numerics.pairwise_costs import CrossCovariances
+from saga_fg.numerics.assignment import CrossCovariances, cheapest_first, least_total
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.association import match
 from saga_fg.tracking.measurements import FrameMeasurements

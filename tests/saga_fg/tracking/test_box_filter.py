@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.tracking.box_filter import HEIGHT_DRIFT, BoxFilter
+from saga_fg.tracking.track_filters import HEIGHT_DRIFT, BoxFilter
 
 NAN = float("nan")
 angles = st.floats(-3.1, 3.1)

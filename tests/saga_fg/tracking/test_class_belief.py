@@ -11,7 +11,7 @@ from saga_fg import Boxes, Detections, Frame, InputError, Tracker
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity
 from saga_fg.model.sensor import Sensor
 from saga_fg.tracking import ClassSettings, TrackerSettings
-from saga_fg.tracking.class_belief import LEAST_BELIEF, ClassGroups
+from saga_fg.tracking.track_table import LEAST_BELIEF, ClassGroups
 
 GROUPS = (("car", "truck", "bus"), ("bicycle", "motorcycle"))
 SENSORS = {"lidar": Sensor(class_accuracy=0.9), "camera": Sensor(class_accuracy=0.6)}

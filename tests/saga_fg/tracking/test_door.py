@@ -8,13 +8,13 @@ import pytest
 from pipelines.config import load_config
 from saga_fg import InputError, Sensor, Tracker
 from saga_fg.estimators import Measurements
-from saga_fg.estimators.layout import StateLayout
+from saga_fg.estimators.partition import StateLayout
+from saga_fg.model.discretisation import Transition
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.model.transition import Transition
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame

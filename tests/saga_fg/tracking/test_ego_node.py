@@ -20,7 +20,7 @@ from saga_fg.model.sensor import NoiseModel
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Odometry, StartSettings
 from saga_fg.tracking import AssociationSettings, ClassSettings, EgoNodeSettings
-from saga_fg.types.ego_measurements import EgoMeasurements, GpsFix, OdometryIncrement
+from saga_fg.types.frame import EgoMeasurements, GpsFix, OdometryIncrement
 from tests.saga_fg.traffic_frames import at_pose, frame, seen, straight, turning_vehicle
 
 PLACE = np.array([4000.0, -7000.0])  # of the scene in the world

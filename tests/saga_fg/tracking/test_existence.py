@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
-from saga_fg.tracking.class_belief import ClassGroups
-from saga_fg.tracking.existence import _existence
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
-from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.track_table import ClassGroups, TrackTable
+from saga_fg.tracking.update import _existence
 from tests.saga_fg.traffic_frames import frame
 
 SETTINGS = ExistenceSettings(lifetime=np.inf)

@@ -14,7 +14,7 @@ from saga_fg.graph import OBJECT, Additions
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.tracking import Journal
-from saga_fg.tracking.graph_record import GraphRecord
+from saga_fg.tracking.journal import GraphRecord
 
 RULES = (Following(interaction=SharedVelocity(along_heading=True), rate=1.5),)
 

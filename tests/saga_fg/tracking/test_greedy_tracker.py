@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Detection, Detections, Frame, GreedyTracker, Sensor
-from saga_fg.model.sensor_geometry import Extrinsics
+from saga_fg.model.sensor import Extrinsics
 from saga_fg.tracking import GreedySettings
 from tests.saga_fg.traffic_frames import NAN, at_pose, columns, frame, run, seen, straight, turning_vehicle
 

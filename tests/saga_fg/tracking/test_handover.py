@@ -10,7 +10,7 @@ from saga_fg.graph import Additions
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.journal import Journal
-from saga_fg.tracking.stationarity import StationaritySettings
+from saga_fg.tracking.track_filters import StationaritySettings
 from tests.saga_fg.traffic_frames import frame, run
 
 SETTINGS = TrackerSettings(

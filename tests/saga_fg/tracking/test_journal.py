@@ -14,8 +14,8 @@ from saga_fg.model.interactions import NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.tracking import AssociationSettings, Journal
-from saga_fg.tracking.edge_effects import edge_effects
-from saga_fg.tracking.observer import TrackerView
+from saga_fg.tracking.journal import TrackerView
+from saga_fg.tracking.prediction import edge_effects
 
 SETTINGS = TrackerSettings(edges=())
 

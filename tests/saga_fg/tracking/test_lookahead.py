@@ -12,7 +12,7 @@ from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
-from saga_fg.tracking.stationarity import StationaritySettings
+from saga_fg.tracking.track_filters import StationaritySettings
 from saga_fg.types.boxes import MAX_POSITION
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from saga_fg.model.road.stopping import RedLight
 from saga_fg.model.sensor import Sensor
+from saga_fg.model.stop_lines import RedLight
 from saga_fg.tracking import Tracker, TrackerSettings
-from saga_fg.tracking.map_tiles import Element, elements, in_known_names
+from saga_fg.tracking.map_nodes import Element, elements, in_known_names
 from saga_fg.types.frame import Detection, Detections, Frame
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight, Wall
 

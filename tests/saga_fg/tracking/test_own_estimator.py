@@ -27,7 +27,7 @@ from scipy.linalg import block_diag
 from saga_fg.errors import InputError
 from saga_fg.estimators import BlockGaussian, EstimatorBase, Gaussian, JointKalmanFilter, Measurements
 from saga_fg.estimators import kalman_predict, kalman_update
-from saga_fg.estimators.layout import StateLayout, checked_prior
+from saga_fg.estimators.partition import StateLayout, checked_prior
 from saga_fg.estimators.measurements import RecordedMeasurements
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, Detection, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
-from saga_fg.model.sensor import NoiseModel
-from saga_fg.model.sensor_geometry import Extrinsics
+from saga_fg.model.sensor import Extrinsics, NoiseModel
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.traffic_frames import at_pose, frame, straight, turning_vehicle
 

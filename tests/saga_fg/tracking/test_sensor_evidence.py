@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from saga_fg import Sensor, Tracker, TrackerSettings
-from saga_fg.model.sensor_geometry import FieldOfView
+from saga_fg.model.sensor import FieldOfView
 from saga_fg.tracking import ClassSettings
-from saga_fg.tracking.sensor_evidence import PRIOR_LOGIT, SensorEvidence
+from saga_fg.tracking.track_table import PRIOR_LOGIT, SensorEvidence
 from tests.saga_fg.traffic_frames import frame, run
 
 NONE = np.empty(0, dtype=np.int64)

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.errors import InputError
-from saga_fg.tracking.speed_prior import SPREAD, speed_prior
-from saga_fg.tracking.traffic import Passages, SpeedPriorSettings, Traffic, TrafficSettings
+from saga_fg.tracking.traffic import SPREAD, Passages, SpeedPriorSettings, Traffic, TrafficSettings, speed_prior
 from saga_fg.types.track import known_velocities
 from tests.saga_fg.traffic_frames import frame
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from saga_fg import Sensor, Tracker, TrackerSettings
 from saga_fg.tracking import StationaritySettings
-from saga_fg.tracking.kinematics import Kinematics
-from saga_fg.tracking.stationarity import Stationarity
+from saga_fg.tracking.track_filters import Kinematics, Stationarity
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 ON = StationaritySettings(prior=0.5)

@@ -7,7 +7,7 @@ from dataclasses import fields
 import numpy as np
 
 from saga_fg import Tracker, TrackerSettings
-from saga_fg.numerics.columns import Columns
+from saga_fg.numerics.arrays import Columns
 from saga_fg.tracking.track_table import TrackTable
 from tests.saga_fg.traffic_frames import frame
 

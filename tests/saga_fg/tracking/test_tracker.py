@@ -13,8 +13,7 @@ from saga_fg import (
     Tracker,
     TrackerSettings,
 )
-from saga_fg.model.sensor import NoiseModel
-from saga_fg.model.sensor_geometry import Extrinsics, FieldOfView
+from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
 from tests.saga_fg.traffic_frames import NAN, SIZE, at_pose, columns, frame, run, seen, straight, turning_vehicle

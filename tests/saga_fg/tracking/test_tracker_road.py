@@ -7,20 +7,16 @@ import numpy as np
 import pytest
 
 from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettings
-from saga_fg.model.cone_geometry import ConeGeometry
-from saga_fg.model.edge_rules import Following, Pairs
+from saga_fg.model.edge_rules import ConeGeometry, Following, Pairs
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.lanes import ConeLine, InLane
 from saga_fg.model.motion import ConstantVelocity, RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.road.cones import ConeLine
-from saga_fg.model.road.lane_keeping import InLane
-from saga_fg.model.road.starting import GreenLight
-from saga_fg.model.road.stopping import RedLight, SmoothStopping
+from saga_fg.model.stop_lines import GreenLight, RedLight, SmoothStopping
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.prediction import node_table
-from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
-from saga_fg.types.signal import COLOURS, colours
+from saga_fg.types.road_map import COLOURS, Lane, RoadMap, StopLine, TrafficLight, colours
 
 MAP = RoadMap(
     (TrafficLight("light", (12.0, 0.0)),),

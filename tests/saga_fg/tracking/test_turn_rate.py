@@ -8,7 +8,7 @@ import pytest
 from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
-from saga_fg.tracking.turn_rate import DEVIATION, STRAIGHT, TURNING, TurnRate
+from saga_fg.tracking.track_filters import DEVIATION, STRAIGHT, TURNING, TurnRate
 from tests.saga_fg.traffic_frames import frame
 
 DT, RATE, SPEED = 0.1, 0.3, 8.0

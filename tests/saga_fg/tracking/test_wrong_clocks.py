@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
-from pipelines.serving.value_tree import TreeWriter, read_tree
+from pipelines.serving.state import TreeWriter, read_tree
 from saga_fg import Tracker
 from saga_fg.tracking import ClockSettings
 from saga_fg.tracking.clock import MANY_SENSORS, Clock, weighted_median

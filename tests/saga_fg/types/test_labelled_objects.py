@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, InputError
-from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.labelled_objects import LabelledObjects
+from saga_fg.types.dataset import Annotations, LabelledObjects, Scene
 
 
 def scene(truth: bool = True) -> Scene:

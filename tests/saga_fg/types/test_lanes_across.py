@@ -8,9 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from saga_fg.numerics.polyline import Polylines, direction_at, feet
-from saga_fg.types.lanes_across import LanesAcross
-from saga_fg.types.road_map import Lane, StopLine
+from saga_fg.numerics.geometry import Polylines, direction_at, feet
+from saga_fg.types.road_map import Lane, LanesAcross, StopLine
 
 STRAIGHT = Lane("straight", ((-50.0, 0.0), (20.0, 0.0)), width=4.0)
 ASIDE = Lane("aside", ((-50.0, 3.0), (0.0, 3.0), (20.0, 5.0)), width=4.0)

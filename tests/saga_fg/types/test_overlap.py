@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from saga_fg import Boxes
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.overlap import bev_iou, iou_3d, paired_bev_iou, paired_giou_3d, paired_iou_3d, touching_pairs
+from saga_fg.types.boxes import bev_iou, iou_3d, paired_bev_iou, paired_giou_3d, paired_iou_3d, touching_pairs
 
 
 def box(x=0.0, y=0.0, z=0.0, length=4.0, width=2.0, height=1.5, yaw=0.0):

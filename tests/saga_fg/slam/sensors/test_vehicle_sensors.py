@@ -15,8 +15,8 @@ from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import EGO_BIAS, EGO_CALIBRATION, EGO_POSE
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Imu, StartSettings, Wheels
-from saga_fg.providers.mounting import ANTENNA, INERTIAL, WHEELS, mounting
-from saga_fg.slam.mapping.providers import MeasuredMotion
+from saga_fg.providers.odometry import ANTENNA, INERTIAL, WHEELS, mounting
+from saga_fg.slam.mapping.mapper import MeasuredMotion
 from saga_fg.slam.sensors import SensorBuffer, SensorConsistency, SensorSettings, sensor_providers
 
 H, PERIOD, GRAVITY = 0.01, 0.2, 9.81

@@ -1,0 +1,461 @@
+"""Evaluation of results: CLEAR, HOTA, AMOTA, errors and calibration, as tables and for programs.
+
+Tracks scored against the ground truth of their scenes: CLEAR figures and RMSE at every moment, hidden objects too.
+
+It serves datasets that have no official evaluation.
+
+HOTA, CLEAR and Identity figures of a result, class by class, in the plane (2D) and in space (3D).
+
+These metrics judge one set of tracks, without a sweep over scores. The tracks scored are those whose mean score reaches
+the class's threshold of best MOTA, as published figures choose them too.
+
+Innovations and their covariances by class (NIS): the tracks and the noise of the detections together.
+
+The squared distance in sigmas of a track and the detection it took has 2 degrees of freedom: its mean is 2 if both
+covariances are right. What lies outside the gate is never matched, which lowers the mean by little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from data_tools.figures import FigureTable, cell, count
+from data_tools.metrics import (
+    EllipseCoverage,
+    ErrorSummary,
+    HotaMetrics,
+    LabelErrors,
+    NuScenesClassMetrics,
+    NuScenesTrackingMetrics,
+    NuScenesTrackingScene,
+    NuScenesTrackingSettings,
+    SceneBoxes,
+    SceneMetrics,
+    TrackSummary,
+    WholeTracks,
+    calibration,
+    coverages,
+    error_summary,
+    errors_by_class,
+    hota_metrics,
+    label_errors,
+    nuscenes_tracking_metrics,
+    scene_metrics_by_label,
+    track_summaries,
+    whole_tracks,
+)
+from data_tools.metrics.hota import Similarity
+from data_tools.plots import calibration_plot, error_histograms, recall_sweep
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
+
+__all__ = [
+    "Evaluation",
+    "evaluate_tracks",
+]
+
+_ERRORS = (
+    *("class", "labels", "with track", "position", "detection", "velocity", "velocity parked"),
+    *("velocity moving", "unknown", "heading", "flipped"),
+)
+_CALIBRATION = ("class", "objects", "boxes", "ANEES / 2", "median", "in 50 %", "in 90 %", "in 99 %", "verdict")
+
+
+def error_tables(errors: LabelErrors) -> list[FigureTable]:
+    """RMSE of tracks (and of detections) at the labels; and, if there are covariances, how well they fit."""
+    classes = errors_by_class(errors)
+    title = "RMSE at labels: position in m, velocity in m/s, heading in degrees"
+    tables = [
+        FigureTable(title, _ERRORS, tuple((name, *_error_cells(error_summary(e))) for name, e in classes.items()))
+    ]
+    calibrations = {name: calibration(e) for name, e in classes.items()}
+    if any(c.boxes for c in calibrations.values()):
+        title = "Calibration: share of errors within the tracks' ellipses; ANEES / 2 and median: 1 is right"
+        rows = tuple((name, *_calibration_cells(c)) for name, c in calibrations.items())
+        tables.append(FigureTable(title, _CALIBRATION, rows))
+    return tables
+
+
+def error_json(errors: LabelErrors) -> dict[str, Any]:
+    """Errors and calibration by class, for programs."""
+    classes = errors_by_class(errors)
+    fits = {name: calibration(e) for name, e in classes.items()}
+    return {
+        "errors": {name: error_summary(e) for name, e in classes.items()},
+        "calibration": {
+            name: {
+                **{
+                    field: getattr(c, field)
+                    for field in ("objects", "boxes", "anees", "median_nees", "coverage", "enough_data")
+                },
+                "consistent": c.consistent if c.enough_data else None,
+            }
+            for name, c in fits.items()
+        },
+    }
+
+
+def error_pictures(errors: LabelErrors) -> dict[str, Any]:
+    """matplotlib figures by name: error histograms and, if there are covariances, how well they fit."""
+    pictures = {"errors": error_histograms(errors)}
+    return pictures | ({"calibration": calibration_plot(errors)} if np.isfinite(errors.nees).any() else {})
+
+
+def _error_cells(f: ErrorSummary) -> tuple[str, ...]:
+    errors = (f.position, f.detection, f.velocity, f.velocity_parked, f.velocity_moving)
+    heading = cell(float(np.degrees(f.heading)), 1)
+    return (
+        cell(f.labels),
+        cell(f.tracked),
+        *(cell(x) for x in errors),
+        cell(f.velocity_unknown),
+        heading,
+        cell(f.flipped),
+    )
+
+
+def _calibration_cells(c: EllipseCoverage) -> tuple[str, ...]:
+    verdict = ("consistent" if c.consistent else "inconsistent") if c.enough_data else "too few boxes"
+    shares = (cell(share) for share in c.coverage.values())
+    return (cell(c.objects), cell(c.boxes), cell(c.anees, 2), cell(c.median_nees, 2), *shares, verdict)
+
+
+SIMILARITIES: dict[str, Similarity] = {"2D": "bev_iou", "3D": "iou_3d"}
+_HOTA_COLUMNS = (
+    *("class", "overlap", "score >=", "HOTA", "DetA", "AssA", "LocA", "MOTA", "MOTP", "IDS", "FRAG"),
+    *("IDF1", "IDP", "IDR"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class HotaRow:
+    """One class at one similarity: `overlap` is 2D, 3D or image; `threshold`: least mean score of its tracks."""
+
+    label: str
+    overlap: str
+    threshold: float
+    figures: HotaMetrics
+
+
+def hota(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], thresholds: Mapping[str, float]) -> list[HotaRow]:
+    """Judge (truth, found) of all scenes for the classes of `thresholds`. Raises `MissingExtraError` w/o trackeval."""
+    rows = []
+    similarities = _similarities(scenes)
+    for label, threshold in thresholds.items():
+        scored = [(truth, _surer(found, label, threshold)) for truth, found in scenes]
+        for overlap, similarity in similarities.items():
+            rows.append(HotaRow(label, overlap, threshold, hota_metrics(scored, label, similarity)))
+    return rows
+
+
+def _similarities(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]]) -> dict[str, Similarity]:
+    """The overlaps that all boxes have; where sizes or headings are missing, the nearness of centres, 0 from 4 m on."""
+    tables = [table.boxes for one in scenes for table in one]
+    plane = all(np.isfinite(boxes.size[:, :2]).all() and np.isfinite(boxes.yaw).all() for boxes in tables)
+    if not plane:
+        return {"centre": "centre"}
+    if not all(np.isfinite(boxes.size[:, 2]).all() for boxes in tables):
+        return {"2D": "bev_iou"}
+    return SIMILARITIES
+
+
+def hota_table(rows: Sequence[HotaRow]) -> FigureTable:
+    """Table for people, in percent as such figures are published."""
+    return FigureTable(
+        "HOTA, CLEAR and Identity, in %; pairs from an overlap of 0.5 on count for CLEAR and Identity",
+        _HOTA_COLUMNS,
+        tuple((row.label, row.overlap, cell(row.threshold), *_hota_cells(row.figures)) for row in rows),
+    )
+
+
+def hota_json(rows: Sequence[HotaRow]) -> dict[str, Any]:
+    """Figures for programs, by class and overlap."""
+    result: dict[str, Any] = {}
+    for row in rows:
+        result.setdefault(row.label, {"threshold": row.threshold})[row.overlap] = row.figures
+    return result
+
+
+def _surer(found: SceneBoxes, label: str, threshold: float) -> SceneBoxes:
+    """The tracks of a class whose mean score is at least `threshold`."""
+    rows = np.flatnonzero(found.boxes.label == label)
+    return found.select(rows[mean_scores(found.id[rows], found.score[rows]) >= threshold - 1e-12])
+
+
+def mean_scores(track: IntArray | StrArray, score: FloatArray) -> FloatArray:
+    """(N,) the mean score of each box's track."""
+    _, number = np.unique(track, return_inverse=True)
+    return np.asarray((np.bincount(number, weights=score) / np.maximum(np.bincount(number), 1))[number])
+
+
+def _hota_cells(f: HotaMetrics) -> tuple[str, ...]:
+    percent = (cell(100 * value, 2) for value in (f.hota, f.deta, f.assa, f.loca, f.mota, f.motp))
+    identity = (cell(100 * value, 2) for value in (f.idf1, f.idp, f.idr))
+    return (*percent, cell(f.ids), cell(f.frag), *identity)
+
+
+_INNOVATION_COLUMNS = ("class", "matches", "NIS / 2", "median", "in 50 %", "in 90 %", "in 99 %")
+
+
+def innovation_table(by_class: Mapping[str, FloatArray]) -> FigureTable:
+    """Table for people."""
+    title = "Innovations: NIS / 2 and median are 1 if the covariances of tracks and detections are right"
+    return FigureTable(
+        title, _INNOVATION_COLUMNS, tuple((label, *_innovation_cells(values)) for label, values in by_class.items())
+    )
+
+
+def innovation_json(by_class: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """Figures for programs."""
+    return {
+        label: {"matches": len(values), "nis": values.mean() / 2, "median": _median(values), "held": coverages(values)}
+        for label, values in by_class.items()
+    }
+
+
+def _innovation_cells(values: FloatArray) -> tuple[str, ...]:
+    shares = (cell(share) for share in coverages(values).values())
+    return (cell(len(values)), cell(float(values.mean()) / 2, 2), cell(_median(values), 2), *shares)
+
+
+def _median(values: FloatArray) -> float:
+    """Over that of the chi-square distribution with 2 degrees of freedom."""
+    return float(np.median(values) / (2 * np.log(2)))
+
+
+TITLE = "Over all scores, as in the nuScenes tracking task, without a limit of range; the rest at the best MOTA"
+_SWEEP_COLUMNS = (
+    *("class", "AMOTA", "AMOTP", "MOTA", "MOTP", "recall", "IDS", "FRAG", "TP", "FP", "FN", "GT", "MT", "ML"),
+    *("FAF", "TID", "LGD"),
+)
+
+
+def score_sweep(pairs: Sequence[tuple[Scene, SceneBoxes]]) -> NuScenesTrackingMetrics:
+    """Score the tracks of scenes with ground truth by the metrics of the task: all classes, at any distance.
+
+    Hidden objects are left out. A frame counts as one median step of time in TID and LGD.
+    """
+    scenes = []
+    for scene, found in pairs:
+        truth = SceneBoxes.of_annotations(scene.ground_truth or (), hidden=False)
+        scenes.append(NuScenesTrackingScene(scene.timestamps, np.zeros((len(scene), 2)), truth, found))
+    labels = sorted({label for each in scenes for t in (each.truth, each.found) for label in t.boxes.label.tolist()})
+    steps = np.concatenate([np.empty(0), *(np.diff(each.timestamps) for each in scenes)])
+    period = float(np.median(steps)) if len(steps) else 1.0
+    settings = NuScenesTrackingSettings(class_range=dict.fromkeys(labels, np.inf), sample_period=period)
+    return nuscenes_tracking_metrics(scenes, settings)
+
+
+def sweep_table(title: str, metrics: NuScenesTrackingMetrics) -> FigureTable:
+    """The figures of the task, a row for all classes and one for each."""
+    rows = [("overall", metrics.overall), *metrics.per_class.items()]
+    return FigureTable(title, _SWEEP_COLUMNS, tuple((name, *_sweep_cells(figures)) for name, figures in rows))
+
+
+def best_thresholds(metrics: NuScenesTrackingMetrics) -> dict[str, float]:
+    """The score threshold of best MOTA of each class that occurs; infinite for one that is never matched."""
+    best = {}
+    for label, curves in metrics.curves.items():
+        reached = np.where(np.isfinite(curves.score), curves.mota, -np.inf)
+        best[label] = float(curves.score[np.argmax(reached)]) if np.isfinite(curves.score).any() else np.inf
+    return best
+
+
+def _sweep_cells(f: NuScenesClassMetrics) -> tuple[str, ...]:
+    shares = (cell(value) for value in (f.amota, f.amotp, f.mota, f.motp, f.recall))
+    counts = (count(value) for value in (f.ids, f.frag, f.tp, f.fp, f.fn, f.gt, f.mt, f.ml))
+    return (*shares, *counts, *(cell(value, 2) for value in (f.faf, f.tid, f.lgd)))
+
+
+LEGEND = (
+    "AMOTA: mean over all scores. score: that of the best MOTA; from it on HOTA,\n"
+    "MOTA, recall, identity switches (IDS), false boxes (FP). m, m/s: RMSE of places\n"
+    "and velocities. in 90 %: share of errors in 90 % ellipses (right: 0.90)."
+)
+_SUMMARY_COLUMNS = ("class", "AMOTA", "HOTA", "score", "MOTA", "recall", "IDS", "FP", "m", "m/s", "in 90 %")
+_LONGEST = 14  # characters of a class
+
+
+def summary_table(sweep: NuScenesTrackingMetrics, errors: LabelErrors, hota: Sequence[HotaRow] = ()) -> FigureTable:
+    """One row for all classes and one for each that has true objects; HOTA by the first overlap there is."""
+    by_class, scores = errors_by_class(errors), best_thresholds(sweep)
+    quality: dict[str, float] = {}
+    for row in hota:
+        quality.setdefault(row.label, row.figures.hota)
+    quality["overall"] = float(np.mean([quality[label] for label in scores if label in quality] or [np.nan]))
+    rows = []
+    for label in ("overall", *scores):
+        f = sweep.overall if label == "overall" else sweep.per_class[label]
+        error, fit = (
+            (error_summary(by_class[label]), calibration(by_class[label])) if label in by_class else (None, None)
+        )
+        shares = (f.amota, quality.get(label, np.nan), scores.get(label, np.nan), f.mota, f.recall)
+        rows.append(
+            (
+                label if len(label) <= _LONGEST else f"{label[: _LONGEST - 1]}~",
+                *(cell(value, 2) for value in shares),
+                *(cell(value, 0) for value in (f.ids, f.fp)),
+                *(cell(value, 2) for value in ((error.position, error.velocity) if error else (np.nan, np.nan))),
+                cell(fit.coverage[0.9] if fit and fit.boxes else np.nan, 2),
+            )
+        )
+    return FigureTable("Tracks beside the ground truth", _SUMMARY_COLUMNS, tuple(rows))
+
+
+_QUALITY_TITLE = "Whole tracks; rank quality: average precision by mean score"
+_QUALITY_COLUMNS = ("class", "tracks", "true", "ghosts", "ghost share", "rank quality")
+
+
+def track_table(tracks: WholeTracks) -> FigureTable:
+    """Table for people."""
+    return FigureTable(
+        _QUALITY_TITLE,
+        _QUALITY_COLUMNS,
+        tuple((name, *_quality_cells(f)) for name, f in track_summaries(tracks).items()),
+    )
+
+
+def _quality_cells(f: TrackSummary) -> tuple[str, ...]:
+    return (*map(cell, (f.tracks, f.true, f.ghosts)), cell(f.ghost_share), cell(f.rank_quality))
+
+
+_MOMENT_TITLE = (
+    "Tracks at every moment; MOTP and errors in m; carried error: of the track that last followed a hidden object"
+)
+_MOMENT_COLUMNS = (
+    *("class", "MOTA", "MOTP", "recall", "IDS", "FP", "FN", "objects", "hidden", "hidden tracked"),
+    *("carried error", "carried error median"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """The figures of one result over some scenes.
+
+    tracking     table of the tracking metrics
+    programs     the same figures by name, with the names of the scenes
+    errors       at labels
+    tracks       as wholes, of all scenes
+    hota         empty where it was not asked for
+    innovations  squared distances in sigmas by class; empty where they are not known
+    draw         makes pictures of the tracking metrics by name
+    sweep        over scores; None where it was not asked for
+    """
+
+    tracking: FigureTable
+    programs: Mapping[str, Any]
+    errors: LabelErrors
+    tracks: WholeTracks
+    hota: Sequence[HotaRow] = ()
+    innovations: Mapping[str, FloatArray] = field(default_factory=dict)
+    draw: Callable[[], Mapping[str, Any]] = dict
+    sweep: NuScenesTrackingMetrics | None = None
+
+    def summary(self) -> FigureTable | None:
+        """One narrow table of what matters most, None without the sweep over scores."""
+        return None if self.sweep is None else summary_table(self.sweep, self.errors, self.hota)
+
+    def tables(self) -> list[FigureTable]:
+        """Tables for people."""
+        innovations = [innovation_table(self.innovations)] if self.innovations else []
+        return [
+            self.tracking,
+            *([] if self.sweep is None else [sweep_table(TITLE, self.sweep)]),
+            *error_tables(self.errors),
+            track_table(self.tracks),
+            *innovations,
+            *([hota_table(self.hota)] if self.hota else []),
+        ]
+
+    def figures(self) -> dict[str, Any]:
+        """Figures for programs."""
+        swept = {} if self.sweep is None else {"sweep": {"overall": self.sweep.overall, **self.sweep.per_class}}
+        return {
+            **self.programs,
+            **swept,
+            **error_json(self.errors),
+            "tracks": track_summaries(self.tracks),
+            "innovations": innovation_json(self.innovations),
+            "hota": hota_json(self.hota),
+        }
+
+    def pictures(self) -> dict[str, Any]:
+        """matplotlib figures by name."""
+        return {**self.draw(), **error_pictures(self.errors)}
+
+
+def evaluate_tracks(
+    results: Sequence[tuple[Scene, SceneBoxes]],
+    with_hota: bool = False,
+    innovations: Mapping[str, FloatArray] | None = None,
+    sweep: bool = False,
+) -> Evaluation:
+    """Score the tracks found in some scenes, class by class, pooled over the scenes.
+
+    sweep        over scores, too (AMOTA); HOTA is then of the tracks from the score of the best MOTA on, else of all
+    innovations  squared distances of the run by class, to be among the figures
+
+    Raises `InputError` for a scene without ground truth, `MissingExtraError` for HOTA without trackeval.
+    """
+    by_label: dict[str, list[SceneMetrics]] = {}
+    errors, tracks, pairs = [], [], []
+    for scene, found in results:
+        if scene.ground_truth is None:
+            raise InputError(f"scene {scene.name}: expected ground truth")
+        for label, metrics in scene_metrics_by_label(scene.ground_truth, found.by_frame(len(scene))).items():
+            by_label.setdefault(label, []).append(metrics)
+        visible = SceneBoxes.of_annotations(scene.ground_truth, hidden=False)
+        errors.append(label_errors(visible, found, visible.boxes.velocity))
+        pairs.append((SceneBoxes.of_annotations(scene.ground_truth), found))
+        tracks.append(whole_tracks(*pairs[-1]))
+    pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
+    swept = score_sweep(results) if sweep else None
+    thresholds = dict.fromkeys(pooled, 0.0) if swept is None else best_thresholds(swept)
+    whole = {"overall": SceneMetrics.pool(pooled.values()), **pooled}
+    return Evaluation(
+        FigureTable(
+            _MOMENT_TITLE, _MOMENT_COLUMNS, tuple((name, *_moment_cells(metrics)) for name, metrics in whole.items())
+        ),
+        {
+            "scenes": tuple(scene.name for scene, _ in results),
+            "tracking": {name: _figures(metrics) for name, metrics in whole.items()},
+        },
+        LabelErrors.pool(errors),
+        WholeTracks.concatenate(tracks),
+        hota(pairs, thresholds) if with_hota else (),
+        innovations or {},
+        dict if swept is None else lambda: {"recall": recall_sweep(swept.curves)},
+        swept,
+    )
+
+
+def _moment_cells(m: SceneMetrics) -> tuple[str, ...]:
+    counts = (m.switches, m.false_positives, m.misses, m.objects, m.hidden_objects)
+    shares = (cell(m.mota), cell(m.motp), cell(m.recall))
+    return (*shares, *map(cell, counts), cell(m.hidden_recall), cell(m.carried.rmse), cell(m.carried.median))
+
+
+def _figures(m: SceneMetrics) -> dict[str, float]:
+    names = ("mota", "motp", "recall", "switches", "false_positives", "misses", "objects", "hidden_objects")
+    figures = {name: getattr(m, name) for name in (*names, "hidden_recall")}
+    samples = {"position": m.position, "velocity": m.velocity, "heading": m.heading, "carried": m.carried}
+    samples |= {"hidden_position": m.hidden_position, "hidden_velocity": m.hidden_velocity}
+    return figures | {f"{name}_rmse": sample.rmse for name, sample in samples.items()}
+
+
+PlacedBoxes = tuple[IntArray, Boxes]
+"""(moment (N,), boxes (N))"""
+
+
+def placed_detections(scene: Scene) -> PlacedBoxes:
+    """The boxes of all frames that were taken at a moment of the scene, in the frames' coordinates (world)."""
+    moment_of = {time: k for k, time in enumerate(scene.timestamps.tolist())}
+    frames = [(moment_of[frame.timestamp], frame) for frame in scene.frames if frame.timestamp in moment_of]
+    moment = np.repeat(np.array([k for k, _ in frames], dtype=np.int64), [len(frame) for _, frame in frames])
+    return moment, Boxes.concatenate([frame.detections.boxes for _, frame in frames])

@@ -1,0 +1,346 @@
+"""Landmarks in a scan: planes, poles and curbs, with their covariances.
+
+Planes in a scan: walls, and the ground under the vehicle.
+
+A plane is n . x + d = 0 in the sensor's frame, n of length 1 pointing to the side of the sensor (d > 0). Fitted to
+points, or to means of surfels, c their centre and a <= b <= e the eigenvalues of S = sum (p - c)(p - c)^T, n is the
+eigenvector of a and d = - n . c. With a noise of sigma across the plane, and k points,
+
+    var(tilt) = sigma^2 / b        (the worse of the two directions),        var(d) = sigma^2 / k + |c|^2 var(tilt)
+
+where the last term is the effect of the tilt on the distance at the sensor. Walls are found by consensus: the upright
+flat surfel with the most others in its plane forms a wall with the connected ones among them; this is repeated with
+the remaining surfels.
+
+Poles in a scan: masts, posts and trunks.
+
+Points above the ground are clustered from above (`clusters_from_above`) on small cells. A cluster is a pole if it is
+thin, tall, filled from its foot to its top, and isolated: few points in the ring around it at its own height.
+Its position is the mean of its points, moved away from the sensor, because the visible points of a circle of radius r
+lie on average pi/4 r in front of its centre. The width w across the line of sight gives r = w / 2.
+
+Curbs: points on the edge of the road, and straight lines through them with the covariance of their ends.
+
+Points. Near the ground, each narrow sector is a profile of heights over the distance: the median height in steps of a
+quarter metre. A curb is a rise within two steps that is more than the roughness of tarmac, less than a wall, and stays;
+the first one from the vehicle outwards is the edge of the road. After Zhao and Yuan, Curb detection and tracking using
+3D-LIDAR scanner, ICIP 2012 (height steps along the rays).
+
+Lines. Each pair of points that is far enough apart is a candidate; the line with the most points beside it, without a
+long gap, is fitted by least squares and its points are removed, then the next is searched (RANSAC of Fischler and
+Bolles, 1981, over all pairs, because there are few points). With n points of deviation sigma across the line, at u_i
+along it, the two ends at u and u' have the covariance
+
+    cov(e(u), e(u')) = sigma^2 ( 1/n + (u - m)(u' - m) / sum (u_i - m)^2 ) + bias^2 [u = u']
+
+where the bias is an error that neighbouring points share: rings cross a curb at equal angles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from data_tools.lidar.registration import surfels_of
+from data_tools.lidar.scan import cell_order_statistics, clusters_from_above, voxel_downsample
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+
+_MIN_COSINE = 0.97  # least cosine between normals of one wall
+_MAX_THICKNESS = 0.15  # largest distance of a surfel from the plane of its wall, m
+_MIN_SURFELS = 8  # fewest surfels of a wall
+SURFEL_SIZE = 1.0  # voxel size of the surfels, m
+PLANE_MAX_RANGE = 50.0  # largest distance from the sensor, m
+MAX_TILT = 0.15  # largest z component of the normal of a wall
+PLANE_MAX_GAP = 3.0  # largest gap within a wall, m
+PLANE_MIN_LENGTH = 3.0  # least length of a wall, m
+WALL_NOISE = 0.03  # standard deviation of surfels across their wall, m
+GROUND_NOISE = 0.02  # standard deviation of surfels of the ground, m
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane and its visible part, in the sensor's frame.
+
+    coefficients  (4,) n and d, d > 0
+    covariance    (3, 3) of two tilts of n (rad^2) and of d (m^2); no correlations, the tilts alike
+    centre        (3,) of the visible part, m
+    extent        (2, 3) its ends: for a wall the lowest point of one end and the highest of the other; for the ground
+                  two corners
+    """
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    centre: FloatArray
+    extent: FloatArray
+
+
+def fit_plane(points: FloatArray, noise: float) -> Plane:
+    """The plane of points (N, 3), m, N >= 3, each with `noise` m across it."""
+    centre = points.mean(axis=0)
+    off = points - centre
+    values, vectors = np.linalg.eigh(off.T @ off)
+    normal, d = vectors[:, 0], float(-vectors[:, 0] @ centre)
+    if d < 0:
+        normal, d = -normal, -d
+    tilt = noise**2 / max(float(values[1]), 1e-9)
+    covariance = np.diag([tilt, tilt, noise**2 / len(points) + float(centre @ centre) * tilt])
+    along = off @ vectors[:, 2]
+    ends = np.stack([points[along.argmin()], points[along.argmax()]])
+    ends[0, 2], ends[1, 2] = points[:, 2].min(), points[:, 2].max()
+    return Plane(np.append(normal, d), covariance, centre, ends)
+
+
+def near_walls(positions: FloatArray, walls: Sequence[Plane], distance: float) -> BoolArray:
+    """Mask of the positions (N, 3), m, within a horizontal `distance`, m, of the visible part of a wall."""
+    near = np.zeros(len(positions), dtype=np.bool_)
+    for wall in walls:
+        along = np.array([-wall.coefficients[1], wall.coefficients[0]])
+        ends = np.sort(wall.extent[:, :2] @ along)
+        u = positions[:, :2] @ along
+        across = np.abs(positions @ wall.coefficients[:3] + wall.coefficients[3])
+        near |= (across <= distance) & (u >= ends[0] - distance) & (u <= ends[1] + distance)
+    return near
+
+
+def fit_ground(ground: FloatArray, reach: float = 15.0) -> Plane | None:
+    """The plane of the ground points (N, 3) within `reach` m; None for too few points."""
+    near = ground[np.hypot(ground[:, 0], ground[:, 1]) <= reach]
+    near = near[voxel_downsample(near, SURFEL_SIZE)]
+    for _ in range(3):
+        if len(near) < 3 * _MIN_SURFELS:
+            return None
+        plane = fit_plane(near, GROUND_NOISE)
+        off = np.abs(near @ plane.coefficients[:3] + plane.coefficients[3])
+        near = near[off <= max(2.5 * float(np.median(off)), 0.01)]
+    return plane
+
+
+def extract_walls(points: FloatArray) -> list[Plane]:
+    """The walls among points (N, 3), m, of a scan without its ground, the largest first."""
+    points = points[np.hypot(points[:, 0], points[:, 1]) <= PLANE_MAX_RANGE]
+    surfels = surfels_of(points, SURFEL_SIZE)
+    surfels = surfels.select(surfels.flat & (np.abs(surfels.normal[:, 2]) <= MAX_TILT))
+    mean, normal = surfels.mean, surfels.normal
+    coplanar = np.abs(normal @ normal.T) >= _MIN_COSINE
+    across = np.abs(normal @ mean.T - np.einsum("ni,ni->n", normal, mean)[:, None])
+    coplanar &= (across <= _MAX_THICKNESS) & (_MAX_THICKNESS >= across.T)
+    walls: list[Plane] = []
+    left = np.ones(len(mean), dtype=np.bool_)
+    while left.any():
+        support = coplanar[:, left].sum(axis=1) * left
+        best = int(support.argmax())
+        if support[best] < _MIN_SURFELS:
+            break
+        rows = _connected(mean, np.flatnonzero(coplanar[best] & left), best, PLANE_MAX_GAP)
+        left[rows] = left[best] = False
+        if len(rows) < _MIN_SURFELS:
+            continue
+        wall = fit_plane(mean[rows], WALL_NOISE)
+        if (
+            np.hypot(*(wall.extent[1] - wall.extent[0])[:2]) >= PLANE_MIN_LENGTH
+            and abs(wall.coefficients[2]) <= MAX_TILT
+        ):
+            walls.append(wall)
+    return walls
+
+
+def _connected(mean: FloatArray, rows: IntArray, seed: int, gap: float) -> IntArray:
+    """The rows connected with `seed` by gaps of at most `gap` m."""
+    pairs = cKDTree(mean[rows]).query_pairs(gap, output_type="ndarray")
+    links = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
+    _, part = connected_components(links, directed=False)
+    return np.asarray(rows[part == part[np.flatnonzero(rows == seed)[0]]])
+
+
+_MIN_FILLED = 0.5  # least share of half-metre steps of the height that contain points
+_CLEAR_RADIUS = 0.6  # radius around the axis without other objects, m
+_DEPTH_NOISE = 0.1  # standard deviation along the line of sight, from the unknown radius, m
+CELL = 0.2  # cell of the clustering grid, m
+POLE_MAX_RANGE = 40.0  # largest distance from the sensor, m
+MIN_HEIGHT = 0.3  # lowest height above the ground of clustered points, m
+POLE_MIN_LENGTH = 1.2  # least height from the lowest to the highest point, m
+MAX_WIDTH = 0.6  # largest horizontal extent, m
+MIN_POINTS = 8  # fewest points
+CLEAR_SHARE = 0.1  # _CLEAR_RADIUS as a share of the range, against columns of walls at grazing angles
+POLE_NOISE = 0.05  # standard deviation of the axis, m
+BEARING_NOISE = 0.006  # standard deviation across the line of sight, rad
+
+
+@dataclass(frozen=True, eq=False)
+class Pole:
+    """An upright pole, in the sensor's frame.
+
+    foot        (3,) lowest visible point of the axis, m
+    top         height of the highest visible point, m
+    radius      m
+    covariance  (2, 2) of the axis' position, x and y, m^2
+    """
+
+    foot: FloatArray
+    top: float
+    radius: float
+    covariance: FloatArray
+
+
+def extract_poles(points: FloatArray, height: FloatArray, walls: Sequence[Plane] = ()) -> list[Pole]:
+    """The poles among points (N, 3), m, at `height` (N,) above the ground, m, except near `walls`."""
+    points = points[(height >= MIN_HEIGHT) & (np.hypot(points[:, 0], points[:, 1]) <= POLE_MAX_RANGE)]
+    everything = points
+    points = points[~near_walls(points, walls, CELL)]
+    slender = [points[rows] for rows in _slender(points, clusters_from_above(points, CELL))]
+    if not slender:
+        return []
+    tree = cKDTree(everything[:, :2], balanced_tree=False, compact_nodes=False)
+    poles = []
+    for candidate in slender:
+        pole = _pole(candidate)
+        around = everything[
+            tree.query_ball_point(pole.foot[:2], max(_CLEAR_RADIUS, CLEAR_SHARE * float(np.hypot(*pole.foot[:2]))))
+        ]
+        level = (around[:, 2] >= pole.foot[2]) & (around[:, 2] <= pole.top)
+        if level.sum() <= 1.2 * len(candidate):
+            poles.append(pole)
+    return poles
+
+
+def _slender(points: FloatArray, clusters: Sequence[IntArray]) -> list[IntArray]:
+    """The clusters that are thin, tall and filled."""
+    if not clusters:
+        return []
+    count = np.array([len(rows) for rows in clusters])
+    grouped, start = points[np.concatenate(clusters)], np.cumsum(count) - count
+    low, high = np.minimum.reduceat(grouped, start), np.maximum.reduceat(grouped, start)
+    size = high - low
+    thin = (count >= MIN_POINTS) & (size[:, :2].max(axis=1) <= MAX_WIDTH) & (size[:, 2] >= POLE_MIN_LENGTH)
+    return [clusters[k] for k in np.flatnonzero(thin).tolist() if _filled(points[clusters[k], 2])]
+
+
+def _filled(height: FloatArray) -> bool:
+    steps = np.floor((height - height.min()) / 0.5)
+    return bool(len(np.unique(steps)) >= _MIN_FILLED * np.ceil(np.ptp(height) / 0.5))
+
+
+def _pole(points: FloatArray) -> Pole:
+    mean = points[:, :2].mean(axis=0)
+    sight = mean / max(float(np.hypot(*mean)), 1e-9)
+    aside = np.array([-sight[1], sight[0]])
+    across = points[:, :2] @ aside
+    radius = float(np.ptp(across)) / 2
+    axis = mean + np.pi / 4 * radius * sight
+    covariance = np.cov(points[:, :2].T) / len(points) + POLE_NOISE**2 * np.eye(2)
+    covariance += (BEARING_NOISE * float(np.hypot(*mean))) ** 2 * np.outer(aside, aside)
+    covariance += _DEPTH_NOISE**2 * np.outer(sight, sight)
+    return Pole(np.append(axis, points[:, 2].min()), float(points[:, 2].max()), radius, covariance)
+
+
+_SECTORS = 180  # number of sectors around the sensor
+SPACING = 0.25  # spacing of the height profile, m
+MIN_RANGE = 2.5  # nearest distance from the sensor, m
+CURB_MAX_RANGE = 20.0  # largest distance from the sensor, limited by the spacing of the rings, m
+MIN_STEP = 0.05  # least step, m
+MAX_STEP = 0.3  # largest step, m
+MAX_OFFSET = 0.2  # largest distance of a point from its line, m
+CURB_MAX_GAP = 4.0  # longest gap between points of a line, m
+CURB_MIN_LENGTH = 6.0  # least length, m
+CURB_NOISE = 0.1  # least standard deviation of a point across the line, m
+BIAS = 0.1  # standard deviation of the error that neighbouring points share, m
+
+
+def extract_curbs(points: FloatArray, height: FloatArray) -> FloatArray:
+    """Points (M, 3), m, on the edge of the road, at most one in each sector.
+
+    points  (N, 3) m, sensor's frame; height (N,) of each above the ground, m
+    """
+    distance = np.hypot(points[:, 0], points[:, 1])
+    low = (np.abs(height) <= MAX_STEP) & (distance >= MIN_RANGE) & (distance < CURB_MAX_RANGE)
+    points, distance = points[low], distance[low]
+    if not len(points):
+        return np.empty((0, 3))
+    steps = int(np.ceil((CURB_MAX_RANGE - MIN_RANGE) / SPACING))
+    turn = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+    sector = (turn * _SECTORS).astype(np.int64) % _SECTORS
+    bin_ = sector * steps + ((distance - MIN_RANGE) / SPACING).astype(np.int64)
+    profile = cell_order_statistics(points[:, 2], bin_, _SECTORS * steps, 2).reshape(_SECTORS, steps)
+    row, step = _first_steps(profile)
+    angle = ((row + 0.5) / _SECTORS - 0.5) * 2 * np.pi
+    out = MIN_RANGE + (step + 0.5) * SPACING
+    return np.column_stack([out * np.cos(angle), out * np.sin(angle), profile[row, step]])
+
+
+def _first_steps(profile: FloatArray) -> tuple[IntArray, IntArray]:
+    """Sectors of the profile (sectors, steps) that rise and stay higher, and the index at which each first does."""
+    seen = np.isfinite(profile)
+    at = np.argsort(~seen, axis=1, kind="stable")  # filled steps of a sector in front, outwards
+    z, count = np.take_along_axis(profile, at, axis=1), seen.sum(axis=1)
+    k = np.arange(z.shape[1] - 3)
+    before = np.maximum(k[:, None] - np.arange(4), 0)  # the last four up to k
+    weight = (k[:, None] >= np.arange(4)).astype(np.float64)
+    mean = np.einsum("rki,ki->rk", z[:, before], weight) / weight.sum(axis=1)
+    rise = np.minimum(z[:, 1:-2], z[:, 2:-1]) - mean
+    with np.errstate(invalid="ignore"):  # NaN beyond the filled ones
+        found = (at[:, 1:-2] - at[:, :-3] <= 2) & (rise >= MIN_STEP) & (rise <= MAX_STEP)
+        found &= np.abs(z[:, :-3] - z[:, np.maximum(k - 2, 0)]) < MIN_STEP / 2
+    found &= k < count[:, None] - 3
+    row = np.flatnonzero(found.any(axis=1))
+    return row, at[row, found[row].argmax(axis=1) + 1]
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A straight line segment: ends (2, 3), m, and the covariance (2, 2) of the ends across it, m^2."""
+
+    ends: FloatArray
+    covariance: FloatArray
+
+
+def straight_lines(points: FloatArray, most: int) -> list[Line]:
+    """At most `most` lines through points (M, 3), m, the one with the most points first."""
+    found: list[Line] = []
+    while len(found) < most and len(points) >= MIN_POINTS:
+        chosen = _best_line(points[:, :2])
+        if chosen is None:
+            break
+        found.append(_fit_line(points[chosen]))
+        points = points[~chosen]
+    return found
+
+
+def _best_line(xy: FloatArray) -> BoolArray | None:
+    """Mask (M,) of the points on the candidate line with the most points; None if none has enough."""
+    i, j = np.triu_indices(len(xy), 1)
+    apart = xy[j] - xy[i]
+    length = np.linalg.norm(apart, axis=1)
+    far = length >= CURB_MIN_LENGTH / 2
+    i, apart, length = i[far], apart[far], length[far]
+    normal = np.stack([-apart[:, 1], apart[:, 0]], axis=1) / length[:, None]
+    off = np.abs(normal @ xy.T - (normal * xy[i]).sum(axis=1)[:, None])
+    count = (off <= MAX_OFFSET).sum(axis=1)
+    for line in np.argsort(-count, kind="stable")[:20]:
+        if count[line] < MIN_POINTS:
+            return None
+        rows = np.flatnonzero(off[line] <= MAX_OFFSET)
+        u = xy[rows] @ (apart[line] / length[line])
+        order = np.argsort(u)
+        pieces = np.split(order, np.flatnonzero(np.diff(u[order]) > CURB_MAX_GAP) + 1)
+        piece = max(pieces, key=len)
+        if len(piece) >= MIN_POINTS and u[piece[-1]] - u[piece[0]] >= CURB_MIN_LENGTH:
+            chosen = np.zeros(len(xy), dtype=np.bool_)
+            chosen[rows[piece]] = True
+            return chosen
+    return None
+
+
+def _fit_line(points: FloatArray) -> Line:
+    centre = points.mean(axis=0)
+    xy = points[:, :2] - centre[:2]
+    along = np.linalg.svd(xy, full_matrices=False)[2][0]
+    u, e = xy @ along, xy @ np.array([-along[1], along[0]])
+    variance = max(float(e @ e) / (len(points) - 2), CURB_NOISE**2)
+    ends = np.array([u.min(), u.max()])
+    covariance = variance * (1 / len(points) + np.outer(ends, ends) / float(u @ u)) + BIAS**2 * np.eye(2)
+    return Line(np.column_stack([centre[:2] + ends[:, None] * along, np.full(2, centre[2])]), covariance)

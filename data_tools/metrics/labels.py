@@ -1,0 +1,290 @@
+"""Quality of labels: precision and recall, errors on common boxes, and without ground truth.
+
+Errors of several systems on common true boxes: those that every system matches.
+
+Pairs are the nearest within a gate, frame by frame and class by class (`nearest_pairs`): first with the visible
+objects, then, of the remaining boxes, with the hidden ones. A pair counts if its track is paired with no other object
+more often: where one system has no box any more, the nearest one is that of a neighbour. A system that finds more boxes
+also finds more difficult ones, so systems are compared on the boxes that all of them find.
+
+Precision and recall of boxes within a matching distance.
+
+A box is a true positive if it is matched to a visible object within the distance: in order of their scores, boxes take
+the nearest free object of their frame and class (the matching of the nuScenes detection benchmark,
+https://www.nuscenes.org/object-detection, "Matching"). Boxes matched to hidden objects are ignored. Over a threshold on
+the score,
+
+    precision = true / (true + false),   recall = true / visible objects
+
+Quality of labels without ground truth.
+
+jerkiness       root mean square of the acceleration between neighbouring boxes of an object, m/s^2: real objects
+                accelerate by a few m/s^2, jumps of a box look like tens
+turned          share of neighbouring boxes whose heading differs by more than a quarter turn
+resized         root mean square of the change of length between neighbouring boxes, m
+gaps            share of frames between the first and last box of an object in which it has none
+residual        mean of r^T R^-1 r / 2 over the detections nearest to a box, r their distance, R the sensor's noise:
+                about 1 for true positions, less for boxes that follow the detections, far above 1 where they are off
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from data_tools.metrics.error_sample import ErrorSample, nees
+from data_tools.metrics.scene_boxes import SceneBoxes, near_pairs, nearest_pairs
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.types.boxes import Boxes
+
+__all__ = [
+    "QUANTITIES",
+    "CommonBoxes",
+    "LabelledScene",
+    "PrecisionRecall",
+    "SelfConsistency",
+    "common_boxes",
+    "precision_recall",
+    "scored_pairs",
+    "self_consistency",
+]
+
+QUANTITIES = ("position", "heading", "size", "velocity", "nees")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScene:
+    """One scene: N true boxes, and the boxes of several systems.
+
+    truth     all objects, hidden ones too
+    visible   (N,) True for objects that a sensor could see
+    velocity  (N, 2) m/s, NaN where unknown
+    distance  (N,) from the vehicle, m
+    systems   boxes by name of the system
+    """
+
+    truth: SceneBoxes
+    visible: BoolArray
+    velocity: FloatArray
+    distance: FloatArray
+    systems: Mapping[str, SceneBoxes]
+
+
+@dataclass(frozen=True, eq=False)
+class CommonBoxes:
+    """M true boxes that every system matches.
+
+    label (M,), distance (M,) m, visible (M,)
+    errors  by system and quantity (M,): position m, heading rad, size m (mean of length, width, height), velocity m/s,
+            nees (squared position error over its covariance, 2 degrees of freedom); NaN where unknown
+    """
+
+    label: StrArray
+    distance: FloatArray
+    visible: BoolArray
+    errors: Mapping[str, Mapping[str, FloatArray]]
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    def select(self, rows: BoolArray | IntArray) -> Self:
+        """The boxes of a mask or of row indices."""
+        errors = {name: {q: column[rows] for q, column in of.items()} for name, of in self.errors.items()}
+        return type(self)(self.label[rows], self.distance[rows], self.visible[rows], errors)
+
+    @classmethod
+    def pool(cls, parts: Iterable[CommonBoxes]) -> Self:
+        """The boxes of all scenes, which have the same systems."""
+        scenes = list(parts)
+        errors = {
+            name: {q: np.concatenate([scene.errors[name][q] for scene in scenes]) for q in QUANTITIES}
+            for name in (scenes[0].errors if scenes else ())
+        }
+        return cls(
+            np.concatenate([np.empty(0, dtype="<U1"), *(scene.label for scene in scenes)]),
+            np.concatenate([np.empty(0), *(scene.distance for scene in scenes)]),
+            np.concatenate([np.empty(0, dtype=np.bool_), *(scene.visible for scene in scenes)]),
+            errors,
+        )
+
+    def sample(self, system: str, quantity: str) -> ErrorSample:
+        """The known errors of a system."""
+        return ErrorSample.known(self.errors[system][quantity])
+
+
+def common_boxes(scene: LabelledScene, gate: float) -> CommonBoxes:
+    """The true boxes that every system matches within `gate` (m), with the errors of each system."""
+    errors = {name: _errors(scene, table, gate) for name, table in scene.systems.items()}
+    found = np.ones(len(scene.truth), dtype=np.bool_)
+    for of in errors.values():
+        found &= np.isfinite(of["position"])
+    whole = CommonBoxes(scene.truth.boxes.label, scene.distance, scene.visible, errors)
+    return whole.select(found)
+
+
+def visible_then_hidden(
+    truth: SceneBoxes, visible: BoolArray, found: SceneBoxes, gate: float
+) -> tuple[IntArray, IntArray]:
+    """Rows of matched true and found boxes: visible objects are matched first, then hidden ones."""
+    free = np.arange(len(found))
+    pairs = []
+    for rows in (np.flatnonzero(visible), np.flatnonzero(~visible)):
+        a, b = truth.select(rows), found.select(free)
+        i, j, _ = nearest_pairs((a.frame, a.boxes), (b.frame, b.boxes), gate)
+        pairs.append((rows[i], free[j]))
+        free = np.setdiff1d(free, free[j])
+    return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
+
+
+def _errors(scene: LabelledScene, found: SceneBoxes, gate: float) -> dict[str, FloatArray]:
+    """The errors of one system at all true boxes, NaN where it has none."""
+    columns = {name: np.full(len(scene.truth), np.nan) for name in QUANTITIES}
+    row, column = visible_then_hidden(scene.truth, scene.visible, found, gate)
+    own = _holds_most(scene.truth.id[row], found.id[column])
+    row, column = row[own], column[own]
+    a, b = scene.truth.boxes.select(row), found.boxes.select(column)
+    offset = (b.position - a.position)[:, :2]
+    columns["position"][row] = np.hypot(*offset.T)
+    columns["heading"][row] = np.abs(wrap_angle(b.yaw - a.yaw))
+    columns["size"][row] = np.abs(b.size - a.size).mean(axis=1)
+    columns["velocity"][row] = np.hypot(*(b.velocity - scene.velocity[row]).T)
+    columns["nees"][row] = nees(offset, found.position_covariance[column])
+    return columns
+
+
+def _holds_most(objects: StrArray, tracks: StrArray) -> BoolArray:
+    """(P,) of pairs whose track is paired with no other object more often."""
+    track, of_track = np.unique(tracks, return_inverse=True)
+    pair, of_pair, count = np.unique(
+        np.stack([of_track, np.unique(objects, return_inverse=True)[1]]),
+        axis=1,
+        return_inverse=True,
+        return_counts=True,
+    )
+    most = np.zeros(len(track), dtype=np.int64)
+    np.maximum.at(most, pair[0], count)
+    return np.asarray(count[of_pair.ravel()] == most[of_track])
+
+
+class ScoredPairs(NamedTuple):
+    """Boxes of a system that count: score (B,), true (B,) for true positives, and the number of visible objects."""
+
+    score: FloatArray
+    true: BoolArray
+    objects: int
+
+
+@dataclass(frozen=True, eq=False)
+class PrecisionRecall:
+    """Precision (B,) and recall (B,) for falling score thresholds."""
+
+    precision: FloatArray
+    recall: FloatArray
+
+    @property
+    def whole(self) -> tuple[float, float]:
+        """Precision and recall of all boxes."""
+        return (float(self.precision[-1]), float(self.recall[-1])) if len(self.recall) else (float("nan"), 0.0)
+
+    @property
+    def best(self) -> tuple[float, float]:
+        """Precision and recall where F1, their harmonic mean, is best."""
+        if len(self.recall) == 0:
+            return float("nan"), 0.0
+        f1 = 2 * self.precision * self.recall / np.maximum(self.precision + self.recall, 1e-12)
+        k = int(np.argmax(f1))
+        return float(self.precision[k]), float(self.recall[k])
+
+    @property
+    def average_precision(self) -> float:
+        """Area under the curve, a step function: precision weighted by the gain in recall."""
+        return float(np.sum(np.diff(self.recall, prepend=0.0) * self.precision))
+
+    def recall_at(self, precision: float) -> float:
+        """The largest recall with at least this precision; 0 if there is none."""
+        return float(self.recall[self.precision >= precision].max(initial=0.0))
+
+
+def scored_pairs(truth: SceneBoxes, visible: BoolArray, found: SceneBoxes, distance: float) -> ScoredPairs:
+    """Match the boxes of one scene within `distance`, m; visible (N,) of the true boxes."""
+    i, j, apart = near_pairs((truth.frame, truth.boxes), (found.frame, found.boxes), distance)
+    order = np.lexsort((apart, j, -found.score[j]))  # by falling score, then by distance
+    taken = np.zeros(len(truth), dtype=np.bool_)
+    true = np.zeros(len(found), dtype=np.bool_)
+    counts = np.ones(len(found), dtype=np.bool_)
+    last = -1
+    for row, column in zip(i[order].tolist(), j[order].tolist(), strict=True):
+        if column == last or taken[row]:
+            continue
+        taken[row], last = True, column
+        true[column] = counts[column] = visible[row]
+    return ScoredPairs(found.score[counts], true[counts], int(visible.sum()))
+
+
+def precision_recall(scenes: list[ScoredPairs]) -> PrecisionRecall:
+    """The curve of all scenes together."""
+    score = np.concatenate([np.empty(0), *(scene.score for scene in scenes)])
+    true = np.concatenate([np.empty(0, dtype=np.bool_), *(scene.true for scene in scenes)])
+    objects = sum(scene.objects for scene in scenes)
+    order = np.argsort(-score, kind="stable")
+    hits = np.cumsum(true[order])
+    last = np.flatnonzero(np.diff(score[order], append=-np.inf) < 0)  # boxes of equal score share one threshold
+    return PrecisionRecall(hits[last] / (last + 1), hits[last] / max(objects, 1))
+
+
+GATE = 2.0  # between a box and its detection, m
+
+
+@dataclass(frozen=True)
+class SelfConsistency:
+    """The figures of one system, see the module; NaN where undefined."""
+
+    objects: int
+    boxes: int
+    frames_each: float
+    jerkiness: float
+    turned: float
+    resized: float
+    gaps: float
+    residual: float
+
+
+def self_consistency(
+    found: SceneBoxes, timestamps: FloatArray, detections: tuple[IntArray, Boxes, FloatArray] | None = None
+) -> SelfConsistency:
+    """The figures of one scene, or of several whose frames are numbered consecutively and whose ids differ.
+
+    timestamps (K,) s of the frames; detections: (frame (M,), boxes, R (M, 2, 2) m^2)
+    """
+    _, number = np.unique(found.id, return_inverse=True)
+    order = np.lexsort((found.frame, number))
+    number, frame = number[order], found.frame[order]
+    boxes = found.boxes.select(order)
+    same = number[1:] == number[:-1]
+    dt = timestamps[frame[1:]] - timestamps[frame[:-1]]
+    step = (boxes.position[1:, :2] - boxes.position[:-1, :2]) / np.where(same, dt, np.nan)[:, None]
+    acceleration = 2 * (step[1:] - step[:-1]) / (dt[1:] + dt[:-1])[:, None]
+    turn = np.abs(wrap_angle(boxes.yaw[1:] - boxes.yaw[:-1]))[same]
+    resized = (boxes.size[1:, 0] - boxes.size[:-1, 0])[same]
+    between = (frame[1:] - frame[:-1])[same]
+    lifespan = int(between.sum()) + len(np.unique(number))  # frames, summed over objects
+    return SelfConsistency(
+        objects=len(np.unique(number)),
+        boxes=len(found),
+        frames_each=len(found) / max(len(np.unique(number)), 1),
+        jerkiness=ErrorSample.known(np.hypot(*acceleration.T)).rmse,
+        turned=ErrorSample((turn > np.pi / 2)[np.isfinite(turn)].astype(np.float64)).mean,
+        resized=ErrorSample.known(resized).rmse,
+        gaps=float((between - 1).sum()) / max(lifespan, 1),
+        residual=float("nan") if detections is None else _residual(found, *detections),
+    )
+
+
+def _residual(found: SceneBoxes, frame: IntArray, boxes: Boxes, R: FloatArray) -> float:
+    row, column, _ = nearest_pairs((found.frame, found.boxes), (frame, boxes), GATE)
+    r = (boxes.position[column] - found.boxes.position[row])[:, :2]
+    return ErrorSample(np.einsum("ni,ni->n", r, np.linalg.solve(R[column], r[..., None])[..., 0]) / 2).mean

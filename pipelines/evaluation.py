@@ -1,0 +1,301 @@
+"""Labels beside online tracks and detections, against ground truth, and the figures of a whole dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.results import SceneResult, scene_result
+from data_tools.datasets.source import DatasetSource
+from data_tools.evaluation import placed_detections
+from data_tools.figures import FigureTable, cell, write_figures
+from data_tools.files.atomic_files import write_text
+from data_tools.metrics import SceneBoxes, coverages
+from data_tools.metrics.labels import (
+    CommonBoxes,
+    LabelledScene,
+    PrecisionRecall,
+    SelfConsistency,
+    common_boxes,
+    precision_recall,
+    scored_pairs,
+    self_consistency,
+)
+from pipelines.config import Method
+from pipelines.report import report_page, result_report
+from pipelines.report.figures import accuracy_charts
+from pipelines.report.page import RunRecord, write_run_record
+from pipelines.smoothing import SmoothConfig
+from pipelines.tracking import Progress, track_scene
+from saga_fg.errors import InputError
+from saga_fg.model.sensor import sensor_model
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.smoothing import gather_evidence
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Dataset, Scene
+
+if TYPE_CHECKING:
+    from data_tools.evaluation import Evaluation
+
+DISTANCES = (0.5, 1.0, 2.0)  # m
+PRECISIONS = (0.9, 0.8, 0.7)
+RANGES = ((0.0, 20.0), (20.0, 40.0), (40.0, np.inf))  # m
+SYSTEMS = ("detections", "online", "labels")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelEvaluation:
+    """The figures of labels over some scenes.
+
+    curves       by distance (m) and system; empty without ground truth
+    same         by distance: the true boxes that all systems match
+    consistency  by system
+    """
+
+    scenes: tuple[str, ...]
+    curves: Mapping[float, Mapping[str, PrecisionRecall]]
+    same: Mapping[float, CommonBoxes]
+    consistency: Mapping[str, SelfConsistency]
+
+    def tables(self) -> list[FigureTable]:
+        """Tables for people."""
+        tables = [] if not self.curves else [_recall_table(self.curves), *map(_group_table, self._groups())]
+        if self.same:
+            tables.append(_calibration_table(self.same[2.0]))
+        return [*tables, _consistency_table(self.consistency)]
+
+    def figures(self) -> dict[str, Any]:
+        """Figures for programs."""
+        return {
+            "scenes": self.scenes,
+            "precision_recall": {
+                str(distance): {
+                    name: {
+                        "whole": curve.whole,
+                        "best_f1": curve.best,
+                        "recall_at": {str(p): curve.recall_at(p) for p in PRECISIONS},
+                    }
+                    for name, curve in curves.items()
+                }
+                for distance, curves in self.curves.items()
+            },
+            "common_boxes": {
+                title: {group: _json_of(boxes) for group, boxes in groups.items()} for title, groups in self._groups()
+            },
+            "consistency": {name: asdict(value) for name, value in self.consistency.items()},
+        }
+
+    def _groups(self) -> list[tuple[str, dict[str, CommonBoxes]]]:
+        """Tables of the same boxes: by distance of the match, class, range, and whether they could be seen."""
+        if not self.same:
+            return []
+        visible = {d: same.select(same.visible) for d, same in self.same.items()}
+        wide = visible[2.0]
+        far = {f"{a:g} to {b:g} m": wide.select((wide.distance >= a) & (wide.distance < b)) for a, b in RANGES}
+        hidden = self.same[2.0].select(~self.same[2.0].visible)
+        return [
+            ("matched within", {f"{d:g} m": same for d, same in visible.items()}),
+            ("class", {str(c): wide.select(wide.label == c) for c in np.unique(wide.label)}),
+            ("range", far),
+            ("occlusion", {"visible": wide, "hidden": hidden}),
+        ]
+
+
+def evaluate_labels(
+    table: str | Path,
+    dataset: Dataset,
+    config: SmoothConfig,
+    method: Method = "saga",
+    progress: Progress | None = None,
+) -> LabelEvaluation:
+    """Judge a table of labels by the dataset it was made of; the online tracks are made anew, as `config` says.
+
+    The scenes are those in the table. Raises `InputError` for a table that is missing, broken or empty, and for
+    scenes and moments that the dataset does not have.
+    """
+    rows = read_label_table(table)
+    if len(rows.source) == 0:
+        raise InputError(f"{table}: expected labels, there are none")
+    scenes: list[str] = []
+    timestamps: list[FloatArray] = []
+    labelled: list[LabelledScene] = []
+    parts: dict[str, list[SceneBoxes]] = {name: [] for name in SYSTEMS}
+    seen: list[tuple[IntArray, Boxes, FloatArray]] = []
+    for name in np.unique(rows.tracks.scene).tolist():
+        scene = dataset.scene(name)
+        online = track_scene(scene, config.tracking.new_tracker(method), progress)
+        systems = {
+            "detections": _detections(scene, config),
+            "online": SceneBoxes.of_tracks(online.tracks),
+            "labels": scene_result(scene, rows.tracks, table).found,
+        }
+        first = len(np.concatenate([np.empty(0), *timestamps]))
+        for system, found in systems.items():
+            parts[system].append(_moved(found, first, name))
+        seen.append(_noise(scene, config, first))
+        timestamps.append(scene.timestamps)
+        scenes.append(name)
+        if scene.ground_truth is not None:
+            labelled.append(_labelled(scene, systems))
+    times = np.concatenate([np.empty(0), *timestamps])
+    moment, boxes, R = zip(*seen, strict=True)
+    noise = np.concatenate(moment), Boxes.concatenate(boxes), np.concatenate(R)
+    consistency = {
+        name: self_consistency(SceneBoxes.concatenate(parts[name]), times, noise) for name in ("online", "labels")
+    }
+    curves: dict[float, dict[str, PrecisionRecall]] = {}
+    same: dict[float, CommonBoxes] = {}
+    if len(labelled) == len(scenes):
+        for distance in DISTANCES:
+            curves[distance] = {
+                system: precision_recall(
+                    [scored_pairs(s.truth, s.visible, s.systems[system], distance) for s in labelled]
+                )
+                for system in SYSTEMS
+            }
+            same[distance] = CommonBoxes.pool(common_boxes(scene, distance) for scene in labelled)
+    return LabelEvaluation(tuple(scenes), curves, same, consistency)
+
+
+def _detections(scene: Scene, config: SmoothConfig) -> SceneBoxes:
+    """The detections taken at the scene's moments, each an object of its own, scores as probabilities."""
+    moment, boxes = placed_detections(scene)
+    moments = set(scene.timestamps.tolist())
+    scores = [
+        sensor_model(config.tracking.sensors, frame.sensor).probability(
+            frame.detections.score, frame.detections.boxes.label
+        )
+        for frame in scene.frames
+        if frame.timestamp in moments
+    ]
+    return SceneBoxes(moment, np.arange(len(boxes)).astype(np.str_), boxes, np.concatenate([np.empty(0), *scores]))
+
+
+def _noise(scene: Scene, config: SmoothConfig, first: int) -> tuple[IntArray, Boxes, FloatArray]:
+    """Moment, boxes and noise R (M, 2, 2) of the usable detections at the scene's moments, which count from `first`."""
+    evidence = gather_evidence(scene.frames, scene.timestamps, config.sensors, config.tracking.tracker.classes)
+    at = np.searchsorted(scene.timestamps, evidence.times[evidence.moment])
+    there = np.flatnonzero(np.isin(evidence.times[evidence.moment], scene.timestamps))
+    boxes = evidence.boxes.select(there)
+    world = replace(boxes, position=boxes.position + np.append(evidence.origin, 0.0))
+    return at[there] + first, world, evidence.R[there, :2, :2]
+
+
+def _labelled(scene: Scene, systems: Mapping[str, SceneBoxes]) -> LabelledScene:
+    assert scene.ground_truth is not None
+    truth = SceneBoxes.of_annotations(scene.ground_truth)
+    visible = np.concatenate([np.empty(0, dtype=np.bool_), *(moment.visible for moment in scene.ground_truth)])
+    place = scene.world_T_ego[truth.frame][:, :2, 3]
+    distance = np.hypot(*(truth.boxes.position[:, :2] - place).T)
+    return LabelledScene(truth, visible, truth.boxes.velocity, distance, systems)
+
+
+def _moved(table: SceneBoxes, first: int, scene: str) -> SceneBoxes:
+    """Boxes with frames counted from `first` on and ids that name the scene."""
+    names = np.array([f"{scene}/{name}" for name in table.id.tolist()], dtype=np.str_)
+    return replace(table, frame=table.frame + first, id=names)
+
+
+def _recall_table(curves: Mapping[float, Mapping[str, PrecisionRecall]]) -> FigureTable:
+    rows = []
+    for distance, by_system in curves.items():
+        level = by_system["online"].best[0]  # the precision at which the online tracks have their best F1
+        for name, curve in by_system.items():
+            at = (curve.recall_at(p) for p in (level, *PRECISIONS))
+            rows.append((f"{name}, {distance:g} m", *(cell(v) for v in (*curve.whole, *curve.best, *at))))
+    columns = ("within", "precision", "recall", "precision at best F1", "recall", "recall at online's precision")
+    title = "Precision and recall: of all boxes, at the best F1 over a score threshold, and recall at equal precision"
+    return FigureTable(title, (*columns, *(f"at {p:g}" for p in PRECISIONS)), tuple(rows))
+
+
+def _group_table(group: tuple[str, Mapping[str, CommonBoxes]]) -> FigureTable:
+    title, parts = group
+    columns = (
+        *(title, "boxes", "position: detections", "online", "labels", "labels / online", "labels / detections"),
+        *("heading: detections", "online", "labels", "size: detections", "online", "labels"),
+        *("velocity: online", "labels"),
+    )
+    rows = tuple((name, cell(len(same)), *_errors(same)) for name, same in parts.items())
+    return FigureTable(f"RMSE on the same boxes, by {title}: m, degrees, m/s", columns, rows)
+
+
+def _errors(same: CommonBoxes) -> tuple[str, ...]:
+    position = {name: same.sample(name, "position").rmse for name in SYSTEMS}
+    heading = (cell(float(np.degrees(same.sample(name, "heading").rmse)), 1) for name in SYSTEMS)
+    ratios = (position["labels"] / (position[name] or np.nan) for name in ("online", "detections"))
+    size = (cell(same.sample(name, "size").rmse) for name in SYSTEMS)
+    velocity = (cell(same.sample(name, "velocity").rmse) for name in ("online", "labels"))
+    return (*map(cell, position.values()), *map(cell, ratios), *heading, *size, *velocity)
+
+
+def _calibration_table(same: CommonBoxes) -> FigureTable:
+    rows = []
+    visible = same.select(same.visible)
+    for label in ("all", *np.unique(visible.label).tolist()):
+        part = visible if label == "all" else visible.select(visible.label == label)
+        for name in ("online", "labels"):
+            values = part.sample(name, "nees").values
+            covered = (cell(share) for share in coverages(values).values())
+            mean = cell(float(values.mean() / 2) if len(values) else float("nan"), 2)
+            rows.append((f"{label}, {name}", cell(len(values)), mean, *covered))
+    columns = ("class", "boxes", "ANEES / 2", "in 50 %", "in 90 %", "in 99 %")
+    return FigureTable("Calibration: share of position errors within the stated ellipses", columns, tuple(rows))
+
+
+def _consistency_table(consistency: Mapping[str, SelfConsistency]) -> FigureTable:
+    columns = (
+        *("system", "objects", "boxes", "frames each", "jerkiness, m/s^2", "turned", "resized, m", "gaps"),
+        "residual",
+    )
+    rows = tuple((name, *(cell(v) for v in asdict(value).values())) for name, value in consistency.items())
+    return FigureTable("Self-consistency, without ground truth", columns, rows)
+
+
+def _json_of(same: CommonBoxes) -> dict[str, Any]:
+    rmse = {
+        name: {q: same.sample(name, q).rmse for q in ("position", "heading", "size", "velocity")} for name in SYSTEMS
+    }
+    coverage = {name: coverages(same.sample(name, "nees").values) for name in ("online", "labels")}
+    return {"boxes": len(same), "rmse": rmse, "coverage": coverage}
+
+
+SHOWN = 3  # scenes in the player: a page of them all would be too large
+
+
+def judge_run(source: DatasetSource, output: Path, method: str, configuration: str, hota: bool) -> Evaluation:
+    """Score the tracks of all scenes of a run in a folder; figures.json and report.html appear in it.
+
+    configuration: YAML of the run. Raises `InputError` for results that do not fit the ground truth.
+    """
+    result = output / source.all_tracks
+    write_run_record(result, RunRecord(method, configuration, {}))
+    found = source.read_results(result)
+    evaluation = source.evaluate(found, hota)
+    figures: dict[str, Any] = {"method": method, "version": version("saga-fg"), "figures": evaluation.figures()}
+    write_figures(output / "figures.json", figures)
+    write_text(output / "report.html", _page(source, result, found, evaluation))
+    return evaluation
+
+
+def _page(source: DatasetSource, result: Path, found: Mapping[str, SceneResult], evaluation: Evaluation) -> str:
+    """A page with the figures of all scenes and the first few of them in the player."""
+    names = list(found)
+    some = result_report(source.restricted(names[:SHOWN]), result)
+    boxes = sum(len(each.found) for each in found.values())
+    facts = [f"{len(names)} scenes, {boxes} boxes", f"saga-fg {version('saga-fg')}"]
+    notes = [f"The player shows {SHOWN} of {len(names)} scenes."] if len(names) > SHOWN else []
+    return report_page(
+        replace(
+            some,
+            facts=facts,
+            notes=[*notes, *some.notes],
+            tables=list(evaluation.tables()),
+            charts=accuracy_charts(evaluation.errors),
+        )
+    )

@@ -1,0 +1,232 @@
+"""Figures of a report: charts as numbers, and tracks without ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_tools.datasets.results import SceneResult
+from data_tools.figures import FigureTable, cell
+from data_tools.metrics import LabelErrors, SceneBoxes, coverages, errors_by_class
+from saga_fg.numerics.arrays import FloatArray, StrArray
+from saga_fg.types.boxes import Boxes
+
+CURVE_POINTS = 100
+FEWEST = 20  # errors that make a curve
+SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+
+
+@dataclass(frozen=True)
+class Series:
+    """A curve, or the heights of bars; `faint`: the reference of the others."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    faint: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Curves over common axes; with `bars`, the one series is drawn as bars from x[k] to x[k + 1]."""
+
+    title: str
+    x_label: str
+    y_label: str
+    series: Sequence[Series]
+    bars: bool = False
+
+
+def accuracy_charts(errors: LabelErrors) -> list[Chart]:
+    """Return distributions of the errors at labels by class, and the shares that the tracks' ellipses hold."""
+    classes = {name: of_class for name, of_class in errors_by_class(errors).items() if name != "overall"}
+    charts = [
+        distribution(
+            f"{title} at labels",
+            unit,
+            "share of labels below",
+            [(name, e.sample(field).values * scale) for name, e in classes.items()],
+        )
+        for title, unit, field, scale in (
+            ("Position error", "m", "position", 1.0),
+            ("Velocity error", "m/s", "velocity", 1.0),
+            ("Heading error", "degrees", "heading", 180 / np.pi),
+        )
+    ]
+    held = [Series("right", (0.0, 1.0), (0.0, 1.0), faint=True)]
+    for name, of_class in classes.items():
+        known = of_class.nees[np.isfinite(of_class.nees)]
+        if len(known) >= FEWEST:
+            held.append(Series(name, SHARES, list(coverages(known, SHARES).values())))
+    charts.append(Chart("Calibration of positions", "share that the ellipse should hold", "share that it holds", held))
+    return [chart for chart in charts if any(not series.faint for series in chart.series)]
+
+
+def latency_chart(milliseconds: FloatArray) -> Chart:
+    """Return the distribution of the tracker's time for a frame; milliseconds (N,), N > 0."""
+    edges = np.histogram_bin_edges(milliseconds, bins=40, range=(0.0, float(np.percentile(milliseconds, 99.5)) or 1.0))
+    counts, _ = np.histogram(np.minimum(milliseconds, edges[-1]), edges)
+    median, p99 = np.percentile(milliseconds, [50, 99])
+    title = f"Time in the tracker: median {median:.1f} ms a frame, 99 % within {p99:.1f} ms"
+    return Chart(title, "ms", "frames", [Series("frames", edges.tolist(), counts.tolist())], bars=True)
+
+
+def distribution(title: str, unit: str, share_of: str, samples: Sequence[tuple[str, FloatArray]]) -> Chart:
+    """Return cumulative distributions up to the 99 % quantile, of the samples with enough values."""
+    share = np.linspace(0.0, 0.99, CURVE_POINTS)
+    series = [
+        Series(name, np.quantile(values, share).tolist(), share.tolist())
+        for name, values in samples
+        if len(values) >= FEWEST
+    ]
+    return Chart(title, unit, share_of, series)
+
+
+SHORT = 3  # moments; a track of fewer
+UNSEEN = 0.15  # s since the last detection, from which a track coasts
+COLUMNS = (
+    *("class", "tracks", "short", "boxes", "life, s", "unseen", "gaps", "speed, m/s", "position ±, m"),
+    *("score",),
+)
+TITLE = (
+    f"Tracks; short: fewer than {SHORT} moments; life, speed, deviation and score: medians; unseen: share of boxes "
+    "without a detection; gaps: times that a track was lost from view and seen again"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _TrackSpans:
+    """T tracks as wholes: their class, s from first to last box, boxes, and gaps, (T,)."""
+
+    label: StrArray
+    seconds: FloatArray
+    boxes: FloatArray
+    gaps: FloatArray
+
+    def of(self, label: str) -> _TrackSpans:
+        rows = np.flatnonzero((self.label == label) | (label == "all"))
+        return _TrackSpans(self.label[rows], self.seconds[rows], self.boxes[rows], self.gaps[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class _Boxes:
+    """N boxes: their class, speed (m/s), deviation of the position (m), score, and whether they are unseen, (N,)."""
+
+    label: StrArray
+    speed: FloatArray
+    deviation: FloatArray
+    score: FloatArray
+    unseen: FloatArray
+
+    def of(self, label: str) -> _Boxes:
+        rows = np.flatnonzero((self.label == label) | (label == "all"))
+        return _Boxes(*(column[rows] for column in vars(self).values()))
+
+
+def track_figures(results: Sequence[SceneResult]) -> FigureTable:
+    """Return a table with a row for each class."""
+    lives, boxes = _track_spans(results), _boxes(results)
+    classes = np.unique(lives.label).tolist()
+    rows = [_row(name, lives.of(name), boxes.of(name)) for name in (["all"] if len(classes) > 1 else []) + classes]
+    return FigureTable(TITLE, COLUMNS, tuple(rows))
+
+
+def track_charts(results: Sequence[SceneResult]) -> list[Chart]:
+    """Return the number of tracks over time, and distributions of lives, speeds and scores by class."""
+    lives, boxes = _track_spans(results), _boxes(results)
+    classes = np.unique(lives.label).tolist()
+    charts = [
+        distribution("Life of tracks", "s", "share of tracks below", [(c, lives.of(c).seconds) for c in classes]),
+        distribution("Speed", "m/s", "share of boxes below", [(c, _known(boxes.of(c).speed)) for c in classes]),
+        distribution("Score", "score", "share of boxes below", [(c, _known(boxes.of(c).score)) for c in classes]),
+    ]
+    return [_counts(results), *(chart for chart in charts if chart.series)]
+
+
+def _counts(results: Sequence[SceneResult]) -> Chart:
+    series = []
+    for each in results[:8]:
+        counts = np.bincount(each.found.frame, minlength=len(each.scene))
+        times = each.scene.timestamps - each.scene.timestamps[:1]
+        series.append(Series(each.scene.name, times.tolist(), counts.tolist()))
+    return Chart("Tracks at a time", "s", "tracks", series)
+
+
+def _row(name: str, lives: _TrackSpans, boxes: _Boxes) -> tuple[str, ...]:
+    known = np.isfinite(boxes.unseen)
+    return (
+        name,
+        cell(len(lives.label)),
+        cell(int((lives.boxes < SHORT).sum())),
+        cell(len(boxes.label)),
+        cell(_median(lives.seconds)),
+        cell(float(boxes.unseen[known].mean()) if known.any() else float("nan")),
+        cell(int(lives.gaps.sum())) if known.any() else cell(float("nan")),
+        *(cell(_median(column)) for column in (boxes.speed, boxes.deviation, boxes.score)),
+    )
+
+
+def _known(values: FloatArray) -> FloatArray:
+    return values[np.isfinite(values)]
+
+
+def _median(values: FloatArray) -> float:
+    known = _known(values)
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _unseen(result: SceneResult) -> FloatArray:
+    """Return (N,) 1 for a box that coasts, 0 for one that was detected, NaN where it is not known."""
+    if result.coasting is None:
+        return np.full(len(result.found), np.nan)
+    return np.where(np.isnan(result.coasting), np.nan, result.coasting > UNSEEN)
+
+
+def _boxes(results: Sequence[SceneResult]) -> _Boxes:
+    tables = [each.found for each in results]
+    variance = [np.trace(table.position_covariance, axis1=1, axis2=2) / 2 for table in tables]
+    columns = (
+        [np.linalg.norm(table.boxes.velocity, axis=1) for table in tables],
+        [np.sqrt(each) for each in variance],
+        [table.score for table in tables],
+        [_unseen(each) for each in results],
+    )
+    label = np.concatenate([np.empty(0, dtype="<U1"), *(table.boxes.label for table in tables)])
+    return _Boxes(label, *(np.concatenate([np.empty(0), *parts]) for parts in columns))
+
+
+def _track_spans(results: Sequence[SceneResult]) -> _TrackSpans:
+    parts: list[tuple[StrArray, FloatArray, FloatArray, FloatArray]] = []
+    for each in results:
+        table, unseen = each.found, np.nan_to_num(_unseen(each))
+        ids, first, number, count = np.unique(table.id, return_index=True, return_inverse=True, return_counts=True)
+        time = each.scene.timestamps[table.frame]
+        order = np.lexsort((table.frame, number))
+        ends = np.cumsum(count)
+        seconds = time[order][ends - 1] - time[order][ends - count]
+        again = (unseen[order][:-1] == 1) & (unseen[order][1:] == 0) & (number[order][:-1] == number[order][1:])
+        gaps = np.bincount(number[order][1:][again], minlength=len(ids))
+        parts.append((table.boxes.label[first], seconds, count.astype(np.float64), gaps.astype(np.float64)))
+    label = np.concatenate([np.empty(0, dtype="<U1"), *(part[0] for part in parts)])
+    return _TrackSpans(label, *(np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in (1, 2, 3)))
+
+
+REACH = 2.0  # m between the centres of a track and a detection of its class
+
+
+def unseen_for(table: SceneBoxes, times: FloatArray, detections: Sequence[Boxes]) -> FloatArray:
+    """Return (N,) s since a detection of the class was near a track; 0 at its first box.
+
+    times (K,), s, and detections of the K moments
+    """
+    last: dict[str, float] = {}
+    unseen = [np.empty(0)]
+    for time, found, boxes in zip(times.tolist(), table.by_frame(len(times)), detections, strict=True):
+        gap = np.linalg.norm(found.boxes.position[:, None, :2] - boxes.position[:, :2], axis=2)
+        near = ((gap < REACH) & (found.boxes.label[:, None] == boxes.label)).any(axis=1)
+        ids = found.id.tolist()
+        last |= {id_: time for id_, seen in zip(ids, near.tolist(), strict=True) if seen or id_ not in last}
+        unseen.append(np.array([time - last[id_] for id_ in ids]))
+    return np.concatenate(unseen)

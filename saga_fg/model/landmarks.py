@@ -1,0 +1,171 @@
+"""Detectors and types of landmarks: points, lines, planes, poles.
+
+Lines on the road: curbs, borders of lanes. A straight line on the ground, (theta, rho): n . x = rho.
+
+A bend is a chain of such lines, each as long as it is straight.
+
+Planes: walls, facades, the ground.
+
+The state is n . x + d = 0 in the world, n of length 1 pointing to the side that is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import gtsam
+import numpy as np
+
+from factors import (
+    HesseLine,
+    OrientedPlane,
+    PlanarPose,
+    ResidualFactors,
+    SpatialPose,
+    Vector,
+    line_factors,
+    plane,
+    plane_factor,
+    point_factors,
+    relative_detection_factors,
+)
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.settings import Positive, Settings, setting
+from saga_fg.types.frame import Frame
+from saga_fg.types.landmark import Observation
+
+
+class LandmarkDetector(Protocol):
+    """Finds landmarks in the data of a moment: a frame, or the points (N, 3), m, of a scan in the scanner's frame."""
+
+    def observations(self, seen: Frame | FloatArray) -> Sequence[Observation]:
+        """Return what is observed: from a frame in the vehicle's coordinates, from points in theirs."""
+
+
+@dataclass(frozen=True)
+class PointLandmark(Settings):
+    """A point, observed as its place (dim,) in the frame of the pose."""
+
+    dim: int = setting(2, "dimension: 2 in the plane, 3 in space")
+    name: str = setting("point", "name in files")
+    density: Positive = setting(
+        0.02, "expected density of landmarks, 1/m^2, or 1/m^3; higher: new landmarks are begun sooner"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dim not in (2, 3):
+            raise InputError(f"dim: expected 2 or 3, got {self.dim!r}")
+
+    @property
+    def pose(self) -> PlanarPose | SpatialPose:
+        return PlanarPose() if self.dim == 2 else SpatialPose()
+
+    @property
+    def variable(self) -> Vector:
+        return Vector(self.dim)
+
+    def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
+        return [point_factors(rows, observed, covariances)]
+
+    def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> FloatArray:
+        return world_T_pose[: self.dim, : self.dim] @ observed + world_T_pose[: self.dim, self.dim]
+
+    def coordinates(self, state: FloatArray) -> dict[str, float]:
+        return dict(zip("xyz", state.tolist(), strict=False))
+
+
+@dataclass(frozen=True)
+class LineLandmark(Settings):
+    """A line, observed as the two ends (6,) of the piece seen, in the frame of the pose; its noise is that of the two
+    ends across the line, m.
+    """
+
+    name: str = setting("road line", "name in files")
+    density: Positive = setting(0.2, "expected density of landmarks, 1/(rad m); higher: new landmarks are begun sooner")
+
+    @property
+    def pose(self) -> SpatialPose:
+        return SpatialPose()
+
+    @property
+    def variable(self) -> HesseLine:
+        return HesseLine()
+
+    def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
+        return [line_factors(rows, observed.reshape(-1, 2, 3), covariances)]
+
+    def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> FloatArray:
+        first, second = (observed.reshape(2, 3) @ world_T_pose[:3, :3].T + world_T_pose[:3, 3])[:, :2]
+        length = np.linalg.norm(second - first)
+        if length == 0.0:
+            raise InputError(f"observed {self.name}: expected two ends that are apart from above, got {observed}")
+        along = (second - first) / length
+        normal = np.array([-along[1], along[0]])
+        rho = float(normal @ (first + second) / 2)
+        normal, rho = (normal, rho) if rho >= 0 else (-normal, -rho)
+        return np.array([np.arctan2(normal[1], normal[0]), rho])
+
+    def coordinates(self, state: FloatArray) -> dict[str, float]:
+        theta, rho = state.tolist()
+        nx, ny = float(np.cos(theta)), float(np.sin(theta))
+        return {"x": rho * nx, "y": rho * ny, "nx": nx, "ny": ny, "rho": rho}
+
+
+@dataclass(frozen=True)
+class PlaneLandmark(Settings):
+    """A plane, observed as (n, d) (4,) in the frame of the pose; its noise is that of two turns (rad) and d (m)."""
+
+    name: str = setting("plane", "name in files")
+    density: Positive = setting(
+        0.05, "expected density of landmarks, 1/(rad^2 m); higher: new landmarks are begun sooner"
+    )
+
+    @property
+    def pose(self) -> SpatialPose:
+        return SpatialPose()
+
+    @property
+    def variable(self) -> OrientedPlane:
+        return OrientedPlane()
+
+    def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        for (pose, landmark), z, covariance in zip(rows.tolist(), observed, covariances, strict=True):
+            graph.add(plane_factor(pose, landmark, z, covariance))
+        return graph
+
+    def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> gtsam.OrientedPlane3:
+        return plane("observed plane", observed).transform(gtsam.Pose3(world_T_pose).inverse())
+
+    def coordinates(self, state: gtsam.OrientedPlane3) -> dict[str, float]:
+        nx, ny, nz, d = state.planeCoefficients().tolist()
+        return {"x": -d * nx, "y": -d * ny, "z": -d * nz, "nx": nx, "ny": ny, "nz": nz, "d": d}
+
+
+@dataclass(frozen=True)
+class PoleLandmark(Settings):
+    """A pole, observed as a point (3,) on it in the frame of the pose; its noise is that ahead and to the left."""
+
+    name: str = setting("pole", "name in files")
+    density: Positive = setting(0.02, "expected density of landmarks, 1/m^2; higher: new landmarks are begun sooner")
+
+    @property
+    def pose(self) -> SpatialPose:
+        return SpatialPose()
+
+    @property
+    def variable(self) -> Vector:
+        return Vector(2)
+
+    def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
+        return [relative_detection_factors(rows, observed, covariances, state_dim=2)]
+
+    def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> FloatArray:
+        return (world_T_pose[:3, :3] @ observed + world_T_pose[:3, 3])[:2]
+
+    def coordinates(self, state: FloatArray) -> dict[str, float]:
+        return {"x": float(state[0]), "y": float(state[1])}

@@ -1,1 +1,0 @@
-"""Kinds of landmarks: points, poles, planes, lines."""

@@ -1,0 +1,394 @@
+"""Stop lines: the way of vehicles to them, stopping where they are closed, starting where they open.
+
+Approaches of vehicles to stop lines: the way along a lane of the map or straight ahead, and the first in each lane.
+
+A vehicle approaches a line along a lane of the map that crosses the line, or else straight along its heading, as where
+a lane ends before the line.
+
+A closed stop line brings the first vehicle to a halt, and through it the queue.
+
+    dv_i/dt += rate tau u ( -v^2 / (2 g) ),    v = u.v_i,    g = u.(p_j - p_i) + bend - length_i / 2 - margin
+
+is the constant deceleration that ends at the line: v the speed along the lane, g the remaining way from the front of
+the vehicle to `margin` before the line, `bend` the extra length of the way along the lane over the straight one.
+Linearised at the estimate (v0, g0):
+
+    -v^2 / (2 g) ~ -v0^2 / (2 g0) - (v0 / g0) (v - v0) + v0^2 / (2 g0^2) (g - g0)
+
+The rule: of the vehicles that come to a line, the first of each lane that can still stop, at
+
+    rate = rate  closed_j  ramp( v^2 / (2 g) from `reaction_deceleration` to `full_deceleration` )
+
+since drivers do not brake for a line far away; a vehicle that would have to brake harder than `max_deceleration` goes
+on. A slow one near the line comes to rest where it is: dv_i/dt += -rate tau v / stop_time. Those behind follow by other
+interactions. Alternatively the line is a stationary leader of the Intelligent Driver Model
+(`saga_fg.model.nonlinear_interactions`): the vehicle brakes later and harder, and a slow one creeps up to the line.
+
+An open stop line lets the first vehicle go, and through it the queue.
+
+    dv_i/dt += rate open_j ( speed - u.v_i ) u      where u.v_i < speed
+
+so that a standing vehicle starts with rate * speed, and its acceleration fades as it speeds up, as that of queues does
+which a green light discharges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from saga_fg.model.edge_rules import VEHICLES, Pairs
+from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
+from saga_fg.model.nonlinear_interactions import (
+    LEAST_GAP,
+    Accelerations,
+    IntelligentDriver,
+    Linearised,
+    accelerated,
+    smooth_acceleration,
+    speed_along,
+)
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
+from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
+from saga_fg.types.road_map import LIGHT, STOP_LINE, LanesAcross
+
+SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
+PAST = 2.0  # m; a vehicle waits at a line with its front up to this far beyond it
+
+
+class Approach(NamedTuple):
+    """E pairs of a vehicle and a stop line: whether it comes to it, the way to it (from the centre, along the lane),
+    m, the direction of the lane at the vehicle (E, 2), and where it will cross the line, m to the left of its middle.
+    """
+
+    comes: BoolArray
+    way: FloatArray
+    direction: FloatArray
+    crossing: FloatArray
+
+    def select(self, rows: IntArray | BoolArray) -> Approach:
+        """Some of the pairs."""
+        return Approach(self.comes[rows], self.way[rows], self.direction[rows], self.crossing[rows])
+
+
+def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
+    """The approaches of vehicles `target` (E,) to stop lines `source` (E,)."""
+    wanted = target * len(nodes) + source
+    if "approach" in nodes.derived:
+        pairs, known = nodes.derived["approach"]
+        at = np.searchsorted(pairs, wanted).clip(max=max(len(pairs) - 1, 0))
+        if len(pairs) and (pairs[at] == wanted).all():
+            found: Approach = known.select(at)
+            return found
+    found = _approach(nodes, target, source)
+    order = np.argsort(wanted)
+    nodes.derived["approach"] = wanted[order], found.select(order)
+    return found
+
+
+def _approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
+    offset = nodes.position[source] - nodes.position[target]
+    u = unit(nodes.heading[target])
+    way = np.einsum("ei,ei->e", offset, u)
+    ends = _ends(nodes, source)
+    aside = u[:, 0] * offset[:, 1] - u[:, 1] * offset[:, 0]  # of the line's middle, to the left of the vehicle's path
+    aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4
+    comes = (np.abs(aside) < np.hypot(*(ends[:, 0] - ends[:, 1]).T) / 2) & aligned & (way > 0)
+    found = Approach(comes, way, u, -aside)
+    if nodes.lanes is not None:
+        _follow_lanes(found, nodes, nodes.lanes, target, source)
+    return found
+
+
+def _follow_lanes(found: Approach, nodes: NodeTable, lanes: LanesAcross, target: IntArray, source: IntArray) -> None:
+    """Change the approaches of those in a lane that crosses the line, to that of the nearest such lane."""
+    vehicles, vehicle = np.unique(target, return_inverse=True)
+    there = lanes.inside(nodes.position[vehicles], unit(nodes.heading[vehicles]))
+    foot = np.full((len(vehicles), len(lanes.centre)), -1)
+    foot[there.vehicle, there.lane] = np.arange(len(there.vehicle))
+    row, crossed = lanes.crossings(source)
+    of = foot[vehicle[row], lanes.lane[crossed]]
+    row, crossed, at = row[of >= 0], crossed[of >= 0], there.feet.select(of[of >= 0])
+    order = np.lexsort((np.abs(at.e), row))
+    nearest = order[np.unique(row[order], return_index=True)[1]]
+    row, crossed, at = row[nearest], crossed[nearest], at.select(nearest)
+    found.way[row], found.crossing[row] = lanes.s[crossed] - at.s, at.e - lanes.e[crossed]
+    found.direction[row], found.comes[row] = at.direction, lanes.s[crossed] > at.s
+
+
+class ComingVehicles(NamedTuple):
+    """E pairs of a vehicle that comes to a stop line and the line (rows of a `NodeTable`), with the approach, the speed
+    along it, m/s, and the way left to the front of the vehicle, m, negative where it is past the line."""
+
+    target: IntArray
+    source: IntArray
+    approach: Approach
+    speed: FloatArray
+    front: FloatArray
+
+    def select(self, rows: IntArray | BoolArray) -> ComingVehicles:
+        """Some of the pairs."""
+        return ComingVehicles(
+            self.target[rows], self.source[rows], self.approach.select(rows), self.speed[rows], self.front[rows]
+        )
+
+    def first(self) -> ComingVehicles:
+        """The first vehicle of each lane."""
+        crossing, way = self.approach.crossing, self.approach.way
+        one_lane = (self.source[:, None] == self.source) & (np.abs(crossing[:, None] - crossing) < SIDE_BY_SIDE)
+        return self.select(~(one_lane & (way < way[:, None])).any(axis=1))
+
+
+def _ends(nodes: NodeTable, source: IntArray) -> FloatArray:
+    """Left and right ends (E, 2, 2) of lines about their middles, m."""
+    lines, row = np.unique(source, return_inverse=True)
+    return np.array([nodes.outline[j] for j in lines.tolist()]).reshape(-1, 2, 2)[row]
+
+
+def _near(nodes: NodeTable, classes: tuple[str, ...], max_distance: float) -> tuple[IntArray, IntArray]:
+    """Vehicles and lines within some distance of each other (E,)."""
+    lines = np.flatnonzero(nodes.label == STOP_LINE)
+    vehicles = np.flatnonzero(of_classes(nodes.label, classes))
+    target, source = np.repeat(vehicles, len(lines)), np.tile(lines, len(vehicles))
+    near = np.hypot(*(nodes.position[target] - nodes.position[source]).T) <= max_distance
+    return target[near], source[near]
+
+
+def coming_vehicles(nodes: NodeTable, classes: tuple[str, ...], max_distance: float) -> ComingVehicles:
+    """All vehicles that come to a line within some distance; those that wait a little past it among them."""
+    key = ("coming", classes, max_distance)
+    if key not in nodes.derived:
+        target, source = _near(nodes, classes, max_distance)
+        ways = approach(nodes, target, source)
+        speed = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], ways.direction), 0.0)
+        front = ways.way - nodes.length[target] / 2
+        found = ComingVehicles(target, source, ways, speed, front)
+        nodes.derived[key] = found.select(ways.comes & (front > -PAST))
+    coming: ComingVehicles = nodes.derived[key]
+    return coming
+
+
+def passed_vehicles(nodes: NodeTable, classes: tuple[str, ...], max_distance: float) -> ComingVehicles:
+    """All vehicles that have crossed a line straight on and are within some distance of it."""
+    target, source = _near(nodes, classes, max_distance)
+    beyond, across = nodes.position[target] - nodes.position[source], unit(nodes.heading[source])
+    ends = _ends(nodes, source)
+    aside = across[:, 0] * beyond[:, 1] - across[:, 1] * beyond[:, 0]
+    passed = np.einsum("ei,ei->e", beyond, across)
+    aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4
+    inside = (passed > 0) & aligned & (np.abs(aside) < np.hypot(*(ends[:, 0] - ends[:, 1]).T) / 2)
+    u = unit(nodes.heading[target])
+    speed = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], u), 0.0)
+    front = -passed - nodes.length[target] / 2
+    return ComingVehicles(target, source, Approach(inside, -passed, u, aside), speed, front).select(inside)
+
+
+HALTING_SPEED = 2.0  # m/s; slower vehicles near a closed line come to rest where they are
+HALTING_GAP = 10.0  # m from the front of the vehicle to the line
+MAX_DECELERATION = 4.5  # drivers who would have to brake harder do not stop, m/s^2
+
+
+@dataclass(frozen=True)
+class Stopping(Settings):
+    """Even deceleration to a halt before a line; the source is the line."""
+
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
+    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau decelerates as much as is needed, s")
+    margin: NonNegative = setting(
+        3.0, "distance left between the front of a stopped vehicle and the line, m; usual 1 to 5"
+    )
+    hardest: Positive = setting(
+        4.5, "limit of the deceleration, m/s^2; usual 3 to 6; higher: harder braking is predicted"
+    )
+    stop_time: Positive = setting(
+        1.0, "time constant with which the last of the speed fades, s; usual 0.5 to 2; higher: slower stops"
+    )
+
+    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
+        """g (E,), m, for ways (E,) from the centres to the line."""
+        return np.maximum(way - nodes.length[target] / 2 - self.margin, LEAST_GAP)
+
+    def law(self, v: FloatArray, g: FloatArray) -> Linearised:
+        """The deceleration (E,) at speeds and remaining ways g (E,)."""
+        g = np.maximum(g, v**2 / (2 * self.hardest))
+        none = np.zeros_like(v)
+        even = Linearised(-(v**2) / (2 * g), -v / g, v**2 / (2 * g**2), none)
+        return Linearised(-v / self.stop_time, none - 1 / self.stop_time, none, none).where(
+            halting(v, g + self.margin), even
+        )
+
+    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
+        """Accelerations (E,), m/s^2, at speeds and remaining ways g (E,)."""
+        return self.law(v, g).value
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        ways = approach(nodes, target, source)
+        v = speed_along(nodes, target, ways.direction)
+        law = self.law(v, self.gap(nodes, target, ways.way))
+        return accelerated(nodes, target, source, ways.direction, v, law, self.time_constant)
+
+
+@dataclass(frozen=True)
+class DriverStopping:
+    """Coming to a line as to the end of a queue; the source is the line."""
+
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
+    driver: IntelligentDriver = settings_group(
+        IntelligentDriver, "parameters of the driver; its standstill gap is to the line"
+    )
+
+    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
+        """Gap (E,), m, for ways (E,) from the centres to the line."""
+        return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
+
+    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
+        """Accelerations (E,), m/s^2, at speeds and gaps g (E,)."""
+        return self.driver.stopping(v, g).value
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        ways = approach(nodes, target, source)
+        v = speed_along(nodes, target, ways.direction)
+        f = self.driver.stopping(v, self.gap(nodes, target, ways.way))
+        return accelerated(nodes, target, source, ways.direction, v, f, self.driver.time_constant)
+
+
+@dataclass(frozen=True)
+class SmoothStopping:
+    """Coming to a line as to the end of a queue, without corners in the law; the source is the line."""
+
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
+    driver: IntelligentDriver = settings_group(
+        IntelligentDriver, "parameters of the driver; `hidden_vehicle_gap` is not used"
+    )
+
+    @property
+    def time_constant(self) -> float:
+        return self.driver.time_constant
+
+    @property
+    def alone(self) -> FloatArray:
+        return np.array([1.0, 0.0, 0.0])
+
+    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
+        """Gap (E,), m, for ways (E,) from the centres to the line."""
+        return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
+
+    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
+        """Accelerations (E,), m/s^2, at speeds and gaps g (E,)."""
+        return smooth_acceleration(self.driver, v, g, np.zeros_like(v)).value
+
+    def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
+        """(E, 3) direction of the lane, and the gap less the distance to the line along it."""
+        ways = approach(nodes, target, source)
+        straight = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], ways.direction)
+        return np.column_stack([ways.direction, self.gap(nodes, target, ways.way) - straight])
+
+    def accelerations(self, own: FloatArray, other: FloatArray, given: FloatArray) -> Accelerations:
+        u = given[..., :2]
+        v, s = (u * own[..., 2:]).sum(axis=-1), (u * (other - own)[..., :2]).sum(axis=-1) + given[..., 2]
+        f = smooth_acceleration(self.driver, v, s, np.zeros_like(v))
+        along = u[..., :, None] * u[..., None, :]
+        by_gap = f.by_gap[..., None, None] * along
+        by_own = np.concatenate([-by_gap, f.by_speed[..., None, None] * along], axis=-1)
+        return Accelerations(f.value[..., None] * u, by_own, np.concatenate([by_gap, 0 * by_gap], axis=-1))
+
+
+@dataclass(frozen=True)
+class RedLight(Settings):
+    """The first vehicle that comes to a closed stop line, and can stop, does."""
+
+    map_classes: ClassVar[tuple[str, ...]] = (LIGHT, STOP_LINE)
+    interaction: Stopping | DriverStopping | SmoothStopping = settings_group(
+        Stopping, "interaction function of the edges"
+    )
+    rate: NonNegative = setting(
+        1.0,
+        "strength of an edge of a vehicle that brakes for a line that is surely closed, 1/s; usual 0.5 to "
+        "2; higher: brakes more surely",
+    )
+    max_distance: NonNegative = setting(
+        100.0, "no edge from a line further away, m; usual 50 to 150; higher: vehicles brake from afar"
+    )
+    reaction_deceleration: NonNegative = setting(
+        0.3, "needed deceleration at which drivers begin to react, m/s^2; usual 0.2 to 1; higher: they react later"
+    )
+    full_deceleration: Positive = setting(
+        1.0, "needed deceleration from which they brake fully, m/s^2; usual 0.8 to 2; higher: they brake later"
+    )
+    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
+
+    def able(self, coming: ComingVehicles) -> ComingVehicles:
+        """Coming vehicles that can stop before the line, or halt at it."""
+        can = (coming.front > 0) & (coming.speed**2 <= 2 * MAX_DECELERATION * coming.front)
+        return coming.select(can | halting(coming.speed, coming.front))
+
+    def brakes(self, nodes: NodeTable, coming: ComingVehicles) -> tuple[FloatArray, FloatArray]:
+        """The probability that each driver brakes for a closed line (E,), and the acceleration then (E,), m/s^2."""
+        g = self.interaction.gap(nodes, coming.target, coming.approach.way)
+        needed = coming.speed**2 / (2 * g) - self.reaction_deceleration
+        ramp = np.clip(needed / max(self.full_deceleration - self.reaction_deceleration, 1e-9), 0.0, 1.0)
+        ramp = np.where(halting(coming.speed, coming.front), 1.0, ramp)
+        return ramp, self.interaction.acceleration(coming.speed, g)
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        first = self.able(coming_vehicles(nodes, self.classes, self.max_distance)).first()
+        weight = np.zeros(len(first.source)) if nodes.closed is None else nodes.closed[first.source]
+        return Pairs(first.target, first.source, self.rate * weight * self.brakes(nodes, first)[0])
+
+
+def halting(speed: FloatArray, front: FloatArray) -> BoolArray:
+    """Mask of the vehicles that come to rest before the line, by their speeds, m/s, and distances from it, m."""
+    return np.asarray((speed < HALTING_SPEED) & (front < HALTING_GAP))
+
+
+CLEARED = 20.0  # m beyond a line within which vehicles still speed up
+
+
+@dataclass(frozen=True)
+class Starting(Settings):
+    """Relaxation to the speed of a queue that is discharged; the source is the line."""
+
+    needs: ClassVar[Needs] = (VELOCITY, ())
+    speed: Positive = setting(
+        10.0, "speed at which vehicles cross an open line, m/s; usual 8 to 14; higher: they accelerate for longer"
+    )
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        u = approach(nodes, target, source).direction
+        return velocity_triples(
+            nodes, target, source, by_velocity=-u[:, :, None] * u[:, None, :], constant=self.speed * u
+        )
+
+
+@dataclass(frozen=True)
+class GreenLight(Settings):
+    """The first vehicle that comes to an open stop line, or has just crossed it, speeds up."""
+
+    map_classes: ClassVar[tuple[str, ...]] = (LIGHT, STOP_LINE)
+    interaction: Starting = settings_group(Starting, "interaction function of the edges")
+    rate: NonNegative = setting(
+        0.2,
+        "strength of an edge from a line that is surely open, 1/s: the first acceleration is this times the speed; "
+        "usual 0.1 to 0.3; higher: vehicles start faster",
+    )
+    max_distance: NonNegative = setting(
+        100.0, "no edge from a line further away, m; usual 20 to 150; higher: slow vehicles speed up from afar"
+    )
+    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
+
+    def acceleration(self, speed: FloatArray) -> FloatArray:
+        """Accelerations (E,) of vehicles of these speeds before a line that is surely open, m/s^2."""
+        return self.rate * np.maximum(self.interaction.speed - speed, 0.0)
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        coming = coming_vehicles(nodes, self.classes, self.max_distance)
+        found = []
+        for first in (coming.first(), passed_vehicles(nodes, self.classes, CLEARED).first()):
+            slow = first.select(first.speed < self.interaction.speed)
+            weight = np.zeros(len(slow.source)) if nodes.open is None else nodes.open[slow.source]
+            found.append(Pairs(slow.target, slow.source, self.rate * weight))
+        return Pairs(*(np.concatenate(column) for column in zip(*found, strict=True)))

@@ -1,0 +1,270 @@
+"""Providers of the vehicle's navigation sensors: satellites and inertial measurements.
+
+The vehicle's place by satellites: r = t + R a - z, with a the antenna's place on the vehicle.
+
+A fix that is older than the frame by dt was taken at exp(-dt xi) a in the vehicle's frame of now, xi its velocity over
+the epoch. The antenna's place can be a variable for all time. A fix far off is left out by a gate, which is as wide as
+the pose is uncertain; what passes is under a robust loss.
+
+The vehicle's pose, velocity and the biases of its inertial sensors from epoch to epoch, by preintegration.
+
+GTSAM's `CombinedImuFactor` between (pose, velocity, biases) of two epochs (Forster, Carlone, Dellaert, Scaramuzza,
+"On-manifold preintegration for real-time visual-inertial odometry", IEEE T-RO 33, 2017). The samples of a frame are
+taken for steady over its interval where they last a little longer or shorter than the epoch. Where there are none, or
+too few, the vehicle goes straight on, with noise on its acceleration and its rate of turn: the same factor of one
+coarse sample.
+
+The sensor may sit anywhere on the vehicle (`mounted`). Its turn there can be a variable for all time: the factor is
+then between the poses of the sensor, and the velocity is the sensor's.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import ImuBias, ResidualFactor, Robust, SpatialPose, Vector, position_factor, prior_factor
+from saga_fg.errors import InputError
+from saga_fg.graph.factor_checks import Factor
+from saga_fg.graph.providers import Additions, GraphView
+from saga_fg.graph.variables import EGO_BIAS, EGO_CALIBRATION, EGO_POSE, EGO_VELOCITY, NewVariable
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.gating import chi_square_quantile
+from saga_fg.providers.odometry import ANTENNA, INERTIAL, NO_POSE, ON_THE_POSE, Mounting, StartSettings, mounting
+from saga_fg.settings import Fraction, NonNegative, Positive, PositiveOrInf, Settings, setting, settings_group
+from saga_fg.types.frame import ImuSamples
+
+_LOG = logging.getLogger(__name__)
+ANTENNA_DEVIATION = 0.5  # standard deviation of the antenna's position beforehand, by axis, m
+
+
+@dataclass(frozen=True)
+class Gps(Settings):
+    """Adds GPS fixes (`frame.ego.gps`) on the vehicle's pose that pass the gate."""
+
+    deviation: Positive = setting(1.0, "standard deviation of a horizontal coordinate of fixes without a covariance, m")
+    height_deviation: Positive = setting(2.0, "standard deviation of the height of fixes without a covariance, m")
+    antenna: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "position of the antenna in the vehicle's frame, m")
+    gate: Fraction = setting(0.999, "gate probability: share of true fixes inside the chi-square gate; 1: use all")
+    outlier_scale: PositiveOrInf = setting(
+        math.inf, "residual from which the Cauchy loss discounts a fix, standard deviations; .inf: never"
+    )
+    estimate_antenna: bool = setting(False, "true: the antenna's position is a variable of the graph; poses in space")
+    name = "gps"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.antenna) != 3 or not all(map(math.isfinite, self.antenna)):
+            raise InputError(f"antenna: expected three finite numbers, got {self.antenna!r}")
+
+    def factors(self, view: GraphView) -> Additions:
+        fix = None if view.frame is None or view.frame.ego is None else view.frame.ego.gps
+        pose = view.now(EGO_POSE).get(0)
+        if fix is None:
+            return Additions()
+        if pose is None:
+            raise InputError(NO_POSE)
+        dim = 2 if pose.dim == 3 else 3
+        if len(fix.position) < dim:
+            raise InputError("gps: expected a place of 3 coordinates, as poses are in space, got 2")
+        z = fix.position[:dim].copy()
+        z[:2] -= view.origin
+        R = fix.covariance
+        if R is None:
+            R = np.diag(np.square([self.deviation, self.deviation, self.height_deviation]))
+        R = R[:dim, :dim]
+        robust = None if math.isinf(self.outlier_scale) else Robust("cauchy", self.outlier_scale)
+        antenna = _moved_back(view, pose.key, np.array(self.antenna), fix.age)
+        factor = position_factor(pose.key, z, R, antenna, robust)
+        if self.gate < 1:
+            values = gtsam.Values()
+            values.insert(pose.key, view.state(pose.key))
+            _, (J,), (r,) = factor.linearisation(values)
+            S = J[0] @ view.covariance(pose.key) @ J[0].T + R
+            if float(r @ np.linalg.solve(S, r)) > chi_square_quantile(self.gate, dim):
+                _LOG.warning(
+                    "%s at %.2f s: a fix %.1f m off is left out", self.name, view.time, float(np.linalg.norm(r))
+                )
+                return Additions()
+        if not self.estimate_antenna:
+            return Additions(factors=[factor])
+        if dim == 2:
+            raise InputError("gps: estimate_antenna: expected the vehicle's pose in space, got one in the plane")
+        key, place, new = view.key(EGO_CALIBRATION, ANTENNA, static=True), np.array(self.antenna), list[NewVariable]()
+        priors = list[Factor]()
+        if ANTENNA not in view.static(EGO_CALIBRATION):
+            new.append(NewVariable(EGO_CALIBRATION, ANTENNA, place, static=True, label="place of the antenna"))
+            priors.append(prior_factor(key, place, ANTENNA_DEVIATION**2 * np.eye(3)))
+        types = (SpatialPose(), Vector(3))
+        function = partial(_by_antenna, z, antenna - place)
+        return Additions(new, [*priors, ResidualFactor((pose.key, key), types, function, R, robust=robust, name="fix")])
+
+
+def _by_antenna(z: FloatArray, moved: FloatArray, pose: gtsam.Pose3, antenna: FloatArray) -> FloatArray:
+    return np.asarray(pose.transformFrom(antenna + moved) - z)
+
+
+def _moved_back(view: GraphView, key: int, antenna: FloatArray, age: float) -> FloatArray:
+    """Place of the antenna `age` s ago in the frame of the present pose; its present place without an earlier pose."""
+    before = view.before(EGO_POSE).get(0)
+    if age == 0 or before is None or view.dt == 0:
+        return antenna
+    motion: Any = view.state(before.key).between(view.state(key))
+    share: Any = type(motion).Expmap(-age / view.dt * type(motion).Logmap(motion))
+    dim = 2 if isinstance(motion, gtsam.Pose2) else 3
+    return np.concatenate([share.transformFrom(antenna[:dim]), antenna[dim:]])
+
+
+INTEGRATION_NOISE = 1e-4  # noise density of integrating the position, m/s/sqrt(Hz)
+UNKNOWN_ACCELERATION = 3.0  # noise density of the acceleration in gaps of the samples, m/s^2/sqrt(Hz)
+UNKNOWN_TURN = 0.3  # noise density of the turn rate in gaps of the samples, rad/s/sqrt(Hz)
+ROTATION_DEVIATION = 0.05  # standard deviation of the sensor's rotation beforehand, by axis, rad
+
+
+@dataclass(frozen=True)
+class Imu(Settings):
+    """Adds the vehicle's pose in space, velocity and biases at every epoch, and inertial samples (`frame.ego.imu`)."""
+
+    start: StartSettings = settings_group(lambda: StartSettings(planar=False), "first pose, in space")
+    start_velocity: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "first velocity in the world, m/s")
+    start_velocity_deviation: Positive = setting(10.0, "standard deviation of the first velocity, m/s")
+    accelerometer_noise: Positive = setting(0.02, "noise density of the accelerometer, m/s^2/sqrt(Hz)")
+    gyroscope_noise: Positive = setting(0.002, "noise density of the gyroscope, rad/s/sqrt(Hz)")
+    accelerometer_bias: Positive = setting(0.1, "standard deviation of the first bias of the accelerometer, m/s^2")
+    gyroscope_bias: Positive = setting(0.01, "standard deviation of the first bias of the gyroscope, rad/s")
+    accelerometer_drift: Positive = setting(1e-3, "random walk of the bias of the accelerometer in one second, m/s^2")
+    gyroscope_drift: Positive = setting(1e-4, "random walk of the bias of the gyroscope in one second, rad/s")
+    gravity: NonNegative = setting(9.81, "gravity, m/s^2")
+    max_gap: Positive = setting(
+        0.05, "longest time of an epoch without samples, s; where they lack more, the epoch is bridged as unknown"
+    )
+    mounted: Mounting = setting(ON_THE_POSE, "x, y, z (m), roll, pitch, yaw (rad) of the sensor in the vehicle's frame")
+    estimate_rotation: bool = setting(False, "true: the sensor's rotation on the vehicle is a variable of the graph")
+    name = "imu"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.start.planar:
+            raise InputError("start.planar: expected false, inertial sensors move a pose in space")
+        mounting("mounted", self.mounted)
+
+    @property
+    def _place(self) -> gtsam.Pose3:
+        return mounting("mounted", self.mounted)
+
+    def predict(self, view: GraphView) -> Additions:
+        before = view.before(EGO_VELOCITY)
+        if not before:
+            return self._start(view)
+        kinds = (EGO_POSE, EGO_VELOCITY, EGO_BIAS)
+        pose, velocity, bias = (view.before(kind)[0].key for kind in kinds)
+        if not isinstance(view.state(pose), gtsam.Pose3):
+            raise InputError("imu: expected the vehicle's pose in space (start.planar: false), got one in the plane")
+        now = [view.key(kind, 0) for kind in kinds]
+        onto = self._place if self.estimate_rotation else gtsam.Pose3()  # the sensor's pose in place of the vehicle's
+        measured = self._preintegrated(view, view.state(pose).compose(onto), view.state(bias))
+        begin = gtsam.NavState(view.state(pose).compose(onto), view.state(velocity))
+        moved = measured.predict(begin, view.state(bias))
+        new = [
+            NewVariable(EGO_VELOCITY, 0, np.array(moved.velocity()), label="vehicle's velocity"),
+            NewVariable(EGO_BIAS, 0, view.state(bias), label="imu bias"),
+        ]
+        if not view.now(EGO_POSE):
+            new.append(NewVariable(EGO_POSE, 0, moved.pose().compose(onto.inverse()), label="vehicle"))
+        if self.estimate_rotation:
+            rotation, more = self._rotation(view)
+            keys = (pose, velocity, now[0], now[1], bias, now[2], rotation)
+            return Additions([*new, *more.variables], [*list(more.factors), self._turned(keys, measured)])  # type: ignore[arg-type]
+        return Additions(new, [gtsam.CombinedImuFactor(pose, velocity, now[0], now[1], bias, now[2], measured)])
+
+    def factors(self, view: GraphView) -> Additions:
+        return Additions()
+
+    def _start(self, view: GraphView) -> Additions:
+        first = self.start.additions(view)
+        velocity, bias = view.key(EGO_VELOCITY, 0), view.key(EGO_BIAS, 0)
+        deviations = np.repeat([self.accelerometer_bias, self.gyroscope_bias], 3)
+        start = np.array(self.start_velocity)
+        return Additions(
+            [
+                *first.variables,
+                NewVariable(EGO_VELOCITY, 0, start, label="vehicle's velocity"),
+                NewVariable(EGO_BIAS, 0, gtsam.imuBias.ConstantBias(), label="imu bias"),
+            ],
+            [
+                *list(first.factors),  # type: ignore[arg-type]
+                prior_factor(velocity, start, self.start_velocity_deviation**2 * np.eye(3)),
+                gtsam.PriorFactorConstantBias(
+                    bias, gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(deviations)
+                ),
+            ],
+        )
+
+    def _rotation(self, view: GraphView) -> tuple[int, Additions]:
+        """Key of the sensor's rotation (3,), as a rotation vector from where the settings have it."""
+        key = view.key(EGO_CALIBRATION, INERTIAL, static=True)
+        if INERTIAL in view.static(EGO_CALIBRATION):
+            return key, Additions()
+        new = NewVariable(EGO_CALIBRATION, INERTIAL, np.zeros(3), static=True, label="rotation of the imu")
+        return key, Additions([new], [prior_factor(key, np.zeros(3), ROTATION_DEVIATION**2 * np.eye(3))])
+
+    def _turned(self, keys: tuple[int, ...], measured: gtsam.PreintegratedCombinedMeasurements) -> ResidualFactor:
+        types = (SpatialPose(), Vector(3), SpatialPose(), Vector(3), ImuBias(), ImuBias(), Vector(3))
+        native = gtsam.CombinedImuFactor(*keys[:6], measured)  # type: ignore[call-overload]
+        covariance = native.noiseModel().covariance()
+        return ResidualFactor(keys, types, partial(_turned, native, self._place), covariance, name="inertial samples")
+
+    def _preintegrated(
+        self, view: GraphView, pose: gtsam.Pose3, bias: gtsam.imuBias.ConstantBias
+    ) -> gtsam.PreintegratedCombinedMeasurements:
+        ego = None if view.frame is None else view.frame.ego
+        samples = None if ego is None else ego.imu
+        if samples is not None and abs(view.dt - float(samples.dt.sum())) > self.max_gap:
+            _LOG.warning(
+                "%s at %.2f s: samples of %.2f s for an epoch of %.2f s; it is bridged without them",
+                self.name, view.time, float(samples.dt.sum()), view.dt,
+            )  # fmt: skip
+            samples = None
+        known = samples is not None
+        if samples is None:
+            turned = pose.rotation() if self.estimate_rotation else pose.compose(self._place).rotation()
+            up = turned.matrix().T @ [[0.0], [0.0], [self.gravity]]
+            corrected = bias.vector()[None]  # what sensors with these biases would say of straight on
+            samples = ImuSamples(np.array([view.dt]), up.T + corrected[:, :3], corrected[:, 3:])
+        parameters = self._parameters(known)
+        measured = gtsam.PreintegratedCombinedMeasurements(parameters, bias)
+        share = view.dt / float(samples.dt.sum())
+        for dt, acceleration, rate in zip(samples.dt, samples.acceleration, samples.angular_rate, strict=True):
+            measured.integrateMeasurement(acceleration, rate, share * float(dt))
+        return measured
+
+    def _parameters(self, known: bool) -> gtsam.PreintegrationCombinedParams:
+        parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(self.gravity)
+        if not self.estimate_rotation:
+            parameters.setBodyPSensor(self._place)
+        noises = (self.accelerometer_noise, self.gyroscope_noise)
+        for name, deviation in (
+            ("Accelerometer", noises[0] if known else UNKNOWN_ACCELERATION),
+            ("Gyroscope", noises[1] if known else UNKNOWN_TURN),
+            ("Integration", INTEGRATION_NOISE),
+            ("BiasAcc", self.accelerometer_drift),
+            ("BiasOmega", self.gyroscope_drift),
+        ):
+            getattr(parameters, f"set{name}Covariance")(_isotropic(deviation))
+        return parameters
+
+
+def _turned(native: gtsam.CombinedImuFactor, place: gtsam.Pose3, *states: Any) -> FloatArray:
+    first, v1, second, v2, bias1, bias2, rotation = states
+    mounted = place.compose(gtsam.Pose3(gtsam.Rot3.Expmap(rotation), np.zeros(3)))
+    return np.asarray(native.evaluateError(first.compose(mounted), v1, second.compose(mounted), v2, bias1, bias2))
+
+
+def _isotropic(deviation: float) -> FloatArray:
+    return np.asarray(deviation**2 * np.eye(3))

@@ -1,0 +1,354 @@
+"""What is inferred beside the joint estimate: identities of detections and landmarks, objects at rest.
+
+Identity of detections: the probability that each one is of the object that it is assigned to.
+
+A detection z assigned to object i may be of another object k of its class, or of none that is known (clutter). With the
+objects where they are estimated, seen from the vehicle,
+
+    p_i = g_i / (g_c + sum_k g_k),   g_k = exp(-1/2 (z - h_k)^T S^-1 (z - h_k)),   S = R + spread^2 I
+
+    g_c = 2 pi sqrt(|S|) / clutter_area
+
+The estimate of the objects comes from the whole window, so that what an object does before and afterwards counts. In
+the graph the detection has a share p_i of its information: one that fits a neighbour as well hardly bends the path.
+Source of the probabilities: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation
+(2001), section 6.6, probabilistic data association.
+
+Association of landmarks of unknown identity, along a path and online.
+
+Along a path assumed so far an observation belongs to the nearest landmark of its kind, by its last observation, within
+`reach`, else to a new one: a pose drifts little between two views of one thing, and association is repeated along the
+path found. Online the joint Gaussian of the new pose and the landmarks of the window that can be seen from it decides
+(`saga_fg.slam.mapping.associate`).
+
+Stationarity of objects: the probability that each one is at rest, from its detections along a path.
+
+Around each detection of an object, within a window, D is the mean place of the later half of the detections less that
+of the earlier half, in the world along the path assumed so far, and T the time between the two. A stationary object
+has D ~ N(0, S): noise of the detections and of the odometry over the T seconds and s metres in between,
+
+    S = R (1/n_1 + 1/n_2) + shift + (scale^2 + course^2) s^2 + range^2 (turn + (bias T)^2)
+
+where shift and turn are the summed variances of the increments in between, in translation and in heading; scale, bias
+and course are the odometry's deviations as known so far. A moving object has D ~ N(0, S + (u T)^2), with the usual
+speed u_2 of its class (`moving_speed`), or u_1 = 0.3 u_2 where traffic creeps. By Bayes, with u_0 = 0 and shares q_k,
+
+    P(stationary | D) = q_0 N(D; 0, S) / sum_k q_k N(D; 0, S + (u_k T)^2)
+
+Where T is short, all these variances are nearly equal, and P is about q_0; so it is for slow classes far away.
+
+In a queue, cars too far to be seen creeping look parked, and the vehicle's path would bend until they are. But others,
+nearer, are seen to creep. So q_0 is one half, and the other half is divided as the traffic moves then, within 10 s:
+maximum likelihood of all detections by expectation maximisation, with a Dirichlet prior worth a few detections.
+
+Online the window ends now, and T is short: q_0 is `online_stationary_share`, q_1 = 0, and the last term of S, errors
+of the heading, counts across the line of sight only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from saga_fg.estimators.graph_window import GraphSolution
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, motion_covariances
+from saga_fg.slam.mapping import (
+    LandmarkObservations,
+    LandmarkSettings,
+    LocalMap,
+    NearbyLandmarks,
+    associate,
+    landmark_key,
+    place_of,
+    pose_key,
+)
+from saga_fg.types.by_class import class_numbers
+from saga_fg.types.landmark import Landmark, LandmarkType, Observation
+
+_SPREAD = 0.2  # m, standard deviation of the estimated positions of objects
+_LEAST = 0.01  # so that no object is without information
+_FAR = 50.0  # squared deviations from which a pair says no more
+
+
+def with_identities(
+    now: RecordedEpoch, world_T_ego: FloatArray, position: FloatArray, clutter_area: float
+) -> RecordedEpoch:
+    """The epoch with the probabilities of its assignments.
+
+    world_T_ego: (4, 4); position: (n, 2) of its objects in the world, m; clutter_area: m^2, inf without clutter
+    """
+    seen, objects = now.seen, now.objects
+    if not len(seen.id):
+        return now
+    placed = np.column_stack([position, np.zeros(len(position))])
+    placed[:, 2] = transform_points(world_T_ego, seen.z)[:, 2].mean()
+    beside = transform_points(inverse_transform(world_T_ego), placed)[:, :2]
+    S = seen.R + _SPREAD**2 * np.eye(2)
+    off = seen.z[:, None, :2] - beside
+    squared = np.einsum("mni,mij,mnj->mn", off, np.linalg.inv(S), off)
+    own = np.searchsorted(objects.id, seen.id)
+    label = np.array(objects.label)
+    rival = label[own][:, None] == label[None]
+    g = np.where(rival, np.exp(-np.minimum(squared, _FAR) / 2), 0.0)
+    clutter = 2 * np.pi * np.sqrt(np.linalg.det(S)) / clutter_area
+    p = g[np.arange(len(own)), own] / (clutter + g.sum(axis=1))
+    return replace(now, seen=replace(seen, probability=np.maximum(p, _LEAST)))
+
+
+def with_all_identities(
+    record: Sequence[RecordedEpoch], path: FloatArray, positions: Sequence[FloatArray], clutter_area: float
+) -> list[RecordedEpoch]:
+    """The epochs of a path (n, 4, 4) likewise; positions: (k, 2) of the objects of each."""
+    return [
+        with_identities(now, pose, position, clutter_area)
+        for now, pose, position in zip(record, path, positions, strict=True)
+    ]
+
+
+Observations = Sequence[Sequence[Observation]]
+
+
+def nearest_landmarks(observations: Observations, path: FloatArray, reach: float) -> LandmarkObservations:
+    """Associate the observations of n epochs along a path (n, 4, 4); reach in m."""
+    start: dict[int, Any] = {}
+    places: dict[LandmarkType, dict[int, FloatArray]] = {}
+    seen: dict[int, list[tuple[int, Observation]]] = {}
+    for epoch, (now, pose) in enumerate(zip(observations, path, strict=True)):
+        for observation in now:
+            state = observation.kind.initialise(pose, observation.value)
+            where = observation.kind.coordinates(state)
+            place = np.array([where["x"], where["y"]])
+            known = places.setdefault(observation.kind, {})
+            distance = {number: float(np.linalg.norm(there - place)) for number, there in known.items()}
+            number = min(distance, key=distance.__getitem__, default=len(start))
+            if distance.get(number, np.inf) > reach:
+                number = len(start)
+                start[number] = state
+            known[number] = place
+            seen.setdefault(epoch, []).append((number, observation))
+    return LandmarkObservations(seen, start)
+
+
+class WindowLandmarks:
+    """Landmarks of an online estimator: those observed in the window, and those that left it, in their last state."""
+
+    def __init__(self, settings: LandmarkSettings) -> None:
+        self._settings = settings
+        self._last_seen: dict[int, int] = {}
+        self._kinds: dict[int, LandmarkType] = {}
+        self._count: dict[int, int] = {}
+        self._gone: dict[int, Landmark] = {}
+        self._near = NearbyLandmarks(by_odometry=False)
+
+    def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> LandmarkObservations:
+        """Associate observations from the epoch k; one without a match initiates a new landmark."""
+        places = [place_of(observation) for observation in observations]
+        pose, covariance = solution.values.atPose3(pose_key(k)).matrix(), solution.marginal(pose_key(k))
+        numbers = self._near.near(pose[:2, 3], covariance).tolist()
+        P = solution.covariance([pose_key(k), *map(landmark_key, numbers)])
+        states = {n: (self._kinds[n], self._state(n, solution.values)) for n in numbers}
+        pairs = associate(LocalMap(pose, P, states), observations, self._settings.gate)
+        start: dict[int, object] = {}
+        seen: list[tuple[int, Observation]] = []
+        for row, observation in enumerate(observations):
+            if row in pairs:
+                number = pairs[row].landmark
+            else:
+                number = len(self._count) + 1
+                self._kinds[number] = observation.kind
+                start[number] = observation.kind.initialise(pose, observation.value)
+            self._count[number] = self._count.get(number, 0) + 1
+            self._last_seen[number] = k
+            self._near.see(number, places[row], pose, covariance)
+            seen.append((number, observation))
+        return LandmarkObservations({k: seen}, start)
+
+    def forget(self, first: int, solution: GraphSolution) -> list[int]:
+        """Let landmarks leave that were last observed before the epoch `first`; returns their keys."""
+        gone = [number for number in self._kinds if self._last_seen[number] < first]
+        for number in gone:
+            self._gone[number] = self._landmark(number, solution)
+            del self._kinds[number]
+        self._near.forget(gone)
+        return [landmark_key(number) for number in gone]
+
+    def all(self, solution: GraphSolution | None) -> list[Landmark]:
+        """All so far: those in the window, and others in their last state."""
+        current = [] if solution is None else [self._landmark(number, solution) for number in self._kinds]
+        return sorted([*self._gone.values(), *current], key=lambda mark: mark.number)
+
+    def _landmark(self, number: int, solution: GraphSolution) -> Landmark:
+        covariance = solution.covariance([landmark_key(number)])
+        count = self._count[number]
+        state = self._state(number, solution.values)
+        return Landmark(number, self._kinds[number], state, covariance, count, count >= self._settings.confirm_after)
+
+    def _state(self, number: int, values: gtsam.Values) -> object:
+        return self._kinds[number].variable.read(values, landmark_key(number))
+
+
+_CREEPING = 0.3  # speed of creeping traffic, as a share of the usual one
+_ALIKE = 10.0  # s, time over which traffic keeps its shares
+_PRIOR = 10.0  # detections of each hypothesis that the prior of the shares is worth
+_ROUNDS = 30  # of expectation maximisation
+ONLINE_STATIONARY_SHARE = 0.1  # prior share of stationary objects online: queues look parked
+
+
+@dataclass(frozen=True)
+class SlowErrors:
+    """Standard deviations of the odometry's scale, its bias of the yaw rate (rad/s) and its course (rad), as known."""
+
+    scale: float
+    bias: float
+    course: float
+
+    @classmethod
+    def at_start(cls, settings: JointSettings) -> SlowErrors:
+        """The deviations of the settings, before any measurement."""
+        return cls(settings.odometry.scale, settings.odometry.bias, settings.odometry.course)
+
+
+@dataclass(frozen=True, eq=False)
+class _PlacedDetections(Columns):
+    """All detections, by object and time: object, row of the record, time (N,), place (N, 2), variance, range, u (N,).
+
+    sight (N, 2): the place less the vehicle's, m
+    drift (N, 3): way driven, m, variance of the translation, m^2, and of the heading, rad^2, from the first epoch on
+    """
+
+    object: IntArray
+    row: IntArray
+    time: FloatArray
+    place: FloatArray
+    sight: FloatArray
+    variance: FloatArray
+    range: FloatArray
+    speed: FloatArray
+    drift: FloatArray
+
+
+def stationary_probabilities(
+    record: Sequence[RecordedEpoch], path: FloatArray, slow: SlowErrors, settings: JointSettings, online: bool = False
+) -> list[FloatArray]:
+    """For each epoch the probabilities (n,) that its objects are stationary; path (K, 4, 4) assumed so far.
+
+    0 where there are too few detections. Between two detections it is the smaller one of theirs.
+    """
+    seen = _place(record, path, settings)
+    p = _probabilities(seen, slow, settings, online)
+    result = [np.zeros(len(now.objects.id)) for now in record]
+    if not len(p):
+        return result
+    first = np.flatnonzero(np.append(True, seen.object[1:] != seen.object[:-1]))
+    for start, end in zip(first, np.append(first[1:], len(p)), strict=True):
+        name, rows, mine = seen.object[start], seen.row[start:end], p[start:end]
+        for k in range(int(rows[0]), int(rows[-1]) + 1):
+            after = int(np.searchsorted(rows, k))
+            value = mine[after] if rows[after] == k else min(mine[after - 1], mine[after])
+            row = int(np.searchsorted(record[k].objects.id, name))
+            if row < len(record[k].objects.id) and record[k].objects.id[row] == name:
+                result[k][row] = value
+    return result
+
+
+def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSettings, online: bool) -> FloatArray:
+    """P(stationary) (N,) of the object of each detection, around it."""
+    n = len(seen.object)
+    if n == 0:
+        return np.empty(0)
+    far = 4 * (seen.time.max() - seen.time.min() + settings.stationary_window)  # puts objects apart on one axis
+    axis = seen.time - seen.time.min() + far * np.unique(seen.object, return_inverse=True)[1]
+    low = np.searchsorted(axis, axis - settings.stationary_window / 2, "left")
+    high = np.searchsorted(axis, axis + settings.stationary_window / 2, "right")
+    start = np.searchsorted(seen.object, seen.object, "left")
+    end = np.searchsorted(seen.object, seen.object, "right")
+    # at the ends of its lifespan the window is shifted into it
+    low = np.where(high == end, np.searchsorted(axis, axis[end - 1] - settings.stationary_window, "left"), low)
+    low = np.maximum(low, start)
+    high = np.where(low == start, np.searchsorted(axis, axis[start] + settings.stationary_window, "right"), high)
+    high = np.minimum(high, end)
+    middle = (low + high) // 2
+    n1, n2 = middle - low, high - middle
+
+    def half(values: FloatArray, a: IntArray, b: IntArray) -> FloatArray:
+        total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+        count = np.maximum(b - a, 1).reshape(-1, *(1,) * (values.ndim - 1))
+        return np.asarray((total[b] - total[a]) / count)
+
+    columns = np.column_stack([seen.place, seen.time - seen.time.min(), seen.drift])
+    between = half(columns, middle, high) - half(columns, low, middle)
+    D, (T, s, shift, turn) = between[:, :2], between[:, 2:].T
+    S = half(seen.variance, low, high) * (1 / np.maximum(n1, 1) + 1 / np.maximum(n2, 1))
+    S = S + shift + (slow.scale**2 + slow.course**2) * s**2
+    turned = half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
+    sight = half(seen.sight, low, high)
+    along = (D * sight).sum(axis=1) ** 2 / np.maximum((sight**2).sum(axis=1), 1e-9)
+    d2 = np.stack([along, (D**2).sum(axis=1) - along])  # along the line of sight, and across
+    S = np.stack([S if online else S + turned, S + turned])
+    usual = (seen.speed * T) ** 2
+    if online:
+        q = ONLINE_STATIONARY_SHARE
+        variances, shares = np.stack([S, S + usual]), np.array([[q], [1 - q]])
+        log = _log_likelihoods(variances, d2)
+    else:
+        variances = np.stack([S, S + _CREEPING**2 * usual, S + usual])
+        log = _log_likelihoods(variances, d2)
+        shares = _shares_of_traffic(log, seen.time, n1 > 0)
+    p = _posteriors(log, shares)[0]
+    return np.where(n1 > 0, p, 0.0)
+
+
+def _log_likelihoods(variances: FloatArray, d2: FloatArray) -> FloatArray:
+    """Of each hypothesis (K, N), but for a constant: variances (K, 2, N) of distances whose squares are d2 (2, N)."""
+    return np.asarray(-(np.log(variances) + d2 / variances).sum(axis=1) / 2)
+
+
+def _posteriors(log: FloatArray, shares: FloatArray) -> FloatArray:
+    """Probabilities (K, N) of hypotheses with log-likelihoods (K, N) and prior shares (K, N) or (K, 1)."""
+    weight = np.log(shares) + log
+    weight = np.exp(weight - weight.max(axis=0))
+    return np.asarray(weight / weight.sum(axis=0))
+
+
+def _shares_of_traffic(log: FloatArray, time: FloatArray, judged: BoolArray) -> FloatArray:
+    """Shares (K, N) of the hypotheses around each detection; log-likelihoods (K, N), time (N,); judged (N,) count."""
+    order = np.argsort(time, kind="stable")
+    low = np.searchsorted(time[order], time - _ALIKE, "left")
+    high = np.searchsorted(time[order], time + _ALIKE, "right")
+    shares = np.tile([[0.5], [0.25], [0.25]], (1, log.shape[1]))
+    for _ in range(_ROUNDS):
+        p = np.where(judged, _posteriors(log, shares), 0.0)[:, order]
+        total = np.concatenate([np.zeros((len(p), 1)), np.cumsum(p, axis=1)], axis=1)
+        count = (total[:, high] - total[:, low] + _PRIOR)[1:]
+        shares[1:] = 0.5 * count / count.sum(axis=0)
+    return shares
+
+
+def _place(record: Sequence[RecordedEpoch], path: FloatArray, settings: JointSettings) -> _PlacedDetections:
+    row = np.repeat(np.arange(len(record)), [len(now.seen.id) for now in record]).astype(np.int64)
+    place = [transform_points(pose, now.seen.z)[:, :2] for now, pose in zip(record, path, strict=True)]
+    sight = [one - pose[:2, 3] for one, pose in zip(place, path, strict=True)]
+    label = [np.array(now.objects.label)[np.isin(now.objects.id, now.seen.id)] for now in record]
+    P = motion_covariances(record, settings)
+    drift = np.zeros((len(record), 3))
+    drift[:, 0] = np.cumsum([np.linalg.norm(now.a_T_b[:3, 3]) for now in record])
+    drift[1:, 1] = np.cumsum((P[:, 3, 3] + P[:, 4, 4]) / 2)
+    drift[1:, 2] = np.cumsum(P[:, 2, 2])
+    placed = _PlacedDetections(
+        np.concatenate([now.seen.id for now in record]),
+        row,
+        np.array([now.time for now in record])[row],
+        np.concatenate(place),
+        np.concatenate(sight),
+        np.concatenate([np.trace(now.seen.R, axis1=1, axis2=2) / 2 for now in record]),
+        np.concatenate([np.hypot(now.seen.z[:, 0], now.seen.z[:, 1]) for now in record]),
+        class_numbers(settings.moving_speed, float, np.concatenate(label)),
+        drift[row],
+    )
+    return placed.select(np.lexsort((placed.row, placed.object)))
