@@ -7,7 +7,7 @@ from importlib import import_module
 from benchmarks.runner import application
 
 NAMES = (
-    *("estimators", "gaps", "joint", "landmarks", "loops", "metrics", "scaling", "service"),
+    *("estimators", "gaps", "joint", "kills", "landmarks", "loops", "metrics", "scaling", "service"),
     *("settling", "slam", "smoothing", "speed", "streaming", "tracking"),
 )
 

@@ -26,7 +26,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the folders beside this script are named as the packages are
 from data_tools.files.atomic_files import write_text
 from saga_fg import InputError
-from tests.data_tools.damage import Target, damaged, targets
+from tests.data_tools.damage import Target, another, targets
 
 PART = 1000  # inputs
 HANGS = 600.0  # s for one input
@@ -96,7 +96,7 @@ def fuzz(name: str, target: Target, seed: int, part: int, state: Path, tell: Cal
     refused = faults = 0
     for number in range(part * PART, (part + 1) * PART):
         path = rng.choice(target.files)
-        content = damaged(originals[path], rng)
+        content = another(path, originals[path], rng)
         kept = state / f"{name.replace(' ', '_').replace(',', '')}-{seed}-{number}{path.suffix}"
         kept.write_bytes(content)  # before it is read: the reader may take the interpreter with it
         path.write_bytes(content)

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
-from data_tools.files.input_files import error_context
+from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.readers import NUMBERS, WHOLE, all_of, read_arrow_arrays
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -56,6 +56,8 @@ def openacc_platoons(root: Path) -> Recordings:
 
     def read(name: str) -> RecordedTraffic:
         row = np.flatnonzero(run == name)
+        if not len(row):
+            raise InputError(f"{path}: {unknown_name('platoon', name, np.unique(run).tolist())}")
         row = row[np.lexsort((columns["t"][row], columns["veh"][row]))]
         time, vehicle, speed, east, north, gap = (columns[key][row] for key in _COLUMNS[2:])
         position = np.column_stack([east, north])

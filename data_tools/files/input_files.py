@@ -93,12 +93,15 @@ def error_context(where: str) -> Iterator[None]:
         raise InputError(f"{where}: {error}") from error
 
 
+_LONGEST = 80  # characters of a name that a message shows
+
+
 def unknown_name(what: str, name: str, known: tuple[str, ...]) -> str:
     """Message about a name that is not among the `known` ones: the nearest of them, and the list if it is short."""
-    nearest = get_close_matches(name, known, n=1, cutoff=0.6)
-    hint = f"; did you mean {nearest[0]!r}? Expected" if nearest else ", expected"
-    shown = ", ".join(known[:12]) + (f", ... ({len(known)} in all)" if len(known) > 12 else "")
-    return f"unknown {what} {name!r}{hint} one of: {shown or 'none here'}"
+    nearest = get_close_matches(name[:_LONGEST], known, n=1, cutoff=0.6)
+    hint = f"; did you mean {nearest[0][:_LONGEST]!r}? Expected" if nearest else ", expected"
+    shown = ", ".join(each[:_LONGEST] for each in known[:12]) + (f", ... ({len(known)} in all)" * (len(known) > 12))
+    return f"unknown {what} {name[:_LONGEST]!r}{hint} one of: {shown or 'none here'}"
 
 
 T = TypeVar("T")

@@ -348,6 +348,10 @@ def read_arrow_arrays(path: Path, choose: Choose, kinds: Mapping[str, str], fill
         if column.dtype.kind not in allowed:
             expected = {NUMBERS: "numbers", WHOLE: "whole numbers"}.get(allowed, "text")
             raise InputError(f"{path}: {name}: expected {expected}, got {column.dtype}")
+        if column.dtype.kind == "O":
+            row = next((k for k, value in enumerate(column) if not isinstance(value, str | None)), None)
+            if row is not None:
+                raise InputError(f"{path}: {name}: row {row + 1}: expected text, got {str(column[row])[:40]!r}")
         columns[name] = column
     return columns
 

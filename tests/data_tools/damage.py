@@ -1,7 +1,7 @@
 """Damage done to valid files, and the readers that must either read what is left or say in one error what is wrong.
 
 `targets(folder)` makes a small valid input for every reader; `damaged` does to the bytes of a file what disks,
-programs and people do to them.
+programs and people do to them, `another` that or a change of structure.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from saga_fg.types.dataset import Dataset, Scene
 from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import box, results, write_results, write_tables
+from tests.data_tools.structures import restructured
 
 PIECES = [
     *(b"", b"NaN", b"nan", b"-1", b"0", b"1e999", b"-1e308", b"1e-320", b"99999999999999999999", b"0x10", b"1_0"),
@@ -182,6 +183,11 @@ def _arrow(folder: Path) -> dict[str, Target]:
         "detections, Parquet": Target((parquet,), lambda: _read_table(parquet)),
         "detections, Feather": Target((feather,), lambda: _read_table(feather)),
     }
+
+
+def another(path: Path, content: bytes, rng: random.Random) -> bytes:
+    """An input from a valid file: its bytes damaged, or its parts changed within the format."""
+    return damaged(content, rng) if rng.random() < 0.5 else restructured(path, content, rng)
 
 
 def damaged(content: bytes, rng: random.Random) -> bytes:

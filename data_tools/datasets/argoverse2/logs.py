@@ -48,7 +48,7 @@ from data_tools.datasets.source import AreaMap, Kind
 from data_tools.files.input_files import error_context, read_bytes, unknown_name
 from data_tools.files.readers import WHOLE, all_of, parsed_json, read_arrow_arrays
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, checked
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
@@ -167,7 +167,7 @@ def transforms(rows: dict[str, Any]) -> FloatArray:
     quaternion, translation = (np.stack([rows[name] for name in names], axis=1) for names in (POSE[:4], POSE[4:]))
     T = np.tile(np.eye(4), (len(quaternion), 1, 1))
     T[:, :3, :3] = quaternion_rotation(checked_quaternions("qw qx qy qz", quaternion))
-    T[:, :3, 3] = translation
+    T[:, :3, 3] = checked("tx_m ty_m tz_m", translation, (len(T), 3))
     return T
 
 

@@ -142,7 +142,7 @@ def seconds_of_dates(values: Sequence[Any]) -> FloatArray:
         if value is not None:
             try:
                 seconds[row] = _seconds(value)
-            except (TypeError, ValueError) as error:
+            except (AttributeError, TypeError, ValueError) as error:  # no text, or none of a date
                 raise ValueError(row) from error
     return seconds
 

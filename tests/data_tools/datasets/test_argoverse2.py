@@ -95,6 +95,12 @@ def test_a_missing_column_a_missing_pose_and_a_broken_file_are_named(tmp_path):
     dataset = write(tmp_path, boxes() | {"track_uuid": ["a", None, "b"]}, poses())
     with pytest.raises(InputError, match=r"annotations.feather: track_uuid: expected a value in every row"):
         dataset.scene("log")
+    dataset = write(tmp_path, boxes() | {"track_uuid": [["a"], ["a"], ["b"]]}, poses())
+    with pytest.raises(InputError, match=r"annotations.feather: track_uuid: row 1: expected text, got .*a"):
+        dataset.scene("log")
+    dataset = write(tmp_path, boxes(), poses() | {"tx_m": [100.0, np.inf, 100.0]})
+    with pytest.raises(InputError, match=r"city_SE3_egovehicle.feather: tx_m ty_m tz_m.*expected a finite number"):
+        dataset.scene("log")
     dataset = write(tmp_path, boxes(), poses())
     path = tmp_path / "log" / "annotations.feather"
     path.write_bytes(path.read_bytes().replace(b"category", b"c\xf9tegory"))

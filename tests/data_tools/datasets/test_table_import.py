@@ -148,6 +148,13 @@ def test_dates_that_are_none_are_named(tmp_path: Path) -> None:
         read_detections(path)
 
 
+def test_numbers_among_dates_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "drive.ndjson"
+    path.write_text('{"time": "2023-11-14T22:13:20", "x": 1, "y": 2}\n{"time": 5, "x": 1, "y": 2}\n')
+    with pytest.raises(InputError, match=r"line 2: timestamp .* expected a date and time of ISO 8601, got '5'"):
+        read_detections(path)
+
+
 def test_units_that_are_given(tmp_path: Path) -> None:
     rows = [{"frame_no": k, "x": 10, "y": 20, "length": 15, "vx": 36, "yaw": 180, "score": 50} for k in (0, 5)]
     units = {"time": "10Hz", "length": "ft", "speed": "km/h", "angle": "deg", "score": "percent"}

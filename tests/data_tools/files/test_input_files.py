@@ -17,7 +17,7 @@ from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.label_table import read_label_table
 from data_tools.datasets.nuscenes import read_tracking_results
-from data_tools.files.input_files import expanded, open_bytes, read_text
+from data_tools.files.input_files import expanded, open_bytes, read_text, unknown_name
 from data_tools.files.readers import open_json, parsed_json
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o
@@ -137,3 +137,9 @@ def test_long_numbers_in_text_tables(tmp_path: Path, value: str) -> None:
     path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" + f"1 0 0 {value} 0 1 0 0 0 0 1 0\n")
     with pytest.raises(InputError, match=r"poses\.txt: line 2: expected values of at most 100 characters, got '"):
         read_kitti_poses(path)
+
+
+def test_messages_show_the_begin_of_long_names() -> None:
+    told = unknown_name("scene", "a" * 10_000, ("a" * 9_999, "b"))
+    assert told.startswith("unknown scene 'aaa")
+    assert len(told) < 500
