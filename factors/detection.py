@@ -1,7 +1,5 @@
 """Detections: measurements of single nodes, in the world or as bearings from a camera.
 
-Detections: measurements of single nodes.
-
     z = h(x) + v,    v ~ N(0, R)            phi  =  rho( || z - h(x) ||_R )
 
 h is a measurement model (see `factors.measurement`); it names the components of the state it reads, so that any state

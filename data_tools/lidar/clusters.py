@@ -1,7 +1,5 @@
 """Detections without a trained detector: ground removed, clusters above it as oriented boxes.
 
-Detections without a trained detector: clusters of points above the ground as oriented boxes.
-
 Points above the ground are clustered from above; clusters as high as walls, or longer than any vehicle, are discarded.
 The box of a cluster has the heading theta for which its points lie close to the box's sides: with c1, c2 the
 coordinates of a point along and across theta, and d its distance from the nearer of the sides that bound c1 and c2,

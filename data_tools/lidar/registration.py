@@ -1,7 +1,5 @@
 """Scan registration: point-to-plane ICP against surfels, and the directions that they leave open.
 
-Scan registration: point-to-plane ICP against the surfels of the scans before.
-
     minimise over T   sum_i rho( n_i . (T p_i - m_i) ),        rho(r) = s^2/2 log(1 + r^2 / s^2)      (Cauchy)
 
 p_i are points of the scan, m_i and n_i mean and normal of the nearest flat surfel of the map. Each iteration updates

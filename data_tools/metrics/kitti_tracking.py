@@ -1,7 +1,5 @@
 """KITTI 3D multi-object tracking metrics, averaged over recall: sAMOTA, AMOTA, AMOTP and the rest.
 
-KITTI 3D multi-object tracking metrics, averaged over recall: sAMOTA, AMOTA, AMOTP and the CLEAR metrics.
-
 True and found boxes of a class are matched frame by frame: as many pairs with the required 3D IoU as possible, and
 among those the largest sum of IoU. Thresholds on the mean score of a track are set where the recall comes nearest to
 1/40, 2/40, ...; with the counts at each (objects gt that count, misses FN, false alarms FP, switches IDS)

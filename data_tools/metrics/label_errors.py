@@ -1,7 +1,5 @@
 """Errors of tracks at labelled objects, their summary, and the quality of whole tracks.
 
-Errors of tracks at labelled objects: position, velocity, heading, and consistency of the covariance.
-
 Labels and tracks are paired frame by frame (`nearest_pairs`). If the detections are given, errors of position, velocity
 and heading are those at labels that a detection matches: every tracker with the same detections is then evaluated on
 the same labels, and its position errors compare with those of the detections. Covariances are evaluated on all pairs.

@@ -1,7 +1,5 @@
 """Sensor and detector model of the simulator: noise, misses, false detections, occlusion.
 
-Sensor and detector model: detections of boxes with noise, misses, false detections and scores.
-
 Noise is Gaussian along the line of sight and across it, with standard deviations base + slope * range, and
 independent from frame to frame. A camera's range may also drift, by a relative error for each object. A radar adds the
 range rate: the velocity over ground along the line of sight; that of false detections is around 0, as of a static

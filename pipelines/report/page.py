@@ -1,7 +1,5 @@
 """The page: results on disk as one HTML file with style, script and data, and the record of their run.
 
-The page: one HTML file with style, script and data in it.
-
 The data is JSON, deflated, in base64; the browser inflates it.
 
 The record of a run, written beside its result for reports: method, version, configuration and times.

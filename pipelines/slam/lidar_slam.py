@@ -1,7 +1,5 @@
 """SLAM with a LiDAR, scan by scan: odometry, keyframes, submaps and landmarks, loops, in one graph.
 
-SLAM with a LiDAR, scan by scan: odometry, keyframes, submaps and landmarks, loops, in one running graph.
-
     prior         the first pose
     odometry      || log( (T_k^-1 T_(k+1))^-1  D_k ) ||_{P_k}      between successive keyframes
     sensors       GPS, inertial samples and wheels of the vehicle, where there are any

@@ -1,7 +1,5 @@
 """Localisation: a drive in the map of an earlier one, by its places and by registration.
 
-Localisation: a drive in the map of an earlier one.
-
     odometry      LiDAR odometry, scan by scan, as in SLAM
     where first   a guess, or place recognition: the points of the first metres, as a submap, are looked for among the
                   submaps of the map; the one that passes registration and shares enough structure is the place, if no

@@ -1,7 +1,5 @@
 """LiDAR odometry: the motion of the sensor scan by scan, and keyframes of a drive.
 
-LiDAR odometry: the motion of the sensor, scan by scan.
-
     predict    T- = T_(k-1) exp(dt xi)                        the velocity of the step before, or of other sensors
     de-skew    by xi, where the points have times
     register   T = point-to-plane ICP of a thinned scan against the surfels of the scans before, from T-

@@ -1,7 +1,5 @@
 """A recording smoothed chunk by chunk as it is read, in memory that does not grow with its length.
 
-A recording smoothed as it is read, in memory that does not grow with its length.
-
     frames -> tracker, frame by frame -> chunks, smoothed one by one with margins -> labels, on disk
 
 The tracker sees the recording once, from one end to the other. All passes of smoothing (`pipelines.smoothing.passes`)

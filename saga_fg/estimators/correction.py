@@ -1,7 +1,5 @@
 """Correction of a joint state by components, and the steps of the joint Kalman filter.
 
-Correction of a joint state that is split into components by measurements of some nodes.
-
     S = H P H^T + R = L L^T     W = L^-1 H P     m <- m + W^T L^-1 (z - H m)     P <- P - W^T W
 
 All components of one size take one batched operation. Where a measurement is so much better than what was known

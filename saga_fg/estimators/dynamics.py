@@ -1,7 +1,5 @@
 """Prediction of a joint state by components, and bounds on which correlations it keeps.
 
-Prediction of a joint state that is split into components.
-
     m <- F m + b        P <- F P F^T + Q        F block-sparse, Q block-diagonal
 
 A component grows by the interactions that enter it; all of one size are predicted by one batched operation.

@@ -1,7 +1,5 @@
 """The inputs of an estimator at an epoch, the filter's step there, and its pass over many.
 
-The inputs of an estimator at an epoch, and the filter's step there.
-
 An epoch is a time at which something was measured, or at which nodes appeared or went. It keeps the inputs (priors of
 new nodes, measurements, nodes that leave, the interval to the next epoch), so that it can be filtered again: with late
 measurements, or linearised at better estimates.

@@ -1,7 +1,5 @@
 """Checks of the factors that a running graph takes, and error messages that name their variables.
 
-Checks of the factors that a running graph takes, before GTSAM's C++ sees them.
-
 | given | becomes |
 |---|---|
 | `gtsam.JacobianFactor`, linear, on vectors themselves | a row of the `LinearGroup` of all that come with it |

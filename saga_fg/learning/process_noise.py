@@ -1,7 +1,5 @@
 """Process noise by maximum likelihood: of constant velocity, and of curvilinear motion.
 
-Process noise of constant-velocity motion by maximum likelihood.
-
     q* = argmax_q  sum over objects and times of  log N( z - H m ; 0, H P H^T + R )
 
 m and P are the prediction of the object's own Kalman filter with the acceleration's spectral density q (the prediction

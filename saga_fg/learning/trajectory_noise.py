@@ -1,7 +1,5 @@
 """Noise of sensors and motion without ground truth, from the trajectories of a tracker.
 
-Noise of sensors and motion from the trajectories of a tracker, without ground truth.
-
     theta* = argmax_theta  sum over detections of  log( (1 - e) N( z - H m ; 0, H P H^T + R(theta) ) + e / area )
 
 m and P are the predictions of each object's own constant-velocity filter, in which all sensors take part; theta holds

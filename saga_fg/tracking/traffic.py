@@ -1,7 +1,5 @@
 """Memory of traffic: where vehicles went lately and how fast, for paths and speeds of others.
 
-Memory of traffic: where vehicles went lately and how fast, for the paths and speeds of others.
-
 A passage is a place of a track with its heading and speed there: where it was last, and every `SPACING` m. Passages
 outlive their tracks and are forgotten after `memory` s. The passages of those that move make trails, and so do the
 lanes of the road map: they tell where to go, at no speed, and are never forgotten.

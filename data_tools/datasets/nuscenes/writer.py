@@ -1,7 +1,5 @@
 """Scenes and labels written in the nuScenes layout, for every tool that reads it.
 
-Scenes with ground truth in the nuScenes layout, for every tool that reads it.
-
     DIRECTORY/VERSION/*.json         the 13 tables, and splits.json with all scenes as split "all"
     DIRECTORY/maps/placeholder.png   a black pixel: there is no map
     DIRECTORY/detections/NAME.json   the detections of the sensor NAME in the official detection-result format

@@ -1,7 +1,5 @@
 """Pose graphs: poses, measurements between pairs of them, points seen, places known from outside.
 
-A pose graph: poses, and measurements between pairs of them.
-
     first_T_second = world_T_first^-1 world_T_second,     measured with information Omega
 
     E = 1/2 sum_e || log( measured_e^-1 first_T_second ) ||^2_Omega_e

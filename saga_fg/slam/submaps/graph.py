@@ -1,7 +1,5 @@
 """Incremental SLAM in submaps: one running graph of bounded size, and the record to solve it whole.
 
-Incremental SLAM in submaps: one running graph of bounded size.
-
     keyframes and landmarks of the running submap      as they come, in iSAM2
     closed submaps                                     one factor each, between its anchor and the next
     loops                                              factors between anchors, under a robust loss
