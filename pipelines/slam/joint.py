@@ -40,6 +40,7 @@ from saga_fg.slam.joint import (
     Observations,
     OdometryIncrements,
     OnlineEstimate,
+    OnlineEstimator,
     estimate_jointly,
     estimate_online,
 )
@@ -109,8 +110,8 @@ def run_joint(
     estimate = estimate_jointly(frames, odometry, new_tracker, settings, start, observed, new_providers)
     online = None
     if lag is not None:
-        tracker, own = new_tracker(), new_providers()
-        online = estimate_online(frames, odometry, tracker, lag, settings, start, observed, providers=own)
+        estimator = OnlineEstimator(new_tracker(), lag, settings, start=start, providers=new_providers())
+        online = estimate_online(frames, odometry, estimator, observed)
     return JointRun(frames, odometry, truth, Trajectory(truth.timestamps, odometry.path(start)), estimate, online)
 
 
@@ -213,7 +214,8 @@ def with_objects(
         for one in result.observations:
             observed[at[one.pose]].append(one.observation)
         marks, others = LandmarkSettings(GATE, s.submaps.confirm_after), [*of_sensors, *new_providers()]
-        online = estimate_online(seen, odometry, new_tracker(), lag, s.objects, start, observed, marks, others)
+        estimator = OnlineEstimator(new_tracker(), lag, s.objects, marks, start, others)
+        online = estimate_online(seen, odometry, estimator, observed)
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
         slam = replace(slam, online=Trajectory(scans.timestamps, placed))
     return SlamWithObjects(slam, result, estimate)

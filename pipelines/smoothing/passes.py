@@ -32,6 +32,7 @@ from saga_fg.settings import settings_group
 from saga_fg.smoothing import (
     Evidence,
     Lifespans,
+    ObjectMotion,
     SmoothedEdges,
     SmoothingSettings,
     StateTable,
@@ -48,6 +49,7 @@ from saga_fg.smoothing import (
     stationary_states,
     stitch_tracklets,
 )
+from saga_fg.smoothing.batch_states import GraphOf
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME
 from saga_fg.smoothing.states import MEDIUM_SCORE
 from saga_fg.tracking import TrackerSettings
@@ -143,7 +145,7 @@ def smooth_objects(
     object_of = np.where(strong, track_of, -1)
     is_strong = np.isin(alone.id, tracklets.id)
     states = passes.coupled(tracklets, object_of, ahead, alone.select(is_strong))
-    first = stitch_tracklets(tracklets, states, passes.velocity_prior(tracklets), evidence, settings.stitching)
+    first = stitch_tracklets(tracklets, states, passes.motion(tracklets).velocity_prior, evidence, settings.stitching)
     object_of[strong] = first[tracklets.rows_of(track_of[strong])]
 
     joined = lifespans_of(object_of, label, moment)
@@ -180,7 +182,7 @@ def smooth_known_objects(
     none."""
     passes = _Passes(evidence, settings, tracker, ())
     lifespans = lifespans_of(object_of, evidence.boxes.label, evidence.moment)
-    states = smooth_states(evidence, object_of, lifespans, passes.velocity_prior(lifespans), settings.classes)
+    states = smooth_states(evidence, object_of, lifespans, passes.motion(lifespans))
     return passes.final(lifespans, object_of, states, StationaryStates(settings.stationary))
 
 
@@ -193,15 +195,18 @@ class _Passes:
     tracker: TrackerSettings
     providers: Sequence[FactorProvider]
 
-    def velocity_prior(self, lifespans: Lifespans) -> FloatArray:
-        """(n, 2, 2) covariance of the velocity of a new object."""
+    def motion(
+        self, lifespans: Lifespans, edges: GraphOf = no_edges, stationary: StationaryStates | None = None
+    ) -> ObjectMotion:
+        """How objects move, whose first velocities are those of new tracks."""
         (speed,) = class_values(self.tracker.classes, ClassSettings, lifespans.label, "initial_speed_deviation")
-        return np.asarray(speed[:, None, None] ** 2 * np.eye(2))
+        prior = np.asarray(speed[:, None, None] ** 2 * np.eye(2))
+        return ObjectMotion(prior, self.settings.classes, edges, stationary)
 
     def alone(self, lifespans: Lifespans, object_of: IntArray, ahead: float) -> StateTable:
         """States without edges of objects that reach beyond their detections, by `ahead` s at their ends."""
         longer = lifespans.reaching(self.evidence.times, EXTENSION, ahead)
-        return smooth_states(self.evidence, object_of, longer, self.velocity_prior(longer), self.settings.classes)
+        return smooth_states(self.evidence, object_of, longer, self.motion(longer))
 
     def coupled(self, lifespans: Lifespans, object_of: IntArray, ahead: float, states: StateTable) -> StateTable:
         """States as by `alone`, with the edges that follow from given states."""
@@ -209,8 +214,7 @@ class _Passes:
             return states
         longer = lifespans.reaching(self.evidence.times, EXTENSION, ahead)
         edges = self._edges(longer, object_of, states)
-        prior, classes = self.velocity_prior(longer), self.settings.classes
-        return smooth_states(self.evidence, object_of, longer, prior, classes, edges)
+        return smooth_states(self.evidence, object_of, longer, self.motion(longer, edges))
 
     def reaching_back(self, lifespans: Lifespans, object_of: IntArray, score: FloatArray) -> Lifespans:
         """Extend objects of a score (n,) above low quality to before their first detection, if that is far away."""
@@ -230,11 +234,9 @@ class _Passes:
             edges = self._edges(lifespans, object_of, states.within(lifespans)) if self.tracker.edges else no_edges
             loss = self.settings.robust
             weight = None if loss is None else robust_weights(self.evidence, object_of, states, loss)
-            prior, classes = self.velocity_prior(lifespans), self.settings.classes
             asked = self.providers or [new_provider(name) for name in self.settings.providers]
-            states = smooth_states(
-                self.evidence, object_of, lifespans, prior, classes, edges, weight, stationary, asked
-            )
+            motion = self.motion(lifespans, edges, stationary)
+            states = smooth_states(self.evidence, object_of, lifespans, motion, weight, asked)
         return states
 
     def _edges(self, lifespans: Lifespans, object_of: IntArray, states: StateTable) -> SmoothedEdges:

@@ -153,7 +153,8 @@ class IntelligentDriver(Settings):
         f = self.following(v, way.ahead - (nodes.length[target] + nodes.length[source]) / 2, w)
         at_rest = f._replace(value=f.value - f.by_leader * w)
         from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :] * f.by_leader[:, None, None]
-        return accelerated(nodes, target, source, u_i, v, at_rest, self.time_constant, from_leader, unit(way.direction))
+        along = Along(u_i, unit(way.direction), v)
+        return accelerated(nodes, target, source, along, at_rest, self.time_constant, from_leader)
 
 
 def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
@@ -161,23 +162,28 @@ def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.einsum("ei,ei->e", nodes.velocity[rows], u), 0.0))
 
 
+class Along(NamedTuple):
+    """Unit directions (E, 2) of the path at the target and at the source, and the speeds (E,) of the target, m/s."""
+
+    at_target: FloatArray
+    at_source: FloatArray
+    speed: FloatArray
+
+
 def accelerated(
     nodes: NodeTable,
     target: IntArray,
     source: IntArray,
-    u: FloatArray,
-    v: FloatArray,
+    path: Along,
     f: Linearised,
     tau: float,
     by_leader: FloatArray | None = None,
-    onward: FloatArray | None = None,
 ) -> Triples:
-    """The triples of an acceleration f along u (E, 2), linearised at the speeds v (E,) and the gap along a path.
+    """The triples of an acceleration f along a path, linearised at the speed and the gap along it.
 
-    by_leader: derivative (E, 2, 2) by the velocity of the source, whose part f leaves out; onward: direction (E, 2) of
-    the path at the source, u if not given
+    by_leader: derivative (E, 2, 2) by the velocity of the source, whose part f leaves out
     """
-    onward = u if onward is None else onward
+    u, onward, v = path
     along = tau * u[:, :, None] * u[:, None, :]
     gap = (nodes.position[source] * onward - nodes.position[target] * u).sum(axis=1)
     by_gap, by_speed = along * f.by_gap[:, None, None], along * f.by_speed[:, None, None]

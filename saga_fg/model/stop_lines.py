@@ -45,6 +45,7 @@ from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Tri
 from saga_fg.model.nonlinear_interactions import (
     LEAST_GAP,
     Accelerations,
+    Along,
     IntelligentDriver,
     Linearised,
     accelerated,
@@ -229,7 +230,7 @@ class Stopping(Settings):
         ways = approach(nodes, target, source)
         v = speed_along(nodes, target, ways.direction)
         law = self.law(v, self.gap(nodes, target, ways.way))
-        return accelerated(nodes, target, source, ways.direction, v, law, self.time_constant)
+        return accelerated(nodes, target, source, Along(ways.direction, ways.direction, v), law, self.time_constant)
 
 
 @dataclass(frozen=True)
@@ -253,7 +254,8 @@ class DriverStopping:
         ways = approach(nodes, target, source)
         v = speed_along(nodes, target, ways.direction)
         f = self.driver.stopping(v, self.gap(nodes, target, ways.way))
-        return accelerated(nodes, target, source, ways.direction, v, f, self.driver.time_constant)
+        path = Along(ways.direction, ways.direction, v)
+        return accelerated(nodes, target, source, path, f, self.driver.time_constant)
 
 
 @dataclass(frozen=True)

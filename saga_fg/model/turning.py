@@ -58,6 +58,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -205,6 +206,15 @@ _LEAST = 1e-9  # time constants, so that nothing is divided by 0
 _P, _V, _A = slice(0, 2), slice(2, 4), slice(4, 6)
 
 
+class Unseen(NamedTuple):
+    """Of n nodes that are not seen: settling and pull (n,) as in `KnownCourses`, variance across (n,) of the velocity
+    across, (m/s)^2."""
+
+    settling: FloatArray
+    across: FloatArray
+    pull: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class KnownCourses(Columns):
     """n nodes of one `Curvilinear` type: ids (n,), heading (n,) rad.
@@ -235,13 +245,10 @@ class KnownCourses(Columns):
         rate_variance: FloatArray,
         mean: FloatArray,
         dt: float,
-        settling: FloatArray | None = None,
-        across: FloatArray | None = None,
-        pull: FloatArray | None = None,
+        unseen: Unseen | None = None,
     ) -> KnownCourses:
-        """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2; settling
-        across (n,) variance of the velocity across, (m/s)^2; these and pull 0 if not given."""
-        settling, across, pull = (np.zeros(len(ids)) if each is None else each for each in (settling, across, pull))
+        """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2."""
+        settling, across, pull = unseen or Unseen(*np.zeros((3, len(ids))))
         noise, brake = course_inputs(heading, rate_variance, mean, settling, across, dt, RATE_CORRELATION)
         return cls(ids, heading, rate, noise, brake, settling, pull, node_type)
 

@@ -10,7 +10,7 @@ from .association import (
     opportunities,
     stitch_tracklets,
 )
-from .batch_states import StationaryStates, no_edges, robust_weights, smooth_states, stationary_states
+from .batch_states import ObjectMotion, StationaryStates, no_edges, robust_weights, smooth_states, stationary_states
 from .boxes import (
     Headings,
     constant_sizes,
@@ -36,6 +36,7 @@ __all__ = [
     "LabelCounts",
     "Labels",
     "Lifespans",
+    "ObjectMotion",
     "OfflineClass",
     "Quality",
     "SmoothedEdges",

@@ -196,32 +196,45 @@ def no_edges(moment: int, ids: IntArray, types: tuple[NodeType, ...]) -> SceneGr
     return SceneGraph(ids, types)
 
 
+@dataclass(frozen=True, eq=False)
+class ObjectMotion:
+    """How the n objects of a recording move.
+
+    velocity_prior  (n, 2, 2) covariance of their first velocities, m^2/s^2
+    classes         settings of their motions
+    graph_of        edges of an interval
+    stationary      which are at rest, and when; None: none
+    """
+
+    velocity_prior: FloatArray
+    classes: Mapping[str, OfflineClass]
+    graph_of: GraphOf = no_edges
+    stationary: StationaryStates | None = None
+
+
 def smooth_states(
     evidence: Evidence,
     object_of: IntArray,
     lifespans: Lifespans,
-    velocity_prior: FloatArray,
-    classes: Mapping[str, OfflineClass],
-    graph_of: GraphOf = no_edges,
+    motion: ObjectMotion,
     weight: FloatArray | None = None,
-    stationary: StationaryStates | None = None,
     providers: Sequence[FactorProvider] = (),
 ) -> StateTable:
     """Smoothed states of every object at every moment of its life.
 
-    object_of (N,) the object of each detection, negative for none; velocity_prior (n, 2, 2) covariance of the objects'
-    first velocities; weight (N,) how much each detection counts, from 0 to 1 (see `robust_weights`), 1 if not given
-    providers   asked once a moment for factors of their own
+    object_of (N,) the object of each detection, negative for none
+    weight    (N,) how much each detection counts, from 0 to 1 (see `robust_weights`), 1 if not given
+    providers asked once a moment for factors of their own
     """
     parts = _epochs(
         evidence,
         object_of,
         lifespans,
-        velocity_prior,
-        _node_types(lifespans, classes),
-        graph_of,
+        motion.velocity_prior,
+        _node_types(lifespans, motion.classes),
+        motion.graph_of,
         np.ones(len(evidence)) if weight is None else weight,
-        stationary or StationaryStates(),
+        motion.stationary or StationaryStates(),
     )
     epochs = list(parts) if providers else parts
     long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING

@@ -88,40 +88,47 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
     groups, likelihood = state.class_groups, measurements.class_likelihood
     evidence = ClassEvidence(groups, table.class_belief, likelihood) if len(groups) else None
     deferred = over_confirmed(state, predicted)
-    found = match(predicted, P, expected, measurements, state.settings, area, cross, evidence, deferred)
+    tracks = ExpectedTracks(predicted, P, expected, cross, deferred)
+    found = match(tracks, measurements, state.settings, area, evidence)
     return relinked(state, measurements, found, position, P)
 
 
+class ExpectedTracks(NamedTuple):
+    """The n tracks as a sensor should see them at the time of a frame.
+
+    boxes     predicted, world
+    P         (n, 2, 2) covariance of their positions
+    chance    (n,) that the track is detected: its existence times the sensor's detection probability
+    cross     covariances between the positions of tracks, for the method `graph`
+    deferred  (n,) tracks that are matched to what the others leave; None: none
+    """
+
+    boxes: Boxes
+    P: FloatArray
+    chance: FloatArray
+    cross: CrossCovariances | None = None
+    deferred: BoolArray | None = None
+
+
 def match(
-    predicted: Boxes,
-    P: FloatArray,
-    expected: FloatArray,
+    tracks: ExpectedTracks,
     measurements: FrameMeasurements,
     settings: TrackerSettings,
     clutter_area: float,
-    cross: CrossCovariances | None = None,
     evidence: ClassEvidence | None = None,
-    deferred: BoolArray | None = None,
 ) -> Matching:
     """The assignment of a frame.
 
-    predicted     boxes of the n tracks at the time of the frame, world
-    P             (n, 2, 2) covariance of their positions
-    expected      (n,) chance that the track is detected: its existence times the sensor's detection probability
     clutter_area  area over which false detections spread, m^2: that of the sensor, else of the settings
-    cross         covariances between the positions of tracks, for the method `graph`
     evidence      of classes, where detectors mistake some for each other
-    deferred      (n,) tracks that are matched to what the others leave; None: none
     """
-    found = candidates(predicted, P, expected, measurements, settings, clutter_area, evidence)
-    if deferred is None or not deferred.any():
-        return _chosen(found, settings.association, cross)
-    late = deferred[found.track]
-    first = _chosen(found.select(np.flatnonzero(~late)), settings.association, cross)
-    second = _chosen(
-        found.select(np.flatnonzero(late & ~np.isin(found.detection, first.detection))), settings.association, cross
-    )
-    return first.append(second)
+    found = candidates(tracks, measurements, settings, clutter_area, evidence)
+    if tracks.deferred is None or not tracks.deferred.any():
+        return _chosen(found, settings.association, tracks.cross)
+    late = tracks.deferred[found.track]
+    first = _chosen(found.select(np.flatnonzero(~late)), settings.association, tracks.cross)
+    left = found.select(np.flatnonzero(late & ~np.isin(found.detection, first.detection)))
+    return first.append(_chosen(left, settings.association, tracks.cross))
 
 
 def _chosen(found: CandidatePairs, association: AssociationSettings, cross: CrossCovariances | None) -> Matching:
@@ -137,15 +144,14 @@ def _chosen(found: CandidatePairs, association: AssociationSettings, cross: Cros
 
 
 def candidates(
-    predicted: Boxes,
-    P: FloatArray,
-    expected: FloatArray,
+    tracks: ExpectedTracks,
     measurements: FrameMeasurements,
     settings: TrackerSettings,
     clutter_area: float,
     evidence: ClassEvidence | None = None,
 ) -> CandidatePairs:
     """The pairs of one class, or group, that are inside its gate; the arguments are those of `match`."""
+    predicted, P, expected = tracks.boxes, tracks.P, tracks.chance
     (classes, of_track), (_, of_detection) = distinct(predicted.label), distinct(measurements.boxes.label)
     names = ("max_distance", "giou_weight")
     reach, giou_weight = class_values(settings.classes, ClassSettings, predicted.label, *names)

@@ -46,7 +46,7 @@ from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Paths
 from saga_fg.model.motion import Curvilinear
 from saga_fg.model.nonlinear_interactions import held
 from saga_fg.model.scene_graph import Edges, SceneGraph
-from saga_fg.model.turning import KnownCourses, turning_time
+from saga_fg.model.turning import KnownCourses, Unseen, turning_time
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, unchecked
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.reporting import reported_rows, untrackable
@@ -115,15 +115,15 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
             own, way = paths.select(path[rows[led]]), speed[led] * dt
             turn = _at(own.heading, way) - own.heading[:, 0]
             heading[led] = own.heading[:, 0]
-            unseen = table.coasting(state.time)[rows[led]]
-            settling[led], across[led] = _across(own, speed[led], unseen, motion.course_time)
+            coasting = table.coasting(state.time)[rows[led]]
+            settling[led], across[led] = _across(own, speed[led], coasting, motion.course_time)
             typical, weight = typical_speed(own, way)
             pull[led] = weight / (weight + 1) * np.where(speed[led] > MOVING, typical - speed[led], 0.0) / FLOW_TIME
             after[rows[led]] = wrap_angle(heading[led] + turn)
             rate[led] = turn / turning_time(motion, dt)
         mean = state.joint.estimator.mean(table.id[rows])
-        ids, course = table.id[rows], (settling, across, pull)
-        found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, *course))
+        ids, unseen = table.id[rows], Unseen(settling, across, pull)
+        found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, unseen))
     if turn_time.any():
         table.turn.predict(dt, turn_time)
     return tuple(found), after

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from data_tools.datasets.mcap import autoware, scene_update, vision
-from data_tools.datasets.mcap.objects import MessageType, frame_name, nanoseconds, wxyz, xyz
+from data_tools.datasets.mcap.objects import MessageType, checked_time, frame_name, nanoseconds, wxyz, xyz
 from data_tools.datasets.mcap.recording import LoggedMessage, Recording, Topic, decoded_messages
 from data_tools.files.input_files import error_context
 from data_tools.files.isolated_reading import isolated
@@ -175,7 +175,7 @@ def _contents(path: Path, files: Sequence[Path], topics: Mapping[str, Topic]) ->
             try:
                 if logged.topic.type in OBJECT_TYPES:
                     content: Any = OBJECT_TYPES[logged.topic.type].rows(logged.message)
-                    content.stamp = content.stamp or logged.log_time
+                    content.stamp = content.stamp or checked_time(logged.log_time)
                 else:
                     content = list(transform_records(logged))
             except AttributeError as error:
@@ -209,4 +209,4 @@ def transform_records(logged: LoggedMessage) -> Iterator[TransformRecord]:
 
 
 def _time(stamp: Any, logged: LoggedMessage) -> int:
-    return nanoseconds(stamp) or logged.log_time
+    return nanoseconds(stamp) or checked_time(logged.log_time)

@@ -161,8 +161,15 @@ def transform_matrix(transform: Any) -> FloatArray:
 def nanoseconds(stamp: Any) -> int:
     """ns of a ROS time (sec, nanosec) or a protobuf timestamp (seconds, nanos)."""
     if hasattr(stamp, "seconds"):
-        return int(stamp.seconds) * 10**9 + int(stamp.nanos)
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+        return checked_time(int(stamp.seconds) * 10**9 + int(stamp.nanos))
+    return checked_time(int(stamp.sec) * 10**9 + int(stamp.nanosec))
+
+
+def checked_time(time: int) -> int:
+    """A time, ns, that 64 bits hold. Raises `InputError` for another."""
+    if not -(2**63) <= time < 2**63:
+        raise InputError(f"time: expected nanoseconds within 64 bits, got {time}")
+    return time
 
 
 def frame_name(name: str) -> str:

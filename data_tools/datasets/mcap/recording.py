@@ -264,7 +264,9 @@ class _SqliteFile:
                     text = definitions.get(type_, "")
                     schema = Schema(id=1, name=type_, encoding="ros2msg" if text else "", data=text.encode())
                     decoders[topic] = _decoder(f"{self.path}: {topic}", schema, encoding)
-                yield topic, int(time), decoders[topic], bytes(data)
+                if not isinstance(time, int):
+                    raise InputError(f"{self.path}: {topic}: timestamp: expected whole nanoseconds, got {time!r:.40}")
+                yield topic, time, decoders[topic], bytes(data)
 
     @staticmethod
     def _definitions(database: sqlite3.Connection) -> dict[str, str]:

@@ -24,7 +24,7 @@ from saga_fg.slam.joint.association import (
     stationary_probabilities,
     with_all_identities,
 )
-from saga_fg.slam.joint.graph import JointEstimate, Record, detections, read_estimate, stationary_factors
+from saga_fg.slam.joint.graph import JointEstimate, detections, read_estimate, stationary_factors
 from saga_fg.slam.joint.lanes import LaneAssociation
 from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects, detections_name
 from saga_fg.slam.joint.record import MAX_ITERATIONS, JointSettings, OdometryIncrements, record_epochs
@@ -69,7 +69,8 @@ def estimate_jointly(
         clutter = tracker.settings.association.clutter_area
         start_moving = estimate is None
         providers = [seen, *new_providers()]
-        estimate = _solve(record, frames, path, slow, start_moving, clutter, lanes, providers, settings)
+        epochs = VehicleAndObjects(record, path, settings)
+        estimate = _solve(epochs, frames, slow, start_moving, clutter, lanes, providers)
         estimate = replace(estimate, observations=seen)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
@@ -92,28 +93,26 @@ def checked_landmarks(
 
 
 def _solve(
-    record: Record,
+    epochs: VehicleAndObjects,
     frames: Sequence[Frame],
-    path: FloatArray,
     slow: SlowErrors,
     start_moving: bool,
     clutter_area: float,
     lanes: LaneAssociation,
     providers: Sequence[FactorProvider],
-    settings: JointSettings,
 ) -> JointEstimate:
-    """Solve several times, each from the solution before: if `start_moving` with all objects moving, which needs no
-    good start; with those stationary that seem so along the path; with identities by the solution; at last with
-    vehicles assigned to lanes along the solution before.
+    """Solve the epochs of a record several times, each from the solution before: if `start_moving` with all objects
+    moving, which needs no good start; with those stationary that seem so along the path; with identities by the
+    solution; at last with vehicles assigned to lanes along the solution before.
     """
     graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=MAX_ITERATIONS, tolerance=TOLERANCE)
-    epochs = VehicleAndObjects(record, path, settings)
+    record, settings = epochs.record, epochs.settings
     for now, frame in zip(record, frames, strict=True):
         graph.advance(now.time)
         ask_all([epochs, *providers], graph, frame)
     if start_moving:
         graph.solve(solver)
-    probabilities = stationary_probabilities(record, path, slow, settings)
+    probabilities = stationary_probabilities(record, np.asarray(epochs.path), slow, settings)
     name = StationaryPairs.name
     graph.add_factors(name, stationary_factors(record, probabilities), name)
     estimate = read_estimate(record, graph.solve(solver), probabilities)

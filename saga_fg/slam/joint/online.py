@@ -181,21 +181,14 @@ class OnlineEstimate:
 def estimate_online(
     frames: Sequence[Frame],
     odometry: OdometryIncrements,
-    tracker: Tracker,
-    lag: float,
-    settings: JointSettings | None = None,
-    start: FloatArray | None = None,
+    estimator: OnlineEstimator,
     landmarks: Observations | None = None,
-    landmark_settings: LandmarkSettings | None = None,
-    providers: Sequence[FactorProvider] = (),
 ) -> OnlineEstimate:
-    """Feed n frames to an `OnlineEstimator`; landmarks: observations at each epoch; landmark_settings
-    and the other parameters: as there.
+    """Feed n frames to a new estimator; landmarks: observations at each epoch.
 
     Raises `InputError` where frames, odometry and landmarks do not fit together.
     """
     landmarks = checked_landmarks(frames, odometry, landmarks)
-    estimator = OnlineEstimator(tracker, lag, settings, landmark_settings, start, providers)
     newest, covariances, settled = [], [], []
     for k, frame in enumerate(frames):
         increment = odometry.a_T_b[k - 1] if k else None

@@ -3,6 +3,7 @@
 import logging
 import sqlite3
 from copy import deepcopy
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ pytest.importorskip("mcap_ros2")
 pytest.importorskip("rosbags")
 
 from data_tools.datasets.mcap.dataset import McapRecording, RecordingOptions
+from data_tools.datasets.mcap.objects import nanoseconds
 from data_tools.datasets.mcap.recording import definition, plain_type
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_transform
@@ -296,6 +298,24 @@ def test_a_bag_is_read_from_plain_tables_alone(tmp_path, name):
         database.executescript(HOSTILE[name])
     database.close()
     with pytest.raises(InputError, match=rf"{file.name}: expected a bag of ROS 2 in SQLite"):
+        read(path)
+
+
+def test_times_beyond_64_bits_are_named():
+    far = SimpleNamespace(seconds=2**62, nanos=0)
+    with pytest.raises(InputError, match=r"time: expected nanoseconds within 64 bits"):
+        nanoseconds(far)
+    assert nanoseconds(SimpleNamespace(sec=-1, nanosec=1)) == 1 - 10**9
+
+
+@pytest.mark.parametrize("time", ["1e300", "'noon'"])
+def test_times_of_a_bag_that_are_none_are_named(tmp_path, time):
+    path = example.write_bag(tmp_path / "drive", example.drive())
+    file = next(path.glob("*.db3"))
+    with sqlite3.connect(file) as database:
+        database.execute(f"UPDATE messages SET timestamp = {time}")
+    database.close()
+    with pytest.raises(InputError, match=rf"{file.name}.*timestamp: expected whole nanoseconds, got"):
         read(path)
 
 

@@ -9,7 +9,7 @@ from saga_fg import ConstantAcceleration, Curvilinear, NodeType, SceneGraph
 from saga_fg.model.discretisation import discretise, linear_motions
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.scene_graph import Edges
-from saga_fg.model.turning import RATE_CORRELATION, CoordinatedTurn, KnownCourses, turning_time
+from saga_fg.model.turning import RATE_CORRELATION, CoordinatedTurn, KnownCourses, Unseen, turning_time
 from tests.saga_fg.random_graphs import node_table
 
 LONG = 1e9  # s, as good as no fading
@@ -177,7 +177,8 @@ def test_an_uncertain_course_keeps_its_variance_across():
     speed, k, variance, dt = 8.0, 1.5, 0.64, 0.01
     quiet = NodeType("car", Curvilinear(acceleration_noise=0.0, lateral_acceleration_noise=0.0, jerk_noise=0.0))
     none, mean = np.zeros(1), np.array([[0, 0, speed, 0, 0, 0]])
-    record = KnownCourses.of(quiet, np.array([7]), none, none, none, mean, dt, np.array([k]), np.array([variance]))
+    unseen = Unseen(np.array([k]), np.array([variance]), none)
+    record = KnownCourses.of(quiet, np.array([7]), none, none, none, mean, dt, unseen)
     F, _, Q = own(record, dt, quiet)
     P_across = 0.0
     for _ in range(1000):
@@ -192,8 +193,8 @@ def test_an_acceleration_to_the_speed_of_traffic_acts_along_the_course(rate):
     quiet = NodeType("car", Curvilinear())
     none, mean = np.zeros(1), np.array([[0, 0, 8.0, 0, 0, 0]])
     with_it, without = (
-        own(KnownCourses.of(quiet, np.array([7]), none, none + rate, none, mean, dt, pull=p), dt, quiet)
-        for p in (pull, None)
+        own(KnownCourses.of(quiet, np.array([7]), none, none + rate, none, mean, dt, Unseen(none, none, p)), dt, quiet)
+        for p in (pull, none)
     )
     for a, b in ((with_it[0], without[0]), (with_it[2], without[2])):
         assert np.array_equal(a, b)

@@ -14,6 +14,7 @@ from saga_fg.slam.joint import (
     ObjectStates,
     OdometryIncrements,
     OdometryNoise,
+    OnlineEstimator,
     estimate_jointly,
     estimate_online,
     lane_key,
@@ -89,7 +90,8 @@ def test_they_hold_it_frame_by_frame() -> None:
     ends = []
     for lanes in (False, True):
         settings = replace(SETTINGS, lanes=lanes)
-        ends.append(off(estimate_online(frames, odometry, new_tracker(), 1.5, settings, poses[0]).newest, poses))
+        estimator = OnlineEstimator(new_tracker(), 1.5, settings, start=poses[0])
+        ends.append(off(estimate_online(frames, odometry, estimator).newest, poses))
     assert ends[1] < ends[0] / 2
 
 

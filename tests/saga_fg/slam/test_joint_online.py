@@ -40,7 +40,7 @@ def test_a_window_of_seconds_is_nearly_the_batch() -> None:
     frames, odometry, poses, _ = drive(n=35)
     reported = worse(odometry, np.random.default_rng(1))
     batch = estimate_jointly(frames, reported, new_tracker, SETTINGS, poses[0])
-    online = estimate_online(frames, reported, new_tracker(), 2.0, SETTINGS, poses[0])
+    online = estimate_online(frames, reported, OnlineEstimator(new_tracker(), 2.0, SETTINGS, start=poses[0]))
     alone = rms(reported.path(poses[0]), poses)
     assert rms(online.newest, poses) < alone / 3
     assert rms(online.settled, poses) < max(1.5 * rms(batch.world_T_ego, poses), 0.15)
@@ -80,7 +80,10 @@ def test_what_leaves_the_window_stays_in_the_prior() -> None:
     reported = worse(odometry, np.random.default_rng(2))
     linear = replace(SETTINGS, outlier_scale=np.inf, moving_speed={DEFAULT: 1e-6})  # nobody stands, no robust loss
     _, seen = seen_poles(poses, np.random.default_rng(4))
-    short, long = (estimate_online(frames, reported, new_tracker(), lag, linear, poses[0], seen) for lag in (0.5, 60.0))
+    short, long = (
+        estimate_online(frames, reported, OnlineEstimator(new_tracker(), lag, linear, start=poses[0]), seen)
+        for lag in (0.5, 60.0)
+    )
     sigma = np.sqrt(np.diag(long.covariances[-1]))[3:5]
     assert (np.abs((short.newest - long.newest)[-1, :2, 3]) < 0.1 * sigma).all()
     np.testing.assert_allclose(short.covariances[-1], long.covariances[-1], rtol=0.02, atol=1e-6)
@@ -90,7 +93,7 @@ def test_landmarks_are_told_apart_and_kept_when_they_leave() -> None:
     frames, odometry, poses, _ = drive(n=30, parked=0, moving=0)
     reported = worse(odometry, np.random.default_rng(2))
     poles, seen = seen_poles(poses, np.random.default_rng(3))
-    online = estimate_online(frames, reported, new_tracker(), 1.0, SETTINGS, poses[0], seen)
+    online = estimate_online(frames, reported, OnlineEstimator(new_tracker(), 1.0, SETTINGS, start=poses[0]), seen)
     certain = [mark for mark in online.landmarks if mark.confirmed]
     assert len(certain) == len(poles)
     assert sum(mark.observations for mark in online.landmarks) == sum(map(len, seen))
@@ -125,7 +128,7 @@ def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(InputError, match="expected one after"):
         estimator.step(frames[0], np.eye(4))
     with pytest.raises(InputError, match="expected observations at 3 times, got 1"):
-        estimate_online(frames, odometry, new_tracker(), 1.0, landmarks=[()])
+        estimate_online(frames, odometry, OnlineEstimator(new_tracker(), 1.0), [()])
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from saga_fg.numerics.arrays import IntArray
 from saga_fg.smoothing import (
     Evidence,
     Lifespans,
+    ObjectMotion,
     OfflineClass,
     SmoothedEdges,
     StateTable,
@@ -59,13 +60,13 @@ def tracks(evidence: Evidence, length: int) -> tuple[IntArray, Lifespans]:
 def states(evidence: Evidence, length: int, tied: bool = False) -> StateTable:
     object_of, lifespans = tracks(evidence, length)
     V = np.tile(25.0 * np.eye(2), (len(lifespans), 1, 1))
-    alone = smooth_states(evidence, object_of, lifespans, V, CLASSES)
+    alone = smooth_states(evidence, object_of, lifespans, ObjectMotion(V, CLASSES))
     if not tied:
         return alone
     rules = (Following(interaction=SharedVelocity()),)
     size = np.zeros(len(lifespans)), np.full(len(lifespans), 4.5)
     edges = SmoothedEdges(rules, float(evidence.times[0]), lifespans, alone, *size)
-    return smooth_states(evidence, object_of, lifespans, V, CLASSES, edges)
+    return smooth_states(evidence, object_of, lifespans, ObjectMotion(V, CLASSES, edges))
 
 
 def peak(run: Callable[[], object]) -> int:

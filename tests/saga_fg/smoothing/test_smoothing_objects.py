@@ -15,6 +15,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
     Lifespans,
+    ObjectMotion,
     OfflineClass,
     SmoothedEdges,
     StateTable,
@@ -65,7 +66,7 @@ def joined(paths: dict[int, FloatArray], settings: StitchingSettings | None = No
     prior = np.tile(25.0 * np.eye(2), (len(lifespans), 1, 1))
     settings = settings or StitchingSettings()
     longer = lifespans.reaching(evidence.times, 1.0, settings.max_gap)
-    states = smooth_states(evidence, numbers, longer, prior, CLASSES)
+    states = smooth_states(evidence, numbers, longer, ObjectMotion(prior, CLASSES))
     return dict(
         zip(lifespans.id.tolist(), stitch_tracklets(lifespans, states, prior, evidence, settings).tolist(), strict=True)
     )
@@ -96,7 +97,8 @@ def test_an_object_claims_detections_before_its_initiation_but_not_those_of_othe
     tracked = np.where(evidence.moment < 2, -1, numbers)
     lifespans = lifespans_of(tracked, evidence.boxes.label, evidence.moment)
     prior = np.tile(25.0 * np.eye(2), (2, 1, 1))
-    states = smooth_states(evidence, tracked, lifespans.reaching(evidence.times, 1.5, 0.0), prior, CLASSES)
+    longer = lifespans.reaching(evidence.times, 1.5, 0.0)
+    states = smooth_states(evidence, tracked, longer, ObjectMotion(prior, CLASSES))
     assert assign_free_detections(evidence, tracked, lifespans, states, 0.99, 3.0).tolist() == numbers.tolist()
     assert assign_free_detections(evidence, tracked, lifespans, states, 0.0, 3.0).tolist() == tracked.tolist()
 
@@ -108,7 +110,7 @@ def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not() -> None:
     paths = {0: noise, 1: waits + noise, 2: line(0, 19, (0, 40), (0.3, 0)) + noise}
     evidence, numbers = gathered(paths)
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
-    states = smooth_states(evidence, numbers, lifespans, np.tile(25.0 * np.eye(2), (3, 1, 1)), CLASSES)
+    states = smooth_states(evidence, numbers, lifespans, ObjectMotion(np.tile(25.0 * np.eye(2), (3, 1, 1)), CLASSES))
     standing = stationary_states(states, lifespans, evidence, numbers, StationarySettings(), CLASSES)
     assert sorted(standing.moment[standing.id == 0].tolist()) == list(range(20))
     assert set(standing.moment[standing.id == 1].tolist()) <= set(range(9))
@@ -119,7 +121,7 @@ def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not() -> None:
 def test_a_score_is_the_mean_over_all_opportunities_and_those_of_the_prior() -> None:
     evidence, numbers = gathered({0: line(0, 9, (0, 0), (1, 0)), 1: line(5, 5, (0, 9), (0, 0))}, score=0.8)
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
-    states = smooth_states(evidence, numbers, lifespans, np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES)
+    states = smooth_states(evidence, numbers, lifespans, ObjectMotion(np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES))
     assert frame_rate(evidence) == pytest.approx(2.0)
     score = evidence_scores(evidence, numbers, lifespans, states, prior_opportunity_time=1.0)
     assert score.tolist() == pytest.approx([8.0 / 12.0, 0.8 / 3.0])
@@ -128,7 +130,7 @@ def test_a_score_is_the_mean_over_all_opportunities_and_those_of_the_prior() -> 
 def test_the_front_is_where_an_object_drives_else_what_most_detections_say() -> None:
     evidence, numbers = gathered({0: line(0, 19, (0, 0), (-5, 0)), 1: line(0, 19, (0, 20), (0, 0))})
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
-    states = smooth_states(evidence, numbers, lifespans, np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES)
+    states = smooth_states(evidence, numbers, lifespans, ObjectMotion(np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES))
     rows = np.arange(len(evidence))
     at = states.rows_of(evidence.moment, numbers)
     found = smooth_headings(states, lifespans, evidence, rows, at, np.full(len(states), 0.01), np.full(2, 2.0))

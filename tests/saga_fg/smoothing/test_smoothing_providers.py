@@ -13,6 +13,7 @@ from saga_fg.graph import LANDMARK, OBJECT, Additions, FactorProvider, GraphErro
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.smoothing import (
+    ObjectMotion,
     SmoothedEdges,
     StateTable,
     StationarySettings,
@@ -85,13 +86,13 @@ def states(providers: Sequence[FactorProvider] = ()) -> StateTable:
     object_of = np.array(owner)
     lifespans = lifespans_of(object_of, evidence.boxes.label, evidence.moment)
     V, n = np.tile(25 * np.eye(2), (4, 1, 1)), len(lifespans)
-    alone = smooth_states(evidence, object_of, lifespans, V, CLASSES)
+    alone = smooth_states(evidence, object_of, lifespans, ObjectMotion(V, CLASSES))
     rules = (Neighbours(min_speed=0.2, classes=("pedestrian",)),)
     edges = SmoothedEdges(rules, 0.0, lifespans, alone, np.full(n, np.nan), np.full(n, 0.5))
     moments = np.arange(len(evidence.times))
     stands = StationaryStates(StationarySettings(), moments, np.full(len(moments), 2))
     weight = np.where(object_of == 1, 0.5, 1.0)
-    return smooth_states(evidence, object_of, lifespans, V, CLASSES, edges, weight, stands, providers)
+    return smooth_states(evidence, object_of, lifespans, ObjectMotion(V, CLASSES, edges, stands), weight, providers)
 
 
 def test_the_graph_is_the_problem_that_is_solved_without_providers() -> None:

@@ -24,7 +24,7 @@ from saga_fg.smoothing import (
     robust_weights,
     smooth_states,
 )
-from saga_fg.smoothing.batch_states import UNKNOWN_POSITION
+from saga_fg.smoothing.batch_states import UNKNOWN_POSITION, ObjectMotion
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
@@ -51,7 +51,7 @@ def test_an_object_alone_is_smoothed_as_by_the_textbook() -> None:
     evidence = evidence_of(times.tolist(), path[:, None].tolist())
     lifespans = lifespans_of(np.zeros(12, dtype=np.int64), evidence.boxes.label, evidence.moment)
     V = 25 * np.eye(2)
-    states = smooth_states(evidence, np.zeros(12, dtype=np.int64), lifespans, V[None], CLASSES)
+    states = smooth_states(evidence, np.zeros(12, dtype=np.int64), lifespans, ObjectMotion(V[None], CLASSES))
 
     prior = Gaussian(
         np.concatenate([evidence.boxes.position[0, :2], [0, 0]]),
@@ -84,10 +84,10 @@ def test_a_long_recording_is_smoothed_in_windows_and_comes_to_the_same(monkeypat
     windows = []
     final = WindowedSmoother.final
     monkeypatch.setattr(WindowedSmoother, "final", lambda self: windows.append(out := final(self)) or out)
-    in_windows = smooth_states(evidence, owner, lifespans, V, CLASSES)
+    in_windows = smooth_states(evidence, owner, lifespans, ObjectMotion(V, CLASSES))
     assert sum(map(len, windows)) > 200
     monkeypatch.setattr(batch_states, "LONG_RECORDING", 1000.0)
-    at_once = smooth_states(evidence, owner, lifespans, V, CLASSES)
+    at_once = smooth_states(evidence, owner, lifespans, ObjectMotion(V, CLASSES))
     assert (in_windows.id == at_once.id).all()
     assert np.allclose(in_windows.mean, at_once.mean, rtol=0, atol=1e-3)
     assert np.allclose(in_windows.covariance, at_once.covariance, rtol=0, atol=1e-6)
@@ -123,7 +123,7 @@ def test_a_pinned_object_stays_where_it_is() -> None:
     mine = np.zeros(20, dtype=np.int64)
     lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
     stands = StationaryStates(StationarySettings(position_drift=0.01), np.arange(20), mine)
-    states = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES, stationary=stands)
+    states = smooth_states(evidence, mine, lifespans, ObjectMotion(25 * np.eye(2)[None], CLASSES, stationary=stands))
     assert np.ptp(states.mean[:, :2], axis=0).max() < 0.1 * SIGMA
     assert np.allclose(states.mean[:, :2] + evidence.origin, path.mean(axis=0), atol=0.1 * SIGMA)
 
@@ -138,7 +138,8 @@ def test_a_pinned_object_wanders_by_the_drift_of_the_poses_whatever_the_rate() -
         lifespans = Lifespans(np.array([0]), np.array(["car"]), np.array([0]), np.array([len(times) - 1]))
         stands = StationaryStates(settings, np.arange(len(times)), np.zeros(len(times), dtype=np.int64))
         first = np.zeros(1, dtype=np.int64)
-        states = smooth_states(evidence, first, lifespans, 25 * np.eye(2)[None], CLASSES, stationary=stands)
+        motion = ObjectMotion(25 * np.eye(2)[None], CLASSES, stationary=stands)
+        states = smooth_states(evidence, first, lifespans, motion)
         deviations.append(np.sqrt(states.covariance[-1, 0, 0] - states.covariance[0, 0, 0]))
     assert deviations == pytest.approx([0.2 * np.sqrt(20)] * 2, rel=0.3)
 
@@ -150,9 +151,9 @@ def test_an_outlier_counts_little_after_reweighting() -> None:
     evidence = evidence_of(times.tolist(), path[:, None].tolist())
     mine = np.zeros(11, dtype=np.int64)
     lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
-    plain = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES)
+    plain = smooth_states(evidence, mine, lifespans, ObjectMotion(25 * np.eye(2)[None], CLASSES))
     weight = robust_weights(evidence, mine, plain, Robust("cauchy", 2.0))
-    robust = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES, weight=weight)
+    robust = smooth_states(evidence, mine, lifespans, ObjectMotion(25 * np.eye(2)[None], CLASSES), weight)
     middle = [abs(s.mean[5, 0] + evidence.origin[0]) for s in (plain, robust)]
     assert weight.argmin() == 5
     assert middle[1] < 0.5 * middle[0]
@@ -162,7 +163,7 @@ def test_a_stationary_object_of_a_recording_of_one_moment() -> None:
     evidence, mine = evidence_of([0.0], [[[3.0, 4.0]]]), np.zeros(1, dtype=np.int64)
     stands = StationaryStates(StationarySettings(min_time=0.0), mine, mine)
     lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
-    states = smooth_states(evidence, mine, lifespans, 25 * np.eye(2)[None], CLASSES, stationary=stands)
+    states = smooth_states(evidence, mine, lifespans, ObjectMotion(25 * np.eye(2)[None], CLASSES, stationary=stands))
     assert np.allclose(states.mean[0, :2] + evidence.origin, [3.0, 4.0])
     assert np.allclose(states.mean[0, 2:], 0.0)
     assert (np.sqrt(np.diag(states.covariance[0])[2:]) <= stands.settings.position_drift).all()

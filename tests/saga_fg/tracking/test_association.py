@@ -6,7 +6,7 @@ import pytest
 from saga_fg import Boxes, Sensor, TrackerSettings
 from saga_fg.numerics.assignment import CrossCovariances, cheapest_first, least_total
 from saga_fg.tracking import AssociationSettings, ClassSettings
-from saga_fg.tracking.association import match
+from saga_fg.tracking.association import ExpectedTracks, match
 from saga_fg.tracking.measurements import FrameMeasurements
 
 CAR = (4.0, 2.0, 1.5)
@@ -48,15 +48,9 @@ def pairs(tracks, found, probability=0.9, expected=0.8, sigma=1.0, classes=None,
         classes or {"default": ClassSettings(max_distance=20.0)}, association=AssociationSettings(**association)
     )
     P = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
-    matching = match(
-        tracks,
-        P,
-        np.broadcast_to(expected, n),
-        measured(found, probability),
-        settings,
-        settings.association.clutter_area,
-        CrossCovariances(*np.triu_indices(n, 1), np.tile(shared * sigma**2 * np.eye(2), (n * (n - 1) // 2, 1, 1))),
-    )
+    cross = CrossCovariances(*np.triu_indices(n, 1), np.tile(shared * sigma**2 * np.eye(2), (n * (n - 1) // 2, 1, 1)))
+    expected_tracks = ExpectedTracks(tracks, P, np.broadcast_to(expected, n), cross)
+    matching = match(expected_tracks, measured(found, probability), settings, settings.association.clutter_area)
     return sorted(zip(matching.track.tolist(), matching.detection.tolist(), strict=True))
 
 
