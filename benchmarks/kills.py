@@ -8,12 +8,12 @@ with all that it has started, and every few kills the same command runs to its e
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -21,17 +21,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated
 from uuid import uuid4
 
 import numpy as np
 import typer
 
-from benchmarks.runner import Rows, Seed, chosen, each
+from benchmarks.runner import PROGRAM, Rows, Seed, chosen, each
 from data_tools.files.atomic_files import LEFTOVER
 from pipelines.scale_out.job import OF_THE_RUN
 
-PROGRAM = (sys.executable, "-c", "from pipelines.cli.main import main; main()")
 RECORDINGS = (
     "nuscenes",
     "--dataroot",
@@ -207,16 +206,14 @@ def _is_whole(name: str, content: bytes) -> bool:
     if name.endswith(".png"):
         return content.endswith(b"IEND\xaeB`\x82")
     if name.endswith(".zip"):
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "one.zip"
-            path.write_bytes(content)
-            return zipfile.is_zipfile(path) and zipfile.ZipFile(path).testzip() is None
+        file = io.BytesIO(content)
+        return zipfile.is_zipfile(file) and zipfile.ZipFile(file).testzip() is None
     return bool(content)
 
 
 def _is_json(content: bytes) -> bool:
     try:
-        _: Any = json.loads(content)
+        json.loads(content)
     except ValueError:
         return False
     return True

@@ -12,6 +12,7 @@ from __future__ import annotations
 import inspect
 import math
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import wraps
@@ -33,6 +34,8 @@ from pipelines.cli.options import Verbose
 from pipelines.tracking import one_thread
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
+
+PROGRAM = (sys.executable, "-c", "from pipelines.cli.main import main; main()")  # the command, for other processes
 
 T = TypeVar("T")
 Row = tuple[str, Mapping[str, Any]]

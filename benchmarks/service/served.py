@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import threading
 from collections import deque
 
+from benchmarks.runner import PROGRAM
 from pipelines.serving import Address, parse_address
 from saga_fg.errors import SagaError
-
-COMMAND = (sys.executable, "-c", "from pipelines.cli.main import main; main()", "serve")
 
 
 class Served:
     """Starts `saga-fg serve` with some options; `address` is where it listens. Raises `SagaError` if it does not."""
 
     def __init__(self, *options: str) -> None:
-        self.process = subprocess.Popen([*COMMAND, *options], stderr=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen([*PROGRAM, "serve", *options], stderr=subprocess.PIPE, text=True)
         self._said: deque[str] = deque(maxlen=20)
         self.address = self._address()
         self._listening = threading.Thread(target=self._listen, daemon=True)  # or it would wait with its warnings

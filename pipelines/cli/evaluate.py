@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipelines.cli import options
-from pipelines.cli import options as how
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
 from pipelines.cli.options import Source, dataset_commands
 from pipelines.cli.track import RayAddress, Workers, exit_on_failures, run_at_scale
@@ -28,10 +27,10 @@ def _evaluate(
         Path | None,
         typer.Argument(help="Result of any tracker, as `saga-fg track` writes it; left out, one is made and scored."),
     ] = None,
-    method: how.MethodOrNone = None,
-    estimator: how.EstimatorOption = None,
-    lag: how.LagOption = None,
-    association: how.AssociationOption = None,
+    method: options.MethodOrNone = None,
+    estimator: options.EstimatorOption = None,
+    lag: options.LagOption = None,
+    association: options.AssociationOption = None,
     config: options.Config = None,
     hota: Annotated[
         bool, typer.Option("--hota", help="HOTA, CLEAR and Identity too (needs the extra [eval]).")
@@ -64,7 +63,7 @@ def _evaluate(
         mend = own if source.truth_option else "score a table: saga-fg evaluate file tracks.csv --truth TABLE"
         raise InputError(f"evaluate {source.name}: expected ground truth, there is none; {mend}")
     if result is None:
-        settings = how.configured(source.family, config, method or "saga", estimator, lag, association)
+        settings = options.configured(source.family, config, method or "saga", estimator, lag, association)
         found, nis = _tracked(source, settings, method or "saga")
     else:
         given = {"--method": method, "--estimator": estimator, "--lag": lag, "--association": association}
@@ -112,7 +111,7 @@ def _evaluate_labels(
     without_truth: Annotated[
         bool, typer.Option("--without-truth", help="Self-consistency only, as where nobody has labelled.")
     ] = False,
-    method: how.MethodOption = "saga",
+    method: options.MethodOption = "saga",
     config: options.Config = None,
     json_file: JsonFile = None,
     verbose: options.Verbose = False,
@@ -186,10 +185,10 @@ def _benchmark(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder of the run; the same one again continues the run.")
     ],
-    method: how.MethodOption = "saga",
-    estimator: how.EstimatorOption = None,
-    lag: how.LagOption = None,
-    association: how.AssociationOption = None,
+    method: options.MethodOption = "saga",
+    estimator: options.EstimatorOption = None,
+    lag: options.LagOption = None,
+    association: options.AssociationOption = None,
     hota: Annotated[bool, typer.Option("--hota", help="HOTA too (needs the extra [eval]).")] = False,
     without_truth: Annotated[
         bool, typer.Option("--without-truth", help="The submission alone, as for a test split without ground truth.")
@@ -211,7 +210,7 @@ def _benchmark(
 
     if not source.all_tracks:
         raise InputError(f"benchmark {source.name}: expected a dataset with official results: saga-fg benchmark --help")
-    settings = how.configured(source.family, config, method, estimator, lag, association)
+    settings = options.configured(source.family, config, method, estimator, lag, association)
     options.apart(output, *source.input_files())
     task = TrackTask(settings, method, source)
     run = run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from pipelines.cli import options
-from pipelines.cli import options as how
 from pipelines.cli.console import Summary, counted, progress_bar
 from pipelines.cli.options import Source, dataset_commands
 from saga_fg.errors import InputError
@@ -103,14 +102,14 @@ def exit_on_failures(report: RunSummary) -> None:
 def _track(
     source: DatasetSource,
     output: Annotated[Path, typer.Option("--output", "-o")],
-    method: how.MethodOption = "saga",
-    estimator: how.EstimatorOption = None,
-    lag: how.LagOption = None,
-    association: how.AssociationOption = None,
-    interactions: how.InteractionsOption = None,
-    predict: how.PredictOption = None,
-    explain: how.ExplainOption = False,
-    learn_offsets: how.LearnOffsetsOption = None,
+    method: options.MethodOption = "saga",
+    estimator: options.EstimatorOption = None,
+    lag: options.LagOption = None,
+    association: options.AssociationOption = None,
+    interactions: options.InteractionsOption = None,
+    predict: options.PredictOption = None,
+    explain: options.ExplainOption = False,
+    learn_offsets: options.LearnOffsetsOption = None,
     workers: Workers = None,
     ray: RayAddress = None,
     config: options.Config = None,
@@ -123,10 +122,10 @@ def _track(
     from pipelines.scale_out import TrackTask
     from pipelines.tracking import keep_predictions, track_dataset
 
-    settings = how.configured(source.family, config, method, estimator, lag, association, interactions)
+    settings = options.configured(source.family, config, method, estimator, lag, association, interactions)
     options.apart(output, *source.input_files())
-    how.check_learn_offsets(learn_offsets, method, at_scale(workers, ray))
-    kept, horizons = how.journal(explain, output, at_scale(workers, ray)), how.horizons(predict, method)
+    options.check_learn_offsets(learn_offsets, method, at_scale(workers, ray))
+    kept, horizons = options.journal(explain, output, at_scale(workers, ray)), options.horizons(predict, method)
     doubts = Doubts(settings.of_method(method), load_config(source.family), source.option_for)
     if at_scale(workers, ray):
         doubts.see_first(source)
@@ -149,7 +148,7 @@ def _track(
     doubts.finish()
     summary.show()
     if learn_offsets is not None:
-        how.write_offsets(
+        options.write_offsets(
             learn_offsets, summary.clocks.values(), settings, f"{counted(summary.scenes, 'scene')}, {source.name}"
         )
 
@@ -181,9 +180,9 @@ def track() -> None:
 def _smooth(
     source: DatasetSource,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
-    method: how.MethodOption = "saga",
-    association: how.AssociationOption = None,
-    interactions: how.InteractionsOption = None,
+    method: options.MethodOption = "saga",
+    association: options.AssociationOption = None,
+    interactions: options.InteractionsOption = None,
     table: Annotated[
         Literal["csv", "ndjson", "parquet"],
         typer.Option("--table", help="Format of the table of boxes; parquet needs the extra [parquet]."),
@@ -207,9 +206,9 @@ def _smooth(
         write_streamed_labels,
     )
 
-    how.association_fits(method, association)
+    options.association_fits(method, association)
     settings = load_smooth_config(source.family, config)
-    tracking = how.with_interactions(settings.tracking, method, interactions)
+    tracking = options.with_interactions(settings.tracking, method, interactions)
     settings = replace(settings, tracking=tracking.with_association(association))
     usual = load_smooth_config(source.family).tracking
     doubts = Doubts(settings.tracking.of_method(method), usual, source.option_for)
