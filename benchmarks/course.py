@@ -17,8 +17,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.scans import SENSOR_HEIGHT, SMALL, ScannerSettings, StaticWorld, simulate_scan
 from data_tools.lidar import Scan
-from data_tools.simulator.scanner import SENSOR_HEIGHT, SMALL, ScannerSettings, StaticWorld, simulate_scan
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import transforms

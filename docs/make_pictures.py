@@ -15,8 +15,8 @@ from running_graph_picture import write_running_graph_pictures
 from scaling_picture import write_scaling_picture
 from slam_loops_picture import write_loops_picture
 
+from benchmarks.scans import SimulatedScans, laser_drive
 from data_tools.simulator import simulate_scene
-from data_tools.simulator.scanner import SimulatedScans, laser_drive
 from pipelines.config import load_config
 from pipelines.demo import run_demo
 from pipelines.slam.joint import run_joint, street

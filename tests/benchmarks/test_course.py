@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.course import SimulatedCourse, revisits
-from data_tools.simulator.scanner import SENSOR_HEIGHT
+from benchmarks.scans import SENSOR_HEIGHT
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_of
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.scans import SimulatedScans
 from benchmarks.slam import all_in_rows, odometry_rows
 from data_tools.datasets.kitti import KittiScans
-from data_tools.simulator.scanner import SimulatedScans
 
 
 def test_both_are_measured_on_the_same_scans() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_tools.simulator.scanner import StaticWorld, street
+from benchmarks.scans import StaticWorld, street
 from saga_fg.types.boxes import Boxes
 
 WIDTH, HEIGHT = 10.0, 6.0  # of the tunnel inside, m

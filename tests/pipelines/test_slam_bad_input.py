@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.scans import SimulatedScans
 from data_tools.lidar import Scan
-from data_tools.simulator.scanner import SimulatedScans
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep, RecordedOdometry, motion, shared
 from pipelines.slam.vehicle_sensors import BetweenKeyframes

@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
+from benchmarks.scans import CURB, SimulatedScans, drive
 from data_tools.lidar import Scan, Submap, read_scan
-from data_tools.simulator.scanner import CURB, SimulatedScans, drive
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
 from pipelines.slam.lidar_results import accumulated_map, covered_spans, metrics, write_lidar_slam

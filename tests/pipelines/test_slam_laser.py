@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.scans import LaserKind, laser_drive, write_carmen
 from data_tools.laser import LaserLog
-from data_tools.simulator.scanner import LaserKind, laser_drive, write_carmen
 from data_tools.trajectories import read_tum_poses
 from pipelines.cli import app
 from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam

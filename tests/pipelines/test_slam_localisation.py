@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.scans import SENSOR_HEIGHT, SimulatedScans
 from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.sensor_logs import SensorLog
-from data_tools.simulator.scanner import SENSOR_HEIGHT, SimulatedScans
 from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.localisation import Localiser, LocaliserSettings

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.course import SimulatedCourse
+from benchmarks.scans import SMALL, StaticWorld, simulate_scan
 from data_tools.lidar import Submap, voxel_downsample
-from data_tools.simulator.scanner import SMALL, StaticWorld, simulate_scan
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray

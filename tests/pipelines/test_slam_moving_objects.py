@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.scans import SMALL, SimulatedScans, StaticWorld, simulate_scan
 from data_tools.lidar import constant_velocity
-from data_tools.simulator.scanner import SMALL, SimulatedScans, StaticWorld, simulate_scan
 from pipelines.config import load_config
 from pipelines.slam.joint import path_tracker
 from pipelines.slam.lidar_results import metrics

@@ -7,8 +7,8 @@ import logging
 import numpy as np
 import pytest
 
+from benchmarks.scans import ScannerSettings, drive, scans, street
 from data_tools.lidar import Scan
-from data_tools.simulator.scanner import ScannerSettings, drive, scans, street
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.odometry import LOST_ROTATION, LOST_TRANSLATION, LidarOdometry, OdometrySettings, OdometryStep
 from saga_fg.errors import InputError

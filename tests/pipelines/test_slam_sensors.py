@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.scans import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, drive
 from data_tools.sensor_logs import SensorLog
-from data_tools.simulator.scanner import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, drive
 from pipelines.cli import app
 from pipelines.slam.configuration import sensor_log
 from pipelines.slam.lidar_results import degenerate_spans, metrics

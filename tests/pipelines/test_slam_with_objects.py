@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.scans import SimulatedScans
 from data_tools.sensor_logs import SensorLog
-from data_tools.simulator.scanner import SimulatedScans
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.cli import app
 from pipelines.config import load_config

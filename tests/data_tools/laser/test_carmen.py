@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.scans import laser_drive, write_carmen
 from data_tools.laser import read_carmen
-from data_tools.simulator.scanner import laser_drive, write_carmen
 from saga_fg import InputError
 
 READINGS = " ".join(f"{1 + k / 10:.2f}" for k in range(11))

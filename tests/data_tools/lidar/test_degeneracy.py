@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.scans import StaticWorld, drive, scans, street
 from data_tools.lidar import (
     Registration,
     RegistrationError,
@@ -15,7 +16,6 @@ from data_tools.lidar import (
     voxel_downsample,
 )
 from data_tools.lidar.registration import Undetermined
-from data_tools.simulator.scanner import StaticWorld, drive, scans, street
 from saga_fg.numerics.geometry import yaw_transform
 from tests.data_tools.featureless import open_field, tunnel
 

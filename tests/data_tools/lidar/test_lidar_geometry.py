@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.scans import CURB, SENSOR_HEIGHT, ScannerSettings, StaticWorld, simulate_scan, street
 from data_tools.lidar import (
     Scan,
     detect_clusters,
@@ -21,7 +22,6 @@ from data_tools.lidar import (
 from data_tools.lidar.clusters import l_shape_heading
 from data_tools.lidar.landmarks import BIAS
 from data_tools.lidar.scan import clusters_from_above
-from data_tools.simulator.scanner import CURB, SENSOR_HEIGHT, ScannerSettings, StaticWorld, simulate_scan, street
 from saga_fg.numerics.geometry import transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes
 

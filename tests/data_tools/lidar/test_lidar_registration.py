@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.scans import StaticWorld, drive, scans, street
 from data_tools.lidar import (
     RegistrationError,
     RegistrationSettings,
@@ -22,7 +23,6 @@ from data_tools.lidar import (
     voxel_downsample,
     voxel_keys,
 )
-from data_tools.simulator.scanner import StaticWorld, drive, scans, street
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes

@@ -30,7 +30,6 @@ from data_tools.laser import LaserLog
 from data_tools.lidar import Scan, constant_velocity
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import inverse_transform, transforms, wrap_angle, yaw_transform
-from saga_fg.settings import Positive, PositiveInt, Settings, setting
 from saga_fg.types.boxes import Boxes
 
 
@@ -57,16 +56,22 @@ class StaticWorld:
 
 
 @dataclass(frozen=True)
-class ScannerSettings(Settings):
-    """Resolution and noise of the LiDAR; 64 rings and 2000 columns are those of a Velodyne HDL-64E."""
+class ScannerSettings:
+    """Resolution and noise of the LiDAR; 64 rings and 2000 columns are those of a Velodyne HDL-64E.
 
-    rings: PositiveInt = setting(32, "number of beams, one above the other")
-    columns: PositiveInt = setting(720, "number of firings a turn")
-    lowest: float = setting(-0.44, "elevation of the lowest beam, rad")
-    highest: float = setting(0.06, "elevation of the highest beam, rad")
-    reach: Positive = setting(80.0, "longest range, m")
-    noise: float = setting(0.02, "standard deviation of a range, m")
-    period: Positive = setting(0.1, "duration of a turn, s")
+    rings, columns   beams, one above the other, and firings a turn
+    lowest, highest  elevations of the outer beams, rad
+    reach, noise     longest range, and standard deviation of a range, m
+    period           duration of a turn, s
+    """
+
+    rings: int = 32
+    columns: int = 720
+    lowest: float = -0.44
+    highest: float = 0.06
+    reach: float = 80.0
+    noise: float = 0.02
+    period: float = 0.1
 
 
 def simulate_scan(
