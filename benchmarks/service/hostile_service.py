@@ -20,8 +20,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,15 +28,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.service.attack import Attack
-from benchmarks.service.endurance import CirclingObjects
 from benchmarks.service.good_client import JUDGED, GoodClient
 from benchmarks.service.hostile_messages import EPOCH, SENSORS
-from benchmarks.service.served import Served
+from benchmarks.service.served import CirclingObjects, Served
 from pipelines.serving import Address, StreamClient
 from pipelines.serving.messages import encode
 from pipelines.tracking import Progress
 from saga_fg.errors import SagaError
-from saga_fg.settings import Positive, PositiveInt, Settings, setting
 
 VALID = 0.2  # share of the messages that are frames of the good clients
 BEAT = 0.01  # s
@@ -46,97 +43,63 @@ MOST_STALL, MOST_GROWTH = 0.5, 1.05  # s; memory at the end by memory at the sta
 LEAST_TRACKED = 0.99  # share of the valid frames
 
 
-@dataclass(frozen=True)
-class HostileBenchSettings(Settings):
-    """Number and rate of messages."""
+def bench_hostile_service(
+    messages: int, objects: int, pace: float, seed: int, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Run it on this machine: counts of messages, times (s) and memory (MB).
 
-    messages: PositiveInt = setting(20_000, "messages in all, a fifth of them valid frames of two good clients")
-    objects: PositiveInt = setting(50, "objects in each valid frame")
-    pace: Positive = setting(50.0, "frames a good client sends in a second")
-    seed: int = setting(0, "seed of messages and faults")
-
-    @property
-    def frames(self) -> int:
-        """Frames that each good client sends."""
-        return max(1, round(self.messages * VALID / len(SENSORS)))
-
-
-@dataclass(frozen=True)
-class HostileBench:
-    """Counts of messages, times and memory.
+    messages  in all, a share `VALID` of them frames of the good clients; objects in each of these; pace: of a good
+              client, frames a second
 
     tracked                         frames of the good clients whose answer was `tracks`
     valid, answered, lost, doubled  frames of the good clients
     late, unconfirmed               answered, of these so
     sent_again                      after broken connections
-    longest_stall                   from sending a good frame to its answer, outside the restart, s
-    machine_stall                   the longest that a thread that only sleeps was kept waiting meanwhile, s
-    memory                          after a tenth and at the end, MB
+    longest_stall                   from sending a good frame to its answer, outside the restart
+    machine_stall                   the longest that a thread that only sleeps was kept waiting meanwhile
+    memory_growth                   at the end, by that after a tenth
     restarts, failures              of the tracker, and internal errors
     dropped                         clients that were closed, by reason
-    first_answer                    from the start of the second service to its first answer to a good client, s
+    first_answer                    from the start of the second service to its first answer to a good client
+
+    Raises `SagaError` when the service does not come up, or does not come back.
     """
-
-    tracked: int
-    valid: int
-    answered: int
-    lost: int
-    doubled: int
-    late: int
-    unconfirmed: int
-    sent_again: int
-    hostile: int
-    refused: int
-    longest_stall: float
-    machine_stall: float
-    memory: tuple[float, float]
-    restarts: int
-    failures: int
-    dropped: dict[str, int]
-    first_answer: float
-
-    @property
-    def shortcomings(self) -> list[str]:
-        """One text for each figure that is out of bounds."""
-        growth, stall = self.memory[1] / self.memory[0], self.longest_stall
-        checks = {
-            f"{self.lost} frames lost": self.lost > 0,
-            f"{self.doubled} frames doubled": self.doubled > 0,
-            f"{self.tracked} of {self.valid} frames tracked, expected {100 * LEAST_TRACKED:g} %": (
-                self.tracked < LEAST_TRACKED * self.valid
-            ),
-            f"a stall of {stall:.3f} s, expected at most {MOST_STALL:g} s": stall > MOST_STALL,
-            f"memory grew to {growth:.3f} of the start, expected at most {MOST_GROWTH:g}": growth > MOST_GROWTH,
-        }
-        return [text for text, wrong in checks.items() if wrong]
-
-
-def bench_hostile_service(settings: HostileBenchSettings, progress: Progress | None = None) -> HostileBench:
-    """Run it on this machine. Raises `SagaError` when the service does not come up, or does not come back."""
+    frames = max(1, round(messages * VALID / len(SENSORS)))
     with tempfile.TemporaryDirectory() as folder:
-        address = Address(path=Path(folder) / "service.sock")
-        return _Run(settings, address, Path(folder) / "state", progress).run()
+        run = _Run(Path(folder), frames, pace, CirclingObjects(objects, seed), seed, progress)
+        return run.run(messages - len(SENSORS) * frames)
+
+
+def shortcomings(figures: Mapping[str, Any]) -> list[str]:
+    """One text for each figure that is out of bounds."""
+    valid, tracked, growth = figures["valid"], figures["tracked"], figures["memory_growth"]
+    lost, doubled, stall = figures["lost"], figures["doubled"], figures["longest_stall"]
+    checks = {
+        f"{lost} frames lost": lost > 0,
+        f"{doubled} frames doubled": doubled > 0,
+        f"{tracked} of {valid} frames tracked, expected {100 * LEAST_TRACKED:g} %": tracked < LEAST_TRACKED * valid,
+        f"a stall of {stall:.3f} s, expected at most {MOST_STALL:g} s": stall > MOST_STALL,
+        f"memory grew to {growth:.3f} of the start, expected at most {MOST_GROWTH:g}": growth > MOST_GROWTH,
+    }
+    return [text for text, wrong in checks.items() if wrong]
 
 
 class _Run:
     """One run: its processes and threads, and what they share."""
 
     def __init__(
-        self, settings: HostileBenchSettings, address: Address, state: Path, progress: Progress | None
+        self, folder: Path, frames: int, pace: float, objects: CirclingObjects, seed: int, progress: Progress | None
     ) -> None:
-        self._settings = settings
-        self._address = address
-        self._options = ("--listen", str(address), "--snapshot", str(state), "--every", "0.2")
-        self._progress = progress
-        self._rng = np.random.default_rng([settings.seed, 5])
+        self._frames, self._pace, self._objects, self._seed, self._progress = frames, pace, objects, seed, progress
+        self._address = Address(path=folder / "service.sock")
+        self._options = ("--listen", str(self._address), "--snapshot", str(folder / "state"), "--every", "0.2")
+        self._rng = np.random.default_rng([seed, 5])
         self._pulse = _Pulse()
-        self._objects = CirclingObjects(settings.objects, settings.seed)
 
-    def run(self) -> HostileBench:
-        settings = self._settings
+    def run(self, hostile: int) -> dict[str, Any]:
+        """With so many hostile messages."""
         server = Served(*self._options)
-        hostile = settings.messages - len(SENSORS) * settings.frames
-        attack = Attack(self._address, settings.seed, hostile, settings.frames / settings.pace)
+        attack = Attack(self._address, self._seed, hostile, self._frames / self._pace)
         clients = [self._good_client(number) for number in range(len(SENSORS))]
         try:
             with _Background(partial(_listen, self._address)), _Background(self._pulse.run):
@@ -161,20 +124,20 @@ class _Run:
             server.kill()
 
     def _good_client(self, number: int) -> GoodClient:
-        sensor, frames = SENSORS[number], self._settings.frames
+        sensor, frames = SENSORS[number], self._frames
 
         def line(seq: int) -> bytes:
-            rng = np.random.default_rng([self._settings.seed, number, seq])
-            elapsed = (seq + number / len(SENSORS)) / self._settings.pace
+            rng = np.random.default_rng([self._seed, number, seq])
+            elapsed = (seq + number / len(SENSORS)) / self._pace
             message = {"seq": seq, "timestamp": round(EPOCH + elapsed, 6), "sensor": sensor}
             return encode(message | {"detections": self._objects.detections(elapsed, rng)})
 
         dies_at = int(self._rng.integers(frames // 10, max(2, frames // 3))) if number == 0 else -1
-        return GoodClient(self._address, sensor, frames, self._settings.pace, line, dies_at)
+        return GoodClient(self._address, sensor, frames, self._pace, line, dies_at)
 
     def _wait(self, clients: list[GoodClient], attack: Attack, until: float) -> None:
         """Until so much of the run is done, telling the hostile clients how far it is."""
-        done, total = 0, len(clients) * self._settings.frames
+        done, total = 0, len(clients) * self._frames
         while done < until * total and any(client.is_alive() for client in clients):
             time.sleep(0.005)
             done = sum(len(client.waits) for client in clients)
@@ -194,7 +157,7 @@ class _Run:
         final: dict[str, Any],
         killed: float,
         started: float,
-    ) -> HostileBench:
+    ) -> dict[str, Any]:
         lost = doubled = 0
         for client in clients:
             missing, again = client.lost_and_doubled(final["taken"].get(client.sensor, 0))
@@ -203,25 +166,26 @@ class _Run:
         waits = [wait for client in clients for wait in client.waits]
         back = min(answered for _, answered in waits if answered > started)
         stalls = [answered - sent for sent, answered in waits if answered < killed or sent > back]
-        return HostileBench(
-            valid=sum(client.frames for client in clients),
-            answered=sum(answers[kind] for kind in (*JUDGED, "repeat")),
-            tracked=answers["tracks"],
-            lost=lost,
-            doubled=doubled,
-            late=answers["late"],
-            unconfirmed=answers["unconfirmed"],
-            sent_again=sum(client.sent_again for client in clients),
-            hostile=hostile,
-            refused=final["refused"],
-            longest_stall=max(stalls),
-            machine_stall=self._pulse.longest,
-            memory=(early["memory_mb"], final["memory_mb"]),
-            restarts=final["restarts"],
-            failures=final["failures"],
-            dropped=final["closed"],
-            first_answer=back - started,
-        )
+        return {
+            "valid": sum(client.frames for client in clients),
+            "tracked": answers["tracks"],
+            "answered": sum(answers[kind] for kind in (*JUDGED, "repeat")),
+            "lost": lost,
+            "doubled": doubled,
+            "late": answers["late"],
+            "unconfirmed": answers["unconfirmed"],
+            "sent_again": sum(client.sent_again for client in clients),
+            "hostile": hostile,
+            "refused": final["refused"],
+            "longest_stall": max(stalls),
+            "machine_stall": self._pulse.longest,
+            "memory": final["memory_mb"],
+            "memory_growth": final["memory_mb"] / early["memory_mb"],
+            "restarts": final["restarts"],
+            "failures": final["failures"],
+            "dropped": final["closed"],
+            "first_answer": back - started,
+        }
 
 
 class _Background:

@@ -13,11 +13,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.runner import each
-from benchmarks.service.endurance import INTERVAL, CirclingObjects
-from benchmarks.service.served import Served
+from benchmarks.service.served import CirclingObjects, Served
 from pipelines.serving import StreamClient
 from pipelines.serving.messages import encode
 
+INTERVAL = 0.1  # s between frames
 SAVED_EVERY = 1.0  # s between two snapshots of the state
 WARM_UP = 10  # frames that are not counted: tracks are new
 

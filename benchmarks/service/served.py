@@ -1,14 +1,35 @@
-"""A service in a process of its own, for benchmarks."""
+"""A service in a process of its own, and the objects that its clients see."""
 
 from __future__ import annotations
 
 import subprocess
 import threading
 from collections import deque
+from typing import Any
+
+import numpy as np
 
 from benchmarks.runner import PROGRAM
 from pipelines.serving import Address, parse_address
 from saga_fg.errors import SagaError
+
+NOISE = 0.2  # of detections, m
+
+
+class CirclingObjects:
+    """`number` cars within 200 m, each on a circle of 20 m."""
+
+    def __init__(self, number: int, seed: int) -> None:
+        rng = np.random.default_rng([seed, 2])
+        self._centre = rng.uniform(-200, 200, (number, 2))
+        self._phase = rng.uniform(0, 2 * np.pi, number)
+
+    def detections(self, time: float, rng: np.random.Generator) -> list[dict[str, Any]]:
+        """Detections of all objects at a time, s, with noise, in the form of a message."""
+        angle = self._phase + 0.3 * time
+        position = self._centre + 20 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        position = position + rng.normal(0, NOISE, position.shape)
+        return [{"label": "car", "x": x, "y": y, "score": 0.9} for x, y in position.round(3).tolist()]
 
 
 class Served:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.service.endurance import ServiceBenchSettings, bench_service
 from pipelines.serving import StreamClient, parse_address
 from saga_fg import InputError
 from tests.pipelines.running_service import COMMAND, frame, serving
@@ -144,14 +143,6 @@ def test_a_reader_that_goes_away_ends_the_pipe_in_one_line():
     assert done.returncode == 0
     assert b"the reader of the tracks has gone away" in done.stderr
     assert b"Traceback" not in done.stderr
-
-
-def test_endurance_loses_nothing():
-    bench = bench_service(ServiceBenchSettings(frames=60, objects=3, malformed=0.1, late=0.2))
-    assert bench.nothing_lost
-    assert bench.out_of_order > 0
-    assert bench.broken > 0
-    assert set(bench.latency) == {"p50", "p90", "p99", "p99.9"}
 
 
 def test_kernels_are_there_before_the_service_listens():
