@@ -13,11 +13,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from benchmarks.agreement import pairwise_agreement
 from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.recordings.ranges import compared, map_beacons
 from benchmarks.runner import Rows, each
 from data_tools.files.atomic_files import check_writable_folder
-from data_tools.metrics.matching import pairwise_agreement
 from pipelines.slam.results import landmark_row, landmark_rows, planar_trajectory, write_landmark_map
 from saga_fg.errors import InputError
 from saga_fg.model.landmarks import PointLandmark

@@ -28,13 +28,13 @@ import numpy as np
 import typer
 from scipy.spatial import cKDTree
 
+from benchmarks.agreement import pairwise_agreement
 from benchmarks.course import SimulatedCourse
 from benchmarks.runner import Row, Rows, Seed, clocked, each, in_turn, timed
 from benchmarks.scans import ScannerSettings
 from data_tools.datasets.kitti import KittiScans
 from data_tools.lidar import Scan, constant_velocity, deskewed, scan_to_map_residual
 from data_tools.lidar.scan import ScanSequence
-from data_tools.metrics.matching import pairwise_agreement
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings

@@ -11,7 +11,7 @@ import numpy as np
 
 from data_tools.figures import FigureTable, cell
 from data_tools.files.atomic_files import atomic_directory, write_text
-from data_tools.metrics import SceneMetrics, SceneMetricSettings, scene_metrics
+from data_tools.metrics import SceneMetrics, scene_metrics
 from data_tools.plots import Panel, birds_eye_view, png
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.source import write_tables
@@ -48,7 +48,6 @@ def compare(
     dataset: Dataset,
     config: TrackConfig,
     methods: Sequence[Method],
-    settings: SceneMetricSettings | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
     """Track every scene with every method. Raises `InputError` for a scene without ground truth."""
@@ -61,7 +60,7 @@ def compare(
         for method in methods:
             run = track_scene(scene, config.new_tracker(method), progress)
             runs[method].append(run)
-            metrics[method].append(scene_metrics(scene.ground_truth, run.tracks, settings))
+            metrics[method].append(scene_metrics(scene.ground_truth, run.tracks))
     return Comparison(
         {method: tuple(runs[method]) for method in methods},
         {method: SceneMetrics.pool(metrics[method]) for method in methods},

@@ -6,7 +6,7 @@ from .bootstrap import (
     relative_change,
     root_mean_square,
 )
-from .error_sample import ErrorSample, coverage, coverages, nees, nees_band
+from .error_sample import ErrorSample, coverage, coverages, nees
 from .hota import HotaMetrics, hota_metrics
 from .kitti_tracking import (
     KittiSimilarity,
@@ -37,7 +37,7 @@ from .nuscenes_tracking import (
     NuScenesTrackingSettings,
     nuscenes_tracking_metrics,
 )
-from .scene import SceneMetrics, SceneMetricSettings, scene_metrics, scene_metrics_by_label
+from .scene import SceneMetrics, scene_metrics, scene_metrics_by_label
 from .scene_boxes import SceneBoxes
 
 __all__ = [
@@ -57,7 +57,6 @@ __all__ = [
     "NuScenesTrackingSettings",
     "RecallCurves",
     "SceneBoxes",
-    "SceneMetricSettings",
     "SceneMetrics",
     "TrackSummary",
     "WholeTracks",
@@ -74,7 +73,6 @@ __all__ = [
     "label_velocities",
     "match_scene",
     "nees",
-    "nees_band",
     "nuscenes_tracking_metrics",
     "paired_bootstrap",
     "ratio_of_sums",

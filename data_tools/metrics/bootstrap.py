@@ -32,10 +32,6 @@ class Interval:
     high: float
     confidence: float
 
-    def excludes(self, value: float) -> bool:
-        """True if `value` lies outside the interval."""
-        return value < self.low or value > self.high
-
     def __str__(self) -> str:
         return f"{self.estimate:.4g} [{self.low:.4g}, {self.high:.4g}]"
 

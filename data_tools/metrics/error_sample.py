@@ -92,13 +92,6 @@ def coverage(nees_values: FloatArray, probability: float, dimension: int = 2) ->
     return float(np.mean(nees_values <= chi_square_quantile(probability, dimension)))
 
 
-def nees_band(count: int, dimension: int = 2, probability: float = 0.999) -> tuple[float, float]:
-    """Two-sided interval that contains the mean NEES of `count` independent consistent estimates with `probability`."""
-    tail = (1 - probability) / 2
-    degrees = dimension * count
-    return chi_square_quantile(tail, degrees) / count, chi_square_quantile(1 - tail, degrees) / count
-
-
 def coverages(nees_values: FloatArray, probabilities: Sequence[float] = (0.5, 0.9, 0.99)) -> dict[float, float]:
     """`coverage` of horizontal positions for several probabilities."""
     return {p: coverage(nees_values, p) for p in probabilities}

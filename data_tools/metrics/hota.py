@@ -98,25 +98,6 @@ def hota_metrics(
     return similarity_metrics([_similarities(*scene, label, similarity, reach) for scene in scenes], threshold)
 
 
-class HotaOfScenes:
-    """HOTA of a class over any of some scenes (truth, found); the frames are compared once.
-
-    Raises `MissingExtraError` without trackeval.
-    """
-
-    def __init__(
-        self, scenes: Sequence[tuple[SceneBoxes, SceneBoxes]], label: str, similarity: Similarity = "iou_3d"
-    ) -> None:
-        self._metric = _trackeval_metrics().HOTA()
-        compared = (_similarities(*scene, label, similarity, reach=4.0) for scene in scenes)
-        self._scenes = [self._metric.eval_sequence(scene.sequence()) for scene in compared]
-
-    def __call__(self, rows: Sequence[int]) -> float:
-        """HOTA of scenes by their numbers, which may occur more than once."""
-        found = self._metric.combine_sequences({str(n): self._scenes[row] for n, row in enumerate(rows)})
-        return float(np.mean(found["HOTA"]))
-
-
 def similarity_metrics(scenes: Sequence[SceneSimilarities], threshold: float = 0.5) -> HotaMetrics:
     """The figures of scenes whose similarities are known. Raises `MissingExtraError` without trackeval."""
     metrics = _trackeval_metrics()

@@ -1,4 +1,4 @@
-"""One-to-one correspondences: CLEAR MOT over a scene, at many thresholds, agreement of groupings.
+"""One-to-one correspondences: CLEAR MOT over a scene, and at many thresholds.
 
 One-to-one correspondences between true objects and tracks over a scene, as the CLEAR MOT metrics define them.
 
@@ -9,7 +9,7 @@ In every frame, in this order:
 2. the others are assigned by the Hungarian method: as many pairs within the gate as possible, and among those the
    assignment with the least sum of distances.
 
-Distances are between centres in the horizontal plane; with `same_label` only equal classes can match.
+Distances are between centres in the horizontal plane; only equal classes can match.
 
 Source: Bernardin and Stiefelhagen, Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics, EURASIP
 Journal on Image and Video Processing, 2008, section 2.1.
@@ -19,14 +19,6 @@ Optimal one-to-one assignment at many score thresholds at once.
 At each threshold ("level") some of the candidate pairs are present. Within each group of candidates (a frame and class)
 the assignment has as many pairs as possible, and among those assignments the least sum of costs. Most pairs have no
 competing pair and are chosen at once; the Hungarian method solves the rest, equal problems of several levels once.
-
-Agreement of an estimated and a true grouping of observations: pairwise precision, recall and F1.
-
-    precision = pairs joined in both / pairs joined in the estimate,     recall = pairs joined in both / ... in truth
-    F1 = 2 precision recall / (precision + recall)
-
-over all pairs of observations. Names of groups have no influence. Source: Manning, Raghavan and Schuetze,
-Introduction to Information Retrieval, 2008, section 16.3.
 """
 
 from __future__ import annotations
@@ -36,11 +28,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, checked_rows
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations
 
@@ -140,7 +131,7 @@ class FrameMatch:
 
 
 def match_scene(
-    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], gate: float = 2.0, same_label: bool = True
+    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], gate: float = 2.0
 ) -> list[FrameMatch]:
     """The matching at each of the K frames of a scene; pairs further apart than `gate` (m) never match.
 
@@ -159,7 +150,7 @@ def match_scene(
     result = []
     for truth, found in zip(ground_truth, tracks, strict=True):
         objects = np.array([numbers[name] for name in truth.id.tolist()], dtype=np.int64)
-        distance = _distances(truth, found, same_label)
+        distance = _distances(truth, found)
         distance[distance > gate] = np.inf
         rows, columns = _assign(distance, seen[objects, None] & (last_track[objects, None] == found.id[None, :]))
         matched = objects[rows]
@@ -169,12 +160,11 @@ def match_scene(
     return result
 
 
-def _distances(truth: Annotations, found: FoundBoxes, same_label: bool) -> FloatArray:
-    """(N, M) horizontal distances, infinite between different classes where these must not match."""
+def _distances(truth: Annotations, found: FoundBoxes) -> FloatArray:
+    """(N, M) horizontal distances, infinite between different classes."""
     offset = truth.boxes.position[:, None, :2] - found.boxes.position[None, :, :2]
     distance = np.hypot(offset[..., 0], offset[..., 1])
-    if same_label:
-        distance[truth.boxes.label[:, None] != found.boxes.label[None, :]] = np.inf
+    distance[truth.boxes.label[:, None] != found.boxes.label[None, :]] = np.inf
     return np.asarray(distance)
 
 
@@ -195,34 +185,3 @@ def _assign(distance: FloatArray, previous: BoolArray) -> tuple[IntArray, IntArr
     rows, columns = np.append(kept_rows, rows[chosen]), np.append(kept_columns, columns[chosen])
     order = np.argsort(rows)
     return rows[order], columns[order]
-
-
-@dataclass(frozen=True)
-class PairwiseAgreement:
-    """precision, recall, f1; precision and recall are 1 without pairs in their denominator."""
-
-    precision: float
-    recall: float
-    f1: float
-
-
-def pairwise_agreement(estimated: ArrayLike, true: ArrayLike) -> PairwiseAgreement:
-    """The agreement of two groupings (n,), given as the group of each observation.
-
-    Raises `InputError` for groupings of different lengths.
-    """
-    groups = checked_rows("estimated", estimated)
-    truth = checked_rows("true", true, len(groups))
-    both = np.unique(np.stack([groups, truth], axis=1), axis=0, return_counts=True)[1]
-    common, claimed, actual = _pairs(both), _pairs(_counts(groups)), _pairs(_counts(truth))
-    precision = common / claimed if claimed else 1.0
-    recall = common / actual if actual else 1.0
-    return PairwiseAgreement(precision, recall, 2 * precision * recall / max(precision + recall, 1e-300))
-
-
-def _counts(groups: IntArray) -> IntArray:
-    return np.unique(groups, return_counts=True)[1].astype(np.int64)
-
-
-def _pairs(counts: IntArray) -> float:
-    return float((counts * (counts - 1) // 2).sum())

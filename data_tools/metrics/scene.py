@@ -29,17 +29,9 @@ from data_tools.metrics.error_sample import ErrorSample, nees
 from data_tools.metrics.matching import FoundBoxes, FrameMatch, match_scene
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.settings import setting
 from saga_fg.types.dataset import Annotations
 
-
-@dataclass(frozen=True)
-class SceneMetricSettings:
-    """Matching of tracks and ground truth."""
-
-    gate: float = setting(2.0, "largest horizontal distance of a matched pair, m")
-    same_label: bool = setting(True, "match objects and tracks of the same class only")
-    cap: float = setting(5.0, "largest carried error, also that of a hidden object whose track is lost, m")
+CAP = 5.0  # largest carried error, also that of a hidden object whose track is lost, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +84,6 @@ class SceneMetrics:
         return 1.0 - faults / self.objects if self.objects else float("nan")
 
     @property
-    def mota_sums(self) -> tuple[float, float]:
-        """(objects less errors, objects), whose ratio is MOTA: the sums for a bootstrap of MOTA."""
-        return float(self.matches - self.false_positives - self.switches), float(self.objects)
-
-    @property
     def motp(self) -> float:
         """Mean position error, m."""
         return self.position.mean
@@ -110,15 +97,12 @@ class SceneMetrics:
         return self.hidden_matches / self.hidden_objects if self.hidden_objects else float("nan")
 
 
-def scene_metrics(
-    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], settings: SceneMetricSettings | None = None
-) -> SceneMetrics:
+def scene_metrics(ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes]) -> SceneMetrics:
     """The metrics of one scene: K annotations and the K `Tracks` of the same frames, both in world coordinates.
 
     Raises `InputError` when their numbers differ.
     """
-    settings = settings or SceneMetricSettings()
-    matchings = match_scene(ground_truth, tracks, settings.gate, settings.same_label)
+    matchings = match_scene(ground_truth, tracks)
     frames = list(zip(ground_truth, tracks, matchings, strict=True))
     pairs = [_pair_errors(*frame) for frame in frames]
     visible = np.concatenate([np.empty(0, dtype=np.bool_), *(truth.visible[m.object_row] for truth, _, m in frames)])
@@ -136,22 +120,21 @@ def scene_metrics(
         hidden_position=ErrorSample(position[~visible]),
         hidden_velocity=ErrorSample.known(velocity[~visible]),
         heading=ErrorSample.known(heading[visible]),
-        carried=ErrorSample(_carried_errors(frames, settings.cap)),
+        carried=ErrorSample(_carried_errors(frames)),
         nees=ErrorSample.known(consistency[visible]),
     )
 
 
 def scene_metrics_by_label(
-    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes], settings: SceneMetricSettings | None = None
+    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes]
 ) -> dict[str, SceneMetrics]:
-    """`scene_metrics` of each class, by name; with `same_label`, pooling them gives the metrics of the whole scene."""
+    """`scene_metrics` of each class, by name; pooling them gives the metrics of the whole scene."""
     boxes = [truth.boxes for truth in ground_truth] + [found.boxes for found in tracks]
     labels = {label for table in boxes for label in table.label.tolist()}
     return {
         label: scene_metrics(
             [_annotations(truth, truth.boxes.label == label) for truth in ground_truth],
             [found.select(found.boxes.label == label) for found in tracks],
-            settings,
         )
         for label in sorted(labels)
     }
@@ -166,7 +149,7 @@ def _pair_errors(truth: Annotations, found: FoundBoxes, matching: FrameMatch) ->
     return np.stack([matching.distance, np.hypot(velocity[:, 0], velocity[:, 1]), heading, consistency])
 
 
-def _carried_errors(frames: Sequence[tuple[Annotations, FoundBoxes, FrameMatch]], cap: float) -> FloatArray:
+def _carried_errors(frames: Sequence[tuple[Annotations, FoundBoxes, FrameMatch]]) -> FloatArray:
     """Carried errors of all hidden objects, see the module."""
     carrier: dict[str, int | str] = {}
     errors: list[float] = []
@@ -178,10 +161,10 @@ def _carried_errors(frames: Sequence[tuple[Annotations, FoundBoxes, FrameMatch]]
                 continue
             at = row_of.get(track)
             if at is None:
-                errors.append(cap)
+                errors.append(CAP)
             else:
                 offset = found.boxes.position[at, :2] - truth.boxes.position[row, :2]
-                errors.append(min(float(np.hypot(*offset)), cap))
+                errors.append(min(float(np.hypot(*offset)), CAP))
         visible = truth.visible[matching.object_row]
         names = truth.id[matching.object_row[visible]].tolist()
         carrier.update(zip(names, found.id[matching.track_row[visible]].tolist(), strict=True))
