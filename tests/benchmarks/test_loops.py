@@ -46,22 +46,18 @@ def with_prior() -> PoseGraph:
     return replace(graph, priors=PosePriors(np.array([0]), true[:1], np.eye(3)[None]))
 
 
-@pytest.mark.parametrize(
-    ("graph", "options", "message"),
-    [
+def test_what_cannot_be_run_is_refused_at_the_door(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for graph, options, message in [
         (triangle(), [], "other.g2o: expected 4 poses and a loop or more, got 3 and 1"),
         (with_prior(), [], "other.g2o: expected a graph of poses alone, without landmarks and priors"),
         (loop(2, seed=1)[0], ["--shares", "-1"], "--shares: expected numbers >= 0 with commas, got '-1'"),
         (loop(2, seed=1)[0], ["--shares", "inf"], "--shares: expected numbers >= 0 with commas, got 'inf'"),
-    ],
-)
-def test_what_cannot_be_run_is_refused_at_the_door(
-    tmp_path: Path, graph: PoseGraph, options: list[str], message: str
-) -> None:
-    code, stdout, stderr = spoilt(tmp_path, graph, *options)
-    assert code == 2
-    assert message in stderr.replace("\n", " ")
-    assert not stdout
+    ]:
+        with subtests.test(message):
+            code, stdout, stderr = spoilt(tmp_path, graph, *options)
+            assert code == 2
+            assert message in stderr.replace("\n", " ")
+            assert not stdout
 
 
 def test_odometry_errs_by_one_per_cent_and_the_drift_asked_for() -> None:
@@ -75,14 +71,12 @@ def test_odometry_errs_by_one_per_cent_and_the_drift_asked_for() -> None:
     assert 0.005 < np.median(ends) < 0.03
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_courses_that_cannot_be_driven_are_refused(refused, subtests: pytest.Subtests) -> None:
+    for arguments, message in [
         ("", "expected either files of pose graphs, or --courses"),
         ("--courses a", "--courses: expected numbers >= 0 with commas, got 'a'"),
         ("--courses 0 --drift -1", "--drift: expected numbers >= 0 with commas"),
         ("graph.g2o --courses 0", "expected either files of pose graphs, or --courses"),
-    ],
-)
-def test_courses_that_cannot_be_driven_are_refused(refused, arguments: str, message: str) -> None:
-    assert message in refused(f"loops {arguments}")
+    ]:
+        with subtests.test(message):
+            assert message in refused(f"loops {arguments}")

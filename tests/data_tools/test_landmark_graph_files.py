@@ -104,9 +104,8 @@ def test_without_vertices_landmarks_start_where_they_are_seen(tmp_path: Path) ->
     np.testing.assert_allclose(found.landmarks, whole.landmarks, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("text", "old", "new", "message"),
-    [
+def test_what_is_wrong_is_located(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, old, new, message in [
         (PLANAR, "EDGE_SE2_XY 1 10", "EDGE_SE2_XY 1 12", "line 9: landmark: there is no landmark 12"),
         (PLANAR, "EDGE_SE2_XY 1 10", "EDGE_SE2_XY 4 10", "line 9: pose: there is no pose 4"),
         (PLANAR, "VERTEX_XY 10", "VERTEX_XY 11", "line 5: id: 11 is given twice"),
@@ -115,11 +114,9 @@ def test_without_vertices_landmarks_start_where_they_are_seen(tmp_path: Path) ->
         (PLANAR, "1.3157749899217608 900", "1.3 -1", "line 10: I11: expected a positive definite matrix"),
         (PLANAR, "EDGE_SE2_PRIOR 2", "EDGE_SE2_PRIOR 5", "line 8: pose: there is no pose 5"),
         (SPATIAL, "1 9 4 4 -3", "1 9 7 4 -3", "line 6: offset: there is no offset 7"),
-    ],
-)
-def test_what_is_wrong_is_located(tmp_path: Path, text: str, old: str, new: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_g2o(written(tmp_path, text.replace(old, new, 1)))
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            read_g2o(written(tmp_path, text.replace(old, new, 1)))
 
 
 def test_landmarks_that_nobody_saw_are_left_out_with_a_warning(

@@ -70,9 +70,8 @@ def test_writing_and_reading_gives_the_same_graph(tmp_path: Path, text: str) -> 
         np.testing.assert_allclose(getattr(again, name), getattr(graph, name), rtol=1e-14, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("text", "old", "new", "message"),
-    [
+def test_what_is_wrong_is_located(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, old, new, message in [
         (PLANAR, "VERTEX_SE2 3", "VERTEX_XYZ 3", "line 2: unknown record 'VERTEX_XYZ'; did you mean .* be removed"),
         (PLANAR, "3 0 0 0", "3 0 0", "line 2: expected 4 values after VERTEX_SE2, got 3"),
         (PLANAR, "3 0 0 0", "3 0 nan 0", "line 2: y: expected a finite number, got 'nan'"),
@@ -90,13 +89,12 @@ def test_writing_and_reading_gives_the_same_graph(tmp_path: Path, text: str) -> 
         (PLANAR, PLANAR, PLANAR.splitlines()[0], "expected EDGE_SE2 records"),
         (PLANAR, PLANAR, PLANAR + SPATIAL, "all in the plane .* or all in space"),
         (SPATIAL, "0 0 0.6 0.8", "0 0 0.6 0.9", "line 2: qx qy qz qw: expected a unit quaternion"),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_is_located(tmp_path: Path, text: str, old: str, new: str, message: str) -> None:
-    path = written(tmp_path, text.replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as caught:
-        read_g2o(path)
-    assert str(path) in str(caught.value)
+    ]:  # fmt: skip
+        with subtests.test(message):
+            path = written(tmp_path, text.replace(old, new, 1))
+            with pytest.raises(InputError, match=message) as caught:
+                read_g2o(path)
+            assert str(path) in str(caught.value)
 
 
 def test_a_file_of_measurements_alone_starts_at_dead_reckoning(tmp_path: Path) -> None:

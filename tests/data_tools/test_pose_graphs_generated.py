@@ -58,17 +58,14 @@ def test_the_same_seed_makes_the_same_graph() -> None:
     assert (city(300, 5)[0].first_T_second[0] != city(300, 6)[0].first_T_second[0]).any()
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_what_cannot_be_made_is_refused(subtests: pytest.Subtests) -> None:
+    for make, message in [
         (lambda: city(1, 0), "poses: expected at least 2"),
         (lambda: city(10, 0, noise=0.0), "noise"),
         (lambda: torus(50, 0, windings=20), "poses: expected at least 80, 4 for each of 20 windings, got 50"),
         (lambda: torus(50, 0, windings=1), "windings: expected at least 2"),
         (lambda: sphere(50, 0, turns=1), "turns: expected at least 2"),
         (lambda: sphere(50, 0, turns=20), "poses: expected at least 80, 4 for each of 20 turns, got 50"),
-    ],
-)
-def test_what_cannot_be_made_is_refused(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make()
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            make()

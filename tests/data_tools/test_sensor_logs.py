@@ -44,20 +44,17 @@ def test_latitude_and_longitude_become_metres(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved[:, 3], [10, 11])
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_faults_are_named_with_their_line(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in [
         ("", "expected a line of columns, the file is empty"),
         ("time,speed [m/s]\n", r"line 1: expected a column time with its unit, such as time \[s\]"),
         ("time [s],speed [knots]\n", "line 1: speed: expected one of m/s, km/h, mph, got 'knots'"),
         ("time [s],speed [m/s]\n1,2\n0.5,2\n", r"line 3: time: expected one after 1\.0+ s, got 0\.5"),
         ("time [s],speed [m/s]\n1,fast\n", "line 2: speed: expected a finite number, got 'fast'"),
         ("time [s],speed [m/s]\n1\n", "line 2: expected 2 columns, got 1"),
-    ],
-)
-def test_faults_are_named_with_their_line(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_sensor_log(written(tmp_path, text), "wheels")
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            read_sensor_log(written(tmp_path, text), "wheels")
 
 
 def test_a_log_is_fed_as_time_goes_on() -> None:

@@ -66,9 +66,8 @@ def test_residuals_wrap():
     assert factor.error(values) == pytest.approx(0.5 * 0.1**2 / 0.01)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_bad_input_is_refused(subtests):
+    for make, message in [
         (lambda: Camera(0.0, 1.0, 0.0, 0.0), "focal lengths"),
         (lambda: Camera(1.0, 1.0, 0.0, np.nan), "intrinsics"),
         (lambda: Camera(1.0, 1.0, 0.0, 0.0, 2 * np.eye(4)), "rotation"),
@@ -76,8 +75,6 @@ def test_residuals_wrap():
         (lambda: PixelBearing(4, camera(), (0, 7)), "distinct components"),
         (lambda: camera().bearings([[1.0, 2.0, 3.0]], np.eye(3)), r"shape \(n, 1\) or \(n, 2\)"),
         (lambda: camera().bearings([[np.nan]], [[1.0]]), "pixels"),
-    ],
-)
-def test_bad_input_is_refused(make, message):
-    with pytest.raises(FactorError, match=message):
-        make()
+    ]:
+        with subtests.test(message), pytest.raises(FactorError, match=message):
+            make()

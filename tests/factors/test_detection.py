@@ -168,9 +168,8 @@ def test_detections_update_like_a_kalman_filter(covariance):
     np.testing.assert_allclose(graph.optimize().at(0), mean + gain @ (z - H @ mean), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_bad_detections_are_refused(subtests):
+    for make, message in [
         (lambda: position(4, (0, 4)), "position: expected distinct components from 0 to 3"),
         (lambda: position(4, (1, 1)), "distinct"),
         (lambda: position_velocity(4, (0, 1), (1, 2)), "distinct"),
@@ -189,11 +188,9 @@ def test_detections_update_like_a_kalman_filter(covariance):
         (lambda: linear_detection_factor(0, LINEAR[3], np.ones(7), np.eye(7)), "near"),
         (lambda: linear_detection_factors([0], position(4), np.ones((2, 2)), np.eye(2)), "keys"),
         (lambda: linear_detection_factors([0, 1], position(4), np.ones((2, 2)), np.ones((3, 2, 2))), "R: expected 2"),
-    ],
-)
-def test_bad_detections_are_refused(make, message):
-    with pytest.raises(FactorError, match=message):
-        make()
+    ]:
+        with subtests.test(message), pytest.raises(FactorError, match=message):
+            make()
 
 
 def test_object_at_the_sensor_is_refused_when_linearised():

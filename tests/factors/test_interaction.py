@@ -117,20 +117,17 @@ def test_bad_steps_are_refused_by_name(covariance):
             interaction_factors(**{**good, **change})
 
 
-@pytest.mark.parametrize(
-    ("F", "b", "Q", "message"),
-    [
+def test_bad_factor_is_refused(subtests):
+    for F, b, Q, message in [
         ([np.eye(2)], [0.0, 0.0], np.eye(2), "one block per key"),
         ([np.eye(2), np.eye(3)], [0.0, 0.0], np.eye(2), "F: expected shape"),
         ([np.eye(2), np.eye(2)], [0.0, np.nan], np.eye(2), "finite"),
         ([np.eye(2), np.eye(2)], [0.0, 0.0], np.ones((2, 2)), "singular"),
         ([np.eye(2), np.eye(2)], [[0.0, 0.0]], np.eye(2), "b: expected shape"),
         ([np.eye(2), np.zeros((2, 0))], [0.0, 0.0], np.eye(2), "one column per block"),
-    ],
-)
-def test_bad_factor_is_refused(F, b, Q, message):
-    with pytest.raises(FactorError, match=message):
-        interaction_factor(1, [2, 3], F, b, Q)
+    ]:
+        with subtests.test(message), pytest.raises(FactorError, match=message):
+            interaction_factor(1, [2, 3], F, b, Q)
 
 
 def filtered(transitions, offsets, Q, mean, P):

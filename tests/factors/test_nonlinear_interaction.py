@@ -165,9 +165,8 @@ def test_many_at_once_equal_one_by_one(name, robust, covariance):
         np.testing.assert_allclose(linear.at(i).augmentedJacobian(), expected.augmentedJacobian(), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_bad_lists_of_interactions_are_refused(subtests):
+    for change, message in [
         ({"neighbours": [1, 2]}, r"neighbours: expected shape \(n, k\)"),
         ({"keys": [1, 2, 3]}, "with 3 and 2"),
         ({"dims": [2, 2, 2]}, "expected 2 dimensions"),
@@ -175,14 +174,18 @@ def test_many_at_once_equal_one_by_one(name, robust, covariance):
         ({"covariances": np.ones((3, 2, 2))}, "expected 2 covariances"),
         ({"dt": -1.0}, "dt"),
         ({"next_keys": [5, -6]}, "integers"),
-    ],
-)
-def test_bad_lists_of_interactions_are_refused(change, message):
-    given = {
-        "next_keys": [11, 12], "keys": [1, 2], "neighbours": [[2], [1]], "dims": 2, "dt": 0.1, "covariances": np.eye(2)
-    } | change  # fmt: skip
-    with pytest.raises(FactorError, match=message):
-        CASES["following"][0].factors(**given)
+    ]:
+        with subtests.test(message):
+            given = {
+                "next_keys": [11, 12],
+                "keys": [1, 2],
+                "neighbours": [[2], [1]],
+                "dims": 2,
+                "dt": 0.1,
+                "covariances": np.eye(2),
+            } | change
+            with pytest.raises(FactorError, match=message):
+                CASES["following"][0].factors(**given)
 
 
 def followers(n, steps, seed):
@@ -237,9 +240,8 @@ def test_gtsams_solvers_reach_the_same_minimum(seed, method):
     np.testing.assert_allclose(isam.calculateBestEstimate().atVector(key), theirs.atVector(key), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_bad_factor_is_refused(subtests):
+    for change, message in [
         ({"dims": [2]}, "expected 2 dimensions"),
         ({"dims": 0}, "positive integer"),
         ({"dt": -0.1}, "dt"),
@@ -247,12 +249,19 @@ def test_gtsams_solvers_reach_the_same_minimum(seed, method):
         ({"covariance": np.ones((2, 2))}, "singular"),
         ({"covariance": np.eye(3)}, "covariance: expected shape"),
         ({"neighbours": [1]}, "more than once"),
-    ],
-)
-def test_bad_factor_is_refused(change, message):
-    given = {"next_key": 1, "key": 2, "neighbours": [3], "dims": 2, "dt": 0.1, "covariance": np.eye(2), **change}
-    with pytest.raises(FactorError, match=message):
-        CASES["following"][0].factor(**given)
+    ]:
+        with subtests.test(message):
+            given = {
+                "next_key": 1,
+                "key": 2,
+                "neighbours": [3],
+                "dims": 2,
+                "dt": 0.1,
+                "covariance": np.eye(2),
+                **change,
+            }
+            with pytest.raises(FactorError, match=message):
+                CASES["following"][0].factor(**given)
 
 
 def values_of(*states):
@@ -262,9 +271,8 @@ def values_of(*states):
     return values
 
 
-@pytest.mark.parametrize(
-    ("predict", "jacobians", "message"),
-    [
+def test_faulty_functions_become_factor_errors(subtests):
+    for predict, jacobians, message in [
         (raises, None, "raises on x1, 2, 3: RuntimeError.*no such thing"),
         (lambda x, others, dt: x[:1], None, r"prediction: expected shape \(2\), got \(1,\)"),
         (lambda x, others, dt: x * np.nan, None, "finite"),
@@ -278,16 +286,15 @@ def values_of(*states):
         ),
         (lambda x, others, dt: x, lambda x, others, dt: None, "TypeError"),
         (lambda x, others, dt: np.add(x, 1, out=x), None, "read-only"),
-    ],
-)
-def test_faulty_functions_become_factor_errors(predict, jacobians, message):
-    x1 = gtsam.symbol("x", 1)
-    factor = NonlinearInteraction(predict, jacobians).factor(x1, 2, [3], 2, 0.1, np.eye(2))
-    values = gtsam.Values()
-    for key in (x1, 2, 3):
-        values.insert(key, np.ones(2))
-    with pytest.raises(FactorError, match=message):
-        factor.linearise(values)
+    ]:
+        with subtests.test(message):
+            x1 = gtsam.symbol("x", 1)
+            factor = NonlinearInteraction(predict, jacobians).factor(x1, 2, [3], 2, 0.1, np.eye(2))
+            values = gtsam.Values()
+            for key in (x1, 2, 3):
+                values.insert(key, np.ones(2))
+            with pytest.raises(FactorError, match=message):
+                factor.linearise(values)
 
 
 def test_missing_or_mistyped_variables_are_named():

@@ -59,23 +59,24 @@ def test_marginal_keeps_what_is_known_of_the_rest(seed, elimination, covariance)
     np.testing.assert_allclose(joint_P, P[np.ix_(rows, rows)], atol=1e-8)
 
 
-@pytest.mark.parametrize("options", [{}, {"function": gtsam.EliminateQR}])
-@pytest.mark.parametrize("seed", range(5))
-def test_block_covariances_are_those_of_the_dense_inverse(seed, options, covariance):
-    rng = np.random.default_rng(seed)
-    keys = rng.permutation(500)[:12].tolist()
-    dims = {key: int(rng.integers(1, 5)) for key in keys}
-    graph = random_graph(rng, dims, covariance)
-    graph.push_back(prior_factor(501, np.zeros(2), np.eye(2)))  # a tree of its own
-    dims[501] = 2
-    found = block_covariances(graph.eliminateMultifrontal(**options), dims)
-    _, P = moments(graph, [*keys, 501])
-    assert set(found) == set(dims)
-    for key, block in found.items():
-        rows = _rows([*keys, 501], dims, key)
-        np.testing.assert_allclose(block, P[np.ix_(rows, rows)], rtol=1e-9, atol=1e-12)
-    with pytest.raises(FactorError, match="dims: expected the dimensions of"):
-        block_covariances(graph.eliminateMultifrontal(), dims | {keys[0]: 7})
+def test_block_covariances_are_those_of_the_dense_inverse(covariance, subtests):
+    for options in [{}, {"function": gtsam.EliminateQR}]:
+        for seed in range(5):
+            with subtests.test(options=options, seed=seed):
+                rng = np.random.default_rng(seed)
+                keys = rng.permutation(500)[:12].tolist()
+                dims = {key: int(rng.integers(1, 5)) for key in keys}
+                graph = random_graph(rng, dims, covariance)
+                graph.push_back(prior_factor(501, np.zeros(2), np.eye(2)))  # a tree of its own
+                dims[501] = 2
+                found = block_covariances(graph.eliminateMultifrontal(**options), dims)
+                _, P = moments(graph, [*keys, 501])
+                assert set(found) == set(dims)
+                for key, block in found.items():
+                    rows = _rows([*keys, 501], dims, key)
+                    np.testing.assert_allclose(block, P[np.ix_(rows, rows)], rtol=1e-9, atol=1e-12)
+                with pytest.raises(FactorError, match="dims: expected the dimensions of"):
+                    block_covariances(graph.eliminateMultifrontal(), dims | {keys[0]: 7})
 
 
 def test_block_covariances_refuse_a_hard_constraint():
@@ -126,19 +127,16 @@ def test_many_factors_equal_one_by_one(seed, covariance):
         np.testing.assert_allclose(factor.augmentedJacobian(), alone.augmentedJacobian(), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("keys", "means", "P", "message"),
-    [
+def test_bad_lists_of_priors_are_refused(subtests):
+    for keys, means, P, message in [
         ([1, 2], [[0.0], [0.0]], np.ones((3, 1, 1)), "expected 2 covariances, got 3"),
         ([1, 1], [[0.0], [0.0]], np.eye(1), "more than once"),
         ([1], [[0.0], [0.0]], np.eye(1), "keys: expected 2 rows"),
         ([1, 2], [[0.0], [np.nan]], np.eye(1), r"means\[1, 0\]"),
         ([1, 2], [0.0, 0.0], np.eye(1), "means: expected shape"),
-    ],
-)
-def test_bad_lists_of_priors_are_refused(keys, means, P, message):
-    with pytest.raises(FactorError, match=message):
-        prior_factors(keys, means, P)
+    ]:
+        with subtests.test(message), pytest.raises(FactorError, match=message):
+            prior_factors(keys, means, P)
 
 
 def test_eliminating_nothing_or_everything(covariance):
@@ -167,40 +165,45 @@ def test_unknown_key_is_refused(covariance):
         marginal_moments(graph, [1, 2])
 
 
-@pytest.mark.parametrize("elimination", ["cholesky", "qr"])
-def test_singular_system_names_the_free_variables_only(elimination):
-    x = [gtsam.symbol("x", i) for i in range(4)]
-    between = [np.eye(2), -np.eye(2)]
-    graph = gaussian_graph(
-        [
-            prior_factor(x[0], [0.0, 0.0], np.eye(2)),
-            gaussian_factor([x[0], x[1]], between, [0.0, 0.0]),
-            gaussian_factor([x[2], x[3]], between, [0.0, 0.0]),  # these two hang in the air
-        ]
-    )
-    with pytest.raises(SingularSystemError, match="does not determine x2, x3") as caught:
-        marginal_factors(graph, x, elimination)
-    assert caught.value.keys == (x[2], x[3])
-    with pytest.raises(SingularSystemError):
-        marginal_moments(graph, x, elimination)
+def test_singular_system_names_the_free_variables_only(subtests):
+    for elimination in ["cholesky", "qr"]:
+        with subtests.test(elimination=elimination):
+            x = [gtsam.symbol("x", i) for i in range(4)]
+            between = [np.eye(2), -np.eye(2)]
+            graph = gaussian_graph(
+                [
+                    prior_factor(x[0], [0.0, 0.0], np.eye(2)),
+                    gaussian_factor([x[0], x[1]], between, [0.0, 0.0]),
+                    gaussian_factor([x[2], x[3]], between, [0.0, 0.0]),  # these two hang in the air
+                ]
+            )
+            with pytest.raises(SingularSystemError, match="does not determine x2, x3") as caught:
+                marginal_factors(graph, x, elimination)
+            assert caught.value.keys == (x[2], x[3])
+            with pytest.raises(SingularSystemError):
+                marginal_moments(graph, x, elimination)
 
 
-@pytest.mark.parametrize("elimination", ["cholesky", "qr"])
-def test_variable_whose_factors_vanish_is_named(elimination):
-    graph = gaussian_graph([gaussian_factor([1, 2], [np.eye(2), np.eye(2)], [0.0, 0.0])])
-    with pytest.raises(SingularSystemError, match="does not determine"):
-        marginal_moments(graph, [1], elimination)
+def test_variable_whose_factors_vanish_is_named(subtests):
+    for elimination in ["cholesky", "qr"]:
+        with subtests.test(elimination=elimination):
+            graph = gaussian_graph([gaussian_factor([1, 2], [np.eye(2), np.eye(2)], [0.0, 0.0])])
+            with pytest.raises(SingularSystemError, match="does not determine"):
+                marginal_moments(graph, [1], elimination)
 
 
-@pytest.mark.parametrize("elimination", ["cholesky", "qr"])
-@pytest.mark.parametrize("others", [[], [6]])
-@pytest.mark.parametrize("broken", ["getA", "getb"])
-def test_nan_is_found_when_marginalising(broken, others, elimination):
-    factor = prior_factor(5, [1.0], [[1.0]])
-    getattr(factor, broken)()[:] = np.nan  # as an in-place update might
-    graph = gaussian_graph([factor, *(gaussian_factor([5, key], [[[1.0]], [[1.0]]], [0.0]) for key in others)])
-    with pytest.raises(FactorError, match="factors on 5 hold numbers that are not finite"):
-        marginal_factors(graph, [5], elimination)
+def test_nan_is_found_when_marginalising(subtests):
+    for elimination in ["cholesky", "qr"]:
+        for others in [[], [6]]:
+            for broken in ["getA", "getb"]:
+                with subtests.test(elimination=elimination, others=others, broken=broken):
+                    factor = prior_factor(5, [1.0], [[1.0]])
+                    getattr(factor, broken)()[:] = np.nan  # as an in-place update might
+                    graph = gaussian_graph(
+                        [factor, *(gaussian_factor([5, key], [[[1.0]], [[1.0]]], [0.0]) for key in others)]
+                    )
+                    with pytest.raises(FactorError, match="factors on 5 hold numbers that are not finite"):
+                        marginal_factors(graph, [5], elimination)
 
 
 def test_unknown_elimination_is_refused():
@@ -222,17 +225,14 @@ def test_qr_keeps_the_digits_that_cholesky_loses():
     assert abs(rough[0] - mean[0]) > 1e-9
 
 
-@pytest.mark.parametrize(
-    ("keys", "means", "covariance", "message"),
-    [
+def test_bad_joint_prior_is_refused(subtests):
+    for keys, means, covariance, message in [
         ([1, 1], [[0.0], [0.0]], np.eye(2), "more than once"),
         ([1, 2], [[0.0]], np.eye(2), "one vector per key"),
         ([], [], np.empty((0, 0)), "one vector per key"),
         ([1, 2], [[0.0], [0.0, 1.0]], np.eye(2), r"covariance: expected shape \(3, 3\)"),
         ([1, 2], [[0.0], [np.inf]], np.eye(2), "finite"),
         ([1, 2], [[0.0], [0.0]], np.ones((2, 2)), "singular"),
-    ],
-)
-def test_bad_joint_prior_is_refused(keys, means, covariance, message):
-    with pytest.raises(FactorError, match=message):
-        joint_prior_factor(keys, means, covariance)
+    ]:
+        with subtests.test(message), pytest.raises(FactorError, match=message):
+            joint_prior_factor(keys, means, covariance)

@@ -237,11 +237,12 @@ def test_factor_on_unknown_variable_is_named():
         solve(graph, [detection_factor(X[5], position(2), [0.0, 0.0], np.eye(2))], values_of({X[0]: np.zeros(1)}))
 
 
-@pytest.mark.parametrize("state", [np.zeros(3), gtsam.Pose2()])
-def test_linear_factor_on_another_dimension_is_refused(state):
-    graph = nonlinear_graph([prior_factor(X[0], [0.0, 0.0], np.eye(2))], {X[0]: 2})
-    with pytest.raises(FactorError, match="2 columns, but these variables have 3 dimensions"):
-        solve(graph, [], values_of({X[0]: state}))
+def test_linear_factor_on_another_dimension_is_refused(subtests):
+    for state in [np.zeros(3), gtsam.Pose2()]:
+        with subtests.test(state=state):
+            graph = nonlinear_graph([prior_factor(X[0], [0.0, 0.0], np.eye(2))], {X[0]: 2})
+            with pytest.raises(FactorError, match="2 columns, but these variables have 3 dimensions"):
+                solve(graph, [], values_of({X[0]: state}))
 
 
 def test_gtsams_own_complaints_come_as_factor_errors():
@@ -267,17 +268,14 @@ def test_solution_passes_on_its_linear_factors():
     np.testing.assert_allclose(solution.covariance([0]), np.linalg.inv(again.hessian()[0]), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
+def test_bad_settings_are_refused(subtests):
+    for given in [
         {"method": "newton"},
         {"max_iterations": 0},
         {"tolerance": 0.0},
         {"damping": -1.0},
         {"tolerance": np.nan},
         {"relative_tolerance": -1e-9},
-    ],
-)
-def test_bad_settings_are_refused(given):
-    with pytest.raises(FactorError):
-        SolverSettings(**given)
+    ]:
+        with subtests.test(given=given), pytest.raises(FactorError):
+            SolverSettings(**given)

@@ -81,9 +81,8 @@ def difference(x, y):
     return x - y
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
+def test_bad_fields_are_refused(subtests):
+    for given, message in [
         ({"rows": [[1, 2], [3, 4, 5]]}, "rows of the same length"),
         ({"rows": [1, 2]}, "rows: expected shape"),
         ({"rows": [[1], [2]]}, "rows: expected shape"),
@@ -91,18 +90,15 @@ def difference(x, y):
         ({"covariances": np.eye(2)[:1]}, "square"),
         ({"covariances": [np.eye(2)] * 3}, "expected 2 covariances"),
         ({"angles": (2,)}, "angles"),
-    ],
-)
-def test_bad_fields_are_refused(given, message):
-    with pytest.raises(FactorError, match=message):
-        ResidualFactors(
-            **{"rows": [[1, 2], [3, 4]], "dims": (2, 2), "residual": difference, "covariances": np.eye(2), **given}
-        )
+    ]:
+        with subtests.test(message), pytest.raises(FactorError, match=message):
+            ResidualFactors(
+                **{"rows": [[1, 2], [3, 4]], "dims": (2, 2), "residual": difference, "covariances": np.eye(2), **given}
+            )
 
 
-@pytest.mark.parametrize(
-    ("residual", "jacobians", "message"),
-    [
+def test_faulty_functions_become_factor_errors(subtests):
+    for residual, jacobians, message in [
         (lambda x, y: x[:, :1] - y[:, :1], None, r"2 factors on 1, 3: residual: expected shape \(2, 2\)"),
         (lambda x, y: np.full(x.shape, np.nan), None, r"residual\[0, 0\]: expected a finite number"),
         (lambda x, y: 1 / 0, None, "ZeroDivisionError"),
@@ -110,15 +106,14 @@ def test_bad_fields_are_refused(given, message):
         (difference, lambda x, y: [np.zeros((2, 2, 2))], "a list of 2 Jacobians"),
         (difference, lambda x, y: [np.zeros((2, 2, 2)), np.zeros((2, 2))], "Jacobian 1: expected shape"),
         (lambda x, y: np.add(x, y, out=x), None, "read-only"),
-    ],
-)
-def test_faulty_functions_become_factor_errors(residual, jacobians, message):
-    factors = ResidualFactors(np.array([[1, 2], [3, 4]]), (2, 2), residual, np.eye(2), jacobians)
-    values = gtsam.Values()
-    for key in range(1, 5):
-        values.insert(key, np.ones(2))
-    with pytest.raises(FactorError, match=message):
-        factors.linearise(values)
+    ]:
+        with subtests.test(message):
+            factors = ResidualFactors(np.array([[1, 2], [3, 4]]), (2, 2), residual, np.eye(2), jacobians)
+            values = gtsam.Values()
+            for key in range(1, 5):
+                values.insert(key, np.ones(2))
+            with pytest.raises(FactorError, match=message):
+                factors.linearise(values)
 
 
 def test_missing_or_mistyped_variables_are_named():

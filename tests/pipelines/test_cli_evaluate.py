@@ -65,20 +65,18 @@ def test_some_scenes_alone(drive: Path, tmp_path: Path) -> None:
     assert json.loads(file.read_text())["scenes"] == ["scene-1"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
+def test_mistakes_are_one_line(drive: Path, subtests: pytest.Subtests) -> None:
+    for arguments, expected in [
         (("--split", "drive", "--scenes", "scene-0"), "either --split NAME or --scenes"),
         ((), "either --split NAME or --scenes"),
         (("--split", "dribe"), "did you mean 'drive'"),
         (("--split", "drive", "--json", "/nowhere/f.json"), "not writable"),
-    ],
-)
-def test_mistakes_are_one_line(drive: Path, arguments: tuple[str, ...], expected: str) -> None:
-    result = evaluate("nuscenes", drive / "result.json", "--dataroot", drive, *arguments)
-    assert result.exit_code == 2
-    assert expected in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    ]:
+        with subtests.test(expected):
+            result = evaluate("nuscenes", drive / "result.json", "--dataroot", drive, *arguments)
+            assert result.exit_code == 2
+            assert expected in result.stderr
+            assert len(result.stderr.splitlines()) == 1
 
 
 def test_a_result_that_lacks_a_sample_is_refused(drive: Path, tmp_path: Path) -> None:
@@ -164,11 +162,12 @@ def test_persons_are_false_or_exempt(tmp_path: Path) -> None:
     assert "--persons: expected false or exempt, got 'sitting'" in result.stderr
 
 
-@pytest.mark.parametrize("iou", ["half", "0", "1.5", ","])
-def test_overlaps_that_are_none(tmp_path: Path, iou: str) -> None:
-    result = evaluate("kitti", tmp_path, "--dataroot", tmp_path, "--iou", iou)
-    assert result.exit_code == 2
-    assert "--iou: expected" in result.stderr
+def test_overlaps_that_are_none(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for iou in ["half", "0", "1.5", ","]:
+        with subtests.test(iou=iou):
+            result = evaluate("kitti", tmp_path, "--dataroot", tmp_path, "--iou", iou)
+            assert result.exit_code == 2
+            assert "--iou: expected" in result.stderr
 
 
 def test_simulated_scenes_are_judged_at_every_moment(tmp_path: Path) -> None:

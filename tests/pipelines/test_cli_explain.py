@@ -53,18 +53,16 @@ def test_a_track_that_lives_to_the_end(folder: Path) -> None:
     assert "then the recording ends" in result.stdout.splitlines()[0]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
+def test_tracks_that_are_not_there(folder: Path, subtests: pytest.Subtests) -> None:
+    for arguments, expected in [
         (("--track", "1"), "expected --scene, the track is in a, b"),
         (("--track", "99"), "expected events of track 99, there are none"),
         (("--track", "car"), "expected the number of a track"),
-    ],
-)
-def test_tracks_that_are_not_there(folder: Path, arguments: tuple[str, ...], expected: str) -> None:
-    result = saga_fg("explain", folder / "tracks.csv", *arguments)
-    assert result.exit_code == 2
-    assert expected in result.stderr
+    ]:
+        with subtests.test(expected):
+            result = saga_fg("explain", folder / "tracks.csv", *arguments)
+            assert result.exit_code == 2
+            assert expected in result.stderr
 
 
 def test_journals_that_are_not_there_or_broken(tmp_path: Path) -> None:
@@ -78,19 +76,22 @@ def test_journals_that_are_not_there_or_broken(tmp_path: Path) -> None:
         assert expected in result.stderr
 
 
-@pytest.mark.parametrize("change", [{"time": "noon"}, {"time": None}, {"event": "eaten"}, {"sensor": {}}, {"label": 1}])
-def test_an_event_that_nobody_wrote(folder: Path, tmp_path: Path, change: dict[str, object]) -> None:
-    lines = (folder / "tracks.csv.journal.jsonl").read_text().splitlines()
-    events = [json.loads(line) for line in lines]
-    changed = next(event for event in events if event.get("track") == 1)
-    changed.update(change)
-    if "label" in change:
-        del changed["label"]
-    (tmp_path / "t.csv.journal.jsonl").write_text("\n".join(map(json.dumps, events)))
-    result = saga_fg("explain", tmp_path / "t.csv", "--track", "1", "--scene", changed["scene"])
-    assert result.exit_code == 2
-    assert result.stderr.startswith(f"error: {tmp_path / 't.csv.journal.jsonl'}: expected events as --explain writes")
-    assert result.stdout == ""
+def test_an_event_that_nobody_wrote(folder: Path, tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for change in [{"time": "noon"}, {"time": None}, {"event": "eaten"}, {"sensor": {}}, {"label": 1}]:
+        with subtests.test(change=change):
+            lines = (folder / "tracks.csv.journal.jsonl").read_text().splitlines()
+            events = [json.loads(line) for line in lines]
+            changed = next(event for event in events if event.get("track") == 1)
+            changed.update(change)
+            if "label" in change:
+                del changed["label"]
+            (tmp_path / "t.csv.journal.jsonl").write_text("\n".join(map(json.dumps, events)))
+            result = saga_fg("explain", tmp_path / "t.csv", "--track", "1", "--scene", changed["scene"])
+            assert result.exit_code == 2
+            assert result.stderr.startswith(
+                f"error: {tmp_path / 't.csv.journal.jsonl'}: expected events as --explain writes"
+            )
+            assert result.stdout == ""
 
 
 def test_the_running_graph_is_drawn(folder: Path, tmp_path: Path) -> None:
@@ -136,11 +137,10 @@ def test_a_graph_that_nobody_wrote(tmp_path: Path) -> None:
         assert "expected graphs as --explain writes them" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("option", "expected"), [(("--method", "centerpoint"), "keeps no journal"), (("--workers", "1"), "goes without")]
-)
-def test_what_keeps_no_journal(folder: Path, tmp_path: Path, option: tuple[str, ...], expected: str) -> None:
-    arguments = (folder / "detections.csv", "-o", tmp_path / "out.csv", "--explain")
-    result = saga_fg("track", "file", *arguments, *option)
-    assert result.exit_code == 2
-    assert expected in result.stderr
+def test_what_keeps_no_journal(folder: Path, tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for option, expected in [(("--method", "centerpoint"), "keeps no journal"), (("--workers", "1"), "goes without")]:
+        with subtests.test(expected):
+            arguments = (folder / "detections.csv", "-o", tmp_path / "out.csv", "--explain")
+            result = saga_fg("track", "file", *arguments, *option)
+            assert result.exit_code == 2
+            assert expected in result.stderr

@@ -131,9 +131,8 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
     assert len(rejected) <= len(named) + 1
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_options_that_do_not_go_together(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for options, message in [
         (["--robust", "huber", "--compare"], "--compare: expected without a robust loss"),
         (["--robust", "huber", "--certify"], "--certify: expected without a robust loss"),
         (
@@ -145,15 +144,14 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
         (["--robust", "consensus", "--robust-scale", "2"], "--robust-scale: expected with --robust"),
         (["--isam2-batch", "2"], "--isam2-batch: expected with --compare only"),
         (["--robust", "huber", "--robust-scale", "-1"], "--robust-scale -1: expected a number > 0"),
-    ],
-)
-def test_options_that_do_not_go_together(tmp_path: Path, options: list[str], message: str) -> None:
-    graph, _ = loop(2, seed=0)
-    write_g2o(tmp_path / "loop.g2o", graph)
-    arguments = ["slam", "g2o", str(tmp_path / "loop.g2o"), "--output", str(tmp_path / "out"), *options]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 2
-    assert message in result.stderr
+    ]:
+        with subtests.test(message):
+            graph, _ = loop(2, seed=0)
+            write_g2o(tmp_path / "loop.g2o", graph)
+            arguments = ["slam", "g2o", str(tmp_path / "loop.g2o"), "--output", str(tmp_path / "out"), *options]
+            result = CliRunner().invoke(app, arguments)
+            assert result.exit_code == 2
+            assert message in result.stderr
 
 
 def test_a_broken_file_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:

@@ -14,16 +14,21 @@ from pipelines.slam.submaps import SlamMap, read_map, write_map
 POINT = SlamMap([np.ones((1, 3), dtype=np.float32)], np.eye(4)[None])
 
 
-@pytest.mark.parametrize("name", ["providers", "landmarks"])
-def test_what_a_configuration_adds_is_refused_in_a_map(recordings: Path, tmp_path: Path, name: str) -> None:
-    write_map(tmp_path, POINT)
-    (tmp_path / "own.yaml").write_text(f"slam: {{{name}: [own:Own]}}\n")
-    command = ["slam", "kitti", "--dataroot", str(recordings / "kitti"), "--map", str(tmp_path)]
-    outcome = CliRunner().invoke(
-        app, [*command, "--config", str(tmp_path / "own.yaml"), "--output", str(tmp_path / "out")]
-    )
-    assert outcome.exit_code != 0
-    assert "--config: slam.providers, slam.landmarks: expected without --map" in " ".join(outcome.output.split())
+def test_what_a_configuration_adds_is_refused_in_a_map(
+    recordings: Path, tmp_path: Path, subtests: pytest.Subtests
+) -> None:
+    for name in ["providers", "landmarks"]:
+        with subtests.test(name=name):
+            write_map(tmp_path, POINT)
+            (tmp_path / "own.yaml").write_text(f"slam: {{{name}: [own:Own]}}\n")
+            command = ["slam", "kitti", "--dataroot", str(recordings / "kitti"), "--map", str(tmp_path)]
+            outcome = CliRunner().invoke(
+                app, [*command, "--config", str(tmp_path / "own.yaml"), "--output", str(tmp_path / "out")]
+            )
+            assert outcome.exit_code != 0
+            assert "--config: slam.providers, slam.landmarks: expected without --map" in " ".join(
+                outcome.output.split()
+            )
 
 
 @pytest.mark.parametrize("guess", ["1,2", "1,2,3,x", "1,2,3,nan"])
@@ -35,12 +40,22 @@ def test_a_guess_that_is_none_is_named(recordings: Path, tmp_path: Path, guess: 
     assert f"--guess: expected x,y,z,yaw, m and rad, got '{guess}'" in " ".join(outcome.output.split())
 
 
-@pytest.mark.parametrize("option", [["--odometry", "oxts"], ["--no-landmarks"]])
-def test_options_that_a_map_has_no_use_for_are_refused(tmp_path: Path, option: list[str]) -> None:
-    command = ["slam", "kitti", "--dataroot", str(tmp_path), "--map", str(tmp_path), "--output", str(tmp_path / "o")]
-    outcome = CliRunner().invoke(app, [*command, *option])
-    assert outcome.exit_code != 0
-    assert "--map: expected without" in outcome.output
+def test_options_that_a_map_has_no_use_for_are_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for option in [["--odometry", "oxts"], ["--no-landmarks"]]:
+        with subtests.test(option=option):
+            command = [
+                "slam",
+                "kitti",
+                "--dataroot",
+                str(tmp_path),
+                "--map",
+                str(tmp_path),
+                "--output",
+                str(tmp_path / "o"),
+            ]
+            outcome = CliRunner().invoke(app, [*command, *option])
+            assert outcome.exit_code != 0
+            assert "--map: expected without" in outcome.output
 
 
 def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_path: Path) -> None:

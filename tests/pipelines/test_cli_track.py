@@ -88,9 +88,8 @@ def test_the_same_command_writes_the_same_file(simulated: Path, tmp_path: Path) 
     assert contents[0] == contents[1]
 
 
-@pytest.mark.parametrize(
-    ("extra", "message"),
-    [
+def test_mistakes_end_in_one_line_and_no_file(simulated: Path, tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for extra, message in [
         ((), "expected either --split NAME or --scenes A,B"),
         (("--split", "all", "--scenes", "scene-0001"), "expected either --split NAME or --scenes A,B"),
         (("--split", "everything"), "unknown split 'everything'"),
@@ -99,17 +98,14 @@ def test_the_same_command_writes_the_same_file(simulated: Path, tmp_path: Path) 
         (("--split", "all", "--detections", "camera=none.json"), "none.json"),
         (("--split", "all", "--version", "v1.0-none"), "v1.0-none"),
         (("--split", "all", "--config", "none.yaml"), "none.yaml: cannot be read"),
-    ],
-)
-def test_mistakes_end_in_one_line_and_no_file(
-    simulated: Path, tmp_path: Path, extra: tuple[str, ...], message: str
-) -> None:
-    result = saga_fg(*arguments(simulated, tmp_path / "tracks.json"), *extra)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert result.stderr.startswith("error: ")
-    assert result.stderr.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
+    ]:
+        with subtests.test(message):
+            result = saga_fg(*arguments(simulated, tmp_path / "tracks.json"), *extra)
+            assert result.exit_code == 2
+            assert message in result.stderr
+            assert result.stderr.startswith("error: ")
+            assert result.stderr.count("\n") == 1
+            assert list(tmp_path.iterdir()) == []
 
 
 def test_a_scene_that_breaks_on_the_way_leaves_the_earlier_result(

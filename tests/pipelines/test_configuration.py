@@ -194,9 +194,8 @@ def test_aliases_that_stand_for_millions_of_entries_are_not_printed() -> None:
     assert str(caught.value) == "my.yaml: rules[0].kind: expected one of distance, following_rule, got a list"
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_mistakes_are_one_line_errors(subtests: pytest.Subtests) -> None:
+    for text, message in [
         ("gate: {probabilty: 0.5}", "my.yaml: gate.probabilty: unknown key, did you mean 'probability'?"),
         ("gaet: {}", "my.yaml: gaet: unknown key, did you mean 'gate'?"),
         (
@@ -235,12 +234,11 @@ def test_aliases_that_stand_for_millions_of_entries_are_not_printed() -> None:
         ("- 1", "my.yaml: the top level: expected a section (key: value), got a list"),
         ("name: 2020-02-31", "my.yaml: expected YAML: day is out of range for month"),
         ("gate: {", "my.yaml: expected YAML: line 1, column 8: expected the node content, but found '<stream end>'"),
-    ],
-)
-def test_mistakes_are_one_line_errors(text: str, message: str) -> None:
-    with pytest.raises(InputError) as caught:
-        read_settings(WholeSettings, text, "my.yaml")
-    assert str(caught.value) == message
+    ]:
+        with subtests.test(message):
+            with pytest.raises(InputError) as caught:
+                read_settings(WholeSettings, text, "my.yaml")
+            assert str(caught.value) == message
 
 
 def test_unreadable_files_are_named(tmp_path: Path) -> None:

@@ -66,24 +66,25 @@ def test_what_is_told_mends_it_when_pasted(
     assert not told(*option)
 
 
-@pytest.mark.parametrize("command", ["inspect", "track"])
 def test_classes_that_are_numbers_are_to_be_filled_in(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, command: str
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, subtests: pytest.Subtests
 ) -> None:
-    found = [{**row, "category": n % 2} for n, row in enumerate(rows()[0])]
-    table = write(tmp_path / "d.csv", found)
-    units = ["--units", "angle=deg,score=percent"]
-    if command == "inspect":
-        text = saga_fg("inspect", table, *units).stdout
-        assert "saga-fg track file" in text.split("Next, with what fits in place of ...:")[1]
-        assert "--classes 0=...,1=... " in text.split("Next, with what fits in place of ...:")[1]
-    else:
-        assert saga_fg("track", "file", table, *units, "--sort", "-o", tmp_path / "t.csv").exit_code == 0
-        text = caplog.text
-    assert "objects are tracked one by one; fill in and add --classes 0=...,1=..." in text
-    pasted = saga_fg("track", "file", table, "--classes", "0=...,1=...", "-o", tmp_path / "t.csv")
-    assert pasted.exit_code == 2
-    assert "--classes: 0=...: expected a name in place of the dots" in pasted.stderr
+    for command in ["inspect", "track"]:
+        with subtests.test(command=command):
+            found = [{**row, "category": n % 2} for n, row in enumerate(rows()[0])]
+            table = write(tmp_path / "d.csv", found)
+            units = ["--units", "angle=deg,score=percent"]
+            if command == "inspect":
+                text = saga_fg("inspect", table, *units).stdout
+                assert "saga-fg track file" in text.split("Next, with what fits in place of ...:")[1]
+                assert "--classes 0=...,1=... " in text.split("Next, with what fits in place of ...:")[1]
+            else:
+                assert saga_fg("track", "file", table, *units, "--sort", "-o", tmp_path / "t.csv").exit_code == 0
+                text = caplog.text
+            assert "objects are tracked one by one; fill in and add --classes 0=...,1=..." in text
+            pasted = saga_fg("track", "file", table, "--classes", "0=...,1=...", "-o", tmp_path / "t.csv")
+            assert pasted.exit_code == 2
+            assert "--classes: 0=...: expected a name in place of the dots" in pasted.stderr
 
 
 def test_settings_for_a_class_or_sensor_that_the_data_lack(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -203,9 +204,10 @@ POSE = {"ego_x": 0.0, "ego_y": 0.0, "ego_yaw": 0.0}
 GOOD = {"timestamp": 0.0, "x": 1.0, "y": 2.0, "scene": "a", "vx": 0.5, "length": 4.0, **POSE}
 
 
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
+def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(
+    tmp_path: Path, subtests: pytest.Subtests
+) -> None:
+    for row, message in [
         ({"x": 2e9}, "line 5: x: expected a finite number within 1e+09, got 2e+09"),
         ({"y": -1e300}, "line 5: y: expected a finite number within 1e+09, got -1e+300"),
         ({"vx": 1e7}, "line 5: vx: expected a finite number within 1e+06, got 1e+07"),
@@ -214,20 +216,17 @@ GOOD = {"timestamp": 0.0, "x": 1.0, "y": 2.0, "scene": "a", "vx": 0.5, "length":
         ({"ego_x": 1e12}, "line 5: ego_x: expected a finite number within 1e+09, got 1e+12"),
         ({"ego_yaw": 1.0}, "line 6: ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time"),
         ({"scene": "n" * 300}, "line 5: scene: expected a name of at most 256 characters"),
-    ],
-)
-def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(
-    tmp_path: Path, row: dict[str, object], message: str
-) -> None:
-    found = [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("abcd")]
-    table = write(tmp_path / "d.csv", [*found[:3], found[3] | row, found[3]])
-    tracked = saga_fg("track", "file", table, "--output", tmp_path / "t.csv")
-    assert tracked.exit_code == 2
-    assert tracked.stderr.startswith(f"error: {table}: ")
-    assert message in tracked.stderr
-    look = saga_fg("inspect", table)
-    assert message in look.stdout + look.stderr
-    assert look.exit_code == 2 or "Next, when the table is mended:" in look.stdout
+    ]:
+        with subtests.test(message):
+            found = [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("abcd")]
+            table = write(tmp_path / "d.csv", [*found[:3], found[3] | row, found[3]])
+            tracked = saga_fg("track", "file", table, "--output", tmp_path / "t.csv")
+            assert tracked.exit_code == 2
+            assert tracked.stderr.startswith(f"error: {table}: ")
+            assert message in tracked.stderr
+            look = saga_fg("inspect", table)
+            assert message in look.stdout + look.stderr
+            assert look.exit_code == 2 or "Next, when the table is mended:" in look.stdout
 
 
 def test_a_look_sees_scenes_that_are_scattered_in_a_long_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

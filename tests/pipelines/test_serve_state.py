@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from pipelines.serving import Address, StreamClient
 from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
@@ -76,23 +74,21 @@ def test_frames_that_were_held_are_sent_again(tmp_path: Path):
         assert status(address)["taken"] == {"sensor": 12}
 
 
-@pytest.mark.parametrize(
-    ("other", "expected"),
-    [
+def test_the_state_of_another_configuration_is_refused(tmp_path: Path, subtests):
+    for other, expected in [
         (["--method", "kf"], "method: the state is of another one, 'saga' instead of 'kf'"),
         (["--estimator", "isam2"], "'estimator: kalman' instead of 'estimator: isam2'"),
-    ],
-)
-def test_the_state_of_another_configuration_is_refused(tmp_path: Path, other: list[str], expected: str):
-    state = tmp_path / "state"
-    command = [*COMMAND, "serve", "--snapshot", str(state)]
-    subprocess.run(command, input=frame(0), capture_output=True, check=True)
-    before = state.read_bytes()
-    done = subprocess.run([*command, *other], input="", capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert expected in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert state.read_bytes() == before
+    ]:
+        with subtests.test(expected):
+            state = tmp_path / "state"
+            command = [*COMMAND, "serve", "--snapshot", str(state)]
+            subprocess.run(command, input=frame(0), capture_output=True, check=True)
+            before = state.read_bytes()
+            done = subprocess.run([*command, *other], input="", capture_output=True, text=True, check=False)
+            assert done.returncode == 2
+            assert expected in done.stderr
+            assert len(done.stderr.splitlines()) == 1
+            assert state.read_bytes() == before
 
 
 def test_factors_of_ones_own_cannot_be_kept(tmp_path: Path):

@@ -89,17 +89,15 @@ def test_a_kind_of_landmark_is_found_and_holds_the_path(street: Path) -> None:
     assert json.loads((street / "plain" / "landmarks.json").read_text()) == []
 
 
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [
+def test_what_cannot_be_is_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for config, message in [
         ("slam: {providers: [wall]}", "providers: expected MODULE:NAME, got 'wall'"),
         ("slam: {landmarks: ['collections:Counter']}", "expected a detector of landmarks, which has a method"),
         ("tracker: {estimator: isam2, providers: ['a:B']}", "tracker.providers: expected under slam"),
         ("slam: {joint: {rounds: 0}}", "slam.joint"),
-    ],
-)
-def test_what_cannot_be_is_refused(tmp_path: Path, config: str, message: str) -> None:
-    done = run(tmp_path / "out", config)
-    assert done.exit_code == 2
-    assert message in done.output
-    assert not (tmp_path / "out").exists()
+    ]:
+        with subtests.test(message):
+            done = run(tmp_path / "out", config)
+            assert done.exit_code == 2
+            assert message in done.output
+            assert not (tmp_path / "out").exists()

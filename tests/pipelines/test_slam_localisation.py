@@ -156,22 +156,23 @@ def test_outside_the_map_odometry_goes_on_and_back_in_it_the_place_is_found(know
     assert off[-10:].max() < 0.3
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_of_two_like_streets_none_is_taken(known: SlamMap, turned: bool) -> None:
-    further = known.map_T_submap.copy()
-    further[:, 0, 3] += 300.0
-    both = [known.map_T_submap, further]
-    twice = SlamMap([*known.points, *known.points], np.concatenate(both[::-1] if turned else both))
-    poses = drive(5.0, 0.5, 25)
-    scans = SimulatedScans(3, world_T_lidar=poses)
-    with pytest.raises(InputError, match="it is ambiguous: several places of the map look like it"):
-        localise(scans, twice)
-    fixes = poses[:, :3, 3] + np.random.default_rng(0).normal(0, 1.0, (25, 3))
-    fixes[:2] += 1000.0  # elsewhere at first: the place is then looked for everywhere, and is ambiguous
-    by_gps = localise(scans, twice, log=SensorLog({"gps": np.column_stack([scans.timestamps, fixes])}))
-    assert np.linalg.norm(by_gps.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.4
-    told = localise(scans, twice, poses[0])
-    assert np.linalg.norm(told.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
+def test_of_two_like_streets_none_is_taken(known: SlamMap, subtests: pytest.Subtests) -> None:
+    for turned in [False, True]:
+        with subtests.test(turned=turned):
+            further = known.map_T_submap.copy()
+            further[:, 0, 3] += 300.0
+            both = [known.map_T_submap, further]
+            twice = SlamMap([*known.points, *known.points], np.concatenate(both[::-1] if turned else both))
+            poses = drive(5.0, 0.5, 25)
+            scans = SimulatedScans(3, world_T_lidar=poses)
+            with pytest.raises(InputError, match="it is ambiguous: several places of the map look like it"):
+                localise(scans, twice)
+            fixes = poses[:, :3, 3] + np.random.default_rng(0).normal(0, 1.0, (25, 3))
+            fixes[:2] += 1000.0  # elsewhere at first: the place is then looked for everywhere, and is ambiguous
+            by_gps = localise(scans, twice, log=SensorLog({"gps": np.column_stack([scans.timestamps, fixes])}))
+            assert np.linalg.norm(by_gps.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.4
+            told = localise(scans, twice, poses[0])
+            assert np.linalg.norm(told.trajectory.positions - poses[:, :3, 3], axis=1).max() < 0.3
 
 
 def test_a_drive_shorter_than_the_search_is_looked_for_at_its_end(known: SlamMap) -> None:

@@ -73,9 +73,8 @@ def test_providers_have_settings_of_their_own() -> None:
     assert Tracker(config.tracker).providers == (Odometry(start), Gps(deviation=0.5), Landmarks())
 
 
-@pytest.mark.parametrize(
-    ("provider", "message"),
-    [
+def test_settings_of_providers_that_make_no_sense(subtests: pytest.Subtests) -> None:
+    for provider, message in [
         ('{kind: "saga_fg.providers:Gps", deviation: -1}', r"providers\[0\]: deviation: expected a finite number > 0"),
         ('{kind: "saga_fg.providers:Gps", deviaton: 1}', r"providers\[0\].deviaton: unknown key, did you mean"),
         ('{kind: "saga_fg.providers:Gps", deviation: far}', r"providers\[0\].deviation: expected a number, got"),
@@ -84,24 +83,20 @@ def test_providers_have_settings_of_their_own() -> None:
         ('{kind: "math:sqrt"}', r"providers\[0\].kind: math:sqrt: expected a dataclass"),
         ('{kind: "no_such_module:X"}', r"providers\[0\].kind: .*expected a module that can be imported"),
         ("3", r"providers\[0\]: expected a section \(key: value\), got 3"),
-    ],
-)
-def test_settings_of_providers_that_make_no_sense(provider: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_settings(TrackConfig, f"tracker: {{estimator: isam2, providers: [{provider}]}}")
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            read_settings(TrackConfig, f"tracker: {{estimator: isam2, providers: [{provider}]}}")
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
+def test_a_sensor_that_is_not_finite_is_refused_with_file_and_key(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for setting, message in [
         ("extrinsics: {x: .nan}", "sensors.lidar.extrinsics: x: expected a finite number, got nan"),
         ("extrinsics: {yaw: .inf}", "sensors.lidar.extrinsics: yaw: expected a finite number, got inf"),
         ("class_accuracy: .nan", "sensors.lidar: class_accuracy: expected a number from 0 to 1, got nan"),
-    ],
-)
-def test_a_sensor_that_is_not_finite_is_refused_with_file_and_key(tmp_path: Path, setting: str, message: str) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text(f"sensors:\n  lidar:\n    {setting}\n")
-    with pytest.raises(InputError) as caught:
-        load_config("nuscenes", path)
-    assert str(caught.value) == f"{path}: {message}"
+    ]:
+        with subtests.test(message):
+            path = tmp_path / "mine.yaml"
+            path.write_text(f"sensors:\n  lidar:\n    {setting}\n")
+            with pytest.raises(InputError) as caught:
+                load_config("nuscenes", path)
+            assert str(caught.value) == f"{path}: {message}"

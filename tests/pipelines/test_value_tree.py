@@ -109,9 +109,8 @@ def test_objects_are_made_again_by_their_constructors():
         read_tree(tree.nodes, b"")
 
 
-@pytest.mark.parametrize(
-    "nodes",
-    [
+def test_what_no_writer_writes_is_refused(subtests):
+    for nodes in [
         [],
         [{"object": ["os", "system"], "parts": {}}],
         [{"object": ["pathlib", "Path"], "parts": {}}],
@@ -130,11 +129,9 @@ def test_objects_are_made_again_by_their_constructors():
         [1, {"graph": 0}],
         [1, {"method": [0, "residual"]}],
         [{"object": ["saga_fg.tracking.settings", "TrackerSettings"], "parts": {}}, {"method": [0, "__init__"]}],
-    ],
-)
-def test_what_no_writer_writes_is_refused(nodes: list[Any]):
-    with pytest.raises(InputError):
-        read_tree(nodes, bytes(8))
+    ]:
+        with subtests.test(nodes=nodes), pytest.raises(InputError):
+            read_tree(nodes, bytes(8))
 
 
 def test_what_cannot_be_written_is_refused():
@@ -204,9 +201,8 @@ def record() -> GraphRecord:
     return GraphRecord.of(estimator.graph())
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_a_graph_whose_parts_do_not_fit_is_refused(subtests):
+    for change, message in [
         ({"elimination": "lu"}, "elimination"),
         ({"values": (np.zeros(3), *record().values[1:])}, "expected a state"),
         ({"values": (np.full(4, np.nan), *record().values[1:])}, "finite"),
@@ -215,11 +211,9 @@ def record() -> GraphRecord:
         ({"variables": (replace(record().variables[0], type=PlanarPose()), *record().variables[1:])}, "vector"),
         ({"groups": {0: replace(record().groups[0], active=np.ones(2, dtype=bool))}}, "one truth value a row"),
         ({"variables": (), "base": (), "values": (), "births": ()}, "never added"),
-    ],
-)
-def test_a_graph_whose_parts_do_not_fit_is_refused(change: dict[str, Any], message: str):
-    with pytest.raises(GraphError, match=message):
-        replace(record(), **change).restored()
+    ]:
+        with subtests.test(message), pytest.raises(GraphError, match=message):
+            replace(record(), **change).restored()
 
 
 def test_factors_that_are_more_than_arrays_are_refused_by_name():

@@ -34,14 +34,15 @@ SETTINGS = [
 ]
 
 
-@pytest.mark.parametrize("kind", SETTINGS)
-def test_every_setting_has_a_default_and_a_comment_and_cannot_be_changed(kind):
-    defaults = kind()
-    assert defaults == kind()
-    for field in dataclasses.fields(kind):
-        assert field.metadata["comment"], f"{kind.__name__}.{field.name}"
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        setattr(defaults, dataclasses.fields(kind)[0].name, None)
+def test_every_setting_has_a_default_and_a_comment_and_cannot_be_changed(subtests):
+    for kind in SETTINGS:
+        with subtests.test(kind=kind):
+            defaults = kind()
+            assert defaults == kind()
+            for field in dataclasses.fields(kind):
+                assert field.metadata["comment"], f"{kind.__name__}.{field.name}"
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                setattr(defaults, dataclasses.fields(kind)[0].name, None)
 
 
 def test_groups_are_made_anew():
@@ -55,9 +56,8 @@ def test_groups_are_made_anew():
     assert Outer().names is not Outer().names
 
 
-@pytest.mark.parametrize(
-    ("kind", "values", "message"),
-    [
+def test_numbers_out_of_range_are_refused(subtests):
+    for kind, values, message in [
         (ConstantVelocity, {"acceleration_noise": -1.0}, "acceleration_noise: expected a finite number >= 0, got -1.0"),
         (ConstantVelocity, {"acceleration_noise": math.nan}, "acceleration_noise: expected a finite number >= 0"),
         (ConstantAcceleration, {"jerk_noise": math.inf}, "jerk_noise: expected a finite number >= 0, got inf"),
@@ -90,11 +90,9 @@ def test_groups_are_made_anew():
         (GreedySettings, {"baseline": -1.0}, "baseline: expected a finite number >= 0"),
         (TrackerSettings, {"max_delay": -0.1}, "max_delay: expected a finite number >= 0"),
         (GreedySettings, {"max_coasting": math.nan}, "max_coasting: expected a number > 0"),
-    ],
-)
-def test_numbers_out_of_range_are_refused(kind, values, message):
-    with pytest.raises(InputError, match=message):
-        kind(**values)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            kind(**values)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,9 +106,8 @@ class EveryRange(Settings):
     classes: Mapping[str, GreedySettings] = settings_group(dict, "by class")
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
+def test_a_range_is_that_of_every_entry(subtests):
+    for values, message in [
         ({"angle": 0.0}, "angle: expected a number above 0 to 3, got 0.0"),
         ({"count": 1}, "count: expected a finite number >= 2, got 1"),
         ({"offset": -math.inf}, "offset: expected a finite number, got -inf"),
@@ -121,13 +118,12 @@ class EveryRange(Settings):
         ({"offset": "left"}, "offset: expected a finite number, got 'left'"),
         ({"span": (1.0, "far")}, "span: expected a finite number >= 0, got 'far'"),
         ({"classes": {"car": {"gate": 0.9}}}, "classes.car: expected GreedySettings, got dict"),
-    ],
-)
-def test_a_range_is_that_of_every_entry(values, message):
-    assert EveryRange(angle=3, lag=math.inf, speed={"car": 1.0}).lag == math.inf
-    with pytest.raises(InputError) as caught:
-        EveryRange(**values)
-    assert str(caught.value) == message
+    ]:
+        with subtests.test(message):
+            assert EveryRange(angle=3, lag=math.inf, speed={"car": 1.0}).lag == math.inf
+            with pytest.raises(InputError) as caught:
+                EveryRange(**values)
+            assert str(caught.value) == message
 
 
 def test_scales_may_be_infinite_to_switch_a_kernel_off():

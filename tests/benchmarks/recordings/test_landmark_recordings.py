@@ -46,9 +46,8 @@ def test_a_drive_past_trees_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(drive.covariance[0], [[0.4, 0.1], [0.1, 0.5]])
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
+def test_a_broken_drive_is_located(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for old, new, message in [
         ("LANDMARK 1", "TREE 1", "line 3: expected ODOMETRY or LANDMARK, got 'TREE'"),
         ("0.02 0 0.03\nODO", "0.02 0\nODO", "line 1: expected 11 values after ODOMETRY, got 10"),
         ("1 3 0.5", "2 3 0.5", "line 2: i: expected pose 1, where the row before ended, got 2"),
@@ -57,13 +56,12 @@ def test_a_drive_past_trees_is_read(tmp_path: Path) -> None:
         ("4 -1 0.4", "inf -1 0.4", "line 3: x: expected a finite number, got 'inf'"),
         ("0.4 0.1 0.5", "0.4 0.9 0.5", "line 3: P11 ... P22: expected a positive definite"),
         (PARK, PARK.splitlines()[0], "expected LANDMARK records"),
-    ],
-)
-def test_a_broken_drive_is_located(tmp_path: Path, old: str, new: str, message: str) -> None:
-    path = park(tmp_path, PARK.replace(old, new, 1))
-    with pytest.raises(InputError, match=message) as caught:
-        read_landmark_log(path)
-    assert str(path) in str(caught.value)
+    ]:
+        with subtests.test(message):
+            path = park(tmp_path, PARK.replace(old, new, 1))
+            with pytest.raises(InputError, match=message) as caught:
+                read_landmark_log(path)
+            assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize("named", ["DR", "TL"])
@@ -90,9 +88,8 @@ def test_the_truth_of_beacons_and_drive_is_optional(tmp_path: Path) -> None:
     assert drive.places == {}
 
 
-@pytest.mark.parametrize(
-    ("texts", "message"),
-    [
+def test_broken_ranges_are_located(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for texts, message in [
         ({"TD": "10.1 2 7 -3\n"}, "P_TD.txt: line 1: range: expected a number > 0"),
         ({"TD": "10.1 2 7.5 3\n"}, "P_TD.txt: line 1: beacon: expected a whole number"),
         ({"TD": "10.1 2 7\n"}, "P_TD.txt: line 1: expected 4 columns"),
@@ -102,8 +99,6 @@ def test_the_truth_of_beacons_and_drive_is_optional(tmp_path: Path) -> None:
         ({"GT": ""}, "P_GT.txt: expected records"),
         ({"TL": "1e300 20 30\n"}, "P_TL.txt: line 1: beacon: expected a number within"),
         ({"TL": "7 20\n"}, "P_TL.txt: line 1: expected 3 columns"),
-    ],
-)
-def test_broken_ranges_are_located(tmp_path: Path, texts: dict[str, str], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_landmark_log(plaza(tmp_path, **texts))
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            read_landmark_log(plaza(tmp_path, **texts))

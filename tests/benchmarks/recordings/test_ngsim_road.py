@@ -89,9 +89,8 @@ def test_a_signal_without_a_cycle_is_an_error_that_says_how_to_go_without() -> N
     assert cycles == {}
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_what_is_wrong_in_a_map_is_named(subtests: pytest.Subtests) -> None:
+    for change, message in [
         (lambda e: e["lights"][0].update(cycle=[["blue", 3]]), r"light 7: cycle: expected \[one of red, .*blue"),
         (lambda e: e["lights"][0].update(cycle=[["red", 0]]), r"light 7: cycle: expected .* steps above 0"),
         (lambda e: e["lights"][0].update(time_offset=0.5), r"light 7: time_offset: expected a whole number"),
@@ -105,10 +104,9 @@ def test_a_signal_without_a_cycle_is_an_error_that_says_how_to_go_without() -> N
         (lambda e: e["lanelets"][0].update(successor="3"), r"lanelet 1: successor: expected a list"),
         (lambda e: e["lanelets"][1].update(id=1), r"lanelets: expected unique ids, 1 occurs twice"),
         (lambda e: e.pop("lanelets"), r"map: lanelets: expected a list, got None"),
-    ],
-)
-def test_what_is_wrong_in_a_map_is_named(change: Any, message: str) -> None:
-    entry = crossing()
-    change(entry)
-    with pytest.raises(InputError, match=message):
-        road_of(entry, "map", steps=STEPS)
+    ]:
+        with subtests.test(message):
+            entry = crossing()
+            change(entry)
+            with pytest.raises(InputError, match=message):
+                road_of(entry, "map", steps=STEPS)

@@ -52,9 +52,8 @@ def test_vehicles_that_overlap_stay_as_they_are(tmp_path: Path) -> None:
     assert traffic.vehicles.present[:, traffic.vehicles.id == "9"].sum() == 8
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
+def test_what_is_wrong_in_a_row_is_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for line, message in [
         ("X,A,4,0,car,1,2,0,1,,4.5", r"windows.csv.gz: line 33: expected 12 columns, got 11"),
         ("X,A,4,0,car,east,2,0,1,,4.5,2", r"line 33: x: expected a finite number, got 'east'"),
         ("X,A,4,0.5,car,1,2,0,1,,4.5,2", r"line 33: step: expected a whole number from 0"),
@@ -62,12 +61,11 @@ def test_vehicles_that_overlap_stay_as_they_are(tmp_path: Path) -> None:
         ("X,A,4,0,car,1,2,0,1,,0,2", r"line 33: length: expected a number above 0, got 0"),
         ("X,A,,0,car,1,2,0,1,,4,2", r"line 33: scenario, id, type: expected a value"),
         ("X,A,1,0,car,1,2,0,1,,4.5,2", r"A: vehicle 1: expected one state at 0.0 s, there are more"),
-    ],
-)
-def test_what_is_wrong_in_a_row_is_named(tmp_path: Path, line: str, message: str) -> None:
-    write_ngsim(tmp_path, [*rows(), line], {"A": crossing()})
-    with pytest.raises(InputError, match=message):
-        ngsim_windows(tmp_path).read("A")
+    ]:
+        with subtests.test(message):
+            write_ngsim(tmp_path, [*rows(), line], {"A": crossing()})
+            with pytest.raises(InputError, match=message):
+                ngsim_windows(tmp_path).read("A")
 
 
 def test_wrong_columns_empty_files_and_missing_files_are_errors(tmp_path: Path) -> None:

@@ -76,9 +76,8 @@ def test_a_car_that_stands_keeps_the_heading_that_it_had(tmp_path: Path) -> None
     np.testing.assert_allclose(traffic.vehicles.velocity[30], 0.0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+def test_what_is_wrong_in_the_file_is_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for changes, message in [
         ({"gap_to_next": None}, r"platoons.parquet: gap_to_next: expected this column, the file has setting, run"),
         ({"speed": ["fast"] * K}, r"speed: expected numbers, got object"),
         ({"veh": [1.5] * K}, r"veh: expected whole numbers, got float64"),
@@ -88,12 +87,11 @@ def test_a_car_that_stands_keeps_the_heading_that_it_had(tmp_path: Path) -> None
         ({"t": [0.0, 0.1] * (K // 2)}, r"vehicle 1: expected one state at 0.0 s, there are more"),
         ({"east": [1e12] * K}, r"east, north: expected numbers within 1e\+09"),
         ({"east": [float("nan")] * K}, r"expected positions and speeds, there are none"),
-    ],
-)
-def test_what_is_wrong_in_the_file_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    columns = {name: column for name, column in (platoon((5.0,)) | changes).items() if column is not None}
-    with pytest.raises(InputError, match=message):
-        write(tmp_path, columns).read("short_gap-part1")
+    ]:
+        with subtests.test(message):
+            columns = {name: column for name, column in (platoon((5.0,)) | changes).items() if column is not None}
+            with pytest.raises(InputError, match=message):
+                write(tmp_path, columns).read("short_gap-part1")
 
 
 def test_no_file_and_an_empty_one_are_errors(tmp_path: Path) -> None:

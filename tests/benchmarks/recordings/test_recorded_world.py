@@ -141,18 +141,15 @@ def test_a_vehicle_that_appears_inside_another_is_tracked_with_the_rest(tmp_path
     assert all(np.isfinite(moment.boxes.position).all() for moment in tracks)
 
 
-@pytest.mark.parametrize(
-    ("viewpoint", "message"),
-    [
+def test_viewpoints_that_are_none_are_errors(traffic: RecordedTraffic, subtests: pytest.Subtests) -> None:
+    for viewpoint, message in [
         ("roof", r"--viewpoint: A: unknown viewpoint 'roof', expected one of: mast, above, vehicle, X,Y,Z, 1, 2, 3"),
         ("1,2", r"--viewpoint: expected X,Y,Z of finite numbers, m, Z not below 0, got '1,2'"),
         ("1,nan,2", r"--viewpoint: expected X,Y,Z"),
         ("1,1,-2", r"--viewpoint: expected X,Y,Z"),
-    ],
-)
-def test_viewpoints_that_are_none_are_errors(traffic: RecordedTraffic, viewpoint: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        sensed_scene(traffic, viewpoint, None, 0)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            sensed_scene(traffic, viewpoint, None, 0)
 
 
 def test_a_source_opens_chosen_windows(tmp_path: Path) -> None:

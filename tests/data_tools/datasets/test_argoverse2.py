@@ -175,9 +175,8 @@ def test_a_log_without_annotations_has_the_times_of_its_boxes(tmp_path):
     assert scene.ground_truth is None
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+def test_wrong_detections_are_refused(tmp_path, subtests):
+    for changes, message in [
         ({"log_id": ["a", "b", "c"]}, "log_id: expected one of the logs, such as log, got a and 2 more"),
         ({"log_id": ["zzz"] * 3}, "log_id: expected one of the logs, such as log, got zzz$"),
         ({"score": [np.nan, 0.4, 0.5]}, "log log: score: expected finite numbers"),
@@ -185,11 +184,9 @@ def test_a_log_without_annotations_has_the_times_of_its_boxes(tmp_path):
         ({"qw": [2.0, 1.0, 1.0]}, "expected a unit quaternion"),
         ({"width_m": [-1.0, 1.0, 1.0]}, "expected positive length, width, height"),
         ({"category": [1, 2, 3]}, "category: expected text, got int64"),
-    ],
-)
-def test_wrong_detections_are_refused(tmp_path, changes, message):
-    with pytest.raises(InputError, match=message):
-        detected(tmp_path, detections(**changes)).scene(LOG)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            detected(tmp_path, detections(**changes)).scene(LOG)
 
 
 def tracked(tmp_path):

@@ -46,11 +46,12 @@ BROKEN_CSV = [
 ]
 
 
-@pytest.mark.parametrize(("text", "message"), BROKEN_CSV, ids=[message[:50] for _, message in BROKEN_CSV])
-def test_broken_csv(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=r"drive\.csv: " + re.escape(message)) as caught:
-        read_detections(write(tmp_path, ".csv", text))
-    assert "\n" not in str(caught.value)
+def test_broken_csv(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in BROKEN_CSV:
+        with subtests.test(message):
+            with pytest.raises(InputError, match=r"drive\.csv: " + re.escape(message)) as caught:
+                read_detections(write(tmp_path, ".csv", text))
+            assert "\n" not in str(caught.value)
 
 
 def test_frame_with_two_poses_or_two_kinds_of_coordinates(tmp_path: Path) -> None:
@@ -78,10 +79,10 @@ BROKEN_NDJSON = [
 ]
 
 
-@pytest.mark.parametrize(("text", "message"), BROKEN_NDJSON, ids=[message[:50] for _, message in BROKEN_NDJSON])
-def test_broken_ndjson(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=r"drive\.ndjson: " + re.escape(message)):
-        read_detections(write(tmp_path, ".ndjson", text))
+def test_broken_ndjson(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in BROKEN_NDJSON:
+        with subtests.test(message), pytest.raises(InputError, match=r"drive\.ndjson: " + re.escape(message)):
+            read_detections(write(tmp_path, ".ndjson", text))
 
 
 BROKEN_NPZ: list[tuple[dict[str, Any], str]] = [
@@ -98,10 +99,10 @@ BROKEN_NPZ: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "message"), BROKEN_NPZ, ids=[message[:40] for _, message in BROKEN_NPZ])
-def test_broken_npz(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=r"drive\.npz: " + re.escape(message)):
-        read_detections(write(tmp_path, ".npz", NPZ | changes))
+def test_broken_npz(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for changes, message in BROKEN_NPZ:
+        with subtests.test(message), pytest.raises(InputError, match=r"drive\.npz: " + re.escape(message)):
+            read_detections(write(tmp_path, ".npz", NPZ | changes))
 
 
 def test_npz_that_is_none(tmp_path: Path) -> None:

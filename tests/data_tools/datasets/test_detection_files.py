@@ -156,19 +156,17 @@ def test_the_vehicles_own_measurements_come_with_its_frames(tmp_path: Path) -> N
     assert third.ego.gps.position.tolist() == [502.0, 20.3, 7.5]
 
 
-@pytest.mark.parametrize(
-    ("columns", "row", "message"),
-    [
+def test_own_measurements_that_make_no_sense(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for columns, row, message in [
         ("gps_x", "1.0", "gps_y: expected a number, since gps_x is given"),
         ("odometry_x,odometry_dt", "1.0,0.1", "odometry_y: expected a number, since odometry_x is given"),
         ("odometry_x,odometry_y,odometry_yaw,odometry_dt", "1,0,0,0", "odometry_dt: expected seconds > 0, got 0"),
         ("gps_x,gps_y", "far,0", "gps_x: expected a number, got 'far'"),
-    ],
-)
-def test_own_measurements_that_make_no_sense(tmp_path: Path, columns: str, row: str, message: str) -> None:
-    path = write(tmp_path, ".csv", f"timestamp,x,y,{columns}\n0.0,1.0,2.0,{row}\n")
-    with pytest.raises(InputError, match=f"line 2: {message}"):
-        read_detections(path)
+    ]:
+        with subtests.test(message):
+            path = write(tmp_path, ".csv", f"timestamp,x,y,{columns}\n0.0,1.0,2.0,{row}\n")
+            with pytest.raises(InputError, match=f"line 2: {message}"):
+                read_detections(path)
 
 
 def test_short_names_of_sides_and_no_guesses_at_others(tmp_path: Path) -> None:

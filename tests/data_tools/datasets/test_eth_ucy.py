@@ -32,18 +32,16 @@ def test_people_stand_on_the_ground_plane_at_the_times_of_the_video(root):
     assert set(boxes.label.tolist()) == {"pedestrian"}
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
+def test_what_is_wrong_in_the_file_is_named(root, subtests):
+    for line, message in [
         ("792 1 1 0 1 0 0", r"obsmat.txt: line 4: expected 8 .* got 7"),
         ("792 1 1 0 nan 0 0 0", r"obsmat.txt: line 4: y: expected a finite number"),
         ("786 2 1 0 1 0 0 0", r"frame 786: id: expected unique object ids"),
-    ],
-)
-def test_what_is_wrong_in_the_file_is_named(root, line, message):
-    (root / "eth" / "obsmat.txt").write_text(OBSMAT + line + "\n", encoding="utf-8")
-    with pytest.raises(InputError, match=message):
-        EthUcy(root).scene("eth")
+    ]:
+        with subtests.test(message):
+            (root / "eth" / "obsmat.txt").write_text(OBSMAT + line + "\n", encoding="utf-8")
+            with pytest.raises(InputError, match=message):
+                EthUcy(root).scene("eth")
 
 
 def test_a_root_without_recordings_and_an_unknown_one_are_errors(root, tmp_path_factory):

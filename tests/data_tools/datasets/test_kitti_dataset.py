@@ -108,11 +108,12 @@ BROKEN_DETECTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("text", "message"), BROKEN_DETECTIONS, ids=[m[:40] for _, m in BROKEN_DETECTIONS])
-def test_broken_detections(root: Path, text: str, message: str) -> None:
-    (root / "found" / "Car" / "0007.txt").write_text(text)
-    with pytest.raises(InputError, match=rf"Car/0007\.txt: {message}"):
-        KittiTracking(root, root / "found").scene("0007")
+def test_broken_detections(root: Path, subtests: pytest.Subtests) -> None:
+    for text, message in BROKEN_DETECTIONS:
+        with subtests.test(message):
+            (root / "found" / "Car" / "0007.txt").write_text(text)
+            with pytest.raises(InputError, match=rf"Car/0007\.txt: {message}"):
+                KittiTracking(root, root / "found").scene("0007")
 
 
 def test_label_beyond_the_last_frame(root: Path) -> None:

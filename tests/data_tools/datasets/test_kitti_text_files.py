@@ -60,10 +60,10 @@ BROKEN_CALIBRATIONS = [
 ]
 
 
-@pytest.mark.parametrize(("text", "message"), BROKEN_CALIBRATIONS, ids=[m[:40] for _, m in BROKEN_CALIBRATIONS])
-def test_broken_calibration(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=rf"c\.txt: {message}"):
-        read_calibration(write(tmp_path / "c.txt", text))
+def test_broken_calibration(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in BROKEN_CALIBRATIONS:
+        with subtests.test(message), pytest.raises(InputError, match=rf"c\.txt: {message}"):
+            read_calibration(write(tmp_path / "c.txt", text))
 
 
 def test_poses_start_at_the_origin_and_are_level(tmp_path: Path) -> None:
@@ -93,10 +93,10 @@ BROKEN_POSES = [
 ]
 
 
-@pytest.mark.parametrize(("text", "message"), BROKEN_POSES, ids=[m[:40] for _, m in BROKEN_POSES])
-def test_broken_poses(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=rf"o\.txt: {message}"):
-        read_poses(write(tmp_path / "o.txt", text))
+def test_broken_poses(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in BROKEN_POSES:
+        with subtests.test(message), pytest.raises(InputError, match=rf"o\.txt: {message}"):
+            read_poses(write(tmp_path / "o.txt", text))
 
 
 def test_labels(tmp_path: Path) -> None:
@@ -143,10 +143,10 @@ BROKEN_LABELS = [
 ]
 
 
-@pytest.mark.parametrize(("text", "message"), BROKEN_LABELS, ids=[m[:40] for _, m in BROKEN_LABELS])
-def test_broken_labels(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=rf"l\.txt: {message}"):
-        read_kitti_labels(write(tmp_path / "l.txt", text))
+def test_broken_labels(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in BROKEN_LABELS:
+        with subtests.test(message), pytest.raises(InputError, match=rf"l\.txt: {message}"):
+            read_kitti_labels(write(tmp_path / "l.txt", text))
 
 
 def test_file_that_is_missing_or_no_text(tmp_path: Path) -> None:

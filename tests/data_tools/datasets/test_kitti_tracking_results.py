@@ -83,18 +83,14 @@ def test_sequence_without_tracks_is_an_empty_file(data: KittiTracking, tmp_path:
     assert (tmp_path / "out" / "0007.txt").read_text() == ""
 
 
-@pytest.mark.parametrize(
-    ("moments", "message"),
-    [
+def test_tracks_that_cannot_be_written(data: KittiTracking, tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for moments, message in [
         ([car((11, 2, 1))], "expected tracks for 3 frames, got 1"),
         ([car((11, 2, 1), "bus")] * 3, "frame 0: unknown class 'bus'"),
         ([car((11, 2, 1), yaw=np.nan)] * 3, "frame 0: track 3: expected a known size and heading"),
         ([car((11, 2, 1), height=np.nan)] * 3, "frame 0: track 3: expected a known size and heading"),
-    ],
-)
-def test_tracks_that_cannot_be_written(
-    data: KittiTracking, tmp_path: Path, moments: list[Tracks], message: str
-) -> None:
-    with pytest.raises(InputError, match=f"out: sequence 0007: {message}"):
-        write_kitti_results(tmp_path / "out", data, [(data.scene("0007"), moments)])
-    assert not (tmp_path / "out").exists()
+    ]:
+        with subtests.test(message):
+            with pytest.raises(InputError, match=f"out: sequence 0007: {message}"):
+                write_kitti_results(tmp_path / "out", data, [(data.scene("0007"), moments)])
+            assert not (tmp_path / "out").exists()

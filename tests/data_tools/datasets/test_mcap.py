@@ -184,21 +184,19 @@ def broken(field, value):
 POSE = ("objects", 1, "kinematics", "pose_with_covariance")
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
+def test_wrong_values_are_named_by_file_topic_message_and_field(tmp_path, subtests):
+    for field, value, message in [
         ((*POSE, "pose", "position", "y"), np.nan, r"objects\[1\]\.kinematics\.\S*\.position: expected finite numbers"),
         ((*POSE, "pose", "position", "y"), 1e12, r"objects\[1\]\.kinematics\.\S*\.position: expected finite numbers"),
         ((*POSE, "pose", "orientation", "w"), 3.0, r"orientation: expected a unit quaternion, got norm 3"),
         ((*POSE, "covariance"), [-1.0] * 36, r"objects\[1\]\S*covariance: expected a positive definite covariance"),
         (("objects", 0, "shape", "dimensions", "x"), -2.0, r"objects\[0\]\.shape\.dimensions: expected sizes >= 0"),
         (("objects", 0, "existence_probability"), np.inf, r"objects\[0\]\.existence_probability: expected finite"),
-    ],
-)
-def test_wrong_values_are_named_by_file_topic_message_and_field(tmp_path, field, value, message):
-    path = example.write_mcap(tmp_path / "drive.mcap", broken(field, value))
-    with pytest.raises(InputError, match=rf"drive\.mcap: {LIDAR}: message 3: .*{message}"):
-        read(path)
+    ]:
+        with subtests.test(message):
+            path = example.write_mcap(tmp_path / "drive.mcap", broken(field, value))
+            with pytest.raises(InputError, match=rf"drive\.mcap: {LIDAR}: message 3: .*{message}"):
+                read(path)
 
 
 def test_a_frame_that_no_transform_has_is_named(tmp_path):
@@ -207,19 +205,17 @@ def test_a_frame_that_no_transform_has_is_named(tmp_path):
         read(path)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_wrong_options(tmp_path, subtests):
+    for options, message in [
         ({"world": "moon"}, "--world: unknown frame 'moon', expected one of: base_link, lidar, map"),
         ({"ego": "base"}, "--ego: unknown frame 'base'"),
         ({"topics": {"a": "/perception/lidar/object"}}, "--topic: unknown topic '/perception/lidar/object'; did you"),
         ({"topics": {"a": "/tf"}}, "--topic /tf: tf2_msgs/TFMessage: expected a topic that holds objects: /perc"),
-    ],
-)
-def test_wrong_options(tmp_path, options, message):
-    path = example.write_mcap(tmp_path / "drive.mcap", example.drive())
-    with pytest.raises(InputError, match=message):
-        read(path, **options)
+    ]:
+        with subtests.test(message):
+            path = example.write_mcap(tmp_path / "drive.mcap", example.drive())
+            with pytest.raises(InputError, match=message):
+                read(path, **options)
 
 
 def test_an_invalid_transform_is_named(tmp_path):

@@ -173,30 +173,33 @@ BROKEN_TABLES = [
 ]
 
 
-@pytest.mark.parametrize(("apply", "message"), BROKEN_TABLES, ids=[message[:40] for _, message in BROKEN_TABLES])
-def test_broken_table(tmp_path: Path, apply: Callable[[Tables], None], message: str) -> None:
-    content = tables()
-    apply(content)
-    with pytest.raises(InputError, match=message) as caught:
-        dataset(tmp_path, content, ground_truth=True)
-    assert "\n" not in str(caught.value)
+def test_broken_table(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for apply, message in BROKEN_TABLES:
+        with subtests.test(message):
+            content = tables()
+            apply(content)
+            with pytest.raises(InputError, match=message) as caught:
+                dataset(tmp_path, content, ground_truth=True)
+            assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("table", list(tables()))
-def test_missing_table(tmp_path: Path, table: str) -> None:
-    write_tables(tmp_path)
-    (tmp_path / "v1.0-mini" / f"{table}.json").unlink()
-    with pytest.raises(InputError, match=rf"v1\.0-mini/{table}\.json: missing table '{table}'"):
-        NuScenes(tmp_path, "v1.0-mini", {}, ground_truth=True)
+def test_missing_table(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for table in list(tables()):
+        with subtests.test(table=table):
+            write_tables(tmp_path)
+            (tmp_path / "v1.0-mini" / f"{table}.json").unlink()
+            with pytest.raises(InputError, match=rf"v1\.0-mini/{table}\.json: missing table '{table}'"):
+                NuScenes(tmp_path, "v1.0-mini", {}, ground_truth=True)
 
 
-@pytest.mark.parametrize("table", ["scene", "sample", "ego_pose", "sample_data"])
-def test_truncated_table(tmp_path: Path, table: str) -> None:
-    write_tables(tmp_path)
-    path = tmp_path / "v1.0-mini" / f"{table}.json"
-    path.write_text(path.read_text()[:-20])
-    with pytest.raises(InputError, match=rf"{table}\.json: character \d+: "):
-        NuScenes(tmp_path, "v1.0-mini", {})
+def test_truncated_table(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for table in ["scene", "sample", "ego_pose", "sample_data"]:
+        with subtests.test(table=table):
+            write_tables(tmp_path)
+            path = tmp_path / "v1.0-mini" / f"{table}.json"
+            path.write_text(path.read_text()[:-20])
+            with pytest.raises(InputError, match=rf"{table}\.json: character \d+: "):
+                NuScenes(tmp_path, "v1.0-mini", {})
 
 
 def test_table_that_is_no_list_of_objects(tmp_path: Path) -> None:
@@ -247,55 +250,52 @@ BROKEN_BOXES = [
 ]
 
 
-@pytest.mark.parametrize(("values", "message"), BROKEN_BOXES, ids=[message[:40] for _, message in BROKEN_BOXES])
-def test_broken_box_names_file_sample_box_and_field(tmp_path: Path, values: dict[str, Any], message: str) -> None:
-    found = results()
-    found["a2"][1].update(values)
-    with pytest.raises(InputError, match=rf"found\.json: sample a2: box 1: {message}") as caught:
-        dataset(tmp_path, found=found)
-    assert "\n" not in str(caught.value)
+def test_broken_box_names_file_sample_box_and_field(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for values, message in BROKEN_BOXES:
+        with subtests.test(message):
+            found = results()
+            found["a2"][1].update(values)
+            with pytest.raises(InputError, match=rf"found\.json: sample a2: box 1: {message}") as caught:
+                dataset(tmp_path, found=found)
+            assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("field", ["translation", "size", "rotation", "detection_name", "detection_score"])
-def test_box_without_a_field(tmp_path: Path, field: str) -> None:
-    found = results()
-    del found["a2"][1][field]
-    with pytest.raises(InputError, match=rf"found\.json: sample a2: box 1: field '{field}' is missing"):
-        dataset(tmp_path, found=found)
+def test_box_without_a_field(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for field in ["translation", "size", "rotation", "detection_name", "detection_score"]:
+        with subtests.test(field=field):
+            found = results()
+            del found["a2"][1][field]
+            with pytest.raises(InputError, match=rf"found\.json: sample a2: box 1: field '{field}' is missing"):
+                dataset(tmp_path, found=found)
 
 
-@pytest.mark.parametrize(
-    ("found", "message"),
-    [
+def test_broken_results(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for found, message in [
         ({"a0": [], "xyz": []}, r"sample xyz: expected samples of the tables, they hold no such sample"),
         ({"b0": []}, r"expected detections of scene scene-0103, the file lists none of its samples"),
         ({"a0": {}}, r"sample a0: expected a list of boxes, got '\{\}'"),
         ({"a0": [3]}, r"sample a0: box 0: expected an object, got 3"),
         ({"a0": [box("a1")]}, r"sample a0: sample_token: expected the sample's own, got 'a1'"),
         ([], r"character \d+: expected '\{'"),
-    ],
-)
-def test_broken_results(tmp_path: Path, found: Any, message: str) -> None:
-    with pytest.raises(InputError, match=rf"found\.json: {message}"):
-        dataset(tmp_path, found=found)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=rf"found\.json: {message}"):
+            dataset(tmp_path, found=found)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_broken_result_file(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in [
         ('{"meta": {}}', "expected a field 'results'"),
         ('{"meta": 1, "results": {}}', "meta: expected an object"),
         ('{"meta": {}, "results": {"a0": [], "a0": []}}', "sample a0: expected each sample once"),
         ('{"meta": {}, "results": {"a0": [{"samp', "character 31: broken or truncated JSON"),
         ("", r"character 0: expected '\{', the file ends"),
-    ],
-)
-def test_broken_result_file(tmp_path: Path, text: str, message: str) -> None:
-    write_tables(tmp_path)
-    path = tmp_path / "found.json"
-    path.write_text(text)
-    with pytest.raises(InputError, match=rf"found\.json: {message}"):
-        NuScenes(tmp_path, "v1.0-mini", {"lidar": path})
+    ]:
+        with subtests.test(message):
+            write_tables(tmp_path)
+            path = tmp_path / "found.json"
+            path.write_text(text)
+            with pytest.raises(InputError, match=rf"found\.json: {message}"):
+                NuScenes(tmp_path, "v1.0-mini", {"lidar": path})
 
 
 def test_missing_detection_file(tmp_path: Path) -> None:

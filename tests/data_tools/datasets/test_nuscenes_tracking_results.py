@@ -129,25 +129,26 @@ def test_a_track_of_the_format_keeps_its_class(tmp_path: Path) -> None:
     assert (samples["a"].id.tolist(), samples["b"].id.tolist()) == (["scene-1-7"], ["scene-1-7-bus"])
 
 
-@pytest.mark.parametrize(
-    ("moments", "message"),
-    [
+def test_tracks_that_cannot_be_written(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for moments, message in [
         ([tracks()], "expected tracks for 2 samples, got 1"),
         ([tracks(size=(np.nan, 2, 1)), tracks()], "sample a: track 7: expected a known size and heading"),
         ([tracks(yaw=np.nan), tracks()], "sample a: track 7: expected a known size and heading"),
-    ],
-)
-def test_tracks_that_cannot_be_written(tmp_path: Path, moments: list[Tracks], message: str) -> None:
-    path = tmp_path / "out.json"
-    with pytest.raises(InputError, match=rf"out\.json: scene scene-1: {message}"):
-        write_tracking_results(path, [(scene(), moments)], META)
-    assert list(tmp_path.iterdir()) == []
+    ]:
+        with subtests.test(message):
+            path = tmp_path / "out.json"
+            with pytest.raises(InputError, match=rf"out\.json: scene scene-1: {message}"):
+                write_tracking_results(path, [(scene(), moments)], META)
+            assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("tokens", [("", "b"), ("a", "a")])
-def test_every_sample_needs_a_token(tmp_path: Path, tokens: tuple[str, str]) -> None:
-    with pytest.raises(InputError, match="expected a token of its own for every sample"):
-        write_tracking_results(tmp_path / "out.json", [(scene(tokens=tokens), [tracks(), tracks()])], META)
+def test_every_sample_needs_a_token(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for tokens in [("", "b"), ("a", "a")]:
+        with (
+            subtests.test(tokens=tokens),
+            pytest.raises(InputError, match="expected a token of its own for every sample"),
+        ):
+            write_tracking_results(tmp_path / "out.json", [(scene(tokens=tokens), [tracks(), tracks()])], META)
 
 
 def test_interrupting_leaves_the_earlier_file(tmp_path: Path) -> None:
@@ -163,20 +164,18 @@ def test_interrupting_leaves_the_earlier_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_broken_tracking_file(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for change, message in [
         ({"tracking_name": "barrier"}, "sample a: box 1: tracking_name: unknown class 'barrier'"),
         ({"tracking_id": "scene-1-1"}, "sample a: tracking_id: expected each track at most once"),
         ({"tracking_id": 4}, "sample a: box 1: tracking_id: expected a string, got 4"),
         ({"tracking_score": None}, "sample a: box 1: tracking_score: expected a number, got 'None'"),
-    ],
-)
-def test_broken_tracking_file(tmp_path: Path, change: dict[str, object], message: str) -> None:
-    path = tmp_path / "out.json"
-    write_tracking_results(path, [(scene(tokens=["a"]), [tracks((1, 2), ("car", "car"), (1, 1))])], META)
-    content = json.loads(path.read_text())
-    content["results"]["a"][1].update(change)
-    path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=rf"out\.json: {message}"):
-        read_tracking_results(path)
+    ]:
+        with subtests.test(message):
+            path = tmp_path / "out.json"
+            write_tracking_results(path, [(scene(tokens=["a"]), [tracks((1, 2), ("car", "car"), (1, 1))])], META)
+            content = json.loads(path.read_text())
+            content["results"]["a"][1].update(change)
+            path.write_text(json.dumps(content))
+            with pytest.raises(InputError, match=rf"out\.json: {message}"):
+                read_tracking_results(path)

@@ -265,18 +265,15 @@ def test_times_since_1970_are_known_in_any_unit(unit: str, step: float) -> None:
     assert Clock.of(times).unit == unit
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
+def test_ways_of_reading_that_do_not_exist(subtests: pytest.Subtests) -> None:
+    for values, message in [
         ({"columns": {"lenghth": "l"}}, "columns.lenghth: unknown column, did you mean 'length'?"),
         ({"units": {"time": "minutes"}}, "time: expected one of s, ms, us, ns, iso8601"),
         ({"units": {"weight": "kg"}}, "units.weight: expected one of time, length"),
         ({"coordinates": "map"}, "coordinates: expected one of , world, ego, sensor, got 'map'"),
-    ],
-)
-def test_ways_of_reading_that_do_not_exist(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message.replace("?", r"\?")):
-        TableImport(**values)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message.replace("?", r"\?")):
+            TableImport(**values)
 
 
 def test_the_options_say_what_the_settings_say() -> None:

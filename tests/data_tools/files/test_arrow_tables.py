@@ -26,29 +26,28 @@ def write(path: Path, columns: list[tuple[str, Any]]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".feather"])
-def test_two_columns_of_one_name_are_refused(tmp_path: Path, suffix: str) -> None:
-    path = write(tmp_path / f"a{suffix}", [("time", [0.0, 0.1]), ("x", X), ("x", X), ("y", X)])
-    with pytest.raises(InputError, match=rf"^{path}: expected every column once, got time, x, x, y$"):
-        read_detections(path)
+def test_two_columns_of_one_name_are_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for suffix in [".parquet", ".feather"]:
+        with subtests.test(suffix=suffix):
+            path = write(tmp_path / f"a{suffix}", [("time", [0.0, 0.1]), ("x", X), ("x", X), ("y", X)])
+            with pytest.raises(InputError, match=rf"^{path}: expected every column once, got time, x, x, y$"):
+                read_detections(path)
 
 
-@pytest.mark.parametrize("suffix", [".parquet", ".feather"])
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (pa.array([{"a": 1.0}, {"a": 2.0}]), "x: expected an array of numbers, got list"),
-        (pa.array([[1.0], [2.0]]), "x: expected an array of numbers, got list"),
-        (pa.array(["1", "2"]).dictionary_encode(), "row 0: x: expected a number, got '1'"),
-        (pa.array([b"1", b"2"]), "x: expected an array of numbers"),
-        (pa.array([None, None]), "row 0: x: expected a finite number of metres, it is left out"),
-        (pa.array([True, False]), "x: expected an array of numbers, got bool"),
-    ],
-)
-def test_columns_of_other_types_are_named(tmp_path: Path, suffix: str, values: Any, message: str) -> None:
-    path = write(tmp_path / f"a{suffix}", [("time", [0.0, 0.1]), ("x", values), ("y", X)])
-    with pytest.raises(InputError, match=rf"^{path}: {message}"):
-        read_detections(path)
+def test_columns_of_other_types_are_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for suffix in [".parquet", ".feather"]:
+        for values, message in [
+            (pa.array([{"a": 1.0}, {"a": 2.0}]), "x: expected an array of numbers, got list"),
+            (pa.array([[1.0], [2.0]]), "x: expected an array of numbers, got list"),
+            (pa.array(["1", "2"]).dictionary_encode(), "row 0: x: expected a number, got '1'"),
+            (pa.array([b"1", b"2"]), "x: expected an array of numbers"),
+            (pa.array([None, None]), "row 0: x: expected a finite number of metres, it is left out"),
+            (pa.array([True, False]), "x: expected an array of numbers, got bool"),
+        ]:
+            with subtests.test(message):
+                path = write(tmp_path / f"a{suffix}", [("time", [0.0, 0.1]), ("x", values), ("y", X)])
+                with pytest.raises(InputError, match=rf"^{path}: {message}"):
+                    read_detections(path)
 
 
 def test_columns_have_their_values_and_dates_are_text(tmp_path: Path) -> None:
@@ -75,12 +74,15 @@ def test_a_column_that_grows_beyond_the_memory_is_one_line(tmp_path: Path, monke
         read_detections(path)
 
 
-@pytest.mark.parametrize("rows", [[date(2024, 5, 1)] * 2, [date(2024, 5, 1), date(2024, 5, 2)], ["2024-05-01"] * 2])
-def test_dates_without_a_time_are_no_times(tmp_path: Path, rows: list[Any]) -> None:
-    path = write(tmp_path / "a.parquet", [("date", rows), ("x", X), ("y", X)])
-    how = TableImport(columns={"timestamp": "date"})
-    with pytest.raises(InputError, match=r"a\.parquet: timestamp \(column 'date'\): expected times with the time of"):
-        read_detections(path, how=how)
+def test_dates_without_a_time_are_no_times(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for rows in [[date(2024, 5, 1)] * 2, [date(2024, 5, 1), date(2024, 5, 2)], ["2024-05-01"] * 2]:
+        with subtests.test(rows=rows):
+            path = write(tmp_path / "a.parquet", [("date", rows), ("x", X), ("y", X)])
+            how = TableImport(columns={"timestamp": "date"})
+            with pytest.raises(
+                InputError, match=r"a\.parquet: timestamp \(column 'date'\): expected times with the time of"
+            ):
+                read_detections(path, how=how)
 
 
 def test_dates_without_a_time_are_no_times_in_text(tmp_path: Path) -> None:

@@ -40,14 +40,15 @@ def test_file_is_written_whole_and_replaced_whole(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out.txt"]
 
 
-@pytest.mark.parametrize("exception", [KeyboardInterrupt, RuntimeError, SystemExit])
-def test_interrupted_file_leaves_the_earlier_one(tmp_path: Path, exception: type[BaseException]) -> None:
-    path = tmp_path / "out.txt"
-    write_text(path, "earlier")
-    with pytest.raises(exception):
-        write_half(path, exception)
-    assert path.read_text() == "earlier"
-    assert names(tmp_path) == ["out.txt"]
+def test_interrupted_file_leaves_the_earlier_one(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for exception in [KeyboardInterrupt, RuntimeError, SystemExit]:
+        with subtests.test(exception=exception):
+            path = tmp_path / "out.txt"
+            write_text(path, "earlier")
+            with pytest.raises(exception):
+                write_half(path, exception)
+            assert path.read_text() == "earlier"
+            assert names(tmp_path) == ["out.txt"]
 
 
 def test_new_file_has_ordinary_permissions(tmp_path: Path) -> None:
@@ -80,15 +81,16 @@ def test_output_path_that_is_a_device() -> None:
     assert Path("/dev/null").is_char_device()
 
 
-@pytest.mark.parametrize("output", [atomic_file, atomic_directory])
-def test_folder_that_is_missing_or_a_file(tmp_path: Path, output) -> None:
-    (tmp_path / "file").write_text("")
-    for parent, reason in (("missing", "does not exist"), ("file", "is not a folder")):
-        with (
-            pytest.raises(InputError, match=f"not writable: the folder .*{parent} {reason}"),
-            output(tmp_path / parent / "out"),
-        ):
-            pytest.fail("the block must not run")
+def test_folder_that_is_missing_or_a_file(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for output in [atomic_file, atomic_directory]:
+        with subtests.test(output=output):
+            (tmp_path / "file").write_text("")
+            for parent, reason in (("missing", "does not exist"), ("file", "is not a folder")):
+                with (
+                    pytest.raises(InputError, match=f"not writable: the folder .*{parent} {reason}"),
+                    output(tmp_path / parent / "out"),
+                ):
+                    pytest.fail("the block must not run")
 
 
 @pytest.mark.parametrize("output", [atomic_file, atomic_directory])

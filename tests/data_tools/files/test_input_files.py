@@ -87,14 +87,16 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("make", HOSTILE)
-def test_what_is_no_file_is_refused(tmp_path: Path, name: str, make: Callable[[Path], None]) -> None:
-    path = tmp_path / name
-    make(path)
-    with pytest.raises(InputError) as caught:
-        READERS[name](path)
-    assert str(caught.value) == f"{path}: cannot be read: {HOSTILE[make]}"
+def test_what_is_no_file_is_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for make, reason in HOSTILE.items():
+        inside = tmp_path / make.__name__
+        inside.mkdir()
+        for name, read in READERS.items():
+            path = inside / name
+            make(path)
+            with subtests.test(path=path), pytest.raises(InputError) as caught:
+                read(path)
+            assert str(caught.value) == f"{path}: cannot be read: {reason}"
 
 
 def test_a_name_with_a_zero_byte() -> None:
@@ -110,33 +112,33 @@ def test_links_to_files_are_followed(tmp_path: Path) -> None:
         assert file.read() == "text"
 
 
-@pytest.mark.parametrize(
-    ("content", "got"),
-    [
+def test_what_is_no_text(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for content, got in [
         (bz2.compress(b"text"), "got a file compressed by bzip2, to be decompressed first"),
         (gzip.compress(b"text"), "got a file compressed by gzip, to be decompressed first"),
         ("Tür".encode("latin-1"), "got bytes that are none: another encoding, or no text"),
-    ],
-    ids=["bzip2", "gzip", "latin-1"],  # bytes of gzip hold the time
-)
-def test_what_is_no_text(tmp_path: Path, content: bytes, got: str) -> None:
-    (tmp_path / "graph.g2o").write_bytes(content)
-    with pytest.raises(InputError, match=rf"graph\.g2o: expected text in UTF-8, {got}"):
-        read_g2o(tmp_path / "graph.g2o")
+    ]:
+        with subtests.test(got):
+            (tmp_path / "graph.g2o").write_bytes(content)
+            with pytest.raises(InputError, match=rf"graph\.g2o: expected text in UTF-8, {got}"):
+                read_g2o(tmp_path / "graph.g2o")
 
 
-@pytest.mark.parametrize("text", ["[" * 5000, '{"a": ' * 5000, "[1", b"\xff"])
-def test_json_that_is_broken_or_too_deep(text: str | bytes) -> None:
-    with pytest.raises(InputError, match=r"^here: broken or truncated JSON: "):
-        parsed_json(text, "here")
+def test_json_that_is_broken_or_too_deep(subtests: pytest.Subtests) -> None:
+    for text in ["[" * 5000, '{"a": ' * 5000, "[1", b"\xff"]:
+        with subtests.test(text=text), pytest.raises(InputError, match=r"^here: broken or truncated JSON: "):
+            parsed_json(text, "here")
 
 
-@pytest.mark.parametrize("value", ["9" * 4000, "1" * 101])
-def test_long_numbers_in_text_tables(tmp_path: Path, value: str) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" + f"1 0 0 {value} 0 1 0 0 0 0 1 0\n")
-    with pytest.raises(InputError, match=r"poses\.txt: line 2: expected values of at most 100 characters, got '"):
-        read_kitti_poses(path)
+def test_long_numbers_in_text_tables(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for value in ["9" * 4000, "1" * 101]:
+        with subtests.test(value=value):
+            path = tmp_path / "poses.txt"
+            path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" + f"1 0 0 {value} 0 1 0 0 0 0 1 0\n")
+            with pytest.raises(
+                InputError, match=r"poses\.txt: line 2: expected values of at most 100 characters, got '"
+            ):
+                read_kitti_poses(path)
 
 
 def test_messages_show_the_begin_of_long_names() -> None:

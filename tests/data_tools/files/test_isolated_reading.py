@@ -39,20 +39,18 @@ def test_two_files_at_once_have_two_children() -> None:
     assert len({next(each) for each in both}) == 2
 
 
-@pytest.mark.parametrize(
-    ("reader", "reason"),
-    [
+def test_what_goes_wrong_is_one_line_with_file_and_reason(subtests: pytest.Subtests) -> None:
+    for reader, reason in [
         (readers.crashes, "its reader crashed (SIGSEGV)"),
         (readers.exits, "its reader crashed (exit code 3)"),
         (readers.grows, "it takes more memory than this machine has for it"),
         (readers.fails, "KeyError: 'a\\nb'"),
-    ],
-)
-def test_what_goes_wrong_is_one_line_with_file_and_reason(reader: Callable[..., Iterator[Any]], reason: str) -> None:
-    with pytest.raises(InputError) as caught:
-        records(reader)
-    assert str(caught.value) == f"a.file: {PROBLEM}: {reason}"
-    assert records(readers.numbers, 2) == [0, 1]
+    ]:
+        with subtests.test(reason):
+            with pytest.raises(InputError) as caught:
+                records(reader)
+            assert str(caught.value) == f"a.file: {PROBLEM}: {reason}"
+            assert records(readers.numbers, 2) == [0, 1]
 
 
 def test_errors_that_name_their_place_stay_as_they_are() -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -69,17 +67,15 @@ def test_patterns_are_sorted_and_every_file_comes_once(tmp_path: Path) -> None:
         expanded([f"{tmp_path}/none.txt"])
 
 
-@pytest.mark.parametrize(
-    ("url", "message"),
-    [
+def test_what_cannot_be_read_is_named(subtests: pytest.Subtests) -> None:
+    for url, message in [
         ("file:///nowhere/a.csv", "file:///nowhere/a.csv: cannot be read: FileNotFoundError"),
         ("no://a/b.csv", "expected a URL"),
-    ],
-)
-def test_what_cannot_be_read_is_named(url: str, message: str) -> None:
-    pytest.importorskip("fsspec")
-    with pytest.raises(InputError, match=message), local_copy(url):
-        pass
+    ]:
+        with subtests.test(message):
+            pytest.importorskip("fsspec")
+            with pytest.raises(InputError, match=message), local_copy(url):
+                pass
 
 
 def test_without_fsspec_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,9 +92,8 @@ def test_a_list_in_itself_is_refused(tmp_path: Path) -> None:
         expanded([str(one)])
 
 
-@pytest.mark.parametrize(
-    ("url", "message"),
-    [
+def test_other_protocols_and_chains_are_refused(subtests: pytest.Subtests) -> None:
+    for url, message in [
         ("zip://a.csv::file:///nowhere/a.zip", "got zip://"),
         ("zip://a.csv::https://localhost/a.zip", "got zip://"),
         ("reference://a.csv", "got reference://"),
@@ -106,22 +101,22 @@ def test_a_list_in_itself_is_refused(tmp_path: Path) -> None:
         ("simplecache::s3://bucket/a.csv", "got simplecache::s3://"),
         ("github://a:b@/c.csv", "got github://"),
         ("://a.csv", "got ://"),
-    ],
-)
-@pytest.mark.parametrize("read", [local_copy, lambda url: local_tree(url, ["*"]), lambda url: expanded([f"{url}*"])])
-def test_other_protocols_and_chains_are_refused(url: str, message: str, read: Callable[[str], Any]) -> None:
-    with pytest.raises(InputError) as caught, ExitStack() as stack:
-        stack.enter_context(read(url))
-    assert f"expected a URL of one protocol, one of {', '.join(PROTOCOLS)}, {message}" in str(caught.value)
+    ]:
+        for read in [local_copy, lambda url: local_tree(url, ["*"]), lambda url: expanded([f"{url}*"])]:
+            with subtests.test(message):
+                with pytest.raises(InputError) as caught, ExitStack() as stack:
+                    stack.enter_context(read(url))
+                assert f"expected a URL of one protocol, one of {', '.join(PROTOCOLS)}, {message}" in str(caught.value)
 
 
-@pytest.mark.parametrize("url", ["file:///nowhere", "http://localhost:1/a", "ftp://localhost:1/a.csv"])
-def test_what_is_not_there_is_one_line(url: str) -> None:
-    pytest.importorskip("fsspec")
-    with pytest.raises((InputError, MissingExtraError)) as caught, local_copy(url):
-        pass
-    assert str(caught.value).startswith(f"{url}: ")
-    assert "\n" not in str(caught.value)
+def test_what_is_not_there_is_one_line(subtests: pytest.Subtests) -> None:
+    for url in ["file:///nowhere", "http://localhost:1/a", "ftp://localhost:1/a.csv"]:
+        with subtests.test(url=url):
+            pytest.importorskip("fsspec")
+            with pytest.raises((InputError, MissingExtraError)) as caught, local_copy(url):
+                pass
+            assert str(caught.value).startswith(f"{url}: ")
+            assert "\n" not in str(caught.value)
 
 
 def test_a_list_names_no_other_host_unless_it_is_given(tmp_path: Path) -> None:

@@ -14,9 +14,8 @@ from tests.data_tools.damage import PCD, PLY
 BINARY = PCD.replace("DATA ascii\n1 2 3\n4 5 6\n", "DATA binary\n").encode() + np.arange(6, dtype="<f4").tobytes()
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "message"),
-    [
+def test_a_wrong_pcd_header_is_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for before, after, message in [
         ("COUNT 1 1 1", "COUNT -1 1 1", "COUNT to be 3 whole numbers from 1"),
         ("COUNT 1 1 1", "COUNT 2 1 1", "one x, one y and one z"),
         ("SIZE 4 4 4", "SIZE 4 4", "SIZE to be 3 whole numbers"),
@@ -28,16 +27,15 @@ BINARY = PCD.replace("DATA ascii\n1 2 3\n4 5 6\n", "DATA binary\n").encode() + n
         ("4 5 6", "4 five 6", "numbers after the header"),
         ("DATA ascii", "DATA cuneiform", "DATA to be ascii, binary"),
         ("HEIGHT 1\n", "", "a line HEIGHT"),
-    ],
-)
-def test_a_wrong_pcd_header_is_named(tmp_path: Path, before: str, after: str, message: str) -> None:
-    path = tmp_path / "scan.pcd"
-    path.write_text(PCD)
-    np.testing.assert_array_equal(read_scan(path).points, [[1, 2, 3], [4, 5, 6]])
-    assert before in PCD
-    path.write_text(PCD.replace(before, after))
-    with pytest.raises(InputError, match=message):
-        read_scan(path)
+    ]:
+        with subtests.test(message):
+            path = tmp_path / "scan.pcd"
+            path.write_text(PCD)
+            np.testing.assert_array_equal(read_scan(path).points, [[1, 2, 3], [4, 5, 6]])
+            assert before in PCD
+            path.write_text(PCD.replace(before, after))
+            with pytest.raises(InputError, match=message):
+                read_scan(path)
 
 
 def test_binary_points_have_to_be_there(tmp_path: Path) -> None:
@@ -49,9 +47,8 @@ def test_binary_points_have_to_be_there(tmp_path: Path) -> None:
         read_scan(path)
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "message"),
-    [
+def test_a_wrong_ply_header_is_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for before, after, message in [
         ("element vertex 2", "element vertex 3", "3 lines of 3 numbers"),
         ("element vertex 2", "element vertex -2", "element vertex to be 1 whole numbers"),
         ("element vertex 2", "element face 2", "vertices as the first element"),
@@ -64,12 +61,11 @@ def test_binary_points_have_to_be_there(tmp_path: Path) -> None:
         ("4 5 6", f"4 5 6.{'0' * 8000}1", "numbers of at most 100 bytes after the header"),
         ("end_header", "header", "a header that ends in a line end_header"),
         ("ply\n", "plum\n", "the lines ply and format"),
-    ],
-)
-def test_a_wrong_ply_header_is_named(tmp_path: Path, before: str, after: str, message: str) -> None:
-    path = tmp_path / "scan.ply"
-    path.write_text(PLY)
-    np.testing.assert_array_equal(read_scan(path).points, [[1, 2, 3], [4, 5, 6]])
-    path.write_text(PLY.replace(before, after, 1))
-    with pytest.raises(InputError, match=message):
-        read_scan(path)
+    ]:
+        with subtests.test(message):
+            path = tmp_path / "scan.ply"
+            path.write_text(PLY)
+            np.testing.assert_array_equal(read_scan(path).points, [[1, 2, 3], [4, 5, 6]])
+            path.write_text(PLY.replace(before, after, 1))
+            with pytest.raises(InputError, match=message):
+                read_scan(path)

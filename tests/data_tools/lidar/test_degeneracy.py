@@ -54,10 +54,13 @@ def test_in_an_open_field_height_and_tilt_are_left() -> None:
     np.testing.assert_allclose(found.map_T_scan[:3, 3], [0.4, 0.0, 0.0], atol=0.01)
 
 
-@pytest.mark.parametrize("world", [tunnel(), open_field()])
-def test_a_whole_registration_refuses(world: StaticWorld) -> None:
-    with pytest.raises(RegistrationError, match="leave a direction of motion unconstrained"):
-        registered(world, np.eye(4), undetermined="refuse")
+def test_a_whole_registration_refuses(subtests: pytest.Subtests) -> None:
+    for world in [tunnel(), open_field()]:
+        with (
+            subtests.test(world=world),
+            pytest.raises(RegistrationError, match="leave a direction of motion unconstrained"),
+        ):
+            registered(world, np.eye(4), undetermined="refuse")
 
 
 def test_rough_surfaces_see_less() -> None:

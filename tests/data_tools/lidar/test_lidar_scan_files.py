@@ -79,9 +79,8 @@ def test_points_without_intensity_have_none(tmp_path: Path, name: str) -> None:
     assert np.isnan(scan.intensity).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "expected"),
-    [
+def test_damaged_files_say_what_is_wrong(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for name, content, expected in [
         ("a.bin", b"123456", r"a\.bin: expected records of 16 bytes .* got 6 bytes"),
         ("a.bin", b"", r"a\.bin: expected records of 16 bytes .* got 0 bytes"),
         ("a.pcd.bin", b"0" * 16, r"a\.pcd\.bin: expected records of 20 bytes"),
@@ -93,13 +92,12 @@ def test_points_without_intensity_have_none(tmp_path: Path, name: str) -> None:
         ("a.ply", b"rubbish", r"a\.ply: expected a header that ends in a line end_header"),
         ("a.txt", b"", r"a\.txt: expected a name that ends in \.pcd\.bin, \.bin"),
         ("missing/a.bin", None, r"a\.bin: cannot be read: No such file"),
-    ],
-)
-def test_damaged_files_say_what_is_wrong(tmp_path: Path, name: str, content: bytes | None, expected: str) -> None:
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match=expected):
-        read_scan(tmp_path / name)
+    ]:
+        with subtests.test(expected):
+            if content is not None:
+                (tmp_path / name).write_bytes(content)
+            with pytest.raises(InputError, match=expected):
+                read_scan(tmp_path / name)
 
 
 def test_a_signalling_nan_is_refused_as_any_other(tmp_path: Path) -> None:
@@ -130,12 +128,13 @@ def test_a_scan_is_checked_and_cut_by_range() -> None:
         Scan(POINTS, INTENSITY[:2])
 
 
-@pytest.mark.parametrize("suffix", ["ply", "pcd"])
-def test_clouds_are_written_and_read_back(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a.{suffix}"
-    write_cloud(path, POINTS)
-    np.testing.assert_array_equal(read_scan(path).points, POINTS)
-    write_cloud(tmp_path / "none.ply", np.empty((0, 3)))
-    assert len(read_scan(tmp_path / "none.ply")) == 0
-    with pytest.raises(InputError, match=r"expected a name that ends in \.ply or \.pcd"):
-        write_cloud(tmp_path / "a.las", POINTS)
+def test_clouds_are_written_and_read_back(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for suffix in ["ply", "pcd"]:
+        with subtests.test(suffix=suffix):
+            path = tmp_path / f"a.{suffix}"
+            write_cloud(path, POINTS)
+            np.testing.assert_array_equal(read_scan(path).points, POINTS)
+            write_cloud(tmp_path / "none.ply", np.empty((0, 3)))
+            assert len(read_scan(tmp_path / "none.ply")) == 0
+            with pytest.raises(InputError, match=r"expected a name that ends in \.ply or \.pcd"):
+                write_cloud(tmp_path / "a.las", POINTS)

@@ -55,17 +55,14 @@ def test_draws_without_data_are_left_out():
     assert np.isnan(nothing.low)
 
 
-@pytest.mark.parametrize(
-    ("a", "b", "confidence", "text"),
-    [
+def test_bad_input(subtests):
+    for a, b, confidence, text in [
         ([[1.0, 2.0]], [[1.0, 2.0], [1.0, 2.0]], 0.95, "b: expected shape"),
         (np.empty((0, 2)), np.empty((0, 2)), 0.95, "at least one scene"),
         ([[1.0, 2.0]], [[1.0, 2.0]], 1.0, "confidence"),
-    ],
-)
-def test_bad_input(a, b, confidence, text):
-    with pytest.raises(InputError, match=text):
-        paired_bootstrap(a, b, confidence=confidence)
+    ]:
+        with subtests.test(a=a, b=b, confidence=confidence, text=text), pytest.raises(InputError, match=text):
+            paired_bootstrap(a, b, confidence=confidence)
 
 
 def test_nees_of_consistent_estimates_lies_in_its_band():

@@ -175,16 +175,13 @@ def test_tables_from_annotations_and_tracks():
     assert len(SceneBoxes.of_tracks([])) == len(SceneBoxes.of_annotations([])) == 0
 
 
-@pytest.mark.parametrize(
-    ("rows", "text"),
-    [
+def test_bad_tables(subtests):
+    for rows, text in [
         ([(1, "a", "car", 0, 0, 0), (0, "b", "car", 0, 0, 0)], "never decrease"),
         ([(0, "a", "car", 0, 0, 0), (1, "b", "car", 0, 0, 0), (1, "b", "car", 1, 0, 0)], r"id\[2\].*'b' occurs twice"),
-    ],
-)
-def test_bad_tables(rows, text):
-    with pytest.raises(InputError, match=text):
-        table(rows)
+    ]:
+        with subtests.test(rows=rows, text=text), pytest.raises(InputError, match=text):
+            table(rows)
 
 
 def test_bad_scenes():

@@ -124,17 +124,14 @@ def test_scores_tell_true_from_false_but_not_always(sensor: SensorSettings) -> N
     assert 0.85 < better < 0.999  # area under the ROC curve
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
+def test_settings_without_sense_are_refused(subtests: pytest.Subtests) -> None:
+    for change, text in [
         ({"rate": 0.0}, "rate: expected a finite number > 0"),
         ({"field_of_view": 7.0}, "field_of_view: expected a number above 0 to 6.28"),
         ({"detection_probability": 1.2}, "detection_probability: expected a number from 0 to 1"),
-    ],
-)
-def test_settings_without_sense_are_refused(change: dict[str, float], text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        replace(lidar(), **change)
+    ]:
+        with subtests.test(change=change, text=text), pytest.raises(InputError, match=text):
+            replace(lidar(), **change)
 
 
 def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes() -> None:

@@ -191,16 +191,13 @@ def test_standing_objects_stand() -> None:
     assert present.all()
 
 
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
+def test_settings_no_world_can_have_are_refused(subtests: pytest.Subtests) -> None:
+    for make, text in [
         (lambda: RoadSettings(lanes=(3, 2)), "lanes: expected ascending numbers"),
         (lambda: PedestrianSettings(groups=(3, 1)), "groups: expected ascending numbers"),
         (lambda: PedestrianSettings(walking_speed=(0.0, 1.0)), "walking_speed: expected a finite number > 0, got 0.0"),
         (lambda: SimulatorSettings(duration=0.0), "duration: expected a finite number > 0"),
         (lambda: SimulatorSettings(warm_up=-1.0), "warm_up: expected a finite number >= 0"),
-    ],
-)
-def test_settings_no_world_can_have_are_refused(make: object, text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        make()  # type: ignore[operator]
+    ]:
+        with subtests.test(make=make, text=text), pytest.raises(InputError, match=text):
+            make()  # type: ignore[operator]

@@ -76,21 +76,19 @@ def test_a_written_pose_is_the_line_the_format_asks_for(tmp_path: Path) -> None:
     np.testing.assert_allclose(values, [0, -1, 0, 2.5, 1, 0, 0, -1, 0, 0, 1, 0.25], atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_broken_kitti_poses_are_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in [
         ("", "expected a pose per line, the file is empty"),
         ("1 0 0 0 0 1 0 0 0 0 1\n", "line 1: expected 12 columns"),
         ("1 0 0 0 0 1 0 0 0 0 1 x\n", "line 1: tz: expected a finite number, got 'x'"),
         ("1 0 0 0 0 1 0 0 0 0 2 0\n", r"world_T_ego\[0\]: expected a rigid transform"),
-    ],
-)
-def test_broken_kitti_poses_are_named(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text(text)
-    with pytest.raises(InputError, match=message) as caught:
-        read_kitti_poses(path)
-    assert str(path) in str(caught.value)
+    ]:
+        with subtests.test(message):
+            path = tmp_path / "poses.txt"
+            path.write_text(text)
+            with pytest.raises(InputError, match=message) as caught:
+                read_kitti_poses(path)
+            assert str(path) in str(caught.value)
 
 
 def test_times_must_be_as_many_as_poses(tmp_path: Path) -> None:
@@ -100,17 +98,15 @@ def test_times_must_be_as_many_as_poses(tmp_path: Path) -> None:
         read_kitti_poses(tmp_path / "poses.txt", tmp_path / "times.txt")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_broken_tum_poses_are_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for text, message in [
         ("# nothing\n", "expected a pose per line, there is none"),
         ("0 0 0 0 0 0 0 0.5\n", "line 1: qx qy qz qw: expected a unit quaternion, got norm 0.5"),
         ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", r"timestamps\[1\]: expected increasing times"),
         ("0 0 nan 0 0 0 0 1\n", "line 1: ty: expected a finite number, got 'nan'"),
-    ],
-)
-def test_broken_tum_poses_are_named(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "poses.tum"
-    path.write_text(text)
-    with pytest.raises(InputError, match=message):
-        read_tum_poses(path)
+    ]:
+        with subtests.test(message):
+            path = tmp_path / "poses.tum"
+            path.write_text(text)
+            with pytest.raises(InputError, match=message):
+                read_tum_poses(path)

@@ -134,23 +134,26 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_input_ends_in_one_exception_and_changes_nothing(make, name):
-    call, message = BAD[name]
-    error = UnknownNodeError if "is not in" in message else InputError
-    estimator, untouched = filled(make), filled(make)
-    with pytest.raises(error, match=message):
-        call(estimator)
-    assert estimator.nodes.tolist() == untouched.nodes.tolist()
-    assert np.array_equal(estimator.joint_mean(IDS), untouched.joint_mean(IDS))
-    assert np.array_equal(estimator.joint_covariance(IDS), untouched.joint_covariance(IDS))
-    for either in (estimator, untouched):
-        new_nodes(np.random.default_rng(3), [23], TRAM).run(either)
-        either.predict(discretise(random_graph(np.random.default_rng(4), (*MIXED, TRAM), [*IDS, 23], 0.5), 0.2))
-        either.update(measured([4, 16]))
-        either.marginalise([8])
-    assert np.array_equal(estimator.joint_covariance([4, 15, 16, 23]), untouched.joint_covariance([4, 15, 16, 23]))
-    assert np.array_equal(estimator.joint_mean([4, 15, 16, 23]), untouched.joint_mean([4, 15, 16, 23]))
+def test_bad_input_ends_in_one_exception_and_changes_nothing(make, subtests):
+    for name in BAD:
+        with subtests.test(name=name):
+            call, message = BAD[name]
+            error = UnknownNodeError if "is not in" in message else InputError
+            estimator, untouched = filled(make), filled(make)
+            with pytest.raises(error, match=message):
+                call(estimator)
+            assert estimator.nodes.tolist() == untouched.nodes.tolist()
+            assert np.array_equal(estimator.joint_mean(IDS), untouched.joint_mean(IDS))
+            assert np.array_equal(estimator.joint_covariance(IDS), untouched.joint_covariance(IDS))
+            for either in (estimator, untouched):
+                new_nodes(np.random.default_rng(3), [23], TRAM).run(either)
+                either.predict(discretise(random_graph(np.random.default_rng(4), (*MIXED, TRAM), [*IDS, 23], 0.5), 0.2))
+                either.update(measured([4, 16]))
+                either.marginalise([8])
+            assert np.array_equal(
+                estimator.joint_covariance([4, 15, 16, 23]), untouched.joint_covariance([4, 15, 16, 23])
+            )
+            assert np.array_equal(estimator.joint_mean([4, 15, 16, 23]), untouched.joint_mean([4, 15, 16, 23]))
 
 
 def test_bad_input_does_not_end_the_interpreter():
@@ -191,13 +194,14 @@ def test_of_no_nodes_there_is_nothing_to_tell(make):
         assert estimator.nodes.tolist() == nodes
 
 
-def test_a_snapshot_of_another_kind_of_estimator_is_refused(make):
-    estimator, untouched = filled(make), filled(make)
-    own = type(make().snapshot())
-    others = [filled(maker(kind.values[0])).snapshot() for kind in ESTIMATORS]
-    for state in others:
-        if not isinstance(state, own):
-            with pytest.raises(InputError, match=f"state: expected {own.__name__}, got {type(state).__name__}"):
-                estimator.restore(state)
-    assert np.array_equal(estimator.joint_mean(IDS), untouched.joint_mean(IDS))
-    assert np.array_equal(estimator.joint_covariance(IDS), untouched.joint_covariance(IDS))
+def test_a_snapshot_of_another_kind_of_estimator_is_refused(make, subtests):
+    with subtests.test():
+        estimator, untouched = filled(make), filled(make)
+        own = type(make().snapshot())
+        others = [filled(maker(kind.values[0])).snapshot() for kind in ESTIMATORS]
+        for state in others:
+            if not isinstance(state, own):
+                with pytest.raises(InputError, match=f"state: expected {own.__name__}, got {type(state).__name__}"):
+                    estimator.restore(state)
+        assert np.array_equal(estimator.joint_mean(IDS), untouched.joint_mean(IDS))
+        assert np.array_equal(estimator.joint_covariance(IDS), untouched.joint_covariance(IDS))

@@ -239,26 +239,24 @@ def two_cars():
     return smoother
 
 
-@pytest.mark.parametrize(
-    ("wrong", "error"),
-    [
+def test_what_is_wrong_is_said_and_changes_nothing(subtests):
+    for wrong, error in [
         (lambda s: s.update(ONE, time=float("nan")), InputError),
         (lambda s: s.update(ONE, time="now"), InputError),
         (lambda s: s.update(Measurements([9], [[0.0]], np.eye(1, 4), [[1.0]]), time=0.05), UnknownNodeError),
         (lambda s: s.update(ONE, robust="huber"), InputError),
         (lambda s: s.update(ONE, robust=GraduatedNonConvexity()), InputError),  # it takes the whole recording
         (lambda s: s.marginalise([1, 1]), InputError),
-    ],
-)
-def test_what_is_wrong_is_said_and_changes_nothing(wrong, error):
-    smoother, untouched = two_cars(), two_cars()
-    with pytest.raises(error):
-        wrong(smoother)
-    for estimator in (smoother, untouched):
-        estimator.predict(discretise(SceneGraph.of([2, 1], CAR), 0.2))
-    np.testing.assert_array_equal(smoother.joint_mean([1, 2]), untouched.joint_mean([1, 2]))
-    for mine, other in zip(smoother.smoothed(), untouched.smoothed(), strict=True):
-        np.testing.assert_array_equal(mine.joint_covariance([1, 2]), other.joint_covariance([1, 2]))
+    ]:
+        with subtests.test(error):
+            smoother, untouched = two_cars(), two_cars()
+            with pytest.raises(error):
+                wrong(smoother)
+            for estimator in (smoother, untouched):
+                estimator.predict(discretise(SceneGraph.of([2, 1], CAR), 0.2))
+            np.testing.assert_array_equal(smoother.joint_mean([1, 2]), untouched.joint_mean([1, 2]))
+            for mine, other in zip(smoother.smoothed(), untouched.smoothed(), strict=True):
+                np.testing.assert_array_equal(mine.joint_covariance([1, 2]), other.joint_covariance([1, 2]))
 
 
 def test_only_means_when_only_means_are_wanted():

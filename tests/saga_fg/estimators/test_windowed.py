@@ -136,7 +136,7 @@ def test_late_measurements_go_where_they_belong_or_are_refused():
         smoother.update(calls[0][1], time=0.1)
 
 
-@pytest.mark.parametrize("name", ["step", "tolerance", "longest"])
-def test_settings_are_checked(name):
-    with pytest.raises(InputError, match=name):
-        WindowSettings(**{name: 0.0})
+def test_settings_are_checked(subtests):
+    for name in ["step", "tolerance", "longest"]:
+        with subtests.test(name=name), pytest.raises(InputError, match=name):
+            WindowSettings(**{name: 0.0})

@@ -60,18 +60,15 @@ def test_objects_seen_too_seldom_tell_nothing():
             fit_acceleration_noise(objects)
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
+def test_wrong_sightings_are_named(subtests):
+    for columns, message in [
         (([0.0, 2.0, 1.0], np.zeros((3, 2)), np.ones((3, 2, 2))), r"time\[2\]: expected times that do not decrease"),
         (([0.0, np.nan], np.zeros((2, 2)), np.ones((2, 2, 2))), r"time\[1\]: expected a finite number"),
         (([0.0, 1.0], np.zeros((3, 2)), np.ones((2, 2, 2))), r"position: expected shape \(2, 2\)"),
         (([0.0, 1.0], np.zeros((2, 2)), np.ones((2, 2))), r"R: expected shape \(2, 2, 2\)"),
-    ],
-)
-def test_wrong_sightings_are_named(columns, message):
-    with pytest.raises(InputError, match=message):
-        MeasuredTrajectory(*columns)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            MeasuredTrajectory(*columns)
 
 
 def test_a_long_trajectory_is_cut_into_pieces_of_about_one_length() -> None:

@@ -109,9 +109,8 @@ def test_types_that_are_equal_but_not_the_same_object():
     assert graph.edge_count == 2
 
 
-@pytest.mark.parametrize(
-    ("chosen", "message"),
-    [
+def test_a_users_rule_that_makes_no_sense_is_named(subtests):
+    for chosen, message in [
         (([0, 3], [1, 1], [0.5, 0.5]), "edge rule Fixed: target: row 3 is outside 3 nodes"),
         (([0], [-1], [0.5]), "edge rule Fixed: source: row -1 is outside 3 nodes"),
         (([0], [1, 2], [0.5]), "edge rule Fixed: source: expected 1 entries, got 2"),
@@ -119,11 +118,9 @@ def test_types_that_are_equal_but_not_the_same_object():
         (([0], [1], [np.nan]), r"edge rule Fixed: rate\[0\]: expected a finite number"),
         (([0], [1], [0.5, 0.5]), r"edge rule Fixed: rate: expected shape \(1,\)"),
         (([1], [1], [0.5]), "edges of SharedVelocity: node row 1 has an edge to itself"),
-    ],
-)
-def test_a_users_rule_that_makes_no_sense_is_named(chosen, message):
-    with pytest.raises(InputError, match=message):
-        build_graph(table(*straight(3)), (Fixed(*chosen),))
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            build_graph(table(*straight(3)), (Fixed(*chosen),))
 
 
 def test_a_users_rule_may_return_plain_lists():

@@ -25,9 +25,8 @@ def test_what_is_written_is_read_again():
     assert read_settings(LearnedInteractions, write_settings(learned)) == learned
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_a_mistake_in_the_file_is_named(subtests):
+    for text, message in [
         ("version: 2", "version: expected 1"),
         ("format: something", "format: expected one of"),
         ("edges: [{kind: following, rate: 50.0}]", r"edges\[0\].rate: expected at most 20 1/s, got 50"),
@@ -36,11 +35,9 @@ def test_what_is_written_is_read_again():
             "edges: [{kind: neighbours, interaction: {kind: car_following, time_constant: 0.1}, rate: 5.0}]",
             r"edges\[0\]: expected stable steps, what two nodes .* grows by the factor",
         ),
-    ],
-)
-def test_a_mistake_in_the_file_is_named(text, message):
-    with pytest.raises(InputError, match=message):
-        read_settings(LearnedInteractions, text, "mine.yaml")
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            read_settings(LearnedInteractions, text, "mine.yaml")
 
 
 def test_dynamics_that_run_away_are_refused():

@@ -60,9 +60,8 @@ def test_components_are_found_by_name():
         car.index(("x", "z"))
 
 
-@pytest.mark.parametrize(
-    ("motion", "message"),
-    [
+def test_a_motion_that_makes_no_sense_is_refused(subtests):
+    for motion, message in [
         (Custom((), np.empty((0, 0)), np.empty((0, 0))), "node type odd: expected distinct component names"),
         (Custom(("x", "x"), np.eye(2), np.eye(2)), "node type odd: expected distinct component names"),
         (Custom(("x",), np.eye(2), np.eye(1)), r"node type odd: generator: expected shape \(1, 1\), got \(2, 2\)"),
@@ -70,8 +69,6 @@ def test_components_are_found_by_name():
         (Custom(("x",), np.eye(1), np.eye(2)), r"node type odd: diffusion: expected shape \(1, 1\)"),
         (Custom(("x", "y"), np.eye(2), [[1, 0.5], [0, 1]]), "node type odd: diffusion: expected a symmetric positive"),
         (Custom(("x", "y"), np.eye(2), [[1, 2], [2, 1]]), "node type odd: diffusion: expected a symmetric positive"),
-    ],
-)
-def test_a_motion_that_makes_no_sense_is_refused(motion, message):
-    with pytest.raises(InputError, match=message):
-        NodeType("odd", motion)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            NodeType("odd", motion)

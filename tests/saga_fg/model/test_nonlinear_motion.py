@@ -172,18 +172,18 @@ def test_a_law_that_fails_is_one_clear_error_after_which_all_goes_on(name, what)
     assert estimator.mean([0])[0, 0] == pytest.approx(0.8)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_bad_edges_are_refused(subtests):
+    for change, message in [
         ({"rate": [-1.0]}, "a rate >= 0"),
         ({"rate": [np.nan]}, "finite"),
         ({"source": [0]}, "itself"),
         ({"given": [np.inf]}, "finite"),
         ({"given": [1.0, 2.0]}, "shape"),
         ({"source": [9]}, "row 9 is outside 2 nodes"),
-    ],
-)
-def test_bad_edges_are_refused(change, message):
-    good = {"target": [0], "source": [1], "rate": [1.0], "given": [4.0]}
-    with pytest.raises(InputError, match=message):
-        SceneGraph(np.arange(2), (WALKER,) * 2, nonlinear=(NonlinearEdges(SmoothDriver(), **{**good, **change}),))
+    ]:
+        with subtests.test(message):
+            good = {"target": [0], "source": [1], "rate": [1.0], "given": [4.0]}
+            with pytest.raises(InputError, match=message):
+                SceneGraph(
+                    np.arange(2), (WALKER,) * 2, nonlinear=(NonlinearEdges(SmoothDriver(), **{**good, **change}),)
+                )

@@ -373,9 +373,8 @@ def test_a_stop_line_looks_where_traffic_goes():
     assert StopLine("a", (-2, 0), (2, 0), "l").heading == pytest.approx(math.pi / 2)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_a_map_that_makes_no_sense_is_refused(subtests):
+    for make, message in [
         (
             lambda: RoadMap((), (StopLine("a", (0, 1), (0, 0), "b"),)),
             "there is no traffic light 'b'",
@@ -386,8 +385,6 @@ def test_a_stop_line_looks_where_traffic_goes():
         (lambda: TrafficLight("", (0, 0)), "expected a name"),
         (lambda: TrafficLight("a", (0, math.nan)), "finite numbers"),
         (lambda: RoadMap(deviation=0), "deviation"),
-    ],
-)
-def test_a_map_that_makes_no_sense_is_refused(make, message):
-    with pytest.raises(InputError, match=message):
-        make()
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            make()

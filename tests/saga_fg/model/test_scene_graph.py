@@ -45,9 +45,8 @@ def test_graphs_without_nodes_or_edges():
     assert SceneGraph.of([1], TRUCK, [empty]).edge_count == 0  # no edge, so none that does not fit
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
+def test_wrong_edges_are_named(subtests):
+    for columns, message in [
         ({"target": (0, 1)}, "edges of pull: source: expected 2 entries, got 1"),
         ({"target": 0}, "edges of pull: target: expected a list of integers, got 0"),
         ({"target": [0.5]}, r"edges of pull: target: expected a list of integers, got \[0.5\]"),
@@ -60,16 +59,13 @@ def test_graphs_without_nodes_or_edges():
         ({"A_other": np.full((1, 4, 4), np.inf)}, r"edges of pull: A_other\[0, 0, 0\]: expected a finite number"),
         ({"A_other": np.zeros((4, 4))}, "edges of pull: A_self: expected shape"),
         ({"b": np.zeros((1, 3))}, r"edges of pull: b: expected shape \(1, 4\)"),
-    ],
-)
-def test_wrong_edges_are_named(columns, message):
-    with pytest.raises(InputError, match=message):
-        edges(**columns)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            edges(**columns)
 
 
-@pytest.mark.parametrize(
-    ("nodes", "types", "groups", "message"),
-    [
+def test_wrong_graphs_are_refused(subtests):
+    for nodes, types, groups, message in [
         ([1, 1], (CAR, CAR), (), "nodes: expected unique ids, 1 occurs more than once"),
         ([1, 2], (CAR,), (), "types: expected 2 node types, got 1"),
         ([1.5], (CAR,), (), "nodes: expected a list of integers"),
@@ -77,11 +73,9 @@ def test_wrong_edges_are_named(columns, message):
         ([1, 2], (CAR, CAR), (edges((-1, 0), (1, 1)),), "edges of pull: target: row -1 is outside 2 nodes"),
         ([8, 9], (CAR, TRUCK), (edges((0,), (1,)),), "source: node 9 has 6 components, the interaction 4"),
         ([8, 9], (CAR, TRUCK), (edges((1,), (0,)),), "target: node 9 has 6 components, the interaction 4"),
-    ],
-)
-def test_wrong_graphs_are_refused(nodes, types, groups, message):
-    with pytest.raises(InputError, match=message):
-        SceneGraph(nodes, types, groups)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            SceneGraph(nodes, types, groups)
 
 
 def test_diffusion_may_be_scaled_node_by_node():

@@ -133,14 +133,17 @@ def test_all_round_means_all_round():
     assert Sensor().sees(around, np.eye(4)).all()
 
 
-@pytest.mark.parametrize("key", ["x", "y", "z", "yaw"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_extrinsics_are_finite(key, value):
-    with pytest.raises(InputError, match=f"^{key}: expected a finite number, got"):
-        Extrinsics(**{key: value})
+def test_extrinsics_are_finite(subtests):
+    for key in ["x", "y", "z", "yaw"]:
+        for value in [float("nan"), float("inf"), -float("inf")]:
+            with (
+                subtests.test(key=key, value=value),
+                pytest.raises(InputError, match=f"^{key}: expected a finite number, got"),
+            ):
+                Extrinsics(**{key: value})
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.1, 0.0, 1.0, 1.1])
-def test_the_accuracy_of_classes_is_a_probability_inside_0_to_1(value):
-    with pytest.raises(InputError, match=r"^class_accuracy: expected"):
-        Sensor(class_accuracy=value)
+def test_the_accuracy_of_classes_is_a_probability_inside_0_to_1(subtests):
+    for value in [float("nan"), float("inf"), -0.1, 0.0, 1.0, 1.1]:
+        with subtests.test(value=value), pytest.raises(InputError, match=r"^class_accuracy: expected"):
+            Sensor(class_accuracy=value)

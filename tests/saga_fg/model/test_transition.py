@@ -28,9 +28,8 @@ def test_blocks_are_where_their_nodes_are():
     assert TRANSITION.Q_matrix.toarray()[10:, 10:] == pytest.approx(0.01 * np.eye(2))
 
 
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
+def test_parts_that_do_not_fit_are_refused(subtests):
+    for parts, message in [
         ({"b": np.zeros(11)}, r"transition over 0.5 s: b: expected 12 entries, got shape \(11,\)"),
         ({"b": np.full(12, np.nan)}, "transition over 0.5 s: b: expected finite numbers"),
         ({"F": (blocks(0, np.eye(6)),)}, "F: blocks of size 6 x 6 do not fit the states of their nodes"),
@@ -38,11 +37,9 @@ def test_blocks_are_where_their_nodes_are():
         ({"Q": TRANSITION.Q[:-1]}, "Q: expected one block for each of 3 nodes"),
         ({"Q": TRANSITION.Q + TRANSITION.Q[:1]}, "Q: expected one block for each of 3 nodes"),
         ({"Q": (blocks(0, np.full((4, 4), np.inf)), *TRANSITION.Q[1:])}, "Q: expected finite numbers"),
-    ],
-)
-def test_parts_that_do_not_fit_are_refused(parts, message):
-    with pytest.raises(InputError, match=message):
-        dataclasses.replace(TRANSITION, **parts)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            dataclasses.replace(TRANSITION, **parts)
 
 
 def test_dynamics_that_explode_within_the_interval_are_refused():

@@ -28,9 +28,8 @@ def test_an_empty_list_is_no_rows_of_anything(shape):
     assert checked("values", [], shape).shape == tuple(n or 0 for n in shape)
 
 
-@pytest.mark.parametrize(
-    ("value", "shape", "message"),
-    [
+def test_wrong_arrays_are_named(subtests):
+    for value, shape, message in [
         ([1.0, 2.0], (3,), r"speed: expected shape \(3,\), got \(2,\)"),
         ([[1.0, 2.0]], (None, 3), r"speed: expected shape \(any, 3\), got \(1, 2\)"),
         (1.0, (None,), r"speed: expected shape \(any,\), got \(\)"),
@@ -41,11 +40,9 @@ def test_an_empty_list_is_no_rows_of_anything(shape):
         ([0.0, np.nan], (2,), r"speed\[1\]: expected a finite number, got nan"),
         ([[0.0, 0.0], [np.inf, 0.0]], (2, 2), r"speed\[1, 0\]: expected a finite number, got inf"),
         ([None], (1,), r"speed\[0\]: expected a finite number, got nan"),
-    ],
-)
-def test_wrong_arrays_are_named(value, shape, message):
-    with pytest.raises(InputError, match=message):
-        checked("speed", value, shape)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            checked("speed", value, shape)
 
 
 def test_complex_arrays_are_not_silently_made_real():
@@ -78,9 +75,8 @@ def test_labels_are_kept(labels):
     assert not result.flags.writeable
 
 
-@pytest.mark.parametrize(
-    ("value", "length", "message"),
-    [
+def test_wrong_labels_are_named(subtests):
+    for value, length, message in [
         (["car", ""], None, r"label\[1\]: expected a name, got an empty string"),
         (["car"], 2, "label: expected 2 entries, got 1"),
         ([], 1, "label: expected 1 entries, got 0"),
@@ -89,11 +85,9 @@ def test_labels_are_kept(labels):
         (None, None, "label: expected a list of strings, got None"),
         (["car", None], None, "label: expected a list of strings"),
         ([["car"]], None, "label: expected a list of strings"),
-    ],
-)
-def test_wrong_labels_are_named(value, length, message):
-    with pytest.raises(InputError, match=message):
-        checked_labels("label", value, length)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            checked_labels("label", value, length)
 
 
 @given(st.lists(st.integers(-(2**63), 2**63 - 1), unique=True))
@@ -103,9 +97,8 @@ def test_ids_are_kept(ids):
     assert not result.flags.writeable
 
 
-@pytest.mark.parametrize(
-    ("value", "length", "message"),
-    [
+def test_wrong_ids_are_named(subtests):
+    for value, length, message in [
         ([3, 1, 3], None, "nodes: expected unique ids, 3 occurs more than once"),
         ([1.0], None, r"nodes: expected a list of integers, got \[1.0\]"),
         ([True], None, "nodes: expected a list of integers"),
@@ -116,11 +109,9 @@ def test_ids_are_kept(ids):
         ([2**63], None, "nodes: expected a list of integers"),
         ([10**400], None, "nodes: expected a list of integers"),
         ([[1], [1, 2]], None, "nodes: expected a list of integers"),
-    ],
-)
-def test_wrong_ids_are_named(value, length, message):
-    with pytest.raises(InputError, match=message):
-        checked_ids("nodes", value, length)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            checked_ids("nodes", value, length)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 4), st.integers(1, 5))
@@ -144,9 +135,8 @@ def test_units_do_not_make_a_matrix_singular():
     assert checked_covariances("R", [np.diag([1e-12, 1e12])], 1, 2).shape == (1, 2, 2)
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
+def test_what_is_no_covariance_is_named(subtests):
+    for bad, message in [
         (np.diag([1.0, 0.0]), r"R\[1\]: expected a positive definite matrix, got \[\[1.0, 0.0\], \[0.0, 0.0\]\]"),
         (np.zeros((2, 2)), r"R\[1\]: expected a positive definite matrix"),
         (np.diag([1.0, -1.0]), r"R\[1\]: expected a positive definite matrix"),
@@ -154,8 +144,6 @@ def test_units_do_not_make_a_matrix_singular():
         (np.outer([0.1, 0.7], [0.1, 0.7]), r"R\[1\]: expected a positive definite matrix"),
         (np.array([[1.0, 0.5], [0.4, 1.0]]), r"R\[1\]: expected a symmetric matrix"),
         (np.array([[1.0, np.nan], [np.nan, 1.0]]), r"R\[1, 0, 1\]: expected a finite number"),
-    ],
-)
-def test_what_is_no_covariance_is_named(bad, message):
-    with pytest.raises(InputError, match=message):
-        checked_covariances("R", [np.eye(2), bad], 2, 2)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            checked_covariances("R", [np.eye(2), bad], 2, 2)

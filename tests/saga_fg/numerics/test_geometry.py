@@ -121,9 +121,8 @@ def broken(row, column, value):
     return T
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
+def test_what_is_not_rigid_is_refused(subtests):
+    for value, message in [
         (np.diag([1.0, 1.0, -1.0, 1.0]), "world_T_ego: expected a rigid 4 x 4 transform"),  # a mirror
         (np.diag([2.0, 2.0, 2.0, 1.0]), "world_T_ego: expected a rigid 4 x 4 transform"),
         (broken(0, 1, 0.1), "world_T_ego: expected a rigid 4 x 4 transform"),
@@ -131,11 +130,9 @@ def broken(row, column, value):
         (np.zeros((4, 4)), "world_T_ego: expected a rigid 4 x 4 transform"),
         (np.eye(3), r"world_T_ego: expected shape \(4, 4\), got \(3, 3\)"),
         (broken(0, 3, np.nan), r"world_T_ego\[0, 3\]: expected a finite number, got nan"),
-    ],
-)
-def test_what_is_not_rigid_is_refused(value, message):
-    with pytest.raises(InputError, match=message):
-        checked_transform("world_T_ego", value)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            checked_transform("world_T_ego", value)
 
 
 def test_quaternions_are_normalised_when_nearly_unit_and_refused_otherwise():

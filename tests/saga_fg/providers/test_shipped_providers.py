@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -261,9 +260,8 @@ IMU = ImuSamples([0.1], [[0, 0, 9.81]], [[0, 0, 0]])
 LEFT_HANDED = np.diag([1.0, -1.0, 1.0])
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_measurements_and_settings_that_make_no_sense(subtests: pytest.Subtests) -> None:
+    for make, message in [
         (lambda: GpsFix([np.nan, 0.0]), r"gps\[0\]: expected a finite number, got nan"),
         (lambda: GpsFix([1.0]), "gps: expected a place of 2 or 3 coordinates, got 1"),
         (lambda: GpsFix([1.0, 2.0], -np.eye(2)), r"gps: covariance\[0\]: expected a positive definite matrix"),
@@ -287,19 +285,16 @@ LEFT_HANDED = np.diag([1.0, -1.0, 1.0])
         (lambda: Odometry(place_drift=np.nan), "place_drift: expected a finite number > 0"),
         (lambda: Imu(StartSettings()), "start.planar: expected false"),
         (lambda: StartSettings((0.0, np.nan, 0.0)), "place: expected finite numbers"),
-    ],
-)
-def test_measurements_and_settings_that_make_no_sense(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make()
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            make()
 
 
 SPACE = StartSettings((0.0, 0.0, 0.0), planar=False)
 
 
-@pytest.mark.parametrize(
-    ("providers", "ego", "message"),
-    [
+def test_what_does_not_fit_is_one_error_and_the_smoother_goes_on(subtests: pytest.Subtests) -> None:
+    for providers, ego, message in [
         (
             [Odometry()],
             EgoMeasurements(OdometryIncrement(np.eye(4), 0.1)),
@@ -321,16 +316,13 @@ SPACE = StartSettings((0.0, 0.0, 0.0), planar=False)
             EgoMeasurements(landmarks={1: Observation(PointLandmark(3), [1.0, 2.0, 0.0], np.eye(3))}),
             "provider landmarks: ",
         ),
-    ],
-)
-def test_what_does_not_fit_is_one_error_and_the_smoother_goes_on(
-    providers: Sequence[Any], ego: EgoMeasurements, message: str
-) -> None:
-    smoother = IncrementalSmoother(providers)
-    smoother.step(0.0)
-    with pytest.raises(GraphError, match=message):
-        smoother.step(DT, frame=frame(1, ego))
-    assert smoother.time == 0.0
-    if ego.imu is None:
-        smoother.step(DT, frame=frame(1, replace(ego, odometry=None, gps=None, landmarks={})))
-        assert smoother.time == DT
+    ]:
+        with subtests.test(message):
+            smoother = IncrementalSmoother(providers)
+            smoother.step(0.0)
+            with pytest.raises(GraphError, match=message):
+                smoother.step(DT, frame=frame(1, ego))
+            assert smoother.time == 0.0
+            if ego.imu is None:
+                smoother.step(DT, frame=frame(1, replace(ego, odometry=None, gps=None, landmarks={})))
+                assert smoother.time == DT

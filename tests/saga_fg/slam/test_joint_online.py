@@ -131,20 +131,18 @@ def test_what_cannot_be_is_refused() -> None:
         estimate_online(frames, odometry, OnlineEstimator(new_tracker(), 1.0), [()])
 
 
-@pytest.mark.parametrize(
-    ("motion", "covariance", "message"),
-    [
+def test_a_motion_that_is_none_does_not_reach_the_graph(subtests: pytest.Subtests) -> None:
+    for motion, covariance, message in [
         (None, None, "a_T_b: expected the motion since the last frame"),
         (np.full((4, 4), np.nan), None, "expected a finite number"),
         (2 * np.eye(4), None, "a_T_b: expected a rigid"),
         (np.eye(4), -np.eye(6), "covariance"),
-    ],
-)
-def test_a_motion_that_is_none_does_not_reach_the_graph(motion, covariance, message) -> None:
-    frames, odometry, *_ = drive(n=3)
-    estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS)
-    estimator.step(frames[0])
-    with pytest.raises(InputError, match=message):
-        estimator.step(frames[1], motion, covariance)
-    estimator.step(frames[1], odometry.a_T_b[0])  # and leaves the estimator as it was
-    assert len(estimator.window().world_T_ego) == 2
+    ]:
+        with subtests.test(message):
+            frames, odometry, *_ = drive(n=3)
+            estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS)
+            estimator.step(frames[0])
+            with pytest.raises(InputError, match=message):
+                estimator.step(frames[1], motion, covariance)
+            estimator.step(frames[1], odometry.a_T_b[0])  # and leaves the estimator as it was
+            assert len(estimator.window().world_T_ego) == 2

@@ -60,17 +60,18 @@ def test_false_loops_are_found_with_known_places() -> None:
     assert np.linalg.norm((agreed.graph.world_T_pose - true)[:, :2, 2], axis=1).max() < 0.3
 
 
-@pytest.mark.parametrize(("dim", "count"), [(2, 1), (3, 2)])
-def test_too_few_places_are_refused_unless_a_pose_is_known(dim: int, count: int) -> None:
-    graph, true = surveyed(dim)
-    places = graph.places
-    assert places is not None
-    few = replace(
-        graph, places=PositionPriors(places.pose[:count], places.position[:count], places.information[:count])
-    )
-    with pytest.raises(InputError, match="nothing tells which way the graph is turned"):
-        optimise_poses(few)
-    k = 3 * (dim - 1)
-    known = PosePriors(np.array([0]), true[:1], 1e6 * np.eye(k)[None])
-    off = optimise_poses(replace(few, priors=known), certify=True).world_T_pose[0] - true[0]
-    assert np.abs(off).max() < 0.05
+def test_too_few_places_are_refused_unless_a_pose_is_known(subtests: pytest.Subtests) -> None:
+    for dim, count in [(2, 1), (3, 2)]:
+        with subtests.test(dim=dim, count=count):
+            graph, true = surveyed(dim)
+            places = graph.places
+            assert places is not None
+            few = replace(
+                graph, places=PositionPriors(places.pose[:count], places.position[:count], places.information[:count])
+            )
+            with pytest.raises(InputError, match="nothing tells which way the graph is turned"):
+                optimise_poses(few)
+            k = 3 * (dim - 1)
+            known = PosePriors(np.array([0]), true[:1], 1e6 * np.eye(k)[None])
+            off = optimise_poses(replace(few, priors=known), certify=True).world_T_pose[0] - true[0]
+            assert np.abs(off).max() < 0.05

@@ -209,9 +209,8 @@ def test_every_observation_belongs_to_one_landmark_of_the_map() -> None:
     assert sum(landmark.observations for landmark in found.landmarks) == len(found.observations)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
+def test_what_cannot_be_is_refused(subtests: pytest.Subtests) -> None:
+    for make, message in [
         (lambda: Observation(PoleLandmark(), [1, 2, np.nan], np.eye(2)), "observed pole"),
         (lambda: Observation(PoleLandmark(), [1, 2, 3], np.eye(3)), "covariance of a pole"),
         (lambda: Observation(PlaneLandmark(), [0, 0, 1, 2], -np.eye(3)), "positive definite"),
@@ -220,8 +219,6 @@ def test_every_observation_belongs_to_one_landmark_of_the_map() -> None:
         (lambda: PoleLandmark(density=0.0), "density"),
         (lambda: LandmarkSettings(gate=0.2), "gate"),
         (lambda: MapperSettings(smooth_every=0), "smooth_every"),
-    ],
-)
-def test_what_cannot_be_is_refused(make: object, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make()  # type: ignore[operator]
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            make()  # type: ignore[operator]

@@ -147,29 +147,28 @@ def test_what_an_observation_cannot_be_names_type_and_time_and_changes_nothing()
     assert [landmark.observations for landmark in mapper.map().landmarks] == [1]
 
 
-@pytest.mark.parametrize(
-    ("motion", "message"),
-    [
+def test_what_is_no_motion_is_refused_and_the_drive_goes_on(subtests: pytest.Subtests) -> None:
+    for motion, message in [
         (np.eye(4), r"a_T_b: expected a 3 x 3 transform like the mapper's poses, got shape \(4, 4\)"),
         (np.full((3, 3), np.nan), "a_T_b"),
         (2 * np.eye(3), "a_T_b: expected a rigid transform"),
         ("ahead", "a_T_b"),
-    ],
-)
-def test_what_is_no_motion_is_refused_and_the_drive_goes_on(motion: FloatArray, message: str) -> None:
-    mapper = LandmarkMapper(np.eye(3), SURE)
-    with pytest.raises(InputError, match=message):
-        mapper.move(motion, Q)
-    mapper.move(ahead(1.0).tolist(), Q)  # type: ignore[arg-type]
-    assert len(mapper.map().world_T_pose) == 2
+    ]:
+        with subtests.test(message):
+            mapper = LandmarkMapper(np.eye(3), SURE)
+            with pytest.raises(InputError, match=message):
+                mapper.move(motion, Q)
+            mapper.move(ahead(1.0).tolist(), Q)  # type: ignore[arg-type]
+            assert len(mapper.map().world_T_pose) == 2
 
 
-@pytest.mark.parametrize("covariance", [np.eye(6), np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)])
-def test_a_first_pose_has_a_covariance(covariance: FloatArray) -> None:
-    with pytest.raises(InputError, match="covariance"):
-        LandmarkMapper(np.eye(3), covariance)
-    with pytest.raises(InputError, match="world_T_pose: expected a rigid transform"):
-        LandmarkMapper(2 * np.eye(3), SURE)
+def test_a_first_pose_has_a_covariance(subtests: pytest.Subtests) -> None:
+    for covariance in [np.eye(6), np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)]:
+        with subtests.test(covariance=covariance):
+            with pytest.raises(InputError, match="covariance"):
+                LandmarkMapper(np.eye(3), covariance)
+            with pytest.raises(InputError, match="world_T_pose: expected a rigid transform"):
+                LandmarkMapper(2 * np.eye(3), SURE)
 
 
 class Sideways(PointLandmark):

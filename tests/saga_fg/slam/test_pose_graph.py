@@ -85,17 +85,15 @@ def test_parts_without_connection_are_named() -> None:
         optimise_poses(apart)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_what_does_not_fit_together_is_refused(subtests: pytest.Subtests) -> None:
+    for change, message in [
         ({"ids": np.zeros(36, dtype=int)}, "unique ids"),
         ({"first": np.full(59, 99)}, "first: expected rows"),
         ({"information": np.zeros((59, 3, 3))}, "positive definite"),
         ({"world_T_pose": np.ones((36, 3, 3))}, "world_T_pose.0.: expected a rigid transform"),
         ({"world_T_pose": np.ones((36, 5, 5))}, "3 x 3 or 4 x 4"),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(change: dict[str, np.ndarray], message: str) -> None:
-    graph, _ = loop(2, seed=0)
-    with pytest.raises(InputError, match=message):
-        replace(graph, **change)
+    ]:
+        with subtests.test(message):
+            graph, _ = loop(2, seed=0)
+            with pytest.raises(InputError, match=message):
+                replace(graph, **change)

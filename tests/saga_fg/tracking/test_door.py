@@ -30,28 +30,28 @@ def frame(number, count=6):
     return Frame(0.1 * number, "lidar", Detections(boxes, np.full(count, 0.9)), np.eye(4))
 
 
-@pytest.mark.parametrize("name", ["position", "velocity", "range_rate", "yaw"])
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
-def test_noise_without_which_no_measurement_can_be_taken_in(name, value):
-    with pytest.raises(InputError, match=name):
-        NoiseModel(**{name: value})
+def test_noise_without_which_no_measurement_can_be_taken_in(subtests):
+    for name in ["position", "velocity", "range_rate", "yaw"]:
+        for value in [0.0, -1.0, np.nan, np.inf]:
+            with subtests.test(name=name, value=value), pytest.raises(InputError, match=name):
+                NoiseModel(**{name: value})
 
 
-@pytest.mark.parametrize("bad", [np.zeros((2, 2)), -np.eye(2), [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]])
-def test_covariances_of_detections_are_positive_definite(bad):
-    boxes = Boxes.of(["car"], np.zeros((1, 3)))
-    with pytest.raises(InputError):
-        Detections(boxes, np.array([0.9]), position_covariance=np.array(bad)[None])
+def test_covariances_of_detections_are_positive_definite(subtests):
+    for bad in [np.zeros((2, 2)), -np.eye(2), [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]]:
+        with subtests.test(bad=bad):
+            boxes = Boxes.of(["car"], np.zeros((1, 3)))
+            with pytest.raises(InputError):
+                Detections(boxes, np.array([0.9]), position_covariance=np.array(bad)[None])
 
 
-@pytest.mark.parametrize(
-    ("column", "value"), [("position", np.nan), ("position", 1e300), ("size", -1.0), ("size", 0.0)]
-)
-def test_boxes_that_cannot_be(column, value):
-    columns = {"position": np.zeros((1, 3)), "size": np.ones((1, 3))}
-    columns[column][0, 0] = value
-    with pytest.raises(InputError, match=column):
-        Boxes.of(["car"], **columns)
+def test_boxes_that_cannot_be(subtests):
+    for column, value in [("position", np.nan), ("position", 1e300), ("size", -1.0), ("size", 0.0)]:
+        with subtests.test(column=column, value=value):
+            columns = {"position": np.zeros((1, 3)), "size": np.ones((1, 3))}
+            columns[column][0, 0] = value
+            with pytest.raises(InputError, match=column):
+                Boxes.of(["car"], **columns)
 
 
 class Rule(Neighbours):
@@ -75,27 +75,33 @@ def tracked_with(rule):
     return [tracker.step(frame(number)) for number in range(3)]
 
 
-@pytest.mark.parametrize(("rule", "error"), [(Rule(SharedVelocity()), "rule Rule"), (Neighbours(Law()), "of Law: b")])
-def test_edges_by_rules_and_laws_of_users(rule, error):
-    with pytest.raises(InputError, match=error):
-        tracked_with(rule)
+def test_edges_by_rules_and_laws_of_users(subtests):
+    for rule, error in [(Rule(SharedVelocity()), "rule Rule"), (Neighbours(Law()), "of Law: b")]:
+        with subtests.test(error), pytest.raises(InputError, match=error):
+            tracked_with(rule)
 
 
-@pytest.mark.parametrize("edges", [{"target": [9]}, {"rate": [-1.0]}, {"rate": [np.nan]}, {"A_self": np.eye(3)[None]}])
-def test_edges_that_cannot_be(edges):
+def test_edges_that_cannot_be(subtests):
     """Made by hand, edges and graphs are checked."""
-    given = {"target": [0], "source": [1], "rate": [0.5], "A_self": -np.eye(4)[None], "A_other": np.eye(4)[None]}
-    with pytest.raises(InputError):
-        SceneGraph([1, 2], (CAR, CAR), (Edges("shared", **given | edges, b=np.zeros((1, 4))),))
+    for edges in [{"target": [9]}, {"rate": [-1.0]}, {"rate": [np.nan]}, {"A_self": np.eye(3)[None]}]:
+        with subtests.test(edges=edges):
+            given = {
+                "target": [0],
+                "source": [1],
+                "rate": [0.5],
+                "A_self": -np.eye(4)[None],
+                "A_other": np.eye(4)[None],
+            }
+            with pytest.raises(InputError):
+                SceneGraph([1, 2], (CAR, CAR), (Edges("shared", **given | edges, b=np.zeros((1, 4))),))
 
 
 NONLINEAR = NonlinearEdges(SmoothDriver(), [0], [1], [1.0], [4.0])
 LINEAR = Edges("shared", [0], [1], [0.5], -np.eye(4)[None], np.eye(4)[None], np.zeros((1, 4)))
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
+def test_groups_of_edges_in_the_wrong_place(subtests):
+    for given, message in [
         (
             {"edges": (NONLINEAR,)},
             "edges: expected a tuple of Edges, got NonlinearEdges of SmoothDriver, .*`nonlinear`",
@@ -103,28 +109,22 @@ LINEAR = Edges("shared", [0], [1], [0.5], -np.eye(4)[None], np.eye(4)[None], np.
         ({"nonlinear": (LINEAR,)}, "nonlinear: expected a tuple of NonlinearEdges, got Edges of shared, .* `edges`"),
         ({"edges": NONLINEAR}, "edges: expected a tuple of Edges, got NonlinearEdges"),
         ({"edges": (3,)}, "edges: expected a tuple of Edges, got one of int"),
-    ],
-    ids=["nonlinear as edges", "edges as nonlinear", "no tuple", "no edges"],
-)
-def test_groups_of_edges_in_the_wrong_place(given, message):
-    with pytest.raises(InputError, match=message):
-        SceneGraph([1, 2], (CAR, CAR), **given)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            SceneGraph([1, 2], (CAR, CAR), **given)
 
 
-@pytest.mark.parametrize(
-    ("rules", "message"),
-    [
+def test_what_is_no_edge_rule(subtests):
+    for rules, message in [
         ((NONLINEAR,), r"\[0\]: expected an edge rule, .*, got NonlinearEdges; their law can be the interaction of"),
         (NONLINEAR, ": expected a tuple of edge rules, got NonlinearEdges$"),
         ((Neighbours(), Neighbours), r"\[1\]: expected an edge rule, .*, got type$"),
-    ],
-    ids=["edges", "no tuple", "a class"],
-)
-def test_what_is_no_edge_rule(rules, message):
-    with pytest.raises(InputError, match=f"^edges{message}"):
-        TrackerSettings(edges=rules)
-    with pytest.raises(InputError, match=f"^rules{message}"):
-        Tracker(rules=rules)
+    ]:
+        with subtests.test(message):
+            with pytest.raises(InputError, match=f"^edges{message}"):
+                TrackerSettings(edges=rules)
+            with pytest.raises(InputError, match=f"^rules{message}"):
+                Tracker(rules=rules)
 
 
 def test_inside_nothing_is_checked_again(monkeypatch):

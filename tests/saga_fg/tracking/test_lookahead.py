@@ -167,12 +167,11 @@ def test_without_tracks_there_is_an_empty_answer_and_without_a_frame_none():
     assert found.joint_covariance.shape == (2, 0, 0)
 
 
-@pytest.mark.parametrize(
-    "horizons", [[], [-1.0], [1.0, np.nan], [np.inf], [2.0, 1.0], [1.0, 1.0], [61.0], 1.0, [[1.0]], ["soon"], None]
-)
-def test_horizons_that_are_none_are_refused(horizons):
-    tracker = followed(until=0.5)
-    with pytest.raises(InputError, match=r"horizons.*: expected"):
-        tracker.predict(horizons)
-    with pytest.raises(InputError, match="horizons: expected a list of seconds"):
-        tracker.predict(1.0)
+def test_horizons_that_are_none_are_refused(subtests):
+    for horizons in [[], [-1.0], [1.0, np.nan], [np.inf], [2.0, 1.0], [1.0, 1.0], [61.0], 1.0, [[1.0]], ["soon"], None]:
+        with subtests.test(horizons=horizons):
+            tracker = followed(until=0.5)
+            with pytest.raises(InputError, match=r"horizons.*: expected"):
+                tracker.predict(horizons)
+            with pytest.raises(InputError, match="horizons: expected a list of seconds"):
+                tracker.predict(1.0)

@@ -212,9 +212,8 @@ def test_from_yaml():
         read_settings(TrackerSettings, "estimator: textbok", "mine.yaml")
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
+def test_one_line_says_what_is_wrong(subtests):
+    for name, message in [
         ("text", "expected one of kalman, isam2, fixed-lag, textbook, gone, or MODULE:NAME, got 'text'"),
         (5, "expected a name, got 5"),
         ("my_estimators:", "expected MODULE:NAME, got 'my_estimators:'"),
@@ -228,14 +227,13 @@ def test_from_yaml():
         ("my_estimators:Failing", "cannot be made: RuntimeError: no licence"),
         ("my_estimators:Halved", "lacks marginalise, posterior of saga_fg.estimators.Estimator"),
         ("my_estimators:Nothing", "lacks lag, providers, time, nodes, add,"),
-    ],
-)
-def test_one_line_says_what_is_wrong(name, message):
-    with pytest.raises(InputError) as raised:
-        Tracker(settings(name))
-    assert str(raised.value).startswith("estimator: ")
-    assert message in str(raised.value)
-    assert "\n" not in str(raised.value)
+    ]:
+        with subtests.test(message):
+            with pytest.raises(InputError) as raised:
+                Tracker(settings(name))
+            assert str(raised.value).startswith("estimator: ")
+            assert message in str(raised.value)
+            assert "\n" not in str(raised.value)
 
 
 def test_what_an_estimator_does_not_take_is_refused():

@@ -115,17 +115,14 @@ def test_detections_carry_range_rates_through_selection_and_transformation():
     assert ego.detections.range_rate[0] == -3.0
 
 
-@pytest.mark.parametrize(
-    ("rate", "message"),
-    [
+def test_wrong_range_rates_are_refused(subtests):
+    for rate, message in [
         (np.inf, r"range_rate\[0\]: expected a finite number, or NaN for unknown, got inf"),
         ("fast", "range_rate: expected numbers"),
         ([1.0, 2.0], r"range_rate: expected shape \(1,\), got \(2,\)"),
-    ],
-)
-def test_wrong_range_rates_are_refused(rate, message):
-    with pytest.raises(InputError, match=message):
-        Detections(Boxes.of(["car"], [(0, 0, 0)]), [0.5], rate if isinstance(rate, list) else [rate])
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            Detections(Boxes.of(["car"], [(0, 0, 0)]), [0.5], rate if isinstance(rate, list) else [rate])
 
 
 def test_a_range_rate_needs_to_be_seen_from_somewhere():

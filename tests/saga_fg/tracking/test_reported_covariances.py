@@ -40,18 +40,15 @@ def test_covariances_survive_selection_and_single_detections():
     assert Detections.of([one, both[0]]).position_covariance[0] == pytest.approx(ALONG[0])
 
 
-@pytest.mark.parametrize(
-    ("covariance", "message"),
-    [
+def test_wrong_covariances_are_refused(subtests):
+    for covariance, message in [
         (-ALONG, "position_covariance.0.: expected a positive definite"),
         (np.array([[[1.0, 0.5], [0.0, 1.0]]]), "position_covariance.0.: expected a symmetric"),
         (np.ones((2, 2)), "position_covariance: expected shape"),
         (np.array([[[1.0, np.nan], [np.nan, 1.0]]]), "position_covariance.0, 0, 1.: expected a finite number"),
-    ],
-)
-def test_wrong_covariances_are_refused(covariance, message):
-    with pytest.raises(InputError, match=message):
-        table(covariance)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            table(covariance)
 
 
 def test_a_wrong_covariance_of_one_detection_is_refused():

@@ -254,10 +254,13 @@ def with_rate(timestamp, rate, velocity=None):
     return Frame(timestamp, "radar", replace(plain.detections, range_rate=np.array([rate])), POSE)
 
 
-@pytest.mark.parametrize("rate", [1e10, 1e300, -2e6])
-def test_range_rates_that_nothing_has_are_refused(rate):
-    with pytest.raises(InputError, match=r"range_rate\[0\]: expected numbers within 1e\+06"):
-        with_rate(0.0, rate)
+def test_range_rates_that_nothing_has_are_refused(subtests):
+    for rate in [1e10, 1e300, -2e6]:
+        with (
+            subtests.test(rate=rate),
+            pytest.raises(InputError, match=r"range_rate\[0\]: expected numbers within 1e\+06"),
+        ):
+            with_rate(0.0, rate)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -286,28 +289,29 @@ def test_how_fast_things_are_can_be_set():
 # what is no frame, and copies
 
 
-@pytest.mark.parametrize("make", [Tracker, GreedyTracker])
-@pytest.mark.parametrize("nothing", [None, [], [Detection("car", (0, 0, 0))], np.zeros((3, 2))], ids=type)
-def test_what_is_no_frame_is_refused(make, nothing):
-    with pytest.raises(InputError, match=f"frame: expected Frame, got {type(nothing).__name__}"):
-        make().step(nothing)
+def test_what_is_no_frame_is_refused(subtests):
+    for make in [Tracker, GreedyTracker]:
+        for nothing in [None, [], [Detection("car", (0, 0, 0))], np.zeros((3, 2))]:
+            with (
+                subtests.test(make=make, nothing=nothing),
+                pytest.raises(InputError, match=f"frame: expected Frame, got {type(nothing).__name__}"),
+            ):
+                make().step(nothing)
 
 
-@pytest.mark.parametrize("make", [Tracker, GreedyTracker])
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"settings": {"min_hits": 2}}, "settings: expected {}, got dict"),
-        ({"sensors": {"lidar": 0.3}}, "sensors.lidar: expected Sensor, got float"),
-        ({"sensors": ()}, "sensors: expected Mapping, got tuple"),
-    ],
-)
-def test_settings_and_sensors_of_another_type_are_named(make, arguments, message):
-    wanted = {Tracker: "TrackerSettings", GreedyTracker: "GreedySettings"}[make]
-    with pytest.raises(InputError, match=message.format(wanted)):
-        make(**arguments)
-    with pytest.raises(InputError, match=r"snapshot: expected \w+Snapshot, got str"):
-        make().restore("state.json")
+def test_settings_and_sensors_of_another_type_are_named(subtests):
+    for make in [Tracker, GreedyTracker]:
+        for arguments, message in [
+            ({"settings": {"min_hits": 2}}, "settings: expected {}, got dict"),
+            ({"sensors": {"lidar": 0.3}}, "sensors.lidar: expected Sensor, got float"),
+            ({"sensors": ()}, "sensors: expected Mapping, got tuple"),
+        ]:
+            with subtests.test(message):
+                wanted = {Tracker: "TrackerSettings", GreedyTracker: "GreedySettings"}[make]
+                with pytest.raises(InputError, match=message.format(wanted)):
+                    make(**arguments)
+                with pytest.raises(InputError, match=r"snapshot: expected \w+Snapshot, got str"):
+                    make().restore("state.json")
 
 
 def test_a_list_of_detections_may_be_any_iterable():
@@ -321,10 +325,10 @@ def test_times_that_are_none_are_refused(timestamp):
             ask()
 
 
-@pytest.mark.parametrize("rows", [np.zeros((3, 2)), [(0, 0, 0)], [None], 7, None], ids=repr)
-def test_what_are_no_detections_is_refused(rows):
-    with pytest.raises(InputError, match="detections: expected a list of Detection"):
-        Detections.of(rows)
+def test_what_are_no_detections_is_refused(subtests):
+    for rows in [np.zeros((3, 2)), [(0, 0, 0)], [None], 7, None]:
+        with subtests.test(rows=rows), pytest.raises(InputError, match="detections: expected a list of Detection"):
+            Detections.of(rows)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, copy.copy, lambda t: pickle.loads(pickle.dumps(t))])

@@ -205,11 +205,12 @@ def test_before_the_first_frame_there_is_nothing():
     assert Tracker().tracks(3.0).timestamp == 3.0
 
 
-@pytest.mark.parametrize("timestamp", [np.nan, np.inf, -np.inf])
-def test_a_time_that_is_none_is_refused_and_nothing_has_happened(timestamp):
-    t = tracker()
-    now = run(t, seen(np.random.default_rng(0), FAST, np.arange(0, 1, 0.1)))[-1]
-    with pytest.raises(InputError, match="timestamp: expected a finite number of seconds"):
-        t.tracks(timestamp)
-    assert columns(t.tracks(now.timestamp)) == columns(now)
-    assert t.step(frame(1.0, FAST(1.0))).id.tolist() == [1, 2]
+def test_a_time_that_is_none_is_refused_and_nothing_has_happened(subtests):
+    for timestamp in [np.nan, np.inf, -np.inf]:
+        with subtests.test(timestamp=timestamp):
+            t = tracker()
+            now = run(t, seen(np.random.default_rng(0), FAST, np.arange(0, 1, 0.1)))[-1]
+            with pytest.raises(InputError, match="timestamp: expected a finite number of seconds"):
+                t.tracks(timestamp)
+            assert columns(t.tracks(now.timestamp)) == columns(now)
+            assert t.step(frame(1.0, FAST(1.0))).id.tolist() == [1, 2]

@@ -70,9 +70,8 @@ def test_columns_are_read_only_and_yaw_is_wrapped(boxes):
         boxes.yaw = np.zeros(len(boxes))
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
+def test_wrong_columns_are_named(subtests):
+    for columns, message in [
         ({"label": ["car", 1.0]}, None),
         ({"label": ["car", ""]}, r"label\[1\]: expected a name"),
         ({"label": [1, 2]}, "label: expected a list of strings"),
@@ -90,15 +89,14 @@ def test_columns_are_read_only_and_yaw_is_wrapped(boxes):
         ({"yaw": [0.0, np.inf]}, r"yaw\[1\]: expected a finite number, or NaN for unknown, got inf"),
         ({"velocity": [(0, 0), (0, np.inf)]}, r"velocity\[1, 1\]: expected a finite number, or NaN"),
         ({"velocity": [(0, 0, 0), (0, 0, 0)]}, r"velocity: expected shape \(2, 2\), got \(2, 3\)"),
-    ],
-)
-def test_wrong_columns_are_named(columns, message):
-    good = {"label": ["car", "car"], "position": [(0, 0, 0), (1, 0, 0)]}
-    if message is None:  # numpy makes strings of them: a label like any other
-        assert len(Boxes.of(**(good | columns))) == 2
-        return
-    with pytest.raises(InputError, match=message):
-        Boxes.of(**(good | columns))
+    ]:
+        with subtests.test(message):
+            good = {"label": ["car", "car"], "position": [(0, 0, 0), (1, 0, 0)]}
+            if message is None:  # numpy makes strings of them: a label like any other
+                assert len(Boxes.of(**(good | columns))) == 2
+                continue
+            with pytest.raises(InputError, match=message):
+                Boxes.of(**(good | columns))
 
 
 @given(tables(), coordinates, coordinates, st.floats(-10, 10))

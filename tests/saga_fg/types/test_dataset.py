@@ -35,9 +35,8 @@ def test_a_scene_without_moments_or_frames():
     assert empty.sensors == ()
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
+def test_a_wrong_scene_is_refused(subtests):
+    for columns, message in [
         ({"timestamps": [0.0, 0.5, 0.5]}, r"scene crossing: timestamps\[2\]: expected increasing times, time repeats"),
         ({"timestamps": [0.0, 1.0, 0.5]}, r"scene crossing: timestamps\[2\]: .* time runs backwards at 0.500000 s"),
         ({"timestamps": [0.0, np.nan, 1.0]}, r"timestamps\[1\]: expected a finite number, got nan"),
@@ -50,11 +49,9 @@ def test_a_scene_without_moments_or_frames():
             {"frames": [Frame(t, "lidar", Detections.empty()) for t in (0.5, 0.4)]},
             r"scene crossing: frames\[1\]: expected frames in order of time, 0.400000 s comes late",
         ),
-    ],
-)
-def test_a_wrong_scene_is_refused(columns, message):
-    with pytest.raises(InputError, match=message):
-        scene(**columns)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            scene(**columns)
 
 
 def test_annotations_keep_their_columns():
@@ -64,16 +61,13 @@ def test_annotations_keep_their_columns():
     assert len(Annotations(np.array([]), Boxes.empty(), np.array([]))) == 0
 
 
-@pytest.mark.parametrize(
-    ("ids", "visible", "message"),
-    [
+def test_wrong_annotations_are_refused(subtests):
+    for ids, visible, message in [
         (("a", "a"), (True, True), "id: expected unique object ids"),
         (("a",), (True, True), "id: expected 2 entries, got 1"),
         ((1, 2), (True, True), "id: expected a list of strings"),
         (("a", "b"), (True,), "visible: expected 2 booleans"),
         (("a", "b"), (1, 0), "visible: expected 2 booleans, got int64"),
-    ],
-)
-def test_wrong_annotations_are_refused(ids, visible, message):
-    with pytest.raises(InputError, match=message):
-        annotations(ids, visible)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            annotations(ids, visible)

@@ -35,9 +35,8 @@ def test_nothing_was_measured(H):
     assert none.H.shape == (0, 2, 4)
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
+def test_wrong_measurements_are_named(subtests):
+    for columns, message in [
         ({"nodes": [1.0, 2.0]}, "nodes: expected a list of integers"),
         ({"nodes": [[1, 2]]}, "nodes: expected a list of integers"),
         ({"nodes": 1}, "nodes: expected a list of integers"),
@@ -59,8 +58,6 @@ def test_nothing_was_measured(H):
         ({"R": np.ones((2, 2))}, r"R\[0\]: expected a positive definite matrix"),
         ({"R": [[1.0, 0.2], [0.0, 1.0]]}, r"R\[0\]: expected a symmetric matrix"),
         ({"R": np.stack([np.eye(2), np.diag([1.0, np.inf])])}, r"R\[1, 1, 1\]: expected a finite number"),
-    ],
-)
-def test_wrong_measurements_are_named(columns, message):
-    with pytest.raises(InputError, match=message):
-        measurements(**columns)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            measurements(**columns)

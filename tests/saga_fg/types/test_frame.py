@@ -63,9 +63,8 @@ def test_scores_stay_when_the_boxes_move():
     assert table.boxes.position[0] == pytest.approx([9, 0, 0])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_a_wrong_detection_is_refused(subtests):
+    for arguments, message in [
         ({"label": ""}, r"label\[0\]: expected a name"),
         ({"label": 3}, "label: expected a list of strings"),
         ({"position": (0, 0)}, r"position: expected shape \(1, 3\), got \(1, 2\)"),
@@ -77,11 +76,9 @@ def test_scores_stay_when_the_boxes_move():
         ({"score": NAN}, r"score\[0\]: expected a finite number, got nan"),
         ({"score": "high"}, "score: expected numbers"),
         ({"score": None}, r"score"),
-    ],
-)
-def test_a_wrong_detection_is_refused(arguments, message):
-    with pytest.raises(InputError, match=message):
-        Detection(**({"label": "car", "position": (0, 0, 0)} | arguments))
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            Detection(**({"label": "car", "position": (0, 0, 0)} | arguments))
 
 
 def test_as_many_scores_as_boxes():
@@ -89,9 +86,8 @@ def test_as_many_scores_as_boxes():
         Detections(Boxes.of(["car"], [(0, 0, 0)]), [0.5, 0.5])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_a_wrong_frame_is_refused(subtests):
+    for arguments, message in [
         ({"timestamp": NAN}, "timestamp: expected a finite number of seconds, got nan"),
         ({"timestamp": "0.1"}, "timestamp: expected a finite number of seconds, got '0.1'"),
         ({"timestamp": np.inf}, "timestamp: expected a finite number of seconds, got inf"),
@@ -106,11 +102,9 @@ def test_as_many_scores_as_boxes():
         ({"world_T_ego": np.zeros((4, 4))}, "world_T_ego: expected a rigid 4 x 4 transform"),
         ({"world_T_ego": np.eye(3)}, r"world_T_ego: expected shape \(4, 4\)"),
         ({"detections": [Detection("car", (0, 0, 0))]}, "detections: expected Detections, got list"),
-    ],
-)
-def test_a_wrong_frame_is_refused(arguments, message):
-    with pytest.raises(InputError, match=message):
-        Frame(**({"timestamp": 0.0, "sensor": "lidar", "detections": Detections.empty()} | arguments))
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            Frame(**({"timestamp": 0.0, "sensor": "lidar", "detections": Detections.empty()} | arguments))
 
 
 def test_a_frame_keeps_what_it_is_given():

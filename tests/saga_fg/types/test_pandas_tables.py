@@ -79,23 +79,19 @@ def test_a_table_is_tracked_in_one_line() -> None:
     pd.testing.assert_frame_equal(now.to_pandas(), tracks[-2:].reset_index(drop=True))
 
 
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
+def test_tables_that_cannot_be_used_are_refused(subtests: pytest.Subtests) -> None:
+    for rows, message in [
         ([1, 2], r"expected a pandas.DataFrame, got list"),
         (pd.DataFrame({"t": [1.0], "x": [1.0]}), r"expected the columns timestamp, y as well, there are t, x"),
         (pd.DataFrame({"timestamp": [1.0], "x": ["far"], "y": [1.0]}), r"x: expected numbers"),
         (pd.DataFrame({"timestamp": [1e15], "x": [1.0], "y": [1.0]}), r"timestamp"),
-    ],
-)
-def test_tables_that_cannot_be_used_are_refused(rows, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        saga_fg.track(rows)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            saga_fg.track(rows)
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "message"),
-    [
+def test_a_value_is_named_by_its_column_and_row(subtests: pytest.Subtests) -> None:
+    for column, value, message in [
         ("x", np.inf, r"^x: row 500: expected a finite number of at most 1e\+09, got inf"),
         ("y", 1e12, r"^y: row 500: expected a finite number of at most 1e\+09, got 1e\+12|1000000000000"),
         (
@@ -105,14 +101,13 @@ def test_tables_that_cannot_be_used_are_refused(rows, message: str) -> None:
         ),
         ("confidence", np.inf, r"^confidence: row 500: expected a finite number, or nothing for unknown, got inf"),
         ("cov_xy", 3.0, r"^cov_xx, cov_xy, cov_yy: row 500: expected a positive definite matrix, got 1.0, 3.0, 1.0"),
-    ],
-)
-def test_a_value_is_named_by_its_column_and_row(column: str, value: float, message: str) -> None:
-    rows = table(label="car", width=1.8, confidence=0.5, cov_xx=1.0, cov_xy=0.0, cov_yy=1.0)
-    rows.index = rows.index + 490
-    rows.loc[500, column] = value
-    with pytest.raises(InputError, match=message):
-        saga_fg.track(rows)
+    ]:
+        with subtests.test(message):
+            rows = table(label="car", width=1.8, confidence=0.5, cov_xx=1.0, cov_xy=0.0, cov_yy=1.0)
+            rows.index = rows.index + 490
+            rows.loc[500, column] = value
+            with pytest.raises(InputError, match=message):
+                saga_fg.track(rows)
 
 
 @pytest.mark.parametrize(

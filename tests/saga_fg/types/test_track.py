@@ -55,9 +55,8 @@ def test_no_tracks():
     assert len(table(0)) == 0
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
+def test_wrong_columns_are_named(subtests):
+    for columns, message in [
         ({"id": [1, 1]}, "id: expected unique ids, 1 occurs more than once"),
         ({"id": [1]}, "id: expected 2 entries, got 1"),
         ({"id": [0.5, 1.5]}, "id: expected a list of integers"),
@@ -66,11 +65,9 @@ def test_no_tracks():
         ({"position_covariance": np.ones((2, 3, 3))}, r"position_covariance: expected shape \(2, 2, 2\)"),
         ({"velocity_covariance": np.full((2, 2, 2), np.inf)}, r"velocity_covariance\[0, 0, 0\]: expected a finite"),
         ({"coasting": [0.0]}, r"coasting: expected shape \(2,\)"),
-    ],
-)
-def test_wrong_columns_are_named(columns, message):
-    with pytest.raises(InputError, match=message):
-        table(**columns)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            table(**columns)
 
 
 def test_columns_are_read_only():
