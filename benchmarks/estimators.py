@@ -25,9 +25,8 @@ import typer
 
 from benchmarks.filters import Filter, GtsamWindow, Ours, OurWindow, Read, Textbook, blocks, dense
 from benchmarks.flocks import DT, Flock, FlockFrame, Kind, flock
-from benchmarks.runner import Row, Rows, Seed, each, growth, in_turn, timed
+from benchmarks.runner import Row, Rows, Seed, counts, each, growth, in_turn, timed
 from factors import gaussian_factors, prior_factors
-from pipelines.cli.options import counts
 from pipelines.tracking import one_thread, resident_memory
 from saga_fg.estimators import (
     BatchSmoother,

@@ -21,7 +21,7 @@ from benchmarks.recordings.sensed import ABOVE
 from benchmarks.runner import Data, Row, Rows, chosen
 from benchmarks.variants import contenders
 from data_tools.metrics.bootstrap import difference, relative_change
-from pipelines.cli.console import progress_bar, writable_picture
+from pipelines.cli.console import progress_bar, writable
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
 from pipelines.learning import learned_motions
@@ -48,6 +48,13 @@ LEARNING = LearningSettings(passes=1, most=100)  # there is a fit to every fold,
 CONTENDERS = "saga,without trails,without lights,kf,constant velocity,turn,stationary,stationary + turn,centerpoint"
 FEWEST = 10  # gaps of a class that has rows of its own
 TITLES = {"kept": "tracks kept alive", "shipped": "tracks end as configured"}
+
+
+def _writable_picture(path: Path | None) -> Path | None:
+    """Refuse a file that cannot be written, or whose name does not say that it is a PNG file."""
+    if path is not None and path.suffix.lower() != ".png":
+        raise InputError(f"{path}: expected a name that ends in .png")
+    return writable(path)
 
 
 def gaps(
@@ -126,7 +133,7 @@ def gaps(
             help="Draw the gap in which the first contender does better than that of --against by most, in the first "
             "set, to this PNG file.",
             metavar="FILE",
-            callback=writable_picture,
+            callback=_writable_picture,
         ),
     ] = None,
     config: Config = None,

@@ -29,7 +29,7 @@ from data_tools.datasets.source import names
 from data_tools.figures import FigureTable
 from data_tools.files.input_files import unknown_name
 from data_tools.metrics import Interval
-from pipelines.cli.console import JsonFile, MarkdownFile, error_console, new_command, report
+from pipelines.cli.console import JsonFile, MarkdownFile, error_console, new_group, report
 from pipelines.cli.options import Verbose
 from pipelines.tracking import one_thread
 from saga_fg.errors import InputError
@@ -76,14 +76,9 @@ def command(run: Callable[..., Rows]) -> Callable[..., None]:
 
 def application(benchmarks: Iterable[Callable[..., Rows]]) -> typer.Typer:
     """One command for all benchmarks."""
-    app = new_command()
+    app = new_group("Measure: every figure stands beside a baseline of the same run.")
     for run in benchmarks:
         app.command()(command(run))
-
-    @app.callback()
-    def measure() -> None:
-        """Measure: every figure stands beside a baseline of the same run."""
-
     return app
 
 
@@ -114,6 +109,14 @@ def chosen(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
         if name not in known:
             raise InputError(f"{option}: {unknown_name('name', name, tuple(known))}")
     return found
+
+
+def counts(option: str, value: str, least: int = 1) -> tuple[int, ...]:
+    """The entries of a comma-separated option as whole numbers from `least` on, each once."""
+    entries = dict.fromkeys(entry.strip() for entry in value.split(",") if entry.strip())
+    if not entries or not all(entry.isdecimal() and len(entry) < 10 and int(entry) >= least for entry in entries):
+        raise InputError(f"{option}: expected whole numbers >= {least} with commas between them, got {value[:40]!r}")
+    return tuple(map(int, entries))
 
 
 def each(items: Sequence[T], name: str) -> Iterator[T]:

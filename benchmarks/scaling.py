@@ -16,8 +16,7 @@ import typer
 
 from benchmarks.filters import Filter, JointGraphTracking, Ours, SeparateGraphTracking
 from benchmarks.flocks import DT, FlockFrame, flock
-from benchmarks.runner import Rows, Seed, each, in_turn
-from pipelines.cli.options import counts
+from benchmarks.runner import Rows, Seed, counts, each, in_turn
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.scene_graph import SceneGraph

@@ -24,9 +24,8 @@ import numpy as np
 import typer
 
 from benchmarks.recording_sets import recording_set
-from benchmarks.runner import Data, Row, Rows, Seed, growth, in_turn
+from benchmarks.runner import Data, Row, Rows, Seed, counts, growth, in_turn
 from benchmarks.service.round_trip import round_trips
-from pipelines.cli.options import counts
 from pipelines.config import Method, TrackConfig, load_config
 from pipelines.tracking import StageClock
 from saga_fg.model.edge_rules import Neighbours

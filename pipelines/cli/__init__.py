@@ -1,19 +1,15 @@
-"""The command `saga-fg`. Pipelines are imported when a command runs, so that `--help` answers at once."""
+"""The command `saga-fg`. What a command needs is imported when it runs, so that `--help` answers at once."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipelines.cli.main import main
-
 if TYPE_CHECKING:
-    from pipelines.cli.commands import app
-
-__all__ = ["app", "main"]
+    from pipelines.cli.commands import app as app
 
 
 def __getattr__(name: str) -> Any:
-    """The app, imported on first use: `main` is to be at hand at once."""
+    """The app, imported on first use: SIGTERM is heard before."""
     if name == "app":
         from pipelines.cli.commands import app
 

@@ -1,167 +1,80 @@
-"""The command `saga-fg`, and its short sub-commands: `docs`, `config`, `demo`, `simulate`."""
+"""The command `saga-fg`: its sub-commands by name, each in a module that is imported when it is asked for."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from importlib.metadata import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from data_tools.files.input_files import unknown_name
-from pipelines.cli.console import counted, new_command, progress_bar, show_tables, working
-from pipelines.cli.evaluate import benchmark_app, evaluate_app
-from pipelines.cli.inspect import explain, inspect_table
-from pipelines.cli.learn import learn_app
-from pipelines.cli.options import Config, Scenario, Verbose
-from pipelines.cli.report import report_app, view_app
-from pipelines.cli.serve import serve, status
-from pipelines.cli.slam import slam_app
-from pipelines.cli.track import smooth_app, track_app
+from pipelines.cli.console import ReportingGroup, new_command, new_group
 from saga_fg import __version__
 from saga_fg.errors import InputError
 
-# Of each kind of settings, those one changes first.
-FIRST = {
-    "tracking": (
-        "tracker.min_hits",
-        "tracker.estimator",
-        "tracker.classes.*.motion",
-        "tracker.classes.*.max_deviation",
-        "sensors.*.noise.*.position",
-    ),
-    "smoothing": (
-        "smoothing.classes.*.acceleration_noise",
-        "smoothing.stitching.max_gap",
-        "smoothing.loss",
-        "smoothing.min_score",
-        "sensors.*.noise.*.position",
-    ),
-    "slam": (
-        "slam.joint.odometry.distance_noise",
-        "slam.lidar.odometry.surfel_size",
-        "slam.lidar.loops.drift",
-        "slam.lidar.landmarks",
-        "slam.lidar.loop_closures",
-    ),
-    "simulator": (
-        "duration",
-        "keyframe_rate",
-        "traffic.signal_probability",
-        "sensors.*.detection_probability",
-        "sensors.*.clutter_rate",
-    ),
-    "limits": ("reorder", "max_detections", "max_clients", "client_timeout", "idle_timeout"),
+COMMANDS = {
+    "inspect": ("inspect:inspect_table", "Look at a table: its columns, units, classes, times, faults."),
+    "track": ("track:track_app", "Track recorded detections of a dataset."),
+    "smooth": ("track:smooth_app", "Make labels of recorded detections, from past and future."),
+    "evaluate": ("evaluate:evaluate_app", "Compare results with the ground truth."),
+    "learn": ("learn:learn_app", "Learn settings from recordings."),
+    "report": ("report:report_app", "Make a page of a result: a player, figures, charts."),
+    "view": ("report:view_app", "See a result in space, in rerun or Foxglove."),
+    "benchmark": ("evaluate:benchmark_app", "Get the figures of a whole dataset, and the submission."),
+    "slam": ("slam:slam_app", "Estimate the vehicle's path and a map, in one factor graph."),
+    "explain": ("inspect:explain", "Tell the life of a track, or draw the running graph."),
+    "simulate": ("start:simulate", "Simulate traffic, and write it as recordings."),
+    "demo": ("start:demo", "Simulate traffic, track it with three methods, compare them."),
+    "serve": ("serve:serve", "Track live: detections in, tracks out, as lines of JSON."),
+    "status": ("serve:status", "Ask a running service for its counts and latencies."),
+    "config": ("start:config", "Print settings, their defaults and what they mean, as YAML."),
+    "docs": ("commands:docs", "Say where a page of the documentation is."),
 }
-POINTER = """\
-# The five settings one changes first. `saga-fg config --full` prints all of them, the page Configuration lists them.
-"""
+"""Module in this folder and name in it of each sub-command, and its line in the list of all."""
 
 
-def config(
-    kind: Annotated[
-        str,
-        typer.Option(
-            "--for",
-            help="Dataset whose shipped settings to print; or heterogeneous: traffic lights, cones, trailers.",
-            metavar="NAME",
-        ),
-    ] = "file",
-    full: Annotated[bool, typer.Option("--full", help="All settings, not only the five one changes first.")] = False,
-    simulator: Annotated[bool, typer.Option("--simulator", help="The simulator's settings instead.")] = False,
-    smoothing: Annotated[bool, typer.Option("--smoothing", help="Those of `saga-fg smooth` instead.")] = False,
-    slam: Annotated[bool, typer.Option("--slam", help="Those of `saga-fg slam` instead.")] = False,
-    limits: Annotated[bool, typer.Option("--limits", help="Those of `saga-fg serve --limits` instead.")] = False,
-    file: Annotated[
-        Path | None, typer.Option("--config", help="Print the settings this YAML file leads to.", metavar="FILE")
-    ] = None,
-    markdown: Annotated[bool, typer.Option("--markdown", help="All settings as tables in Markdown.")] = False,
-    verbose: Verbose = False,
+class LazyGroup(ReportingGroup):
+    """The group of `COMMANDS`."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = dict.fromkeys(COMMANDS, TyperCommand(None))  # listed, and suggested
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, name = COMMANDS[cmd_name][0].partition(":")
+        found = getattr(import_module(f"pipelines.cli.{module}"), name)
+        return typer.main.get_command(found) if isinstance(found, typer.Typer) else new_command(found, cmd_name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+
+
+app = new_group(
+    "Track many interacting objects with a graph-aware Kalman filter.\n\n"
+    "Start with `saga-fg demo`; then `saga-fg track --help` for recordings.",
+    LazyGroup,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"saga-fg {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def saga_fg(
+    show_version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
+    ] = False,
 ) -> None:
-    """Print settings, their defaults and what they mean, as YAML to edit and pass to `--config`.
-
-    A file needs to hold only what it changes.
-
-    \b
-    Examples:
-      saga-fg config > mine.yaml                             # the five settings one changes first
-      saga-fg config --full > mine.yaml                      # everything
-      saga-fg config --for kitti --config mine.yaml --full   # what mine.yaml makes of the defaults for KITTI
-      saga-fg config --smoothing --for nuscenes              # settings of `saga-fg smooth`
-      saga-fg config --simulator                             # settings of `saga-fg simulate`
-      saga-fg config --slam --for kitti                      # settings of `saga-fg slam`
-      saga-fg config --limits                                # limits of `saga-fg serve`
-    """
-    from data_tools.datasets.source import dataset_source
-    from data_tools.simulator import SimulatorSettings
-    from pipelines.config import load_config
-    from pipelines.configuration import load_settings, settings_reference, write_settings
-    from pipelines.serving import StreamSettings
-    from pipelines.slam.configuration import load_slam_config
-    from pipelines.smoothing import load_smooth_config
-
-    chosen = {"simulator": simulator, "smoothing": smoothing, "slam": slam, "limits": limits}
-    if sum(chosen.values()) > 1:
-        raise InputError("expected one of --simulator, --smoothing, --slam and --limits")
-    name = next((name for name, wanted in chosen.items() if wanted), "tracking")
-    settings: Any
-    if name in ("simulator", "limits"):
-        cls: type[Any] = SimulatorSettings if simulator else StreamSettings
-        settings = load_settings(cls, file) if file else cls()
-    else:
-        load = {"smoothing": load_smooth_config, "slam": load_slam_config, "tracking": load_config}[name]
-        family = kind if kind == "heterogeneous" else dataset_source(kind).family
-        settings = load(family, file)
-    if markdown:
-        text = settings_reference(type(settings))
-    elif full:
-        text = write_settings(settings)
-    else:
-        text = POINTER + write_settings(settings, selection=FIRST[name])
-    typer.echo(text, nl=False)
-
-
-READING = """\
-MOTA counts missed objects, false boxes and identity switches. kf and saga go on reporting hidden objects, centerpoint
-does not. A hidden object without a box is no miss, but a box farther than 2 m from all objects is false, so a method
-that predicts hidden objects badly loses MOTA."""
-
-
-def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and the page.")] = Path(
-        "saga-fg-demo"
-    ),
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of simulated scenes.")] = 3,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulation.")] = 0,
-    scenario: Annotated[
-        Scenario,
-        typer.Option("--scenario", help="What the scenes are about; those with a map by the heterogeneous settings."),
-    ] = "traffic",
-    config: Config = None,
-    verbose: Verbose = False,
-) -> None:
-    """Simulate traffic, track it with three methods, and compare them.
-
-    Prints a table, and writes a bird's-eye picture and an HTML page with a player. Takes less than a minute.
-
-    \b
-    Examples:
-      saga-fg demo
-      saga-fg demo --output out --scenes 1 --seed 3
-      saga-fg demo --output out --scenario road-works --scenes 1
-    """
-    from data_tools.simulator.settings import scenario_settings
-    from pipelines.config import load_config
-    from pipelines.demo import comparison_table, run_demo
-
-    with progress_bar() as progress:
-        family = "simulated" if scenario in ("traffic", "two-sensors") else "heterogeneous"
-        settings = load_config(family, config)
-        result = run_demo(output, settings, scenario_settings(scenario), scenes, seed, progress)
-    title = f"{counted(scenes, 'simulated scene')}, seed {seed}"
-    show_tables([comparison_table(result.comparison, title)])
-    typer.echo(READING)
-    typer.echo(f"picture: {result.picture}\npage:    {result.page}")
+    pass
 
 
 PAGES = Path(__file__).resolve().parents[2] / "docs"
@@ -192,97 +105,3 @@ def location(page: str, folder: Path) -> str:
 def _address() -> str:
     urls: dict[str, str] = dict(entry.split(", ", 1) for entry in metadata("saga-fg").get_all("Project-URL", []))
     return urls["Documentation"]
-
-
-MAPLESS: tuple[Scenario, ...] = ("traffic", "two-sensors")
-"""Scenarios without lights and lanes as objects, which the nuScenes layout has no place for."""
-
-
-def simulate(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 4,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same scenes.")] = 0,
-    scenario: Annotated[
-        Scenario,
-        typer.Option(
-            "--scenario", help="What the scenes are about; all but traffic and two-sensors are written as tables."
-        ),
-    ] = "traffic",
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE")
-    ] = None,
-    verbose: Verbose = False,
-) -> None:
-    """Simulate traffic, and write it in the nuScenes layout, or as tables.
-
-    Tables of nuScenes with ground truth go to v1.0-mini/, the detections of every sensor to detections/.
-    nuScenes knows no lights and no lanes, so other scenarios get a folder for each scene: detections.csv with the
-    colours of lights, truth.csv, and settings.yaml with the map of the scene.
-
-    \b
-    Examples:
-      saga-fg simulate --output simulated --scenes 4 --seed 0
-      saga-fg track nuscenes --dataroot simulated --split all \\
-          --detections lidar=simulated/detections/lidar.json --output tracks.json
-      saga-fg simulate --output junctions --scenario red-light --scenes 2
-      saga-fg track file junctions/scene-0001/detections.csv \\
-          --config junctions/scene-0001/settings.yaml --output tracks.csv
-    """
-    from data_tools.datasets.nuscenes import write_nuscenes
-    from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-    from data_tools.simulator.settings import scenario_settings
-    from pipelines.configuration import load_settings
-    from pipelines.demo import write_simulated_tables
-
-    settings = scenario_settings(scenario)
-    if config is not None:
-        settings = load_settings(SimulatorSettings, config, settings)
-    made = f"{output}: {counted(scenes, 'scene')} of {settings.duration:g} s, seed {seed}"
-    traffic = SimulatedTraffic(settings, scenes, seed)
-    with working(f"simulating {counted(scenes, 'scene')}"):
-        if scenario in MAPLESS:
-            write_nuscenes(output, traffic, traffic.mounts)
-        else:
-            write_simulated_tables(output, traffic)
-    if scenario not in MAPLESS:
-        typer.echo(f"{made}; in each folder detections.csv, truth.csv, settings.yaml")
-        return
-    detections = ", ".join(str(output / "detections" / f"{name}.json") for name in settings.sensors)
-    typer.echo(f"{made}; detections: {detections}")
-
-
-app = new_command()
-app.command("inspect")(inspect_table)
-app.add_typer(track_app, name="track")
-app.add_typer(smooth_app, name="smooth")
-app.add_typer(evaluate_app, name="evaluate")
-app.add_typer(learn_app, name="learn")
-app.add_typer(report_app, name="report")
-app.add_typer(view_app, name="view")
-app.add_typer(benchmark_app, name="benchmark")
-app.add_typer(slam_app, name="slam")
-app.command()(explain)
-app.command()(simulate)
-app.command()(demo)
-app.command()(serve)
-app.command()(status)
-app.command()(config)
-app.command()(docs)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"saga-fg {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def saga_fg(
-    show_version: Annotated[
-        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version)
-    ] = False,
-) -> None:
-    """Track many interacting objects with a graph-aware Kalman filter.
-
-    Start with `saga-fg demo`; then `saga-fg track --help` for recordings.
-    """

@@ -1,6 +1,4 @@
-"""Output of the command: results on stdout, progress and errors on stderr, tables and files of them.
-
-Output of the command: results on stdout; progress, warnings and one-line errors on stderr.
+"""Output of the command: results and tables on stdout and in files; progress, warnings and one-line errors on stderr.
 
 Exit codes: 0 done, 2 wrong arguments or input (`SagaError`), 130 interrupted, 143 terminated (`main`); anything else is
 a bug and a traceback.
@@ -11,9 +9,8 @@ from __future__ import annotations
 import functools
 import logging
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,14 +20,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from typer.core import TyperGroup
 
-from saga_fg.errors import InputError, SagaError
+from saga_fg.errors import SagaError
 
 if TYPE_CHECKING:
     from data_tools.figures import FigureTable
-    from pipelines.config import TrackConfig
     from pipelines.tracking import Progress as ProgressCallback
-    from pipelines.tracking import TrackedScene
-    from saga_fg.tracking import SensorTime
 
 log = logging.getLogger(__name__)
 
@@ -65,16 +59,29 @@ class ReportingGroup(TyperGroup):
             raise typer.Exit(INTERRUPTED) from error
 
 
-def new_command() -> typer.Typer:
-    """A command of its own, whose sub-commands are to be added."""
+def _no_options() -> None:
+    """A group is a group even while nothing has been added to it."""
+
+
+def new_group(text: str, cls: type[TyperGroup] = ReportingGroup) -> typer.Typer:
+    """A command whose sub-commands are to be added."""
     return typer.Typer(
-        cls=ReportingGroup,
+        cls=cls,
+        help=text,
+        callback=_no_options,
         no_args_is_help=True,
         rich_markup_mode=None,
         add_completion=False,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
+
+
+def new_command(run: Callable[..., None], name: str, **settings: Any) -> Any:
+    """A function as a command, without the Typer around it; settings: as `typer.Typer.command` takes them."""
+    app = typer.Typer(rich_markup_mode=None, add_completion=False)
+    app.command(name, **settings)(run)
+    return typer.main.get_command(app)
 
 
 class _ConsoleHandler(logging.Handler):
@@ -131,13 +138,6 @@ def writable(path: Path | None) -> Path | None:
     return path
 
 
-def writable_picture(path: Path | None) -> Path | None:
-    """Refuse a file that cannot be written, or whose name does not say that it is a PNG file."""
-    if path is not None and path.suffix.lower() != ".png":
-        raise InputError(f"{path}: expected a name that ends in .png")
-    return writable(path)
-
-
 JsonFile = Annotated[
     Path | None,
     typer.Option("--json", help="Write the figures to this file too.", metavar="FILE", callback=writable),
@@ -145,10 +145,6 @@ JsonFile = Annotated[
 MarkdownFile = Annotated[
     Path | None,
     typer.Option("--markdown", help="Write the tables to this file too.", metavar="FILE", callback=writable),
-]
-PictureFile = Annotated[
-    Path | None,
-    typer.Option("--plot", help="Draw the figures to this PNG file too.", metavar="FILE", callback=writable_picture),
 ]
 
 
@@ -187,57 +183,6 @@ def show_tables(tables: Iterable[FigureTable]) -> None:
         widths = (max(map(len, texts)) for texts in zip(table.columns, *table.rows, strict=True))
         needed = max(len(table.title), sum(width + 3 for width in widths) + 1)
         Console(width=max(Console().width, needed)).print(shown)
-
-
-@dataclass
-class Summary:
-    """Counts the scenes that pass through it."""
-
-    output: Path
-    scenes: int = 0
-    frames: int = 0
-    boxes: int = 0
-    seconds: float = 0.0
-    best_score: dict[tuple[str, int], float] = field(default_factory=dict)  # of each track, by scene and id
-    milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    classes: set[str] = field(default_factory=set)
-    clocks: dict[str, Mapping[str, SensorTime]] = field(default_factory=dict)  # of the sensors, by scene
-
-    def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
-        """Pass runs on and count them."""
-        for run in runs:
-            self.scenes += 1
-            self.frames += run.frames
-            self.seconds += run.seconds
-            self.milliseconds[run.scene.name] = run.milliseconds
-            if run.clocks:
-                self.clocks[run.scene.name] = run.clocks
-            self.boxes += sum(len(tracks) for tracks in run.tracks)
-            for tracks in run.tracks:
-                self.classes.update(tracks.boxes.label.tolist())
-                for id_, score in zip(tracks.id.tolist(), tracks.score.tolist(), strict=True):
-                    track = (run.scene.name, id_)
-                    self.best_score[track] = max(score, self.best_score.get(track, score))
-            yield run
-
-    def write_record(self, method: str, settings: TrackConfig, recordings: Mapping[str, Any]) -> None:
-        """Write the record of the run beside its result, for reports; recordings: `DatasetSource.kept`."""
-        from pipelines.configuration import write_settings
-        from pipelines.report.page import RunRecord, write_run_record
-
-        rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
-        configuration = write_settings(settings, comments=False)
-        write_run_record(
-            self.output, RunRecord(method, configuration, rounded, recordings=recordings, clocks=self.clocks)
-        )
-
-    def show(self) -> None:
-        """Print the line on stdout."""
-        rate = f", {self.frames / self.seconds:.0f} frames/s" if self.seconds > 0 else ""
-        sure = sum(score > 0.5 for score in self.best_score.values())
-        tracks = f"{counted(len(self.best_score), 'track')} ({sure} with a score above 0.5)"
-        counts = (counted(self.scenes, "scene"), counted(self.frames, "frame"), tracks, counted(self.boxes, "box"))
-        typer.echo(f"{self.output}: {', '.join(counts)}{rate}")
 
 
 def counted(number: int, noun: str) -> str:

@@ -5,20 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
 import typer
 
+from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.results import SceneResult
+from data_tools.datasets.source import DatasetSource, Innovations
+from data_tools.evaluation import LEGEND
+from data_tools.files.atomic_files import atomic_directory, write_text
+from data_tools.plots import png
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
 from pipelines.cli.options import Source, dataset_commands
 from pipelines.cli.track import RayAddress, Workers, exit_on_failures, run_at_scale
+from pipelines.config import Method, TrackConfig
+from pipelines.doubts import Doubted, Doubts
+from pipelines.evaluation import evaluate_labels, judge_run
+from pipelines.explaining import journal_innovations, journal_of
+from pipelines.scale_out import TrackTask
+from pipelines.smoothing import load_smooth_config
+from pipelines.tracking import InnovationRecorder, track_dataset
 from saga_fg.errors import InputError
-
-if TYPE_CHECKING:
-    from data_tools.datasets.results import SceneResult
-    from data_tools.datasets.source import DatasetSource, Innovations
-    from pipelines.config import Method, TrackConfig
 
 
 def _evaluate(
@@ -53,11 +62,6 @@ def _evaluate(
     The scenes scored are those of the result, or those that are named.
     Where detections are given and the metrics are official, errors are those at the labels that detections match.
     """
-    from data_tools.evaluation import LEGEND
-    from data_tools.files.atomic_files import atomic_directory, write_text
-    from data_tools.plots import png
-    from pipelines.explaining import journal_innovations, journal_of
-
     if not source.has_truth:
         own = f"name it: {source.truth_option} TABLE"
         mend = own if source.truth_option else "score a table: saga-fg evaluate file tracks.csv --truth TABLE"
@@ -91,9 +95,6 @@ def _tracked(
     source: DatasetSource, settings: TrackConfig, method: Method
 ) -> tuple[Mapping[str, SceneResult], Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
-    from pipelines.doubts import Doubted, Doubts
-    from pipelines.tracking import InnovationRecorder, track_dataset
-
     doubts = Doubts(settings.of_method(method), option_for=source.option_for)
     recorder = InnovationRecorder()
     with TemporaryDirectory() as folder, source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
@@ -121,12 +122,6 @@ def _evaluate_labels(
     The scenes are those in the table. Without ground truth, the figures say how smooth the labels are and how well they
     agree with the detections.
     """
-    import numpy as np
-
-    from data_tools.datasets.label_table import read_label_table
-    from pipelines.evaluation import evaluate_labels
-    from pipelines.smoothing import load_smooth_config
-
     table = _table(result)
     scenes = np.unique(read_label_table(table).tracks.scene).tolist()
     settings = load_smooth_config(source.family, config)
@@ -141,8 +136,9 @@ def _evaluate_texts(source: Source) -> dict[str, str | None]:
     return {} if source.summarised else {"full": None}
 
 
-_evaluate_commands = dataset_commands(
+evaluate_app = dataset_commands(
     "evaluate",
+    "Compare results with the ground truth.",
     _evaluate,
     (
         "evaluate {result}",
@@ -152,20 +148,13 @@ _evaluate_commands = dataset_commands(
     _evaluate_texts,
     listed=lambda source: source.has_truth or bool(source.truth_option),
 )
-evaluate_app = typer.Typer(cls=_evaluate_commands, no_args_is_help=True, rich_markup_mode=None)
-_label_commands = dataset_commands("evaluate labels", _evaluate_labels, ("evaluate labels {result}",))
-labels_app = typer.Typer(cls=_label_commands, no_args_is_help=True, rich_markup_mode=None)
+labels_app = dataset_commands(
+    "evaluate labels",
+    "Judge labels that `saga-fg smooth` made, beside the online tracks and the detections.",
+    _evaluate_labels,
+    ("evaluate labels {result}",),
+)
 evaluate_app.add_typer(labels_app, name="labels")
-
-
-@evaluate_app.callback()
-def evaluate() -> None:
-    """Compare results with the ground truth."""
-
-
-@labels_app.callback()
-def labels() -> None:
-    """Judge labels that `saga-fg smooth` made, beside the online tracks and the detections."""
 
 
 def _table(result: Path) -> Path:
@@ -205,9 +194,6 @@ def _benchmark(
     the official server. A scene that is done is not done again, unless its input, the settings or
     saga-fg have changed.
     """
-    from pipelines.evaluation import judge_run
-    from pipelines.scale_out import TrackTask
-
     if not source.all_tracks:
         raise InputError(f"benchmark {source.name}: expected a dataset with official results: saga-fg benchmark --help")
     settings = options.configured(source.family, config, method, estimator, lag, association)
@@ -226,8 +212,9 @@ def _benchmark(
         typer.echo(f"{submission}: for the official server")
 
 
-_benchmark_commands = dataset_commands(
+benchmark_app = dataset_commands(
     "benchmark",
+    "Get the figures of a whole dataset, with tracks, a page and, where there is one, the official submission.",
     _benchmark,
     (
         "benchmark {recordings} --output run   # stopped? the same again",
@@ -236,9 +223,3 @@ _benchmark_commands = dataset_commands(
     ),
     listed=lambda source: bool(source.all_tracks),
 )
-benchmark_app = typer.Typer(cls=_benchmark_commands, no_args_is_help=True, rich_markup_mode=None)
-
-
-@benchmark_app.callback()
-def benchmark() -> None:
-    """Get the figures of a whole dataset, with tracks, a page and, where there is one, the official submission."""

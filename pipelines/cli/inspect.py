@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from data_tools.datasets import import_options
-from pipelines.cli import options
+from data_tools.datasets.detection_files import TableImport
+from data_tools.datasets.detection_files.column_names import pairs
+from data_tools.datasets.detection_files.survey import TableSurvey, survey_table
+from data_tools.figures import write_figures
+from data_tools.files.atomic_files import atomic_file, check_writable
+from data_tools.files.input_files import error_context
+from data_tools.plausibility import FILL_IN, Doubt, Mend, idle_rules, usual_classes
 from pipelines.cli.console import JsonFile, counted
 from pipelines.cli.options import Verbose
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from data_tools.datasets.detection_files import TableImport
-    from data_tools.datasets.detection_files.survey import TableSurvey
-    from data_tools.plausibility import Doubt
+from pipelines.config import load_config
+from pipelines.configuration import load_settings
+from pipelines.explaining import clock_lines, graph_picture, journal_of, read_graphs, read_track, story
+from saga_fg.errors import InputError
+from saga_fg.model.edge_rules import acting_classes
 
 MOST = 12  # scenes and classes that are listed
 EPOCH = 1e8  # s, from which times count from 1970
@@ -48,7 +54,7 @@ def inspect_table(
     ] = None,
     sort: Annotated[bool, typer.Option("--sort", help=import_options.SORT)] = False,
     import_file: Annotated[Path | None, typer.Option("--import", help=import_options.IMPORT, metavar="FILE")] = None,
-    verbose: options.Verbose = False,
+    verbose: Verbose = False,
 ) -> None:
     """Look at a table: its columns, units, classes, times, what looks wrong, and the command to run next.
 
@@ -60,11 +66,6 @@ def inspect_table(
       saga-fg inspect detections.parquet --columns time=ts_ns,x=pos_x,y=pos_y --units angle=deg
       saga-fg inspect truth.csv
     """
-    from data_tools.datasets.detection_files import TableImport
-    from data_tools.datasets.detection_files.column_names import pairs
-    from data_tools.datasets.detection_files.survey import survey_table
-    from pipelines.configuration import load_settings
-
     given = TableImport(
         pairs("--columns", columns), pairs("--classes", classes), pairs("--units", units), coordinates or "", sort
     )
@@ -125,10 +126,6 @@ def _show_times(survey: TableSurvey) -> None:
 
 def _show_classes(survey: TableSurvey) -> list[Doubt]:
     """List the classes; return what is doubtful about those that no edge rule acts on."""
-    from data_tools.plausibility import Doubt, Mend, idle_rules, usual_classes
-    from pipelines.config import load_config
-    from saga_fg.model.edge_rules import acting_classes
-
     acting = acting_classes(load_config("file").tracker.edges)
     mapped = {name: survey.how.classes.get(name, name) for name in survey.classes}
     typer.echo("\nClasses, with rows and median length, width, height:")
@@ -150,10 +147,6 @@ def _show_classes(survey: TableSurvey) -> list[Doubt]:
 
 def _mended(survey: TableSurvey, doubts: Sequence[Doubt], given: TableImport) -> TableImport:
     """The options that were given, with those that mend what looks wrong."""
-    from dataclasses import replace
-
-    from data_tools.plausibility import Mend
-
     mends = [doubt.mend for doubt in doubts if doubt.mend is not None]
     if survey.raw.clock.guessed:
         mends.insert(0, Mend(units={"time": survey.raw.clock.unit}))
@@ -168,8 +161,6 @@ def _mended(survey: TableSurvey, doubts: Sequence[Doubt], given: TableImport) ->
 
 
 def _show_next(survey: TableSurvey, table: Path, options: str) -> None:
-    from data_tools.plausibility import FILL_IN
-
     name = shlex.quote(str(table))
     command = survey.raw.argoverse_command()
     to_mend = survey.faults and not survey.raw.found.open
@@ -212,12 +203,6 @@ def explain(
       saga-fg explain results --scene 0011 --track 4 --json events.json
       saga-fg explain tracks.json --scene scene-0103 --graph --time 3.4 --output graph.png
     """
-    from data_tools.figures import write_figures
-    from data_tools.files.atomic_files import atomic_file, check_writable
-    from data_tools.files.input_files import error_context
-    from pipelines.explaining import clock_lines, graph_picture, journal_of, read_graphs, read_track, story
-    from saga_fg.errors import InputError
-
     journal = journal_of(result)
     if graph:
         if output is None or output.suffix not in (".png", ".svg", ".pdf"):

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from data_tools.datasets.source import DatasetSource, dataset_names
+from data_tools.files.atomic_files import check_writable, write_text
 from pipelines.cli import options
-from pipelines.cli.console import JsonFile, MarkdownFile, ReportingGroup, counted, progress_bar, report
+from pipelines.cli.console import JsonFile, MarkdownFile, ReportingGroup, counted, new_group, progress_bar, report
 from pipelines.cli.options import Source, dataset_commands
-
-if TYPE_CHECKING:
-    from data_tools.datasets.source import DatasetSource
+from pipelines.config import load_config, load_interactions
+from pipelines.configuration import write_settings
+from pipelines.learning import learn_noise, learned_fragment, scenes_to_learn_from
+from pipelines.learning.interactions import LearningSettings, learn_interactions, learned_figures, learned_tables
 
 
 def _interactions(
@@ -41,12 +44,6 @@ def _interactions(
     the base motion alone, with the edges of the configuration and with learned ones. Truth is the ground truth or,
     where detections are given, the tracks of a tracker.
     """
-    from data_tools.files.atomic_files import check_writable, write_text
-    from pipelines.config import load_config, load_interactions
-    from pipelines.configuration import write_settings
-    from pipelines.learning import scenes_to_learn_from
-    from pipelines.learning.interactions import LearningSettings, learn_interactions, learned_figures, learned_tables
-
     check_writable(output)
     options.apart(output, *source.input_files(), *(() if start is None else (start,)))
     settings = load_config(source.family, config)
@@ -75,10 +72,6 @@ def _noise(
     verbose: options.Verbose = False,
 ) -> None:
     """Learn what sensors are like, and how objects move, from detections and, where there is some, ground truth."""
-    from data_tools.files.atomic_files import check_writable, write_text
-    from pipelines.config import load_config
-    from pipelines.learning import learn_noise, learned_fragment
-
     options.apart(output, *source.input_files())
     settings = load_config(source.family, config)
     with_truth = source.has_truth and not without_truth
@@ -97,8 +90,15 @@ def _noise_texts(source: Source) -> dict[str, str | None]:
     return {} if source.has_truth else {"without_truth": None}
 
 
-_noise_commands = dataset_commands(
+noise_app = dataset_commands(
     "learn noise",
+    """Learn what sensors are like, and how objects move, from recordings.
+
+    For each sensor and class: noise of positions (base, along and across the line of sight), velocities, headings and
+    heights, what a score is worth, the chance of detection, the field of view. For each class: its process noise, and
+    for curvilinear motion how fast accelerations and turns fade (fading_time, turn_time). Where there is ground truth,
+    it is used; where there is none, the tracker's own tracks take its place.
+    """,
     _noise,
     (
         "learn noise {recordings} --output noise.yaml",
@@ -106,8 +106,9 @@ _noise_commands = dataset_commands(
     ),
     _noise_texts,
 )
-_interaction_commands = dataset_commands(
+interactions_app = dataset_commands(
     "learn interactions",
+    "Learn who follows whom, and how strongly: edge rules for a tracker.",
     _interactions,
     (
         "learn interactions {recordings} --output interactions.yaml",
@@ -120,36 +121,11 @@ class LearnGroup(ReportingGroup):
     """The kinds of settings that can be learned; names the command where a dataset is given in their place."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        from data_tools.datasets.source import dataset_names
-
         if args and args[0] in dataset_names():
             ctx.fail(f"No such command '{args[0]}'; try 'learn noise {args[0]}' or 'learn interactions {args[0]}'.")
         return super().resolve_command(ctx, args)
 
 
-learn_app = typer.Typer(cls=LearnGroup, no_args_is_help=True, rich_markup_mode=None)
-noise_app = typer.Typer(cls=_noise_commands, no_args_is_help=True, rich_markup_mode=None)
-interactions_app = typer.Typer(cls=_interaction_commands, no_args_is_help=True, rich_markup_mode=None)
+learn_app = new_group("Learn settings from recordings.", LearnGroup)
 learn_app.add_typer(noise_app, name="noise")
 learn_app.add_typer(interactions_app, name="interactions")
-
-
-@learn_app.callback()
-def learn() -> None:
-    """Learn settings from recordings."""
-
-
-@interactions_app.callback()
-def interactions() -> None:
-    """Learn who follows whom, and how strongly: edge rules for a tracker."""
-
-
-@noise_app.callback()
-def noise() -> None:
-    """Learn what sensors are like, and how objects move, from recordings.
-
-    For each sensor and class: noise of positions (base, along and across the line of sight), velocities, headings and
-    heights, what a score is worth, the chance of detection, the field of view. For each class: its process noise, and
-    for curvilinear motion how fast accelerations and turns fade (fading_time, turn_time). Where there is ground truth,
-    it is used; where there is none, the tracker's own tracks take its place.
-    """

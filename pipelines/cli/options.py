@@ -4,32 +4,32 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
-from typer.core import TyperGroup
 
-from pipelines.cli.console import set_up_logging
+from data_tools.datasets.source import DatasetSource, Verb, dataset_names, dataset_source
+from data_tools.files.atomic_files import check_writable, write_text
+from pipelines.cli.console import ReportingGroup, new_command, new_group, set_up_logging
+from pipelines.config import Method, TrackConfig, load_config, load_interactions
+from pipelines.configuration import load_settings
+from pipelines.explaining import journal_of
+from pipelines.learning import offset_fragment
+from pipelines.report.page import as_recorded
 from saga_fg.errors import InputError
-from saga_fg.tracking import AssociationName
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from data_tools.datasets.source import DatasetSource, Verb
-    from pipelines.config import Method, TrackConfig
-    from saga_fg.numerics.arrays import FloatArray
-    from saga_fg.tracking import SensorTime
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.tracking import AssociationName, SensorTime
+from saga_fg.tracking.by_name import estimator_parameters
+from saga_fg.types.track import checked_horizons
 
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say more on stderr.", callback=set_up_logging, show_default=False)
 ]
-Scenario = Literal["traffic", "red-light", "road-works", "towing", "cycling", "two-sensors"]
 
 Config = Annotated[
     Path | None, typer.Option("--config", help="YAML file over the defaults; see `saga-fg config`.", metavar="FILE")
@@ -59,20 +59,12 @@ def apart(output: Path, *inputs: Path, option: str = "--output") -> None:
             raise InputError(f"{option} {output}: expected another file than those that are read")
 
 
-def counts(option: str, value: str, least: int = 1) -> tuple[int, ...]:
-    """The entries of a comma-separated option as whole numbers from `least` on, each once."""
-    entries = dict.fromkeys(entry.strip() for entry in value.split(",") if entry.strip())
-    if not entries or not all(entry.isdecimal() and len(entry) < 10 and int(entry) >= least for entry in entries):
-        raise InputError(f"{option}: expected whole numbers >= {least} with commas between them, got {value[:40]!r}")
-    return tuple(map(int, entries))
-
-
 _METHOD = typer.Option(
     "--method",
     help="saga: graph-aware Kalman filter; kf: without edges, trails and lanes; centerpoint: greedy nearest centre.",
 )
-MethodOption = Annotated[Literal["saga", "kf", "centerpoint"], _METHOD]
-MethodOrNone = Annotated[Literal["saga", "kf", "centerpoint"] | None, _METHOD]
+MethodOption = Annotated[Method, _METHOD]
+MethodOrNone = Annotated[Method | None, _METHOD]
 
 EstimatorOption = Annotated[
     str | None,
@@ -136,8 +128,6 @@ def configured(
     interactions: Path | None = None,
 ) -> TrackConfig:
     """The settings of a run: the family's, the file's, then the options'."""
-    from pipelines.config import load_config
-
     settings = with_interactions(load_config(family, config), method, interactions)
     _estimator_fits(method, estimator, lag, settings.tracker.estimator)
     association_fits(method, association)
@@ -152,8 +142,6 @@ def association_fits(method: str, association: str | None) -> None:
 
 def with_interactions(config: TrackConfig, method: str, interactions: Path | None) -> TrackConfig:
     """The configuration with learned edge rules, if a file of them is given; it has an effect on saga alone."""
-    from pipelines.config import load_interactions
-
     if interactions is None:
         return config
     if method != "saga":
@@ -163,8 +151,6 @@ def with_interactions(config: TrackConfig, method: str, interactions: Path | Non
 
 def horizons(predict: str | None, method: Method) -> FloatArray | None:
     """The horizons (H,) of --predict, s; None if it is left out. Raises `InputError` for anything else."""
-    from saga_fg.types.track import checked_horizons
-
     if predict is None:
         return None
     if method == "centerpoint":
@@ -179,8 +165,6 @@ def horizons(predict: str | None, method: Method) -> FloatArray | None:
 
 def _estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:
     """Raise `InputError` where --estimator or --lag would have no effect."""
-    from saga_fg.tracking.by_name import estimator_parameters
-
     if method == "centerpoint" and (estimator is not None or lag is not None):
         raise InputError("--estimator, --lag: the method centerpoint has no estimator")
     if lag is not None and "lag" not in estimator_parameters(estimator or configured):
@@ -189,8 +173,6 @@ def _estimator_fits(method: str, estimator: str | None, lag: float | None, confi
 
 def journal(explain: bool, output: Path, at_scale: bool) -> Path | None:
     """Path of the journal, None if none is wanted. Raises `InputError` where none can be kept."""
-    from pipelines.explaining import journal_of
-
     if explain and at_scale:
         raise InputError("--explain: goes without --workers and --ray")
     return journal_of(output) if explain else None
@@ -198,8 +180,6 @@ def journal(explain: bool, output: Path, at_scale: bool) -> Path | None:
 
 def check_learn_offsets(path: Path | None, method: str, at_scale: bool = False) -> None:
     """Raise `InputError` where --learn-offsets would have no effect, or its file is not writable."""
-    from data_tools.files.atomic_files import check_writable
-
     if path is None:
         return
     if method == "centerpoint":
@@ -211,46 +191,40 @@ def check_learn_offsets(path: Path | None, method: str, at_scale: bool = False) 
 
 def write_offsets(path: Path, scenes: Iterable[Mapping[str, SensorTime]], settings: TrackConfig, origin: str) -> None:
     """Write the file of --learn-offsets, and say what is in it."""
-    from data_tools.files.atomic_files import write_text
-    from pipelines.learning import offset_fragment
-
     text, offsets = offset_fragment(scenes, settings.sensors, origin)
     write_text(path, text)
     found = ", ".join(f"{name} {offset:+.4f} s" for name, offset in offsets.items())
     typer.echo(f"{path}: {found or 'no two sensors have moving objects in common'}", err=True)
 
 
-Source = type["DatasetSource"]
+Source = type[DatasetSource]
 _WIDTH = 92  # columns of an example
 
 
 def dataset_commands(
     verb: Verb,
+    about: str,
     run: Callable[..., None],
     examples: tuple[str, ...],
     texts: Callable[[Source], Mapping[str, str | None]] = lambda source: {},
-    listed: Callable[[Source], bool] | None = None,
-) -> type[TyperGroup]:
+    listed: Callable[[Source], bool] = lambda source: True,
+) -> typer.Typer:
     """A group with a command `saga-fg VERB DATASET` for each dataset, beside those that are added to it.
 
+    about     help of the group
     run       called with the dataset and the values of its other parameters, which are the verb's options; its
               docstring is the help
     examples  what follows `saga-fg`, with the fields {recordings}: name and options of the dataset, {result}: the same
               with a result, {name} alone, {tracks}: name of a result alone
     texts     of the verb's options that differ for a dataset, by parameter; None leaves the option out
-    listed    which datasets the help lists; all if left out
+    listed    which datasets the help lists
     """
 
-    class DatasetGroup(TyperGroup):
+    class DatasetGroup(ReportingGroup):
         def list_commands(self, ctx: Any) -> list[str]:
-            from data_tools.datasets.source import dataset_names
-
-            names = [name for name in dataset_names() if listed is None or _is_listed(name, listed)]
-            return [*names, *super().list_commands(ctx)]
+            return [*(name for name in dataset_names() if _is_listed(name, listed)), *super().list_commands(ctx)]
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
-            from data_tools.datasets.source import dataset_names, dataset_source
-
             own = super().get_command(ctx, cmd_name)
             if own is not None:
                 return own
@@ -263,7 +237,7 @@ def dataset_commands(
                     raise
                 return _broken(cmd_name, error)  # so that the list of all datasets can be shown
 
-    return DatasetGroup
+    return new_group(about, DatasetGroup)
 
 
 def _without_dataset(verb: str, place: str) -> str:
@@ -276,8 +250,6 @@ def _without_dataset(verb: str, place: str) -> str:
 
 
 def _is_listed(name: str, listed: Callable[[Source], bool]) -> bool:
-    from data_tools.datasets.source import dataset_source
-
     try:
         return listed(dataset_source(name))
     except InputError:
@@ -293,7 +265,7 @@ def _command(
 ) -> Any:
     """The command of a verb for one dataset."""
     _, *of_verb = inspect.signature(run).parameters.values()
-    hints = get_type_hints(run, localns={"DatasetSource": object}, include_extras=True)
+    hints = get_type_hints(run, include_extras=True)
     of_verb = [each.replace(annotation=hints[each.name]) for each in of_verb]
     reads_result = any(each.name == "result" for each in of_verb)
     different = {"config": _config_text(source), **texts(source)}
@@ -309,9 +281,6 @@ def _command(
     settings = _settings(source)
 
     def command(**values: Any) -> None:
-        from pipelines.configuration import load_settings
-        from pipelines.report.page import as_recorded
-
         chosen = {each.name: values.pop(each.name) for each in of_dataset}
         for name, kind in settings.items():
             if chosen.get(name) is not None:
@@ -325,10 +294,9 @@ def _command(
     keyword = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in ordered]
     command.__signature__ = inspect.Signature(keyword)  # type: ignore[attr-defined]
     command.__annotations__ = {each.name: each.annotation for each in keyword}
-    app = typer.Typer(rich_markup_mode=None, add_completion=False)
-    text = f"{inspect.getdoc(run)}\n\n{inspect.getdoc(source)}\n\n{_examples(verb, source, examples)}"
-    app.command(source.name, help=text, short_help=(inspect.getdoc(source) or "").partition("\n\n")[0])(command)
-    return typer.main.get_command(app)
+    about = inspect.getdoc(source) or ""
+    text = f"{inspect.getdoc(run)}\n\n{about}\n\n{_examples(verb, source, examples)}"
+    return new_command(command, source.name, help=text, short_help=about.partition("\n\n")[0])
 
 
 def _config_text(source: Source) -> str:
@@ -338,14 +306,12 @@ def _config_text(source: Source) -> str:
 
 def _broken(name: str, error: InputError) -> Any:
     """A command in place of one that cannot be made, which says why."""
-    app = typer.Typer(rich_markup_mode=None, add_completion=False)
 
     def command(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
         raise error
 
-    context = {"ignore_unknown_options": True}
-    app.command(name, help=f"Cannot be loaded: {error}", context_settings=context)(command)
-    return typer.main.get_command(app)
+    text = f"Cannot be loaded: {error}"
+    return new_command(command, name, help=text, context_settings={"ignore_unknown_options": True})
 
 
 def _parameters(source: Source, verb: Verb, reads_result: bool) -> list[inspect.Parameter]:

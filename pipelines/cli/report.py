@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from data_tools.datasets.source import DatasetSource
+from data_tools.files.atomic_files import check_writable, write_text
+from pipelines import view
 from pipelines.cli import options
 from pipelines.cli.console import working
 from pipelines.cli.options import Source, dataset_commands
-
-if TYPE_CHECKING:
-    from data_tools.datasets.source import DatasetSource
-    from pipelines.view import SceneView
+from pipelines.explaining import journal_of, read_graphs
+from pipelines.report import report_page, result_report
+from saga_fg.errors import InputError
 
 
 def _report(
@@ -32,10 +34,6 @@ def _report(
     verbose: options.Verbose = False,
 ) -> None:
     """Make a page of a tracking result: a player, charts, and figures, of errors where there is ground truth."""
-    from data_tools.files.atomic_files import check_writable, write_text
-    from pipelines.report import report_page, result_report
-    from saga_fg.errors import InputError
-
     options.apart(output, result, *([] if beside is None else [beside]), *source.input_files())
     if output.suffix not in (".html", ".htm"):
         raise InputError(f"{output}: expected a file name that ends in .html")
@@ -48,24 +46,16 @@ def _report(
 
 def _report_texts(source: Source) -> dict[str, str | None]:
     """Options of datasets without camera images."""
-    from data_tools.datasets.source import DatasetSource
-
     return {"images": None} if source.images is DatasetSource.images else {}
 
 
-_report_commands = dataset_commands(
+report_app = dataset_commands(
     "report",
+    "Make a page of a result: a player, figures, charts; one HTML file that needs no network.",
     _report,
     ("report {result} --output report.html", "report {result} --beside other/{tracks} --output report.html"),
     _report_texts,
 )
-report_app = typer.Typer(cls=_report_commands, no_args_is_help=True, rich_markup_mode=None)
-
-
-@report_app.callback()
-def report() -> None:
-    """Make a page of a result: a player, figures, charts; one HTML file that needs no network."""
-
 
 Save = Annotated[
     Path | None,
@@ -91,27 +81,23 @@ def _view(
     verbose: options.Verbose = False,
 ) -> None:
     """See a tracking result, with the ground truth, the detections and the LiDAR scans where they are there."""
-    from pipelines.view.scenes import result_views
-
     if save is not None:
         options.apart(save, result, *source.input_files(), option="--save")
-    _show(result, save, lambda: result_views(source, result, spacing), slam)
+    _show(result, save, lambda: view.result_views(source, result, spacing), slam)
 
 
 def _view_texts(source: Source) -> dict[str, str | None]:
     """Options of datasets without LiDAR scans."""
-    from data_tools.datasets.source import DatasetSource
-
     return {"spacing": None} if source.scans is DatasetSource.scans else {}
 
 
-_view_commands = dataset_commands("view", _view, ("view {result}", "view {result} --save tracks.mcap"), _view_texts)
-view_app = typer.Typer(cls=_view_commands, no_args_is_help=True, rich_markup_mode=None)
-
-
-@view_app.callback()
-def view() -> None:
-    """See a result in space: boxes, tracks, ellipses, edges, graph, truth, LiDAR, landmarks (rerun or Foxglove)."""
+view_app = dataset_commands(
+    "view",
+    "See a result in space: boxes, tracks, ellipses, edges, graph, truth, LiDAR, landmarks (rerun or Foxglove).",
+    _view,
+    ("view {result}", "view {result} --save tracks.mcap"),
+    _view_texts,
+)
 
 
 @view_app.command()
@@ -129,42 +115,31 @@ def slam(
     _show(result, save, list, result)
 
 
-def _show(result: Path, save: Path | None, make: Callable[[], Sequence[SceneView]], slam: Path | None = None) -> None:
+def _show(
+    result: Path, save: Path | None, make: Callable[[], Sequence[view.SceneView]], slam: Path | None = None
+) -> None:
     """Write or open the scenes that `make` gives, with the map of a run of SLAM."""
-    from pipelines.explaining import journal_of, read_graphs
-    from pipelines.view import (
-        check_view_file,
-        draw_scene,
-        draw_slam,
-        in_order,
-        load_rerun,
-        read_slam_view,
-        show_rerun,
-        write_view,
-    )
-    from saga_fg.errors import InputError
-
     if save is None:
-        load_rerun()
+        view.load_rerun()
     else:
-        check_view_file(save)
+        view.check_view_file(save)
     with working("making the view"):
         graphs = read_graphs(journal_of(result)) if journal_of(result).exists() else {}
         scenes = [replace(each, graphs=graphs.get(each.report.scene.name, ())) for each in make()]
-        driven = read_slam_view(slam) if slam is not None else None
+        driven = view.read_slam_view(slam) if slam is not None else None
         roots = [each.report.scene.name for each in scenes]
         if driven is not None and len(scenes) > 1:
             raise InputError(f"--slam {slam}: expected one sequence, got {', '.join(roots)}; choose one")
-        drawings = [draw_scene(each) for each in scenes]
+        drawings = [view.draw_scene(each) for each in scenes]
         if driven is not None:
             root = f"{roots[0]}/slam" if roots else "slam"
             origin = scenes[0].report.scene.world_T_ego[0, :3, 3] if scenes else None
-            drawings.append(draw_slam(driven, root, origin))
+            drawings.append(view.draw_slam(driven, root, origin))
         roots = roots or ["slam"]
         if save is None:
-            show_rerun(result.name, roots, in_order(*drawings))
+            view.show_rerun(result.name, roots, view.in_order(*drawings))
         else:
-            write_view(save, result.name, roots, in_order(*drawings))
+            view.write_view(save, result.name, roots, view.in_order(*drawings))
     if save is not None:
         how = f"open it with: rerun {save}" if save.suffix == ".rrd" else "open it in Foxglove"
         typer.echo(f"{save}: {save.stat().st_size / 1e6:.1f} MB; {how}")

@@ -10,18 +10,32 @@ import sys
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from pipelines.cli import options as how
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.termination import TERMINATED
+from pipelines.config import TrackConfig, load_config
+from pipelines.configuration import load_settings, write_settings
+from pipelines.doubts import Doubts
+from pipelines.explaining import clock_text
+from pipelines.serving import (
+    Address,
+    SocketServer,
+    StateKeeper,
+    StopRequest,
+    StreamClient,
+    StreamSettings,
+    StreamTracker,
+    parse_address,
+    serve_pipe,
+)
+from pipelines.serving.settings import LogLimitFilter
+from pipelines.tracking import one_thread, return_large_blocks
 from saga_fg.errors import InputError
-
-if TYPE_CHECKING:
-    from pipelines.config import TrackConfig
-    from pipelines.serving import Address, StateKeeper, StopRequest, StreamTracker
+from saga_fg.kernels.compilation import load_kernels
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 
@@ -83,13 +97,6 @@ def serve(
       saga-fg serve --listen ./saga.sock --snapshot state.saga --every 2
       saga-fg status
     """
-    from pipelines.config import load_config
-    from pipelines.configuration import load_settings
-    from pipelines.doubts import Doubts
-    from pipelines.serving import StopRequest, StreamSettings, StreamTracker
-    from pipelines.serving.settings import LogLimitFilter
-    from pipelines.tracking import one_thread, return_large_blocks
-
     if not verbose:
         for handler in logging.getLogger().handlers:
             handler.addFilter(LogLimitFilter())
@@ -119,9 +126,6 @@ def _restored(
     stream: StreamTracker[Any], snapshot: Path, every: float, settings: TrackConfig, method: str
 ) -> StateKeeper:
     """The keeper of a stream that goes on from its file, if there is one."""
-    from pipelines.configuration import write_settings
-    from pipelines.serving import StateKeeper
-
     if settings.tracker.providers:
         raise InputError("--snapshot: expected no tracker.providers, whose factors cannot be kept in a file")
     tracker = settings.tracker
@@ -141,8 +145,6 @@ def _serve(
     stream: StreamTracker[Any], keeper: StateKeeper | None, listen: str | None, allow_remote: bool, stop: StopRequest
 ) -> None:
     """Until the source ends or the service is told to stop."""
-    from pipelines.serving import SocketServer, parse_address, serve_pipe
-    from saga_fg.kernels.compilation import load_kernels
 
     def ready(address: Address | None = None) -> None:
         load_kernels()
@@ -178,8 +180,6 @@ def status(
     Example:
       saga-fg status 127.0.0.1:7447
     """
-    from pipelines.serving import StreamClient, parse_address
-
     where = parse_address(address)
     with StreamClient(where, timeout=10.0) as client:
         try:
@@ -192,8 +192,6 @@ def status(
 
 
 def _summary(answer: dict[str, Any]) -> str:
-    from pipelines.explaining import clock_text
-
     counts = ", ".join(
         f"{answer[name]} {text}"
         for name, text in (

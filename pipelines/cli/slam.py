@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
-from enum import StrEnum
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import numpy as np
 import typer
 
-from pipelines.cli.console import ReportingGroup, counted, progress_bar, working
+from data_tools import pose_graphs
+from data_tools.files.atomic_files import check_writable_folder
+from data_tools.files.input_files import error_context
+from data_tools.laser import read_carmen
+from data_tools.simulator import simulate_scene
+from factors import Robust
+from pipelines.cli.console import counted, new_group, progress_bar, working
 from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
 from pipelines.cli.slam_kitti import kitti
-
-if TYPE_CHECKING:
-    from pipelines.slam.pose_graph_baselines import FromStart
-    from saga_fg.numerics.arrays import IntArray
-    from saga_fg.slam.joint import Observations
-    from saga_fg.types.frame import Frame
+from pipelines.slam.configuration import load_laser_settings, load_slam_config
+from pipelines.slam.joint import run_joint, street
+from pipelines.slam.laser_slam import laser_slam
+from pipelines.slam.pose_graph_baselines import FromStart, from_same_starts, isam2
+from pipelines.slam.results import write_joint, write_laser_slam, write_pose_graph
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import IntArray
+from saga_fg.slam.joint import Observations
+from saga_fg.slam.pose_graph import consensus, graph_error, optimise_poses
+from saga_fg.types.frame import Frame
 
 _ROUNDING = 1e-9  # an error that counts as none: all measurements agree
 Loss = Literal["consensus", "huber", "cauchy", "geman-mcclure", "tukey"]
+Shape = Literal["city", "torus", "sphere", "grid", "cube"]
 
 
 def g2o(
@@ -69,15 +82,6 @@ def g2o(
       saga-fg slam g2o CSAIL.g2o --output CSAIL --certify --covariances last
       saga-fg slam g2o with_false_loops.g2o --robust consensus --output clean
     """
-    from data_tools.files.atomic_files import check_writable_folder
-    from data_tools.files.input_files import error_context
-    from data_tools.pose_graphs import read_g2o
-    from factors import Robust
-    from pipelines.slam.pose_graph_baselines import from_same_starts, isam2
-    from pipelines.slam.results import write_pose_graph
-    from saga_fg.errors import InputError
-    from saga_fg.slam.pose_graph import consensus, graph_error, optimise_poses
-
     if robust not in (None, "consensus") and certify:
         raise InputError("--certify: expected without a robust loss, the proof is for squared errors")
     if robust not in (None, "consensus") and compare:
@@ -93,7 +97,7 @@ def g2o(
     rejected: list[str] = []
     compared: list[FromStart] = []
     loss = None if robust is None or robust == "consensus" else Robust(robust, scale)
-    graph = read_g2o(file)
+    graph = pose_graphs.read_g2o(file)
     rows = _rows(covariances, graph.ids)
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
         guess = graph_error(graph, loss)
@@ -143,10 +147,6 @@ def g2o(
 
 def _rows(chosen: str, ids: IntArray) -> IntArray:
     """Rows of the poses whose covariances are wanted."""
-    import numpy as np
-
-    from saga_fg.errors import InputError
-
     if chosen in ("all", "last", "none"):
         return {"all": np.arange(len(ids)), "last": np.array([len(ids) - 1]), "none": np.arange(0)}[chosen]
     known = {str(name): row for row, name in enumerate(ids.tolist())}
@@ -157,16 +157,6 @@ def _rows(chosen: str, ids: IntArray) -> IntArray:
         if name not in known:
             raise InputError(f"--covariances: expected all, last, none or ids of poses with commas, got {name!r:.40}")
     return np.array([known[name] for name in names])
-
-
-class Shape(StrEnum):
-    """Shape of the simulated drive."""
-
-    CITY = "city"
-    TORUS = "torus"
-    SPHERE = "sphere"
-    GRID = "grid"
-    CUBE = "cube"
 
 
 def generate(
@@ -184,11 +174,8 @@ def generate(
       saga-fg slam generate city --poses 10000 --output city.g2o
       saga-fg slam g2o city.g2o --output city --compare
     """
-    from data_tools import pose_graphs
-    from saga_fg.errors import InputError
-
     try:
-        graph, _ = getattr(pose_graphs, shape.value)(poses, seed, noise=noise)
+        graph, _ = getattr(pose_graphs, shape)(poses, seed, noise=noise)
     except InputError as error:
         raise InputError(f"--{error}") from None
     pose_graphs.write_g2o(output, graph)
@@ -215,14 +202,6 @@ def laser(
     Example:
       saga-fg slam laser intel.clf.bz2 --output intel
     """
-    import time
-
-    from data_tools.files.atomic_files import check_writable_folder
-    from data_tools.laser import read_carmen
-    from pipelines.slam.configuration import load_laser_settings
-    from pipelines.slam.laser_slam import laser_slam
-    from pipelines.slam.results import write_laser_slam
-
     check_writable_folder(output)
     settings = load_laser_settings(config)
     log = read_carmen(file)
@@ -262,14 +241,6 @@ def simulated(
       saga-fg slam simulated --seed 3 --output street
       saga-fg slam simulated --seed 3 --online --lag 2 --output street
     """
-    from dataclasses import replace
-
-    from data_tools.files.atomic_files import check_writable_folder
-    from data_tools.simulator import simulate_scene
-    from pipelines.slam.configuration import load_slam_config
-    from pipelines.slam.joint import run_joint, street
-    from pipelines.slam.results import write_joint
-
     window = online_window(online, lag)
     check_writable_folder(output)
     settings = load_slam_config("simulated", config)
@@ -290,14 +261,6 @@ def simulated(
         typer.echo(f"{name} (lag {window:g} s): ATE {errors[name].ate:.3f} m")
 
 
-slam_app = typer.Typer(cls=ReportingGroup, no_args_is_help=True, rich_markup_mode=None)
-slam_app.command()(g2o)
-slam_app.command()(kitti)
-slam_app.command()(generate)
-slam_app.command()(laser)
-slam_app.command()(simulated)
-
-
-@slam_app.callback()
-def slam() -> None:
-    """Estimate where the vehicle was and what stands around it, in one factor graph."""
+slam_app = new_group("Estimate where the vehicle was and what stands around it, in one factor graph.")
+for run in (g2o, kitti, generate, laser, simulated):
+    slam_app.command()(run)

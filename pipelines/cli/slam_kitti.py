@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import numpy as np
 import typer
 
+from data_tools.datasets.kitti import KittiScans, KittiTracking
+from data_tools.datasets.kitti.dataset import read_origin
+from data_tools.files.atomic_files import check_writable_folder
+from data_tools.lidar.scan import ScanSequence
+from data_tools.sensor_logs import SensorLog
 from pipelines.cli.console import counted, progress_bar, working
 from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
-
-if TYPE_CHECKING:
-    from data_tools.lidar.scan import ScanSequence
-    from data_tools.sensor_logs import SensorLog
-    from pipelines.slam.joint import SlamWithObjects
-    from pipelines.slam.lidar_slam import LidarSlamResult
-    from pipelines.slam.localisation import LocaliserSettings
-    from pipelines.slam.submaps import Origin, SlamMap
-    from saga_fg.numerics.arrays import FloatArray
-    from saga_fg.slam.sensors import SensorSettings
+from pipelines.slam.configuration import load_slam_config, sensor_log
+from pipelines.slam.joint import SlamWithObjects, path_tracker, with_objects
+from pipelines.slam.lidar_results import write_lidar_slam
+from pipelines.slam.lidar_slam import LidarSlamResult, lidar_slam
+from pipelines.slam.localisation import LocaliserSettings
+from pipelines.slam.localised_drive import localise, write_localised
+from pipelines.slam.submaps import Origin, SlamMap, read_map
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.slam.sensors import SensorSettings
 
 
 def kitti(
@@ -96,18 +104,6 @@ def kitti(
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --objects --output slam
       saga-fg slam kitti --dataroot data/kitti --sequence 0004 --objects --odometry oxts --output slam
     """
-    from dataclasses import replace
-
-    from data_tools.datasets.kitti import KittiScans, KittiTracking
-    from data_tools.datasets.kitti.dataset import read_origin
-    from data_tools.files.atomic_files import check_writable_folder
-    from pipelines.slam.configuration import load_slam_config, sensor_log
-    from pipelines.slam.joint import path_tracker, with_objects
-    from pipelines.slam.lidar_results import write_lidar_slam
-    from pipelines.slam.lidar_slam import lidar_slam
-    from pipelines.slam.submaps import read_map
-    from saga_fg.errors import InputError
-
     if detections is not None and not objects:
         raise InputError("--detections: expected with --objects only")
     if online and not objects:
@@ -204,8 +200,6 @@ def _localise(
     log: SensorLog | None,
     sensors: SensorSettings,
 ) -> None:
-    from pipelines.slam.localised_drive import localise, write_localised
-
     with progress_bar() as progress:
         start = None if guess is None else _guess(guess)
         found = localise(scans, slam_map, start, settings, progress, log, sensors)
@@ -220,11 +214,6 @@ def _localise(
 
 def _guess(numbers: str) -> FloatArray:
     """A pose (4, 4) of x, y, z, yaw as a text "1.5,-3,1.8,0.2", m and rad."""
-    import numpy as np
-
-    from saga_fg.errors import InputError
-    from saga_fg.numerics.geometry import yaw_transform
-
     try:
         values = [float(word) for word in numbers.split(",")]
     except ValueError:

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+from data_tools.datasets.source import DatasetSource
+from pipelines import smoothing
 from pipelines.cli import options
-from pipelines.cli.console import Summary, counted, progress_bar
+from pipelines.cli.console import counted, progress_bar
 from pipelines.cli.options import Source, dataset_commands
+from pipelines.config import TrackConfig, load_config
+from pipelines.configuration import write_settings
+from pipelines.doubts import Doubted, Doubts
+from pipelines.explaining import trackers
+from pipelines.report.page import RunRecord, write_run_record
+from pipelines.scale_out import RunSummary, SceneTask, SmoothTask, TrackTask, file_name, new_pool, run_scenes
+from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg.errors import InputError
-
-if TYPE_CHECKING:
-    from data_tools.datasets.source import DatasetSource
-    from pipelines.scale_out import Pool, RunSummary, SceneTask
-    from pipelines.smoothing import SmoothedScene, StreamedScene
-    from saga_fg.types.dataset import Dataset
+from saga_fg.smoothing import LabelCounts
+from saga_fg.tracking import SensorTime
+from saga_fg.types.dataset import Dataset
 
 FAILED_SCENES = 1  # exit code
 
@@ -61,13 +67,8 @@ def run_at_scale(
 
     merge  makes the file `merged` of what they left, if all have done it; "" for none
     """
-    from pipelines.scale_out import LocalPool, RayPool, file_name, run_scenes
-
     if output.suffix:
         raise InputError(f"--output {output}: expected the name of a folder, since scenes are done in parallel")
-
-    def new_pool(scratch: Path) -> Pool:
-        return LocalPool(workers or 0, scratch) if ray is None else RayPool(ray, workers or 0)
 
     def finish(report: RunSummary) -> None:
         if merged and not report.failed:
@@ -81,7 +82,7 @@ def run_at_scale(
             len(there.names),
             task,
             output,
-            new_pool,
+            lambda scratch: new_pool(workers or 0, ray, scratch),
             lambda _, done, of: bar("scenes", done, of),
             finish,
         )
@@ -89,6 +90,54 @@ def run_at_scale(
     states = f"{len(report.done)} done, {len(report.unchanged)} unchanged, {len(report.failed)} failed"
     typer.echo(f"{output}: {counted(report.scenes, 'scene')}: {states}{counts}")
     return report
+
+
+@dataclass
+class Summary:
+    """Counts the scenes that pass through it."""
+
+    output: Path
+    scenes: int = 0
+    frames: int = 0
+    boxes: int = 0
+    seconds: float = 0.0
+    best_score: dict[tuple[str, int], float] = field(default_factory=dict)  # of each track, by scene and id
+    milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    classes: set[str] = field(default_factory=set)
+    clocks: dict[str, Mapping[str, SensorTime]] = field(default_factory=dict)  # of the sensors, by scene
+
+    def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
+        """Pass runs on and count them."""
+        for run in runs:
+            self.scenes += 1
+            self.frames += run.frames
+            self.seconds += run.seconds
+            self.milliseconds[run.scene.name] = run.milliseconds
+            if run.clocks:
+                self.clocks[run.scene.name] = run.clocks
+            self.boxes += sum(len(tracks) for tracks in run.tracks)
+            for tracks in run.tracks:
+                self.classes.update(tracks.boxes.label.tolist())
+                for id_, score in zip(tracks.id.tolist(), tracks.score.tolist(), strict=True):
+                    track = (run.scene.name, id_)
+                    self.best_score[track] = max(score, self.best_score.get(track, score))
+            yield run
+
+    def write_record(self, method: str, settings: TrackConfig, recordings: Mapping[str, Any]) -> None:
+        """Write the record of the run beside its result, for reports; recordings: `DatasetSource.kept`."""
+        rounded = {name: [round(ms, 3) for ms in times] for name, times in self.milliseconds.items()}
+        configuration = write_settings(settings, comments=False)
+        write_run_record(
+            self.output, RunRecord(method, configuration, rounded, recordings=recordings, clocks=self.clocks)
+        )
+
+    def show(self) -> None:
+        """Print the line on stdout."""
+        rate = f", {self.frames / self.seconds:.0f} frames/s" if self.seconds > 0 else ""
+        sure = sum(score > 0.5 for score in self.best_score.values())
+        tracks = f"{counted(len(self.best_score), 'track')} ({sure} with a score above 0.5)"
+        counts = (counted(self.scenes, "scene"), counted(self.frames, "frame"), tracks, counted(self.boxes, "box"))
+        typer.echo(f"{self.output}: {', '.join(counts)}{rate}")
 
 
 def exit_on_failures(report: RunSummary) -> None:
@@ -116,12 +165,6 @@ def _track(
     verbose: options.Verbose = False,
 ) -> None:
     """Track the detections of recordings."""
-    from pipelines.config import load_config
-    from pipelines.doubts import Doubted, Doubts
-    from pipelines.explaining import trackers
-    from pipelines.scale_out import TrackTask
-    from pipelines.tracking import keep_predictions, track_dataset
-
     settings = options.configured(source.family, config, method, estimator, lag, association, interactions)
     options.apart(output, *source.input_files())
     options.check_learn_offsets(learn_offsets, method, at_scale(workers, ray))
@@ -168,13 +211,7 @@ def _texts(source: Source) -> dict[str, str]:
     return {"output": source.tracks + " With --workers or --ray: a folder." * is_file}
 
 
-_track_commands = dataset_commands("track", _track, _TRACK_EXAMPLES, _texts)
-track_app = typer.Typer(cls=_track_commands, no_args_is_help=True, rich_markup_mode=None)
-
-
-@track_app.callback()
-def track() -> None:
-    """Track recorded detections of a dataset."""
+track_app = dataset_commands("track", "Track recorded detections of a dataset.", _track, _TRACK_EXAMPLES, _texts)
 
 
 def _smooth(
@@ -196,21 +233,11 @@ def _smooth(
 
     Tables of detections are smoothed as they are read: memory does not grow with their length.
     """
-    from pipelines.doubts import Doubted, Doubts
-    from pipelines.scale_out import SmoothTask
-    from pipelines.smoothing import (
-        load_smooth_config,
-        smooth_dataset,
-        smooth_stream,
-        write_labels,
-        write_streamed_labels,
-    )
-
     options.association_fits(method, association)
-    settings = load_smooth_config(source.family, config)
+    settings = smoothing.load_smooth_config(source.family, config)
     tracking = options.with_interactions(settings.tracking, method, interactions)
     settings = replace(settings, tracking=tracking.with_association(association))
-    usual = load_smooth_config(source.family).tracking
+    usual = smoothing.load_smooth_config(source.family).tracking
     doubts = Doubts(settings.tracking.of_method(method), usual, source.option_for)
     if at_scale(workers, ray):
         doubts.see_first(source)
@@ -221,16 +248,16 @@ def _smooth(
     stream = source.stream()
     if stream is not None:
         with stream as parts, progress_bar() as progress:
-            streamed = write_streamed_labels(
+            streamed = smoothing.write_streamed_labels(
                 output,
-                lambda folder: smooth_stream(doubts.over(parts), settings, folder, method, progress=progress),
+                lambda folder: smoothing.smooth_stream(doubts.over(parts), settings, folder, method, progress=progress),
                 f".{table}",
             )
         _show(output, streamed)
         return
     with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
-        runs = smooth_dataset(Doubted(dataset, doubts), settings, method, progress=progress)
-        done = write_labels(
+        runs = smoothing.smooth_dataset(Doubted(dataset, doubts), settings, method, progress=progress)
+        done = smoothing.write_labels(
             output, runs, f".{table}", lambda folder, labels: source.write_labels(folder, dataset, labels)
         )
     _show(output, done)
@@ -240,19 +267,16 @@ _SMOOTH_EXAMPLES = (
     "smooth {recordings} --output labels",
     "smooth {recordings} --output labels --workers 0   # all cores",
 )
-_smooth_commands = dataset_commands("smooth", _smooth, _SMOOTH_EXAMPLES)
-smooth_app = typer.Typer(cls=_smooth_commands, no_args_is_help=True, rich_markup_mode=None)
+smooth_app = dataset_commands(
+    "smooth",
+    "Make labels of recorded detections: past and future of every object, gaps filled, uncertainty stated.",
+    _smooth,
+    _SMOOTH_EXAMPLES,
+)
 
 
-@smooth_app.callback()
-def smooth() -> None:
-    """Make labels of recorded detections: past and future of every object, gaps filled, uncertainty stated."""
-
-
-def _show(output: Path, runs: tuple[SmoothedScene, ...] | tuple[StreamedScene, ...]) -> None:
+def _show(output: Path, runs: Sequence[smoothing.SmoothedScene | smoothing.StreamedScene]) -> None:
     """The line that says what was done."""
-    from saga_fg.smoothing import LabelCounts
-
     total = LabelCounts.sum(run.counts for run in runs)
     typer.echo(
         f"{output}: {counted(len(runs), 'scene')}, {counted(total.objects, 'object')}, {counted(total.boxes, 'box')}: "

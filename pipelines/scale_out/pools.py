@@ -84,6 +84,11 @@ class LocalPool:
                 worker.end()
 
 
+def new_pool(workers: int, address: str | None, scratch: Path) -> LocalPool | RayPool:
+    """Workers on a Ray cluster at an address, on this machine without one; `scratch`: for their temporary files."""
+    return LocalPool(workers, scratch) if address is None else RayPool(address, workers)
+
+
 class _Worker:
     """A process and the pipe to it."""
 

@@ -5,7 +5,7 @@
 """
 
 from pipelines.view.drawing import Drawing, in_order
-from pipelines.view.scenes import SceneView, SlamView, draw_scene, draw_slam, read_slam_view
+from pipelines.view.scenes import SceneView, SlamView, draw_scene, draw_slam, read_slam_view, result_views
 from pipelines.view.writers import check_view_file, load_rerun, show_rerun, write_view
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "in_order",
     "load_rerun",
     "read_slam_view",
+    "result_views",
     "show_rerun",
     "write_view",
 ]

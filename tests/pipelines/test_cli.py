@@ -21,10 +21,10 @@ from typer.testing import CliRunner, Result
 from data_tools.datasets.nuscenes.source import sensor_locations
 from data_tools.datasets.source import names
 from pipelines.cli import app
-from pipelines.cli.commands import FIRST
+from pipelines.cli.start import FIRST
 from saga_fg import InputError
 
-SAGA_FG = [sys.executable, "-c", "from pipelines.cli import main; main()"]
+SAGA_FG = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
 
 
 def saga_fg(*arguments: str | Path) -> Result:
@@ -185,7 +185,7 @@ def test_a_bug_is_not_dressed_up_as_bad_input(monkeypatch: pytest.MonkeyPatch) -
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("pipelines.config.load_config", broken)
+    monkeypatch.setattr("pipelines.cli.start.load_config", broken)
     assert isinstance(saga_fg("config").exception, ZeroDivisionError)
 
 
