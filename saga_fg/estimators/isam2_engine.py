@@ -35,6 +35,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
 
 _FEW = 24  # variables that GTSAM eliminates as quickly one after the other
+_MANY = 0.5  # share of the variables; iSAM2 eliminates all anew from 0.65 on, in an order of its own
 _LARGE = 16  # variables of a component whose marginals cost less together than one by one
 
 log = logging.getLogger(__name__)
@@ -75,7 +76,7 @@ class Engine:
         self.slots: dict[int, IntArray] = {}
         self._held: dict[int, HeldGroup] = {}  # groups as they were at the last update
         self.unsettled = frozenset[int]()  # variables whose last step was longer than the threshold
-        self._rank: dict[int, int] = {}  # of every variable in time, where the whole tree was eliminated in that order
+        self._times: dict[int, float] = {}  # times of all variables, s, in whose order the tree has been eliminated
         self._births: dict[int, int] = {}  # of the variables that it has
         self._hints: dict[int, frozenset[int]] = {}  # keys of factors without information, by slot; see `_hinted`
         self.at_root = frozenset[int]()  # variables to hold there beside the newest
@@ -202,10 +203,10 @@ class Engine:
         groups = graph.groups
         if groups.keys() != self._held.keys() or any(groups[number] is not held for number, held in self._held.items()):
             return False  # it has not seen all of the graph
-        if not leaving <= self._rank.keys():
+        if not leaving <= self._times.keys():
             return False
-        latest = max(self._rank[key] for key in leaving)
-        if any(self._rank.get(key, -1) <= latest for key in graph.variables.keys() - leaving):
+        latest = max(self._times[key] for key in leaving)
+        if any(self._times.get(key, -math.inf) <= latest for key in graph.variables.keys() - leaving):
             return False  # some may have been eliminated before those that leave: GTSAM would crash at its next update
         keys, rows = gtsam.KeyList(), graph.rows_on(leaving)
         for key in leaving:
@@ -230,7 +231,7 @@ class Engine:
         number = graph.replace_rows(rows, factors, leaving)
         self.points.remove(leaving)
         for key in leaving:
-            del self._rank[key]
+            del self._times[key]
         for old in rows:
             if old in groups:
                 self.slots[old] = np.where(groups[old].active, self.slots[old], -1)
@@ -368,15 +369,17 @@ class Engine:
             factors.push_back(native_factor(keys, dims, np.zeros((1, sum(dims) + 1), order="F")))
         for key in new:
             insert_state(values, graph.variable(key), graph.variable(key).type.read(base, key))
+        # without a linearisation point: increments are those that iSAM2 counts, from the base
+        added = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = removed
         held = self.at_root & graph.variables.keys()
         last = {*graph.carried_over.values(), *graph.newest, *held} & graph.variables.keys()
-        self._rank, order = {}, dict.fromkeys(last, 1)
-        again: Collection[int] = held - self._held_at_root - set(new)
-        if self.in_time and (new or removed):
-            self._rank = order = _in_time(graph, last)
-            again = [key for key in graph.variables if self.isam.valueExists(key)]
+        order: dict[int, int] = dict.fromkeys(last, 1)
+        again: Set[int] = held - self._held_at_root - set(new)
+        if self.in_time:
+            affected = set(self.isam.predictUpdateInfo(added, values, parameters)[0])
+            order, again = self._eliminated_in_time(graph, last, affected, set(new))
         moved, groups = gtsam.KeyList(), gtsam.KeyGroupMap()
         for key in again:
             moved.push_back(key)
@@ -387,8 +390,6 @@ class Engine:
         parameters.constrainedKeys = groups
         self._held_at_root = held
         try:
-            # without a linearisation point: increments are those that iSAM2 counts, from the base
-            added = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)
             result = self.isam.update(added, values, parameters)
             estimate, self._delta = self.isam.calculateEstimate(), self.isam.getDelta()
         except (RuntimeError, ValueError) as error:
@@ -402,6 +403,23 @@ class Engine:
             start += len(mine)
         self._hints |= dict(zip(slots[start:], map(frozenset, hinted), strict=True))
         graph.moved_to(estimate)
+
+    def _eliminated_in_time(
+        self, graph: SceneFactorGraph, last: Set[int], affected: Set[int], new: Set[int]
+    ) -> tuple[dict[int, int], Set[int]]:
+        """Ranks of the variables that the next update eliminates, and those among them that it has to be told.
+
+        The whole tree stays eliminated in the order of time: the update changes the `affected` cliques alone, whose
+        variables are ranked without gaps, as iSAM2 asks. Where these are so many that iSAM2 may eliminate all
+        variables instead, all are ranked. Those of all time, and `last`, come last.
+        """
+        times = {key: math.inf if key in last or one.time is None else one.time for key, one in graph.variables.items()}
+        chosen: Set[int] = times.keys() & (affected | new)
+        if not times.keys() - new <= self._times.keys() or len(chosen) > _MANY * len(times):
+            chosen = times.keys()
+        self._times = times
+        rank = {time: k for k, time in enumerate(sorted({times[key] for key in chosen}))}
+        return {key: rank[times[key]] for key in chosen}, chosen - new
 
     def _undetermined(self, graph: SceneFactorGraph, error: Exception | None) -> GraphError:
         point, linear = graph.point(), gtsam.GaussianFactorGraph()
@@ -437,13 +455,6 @@ def _columns(dims: Mapping[int, int], keys: Iterable[int]) -> IntArray:
     """The columns of `keys` among those of variables of `dims`, which stand one after the other."""
     start = dict(zip(dims, itertools.accumulate(dims.values(), initial=0), strict=False))
     return np.array([column for key in keys for column in range(start[key], start[key] + dims[key])], dtype=np.int64)
-
-
-def _in_time(graph: SceneFactorGraph, last: Set[int]) -> dict[int, int]:
-    """Rank in time of every variable, from 0 without gaps, as iSAM2 asks; those of all time, and `last`, come last."""
-    times = {key: math.inf if key in last or one.time is None else one.time for key, one in graph.variables.items()}
-    rank = {time: k for k, time in enumerate(sorted(set(times.values())))}
-    return {key: rank[time] for key, time in times.items()}
 
 
 class Displacements:
