@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.gap_runs import LivedRun, judged_run, judgement
 from benchmarks.recording_sets import RecordingSet
 from data_tools.files.atomic_files import write_bytes
 from data_tools.plots import png
 from data_tools.plots.birds_eye import COLOURS, ellipse
-from pipelines.learning.gaps import CAP, Contender, JudgedRun, Run, judged_run
+from pipelines.learning.gaps import CAP, Contender, JudgedRun
 from saga_fg.errors import InputError
 from saga_fg.learning.gaps import Gap, colours_at
 from saga_fg.learning.labelled_scene import LabelledScene
@@ -33,7 +34,9 @@ LIGHTS = {"red": "#d62728", "amber": "#ff9f0e", "green": "#2ca02c"}
 Turned = Callable[[FloatArray], FloatArray]  # points (n, 2) of the world as (2, n) along and across the object's way
 
 
-def telling_gap(first: Sequence[Run], second: Sequence[Run], situations: Sequence[str] = ()) -> tuple[str, Gap]:
+def telling_gap(
+    first: Sequence[LivedRun], second: Sequence[LivedRun], situations: Sequence[str] = ()
+) -> tuple[str, Gap]:
     """The recording and the gap in which the first contender does better than the second by most.
 
     Where identity is kept by the first alone; among those, or else among all, of largest difference of errors. With
@@ -45,7 +48,7 @@ def telling_gap(first: Sequence[Run], second: Sequence[Run], situations: Sequenc
             if situations and all(each.isdisjoint(situations) for each in at.values()):
                 continue
             gain = float(np.nan_to_num(min(other.error, CAP) - mine.error))
-            worth = (int(mine.kept is True) - int(other.kept is True), gain)
+            worth = (int(mine.kept) - int(other.kept), gain)
             if best is None or worth > best[0]:
                 best = worth, ours.recording, gap
     if best is None:
@@ -56,7 +59,7 @@ def telling_gap(first: Sequence[Run], second: Sequence[Run], situations: Sequenc
 def write_telling_picture(
     path: Path,
     source: RecordingSet,
-    runs: Sequence[Run],
+    runs: Sequence[LivedRun],
     contenders: Sequence[Contender],
     situations: Sequence[str] = (),
 ) -> None:
@@ -102,7 +105,7 @@ def gap_picture(labelled: LabelledScene, gap: Gap, drawn: dict[str, JudgedRun]) 
             *turned(np.where(seen[:, None], labels, np.nan)), color="#555555", linewidth=3.0, label="labels, detected"
         )
         _draw_tracks(ax, time, gap, shown.tolist(), run, turned)
-        outcome = run.outcome(gap)
+        outcome = judgement(run, gap)
         fate = "identity kept" if outcome.kept else "identity lost"
         ax.set_title(f"{name}: {fate}, mean error in the gap {outcome.error:.2f} m", loc="left", fontsize=10)
         ax.set(aspect="equal", ylabel="m", xlim=(left, right))
@@ -131,7 +134,8 @@ def _draw_surroundings(ax: Any, labelled: LabelledScene, gap: Gap, turned: Turne
 
 def _draw_tracks(ax: Any, time: FloatArray, gap: Gap, shown: list[int], run: JudgedRun, turned: Turned) -> None:
     """The way of each track that holds the object before or after the gap, and its ellipses in the gap."""
-    holders = run.holders(gap)
+    name_of = str(run.labelled.id[gap.row])
+    holders = [found.get(name_of) for found in run.track_of]
     for number, name in enumerate(dict.fromkeys(holders[k] for k in shown if holders[k] is not None)):
         colour, seconds, places = COLOURS[number % len(COLOURS)], 1.0, list[FloatArray]()
         for k in shown:

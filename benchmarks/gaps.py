@@ -16,6 +16,7 @@ import numpy as np
 import typer
 
 from benchmarks.gap_picture import write_telling_picture
+from benchmarks.gap_runs import LIVES, GapBenchSettings, Judgement, LivedRun, bench_gaps
 from benchmarks.recording_sets import TRAFFIC_SETS, RecordingSet, chosen_sets
 from benchmarks.recordings.sensed import ABOVE
 from benchmarks.runner import Data, Row, Rows, chosen
@@ -25,17 +26,7 @@ from pipelines.cli.console import progress_bar, writable
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
 from pipelines.learning import learned_motions
-from pipelines.learning.gaps import (
-    LIVES,
-    Contender,
-    GapBenchSettings,
-    GapOutcome,
-    Run,
-    bench_gaps,
-    by_cluster,
-    compared,
-    situation_figures,
-)
+from pipelines.learning.gaps import Contender, by_cluster, compared, situation_figures
 from pipelines.learning.interactions import LEARNED, LearningSettings, learn_interactions
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
@@ -191,9 +182,9 @@ def split_runs(
     base: TrackConfig,
     settings: GapBenchSettings,
     progress: Progress | None = None,
-) -> list[Run]:
+) -> list[LivedRun]:
     """All runs on the recordings; with folds, of contenders fitted to the other ones as well."""
-    runs: list[Run] = []
+    runs: list[LivedRun] = []
     for train, test in splits_of(recordings, folds):
         fitted: list[Contender] = []
         if train and "noise" in fits:
@@ -245,12 +236,12 @@ class Group(NamedTuple):
         """Return True if its length is that of the group, too."""
         return self.has(gap, label) and self.length in (None, gap.length)
 
-    def error(self, outcome: GapOutcome) -> float:
+    def error(self, outcome: Judgement) -> float:
         """Over the gap, or at the end of the length; NaN where it does not reach that."""
         return outcome.error if self.length is None else outcome.at.get(self.length, float("nan"))
 
 
-def rows_of(name: str, runs: Sequence[Run], against: str, by_class: bool, situations: bool) -> Iterator[Row]:
+def rows_of(name: str, runs: Sequence[LivedRun], against: str, by_class: bool, situations: bool) -> Iterator[Row]:
     """Real gaps, made gaps, situations and links, for each life of the tracks."""
     for life in dict.fromkeys(run.life for run in runs):
         title, mine = f"{name}, {TITLES[life]}", [run for run in runs if run.life == life]
@@ -260,7 +251,7 @@ def rows_of(name: str, runs: Sequence[Run], against: str, by_class: bool, situat
             for contender, found in of.items():
                 if row := _row(group, found, of[against]):
                     yield f"{title}: {kind}", {"objects": _objects(group), "contender": contender, **row}
-        for f in situation_figures(mine, against) if situations else ():
+        for f in situation_figures(mine, against) if situations and life == "kept" else ():
             about = {"objects": f.situation, "contender": f.contender, "gaps": f.gaps, "lost": f.lost}
             errors = {"error, m": f.error.estimate, f"against {against}": f.error_change, "median, m": f.median}
             density = {"NLL, nats": f.nll.estimate, f"less that of {against}": f.nll_change}
@@ -275,7 +266,7 @@ def rows_of(name: str, runs: Sequence[Run], against: str, by_class: bool, situat
                 yield f"{title}: links through gaps", {"contender": contender, **known, "false share": share}
 
 
-def _groups(runs: Sequence[Run], by_class: bool) -> Iterator[Group]:
+def _groups(runs: Sequence[LivedRun], by_class: bool) -> Iterator[Group]:
     """Groups of gaps that have rows: moving and stationary objects, and their classes."""
     every = [(gap, label) for run in runs for gap, label in zip(run.gaps, run.label, strict=True)]
     for moving, made in product((True, False), (False, True)):
@@ -291,13 +282,13 @@ def _objects(group: Group) -> str:
     return ", ".join(word for word in words if word)
 
 
-def _row(group: Group, runs: Sequence[Run], base: Sequence[Run]) -> Mapping[str, Any]:
+def _row(group: Group, runs: Sequence[LivedRun], base: Sequence[LivedRun]) -> Mapping[str, Any]:
     """The figures of a contender on a group; nothing where it has none. Errors over all gaps this long or longer."""
 
     def values(
-        some: Sequence[Run], has: Callable[[Gap, str], bool], value: Callable[[GapOutcome], Any]
+        some: Sequence[LivedRun], has: Callable[[Gap, str], bool], value: Callable[[Judgement], Any]
     ) -> list[FloatArray]:
-        def of_run(run: Run) -> FloatArray:
+        def of_run(run: LivedRun) -> FloatArray:
             every = zip(run.gaps, run.label, run.outcomes, strict=True)
             return np.array([value(outcome) for gap, label, outcome in every if has(gap, label)], dtype=np.float64)
 

@@ -30,11 +30,12 @@ from data_tools.datasets.annotated import detected
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable, cell
 from pipelines.config import TrackConfig
-from pipelines.learning.gaps import Contender, GapBenchSettings, Run, bench_gaps, situation_figures, situation_tables
+from pipelines.learning.gaps import Contender, Run, judged_on, situation_figures, situation_tables
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import MOST_GAPS, TEMPLATE, GapSettings, HiddenObjects, Rule, fit_interactions, hidden_objects
+from saga_fg.learning import MOST_GAPS, TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
 from saga_fg.learning.gaps import LENGTHS
+from saga_fg.learning.hidden_objects import FOLLOWED, LONGEST
 from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.sensor import Sensor
@@ -45,6 +46,7 @@ from saga_fg.types.track import Tracks
 
 BASE, SHIPPED, LEARNED = "base motion", "shipped edges", "learned edges"
 NOWHERE = "nowhere"
+SEED = 0  # of the choice of made gaps
 PLACE_NOISE = 0.1  # m: differences below it do not count
 Rules = tuple[Rule, ...]
 
@@ -53,15 +55,13 @@ Rules = tuple[Rule, ...]
 class LearningSettings:
     """Settings of learning and of its test on recordings held out.
 
-    passes  number of times that each recording held out is tracked, each time with other made gaps
-    seed    of the choice of these gaps
-    gaps    choice of the gaps to learn from
-    most    largest number of these, a random sample
+    passes   number of times that each recording held out is tracked, each time with other made gaps
+    longest  length of the longest gap to learn from, s
+    most     largest number of gaps to learn from, a random sample
     """
 
     passes: int = 2
-    seed: int = 0
-    gaps: GapSettings = GapSettings()
+    longest: float = LONGEST
     most: int = MOST_GAPS
 
 
@@ -78,18 +78,6 @@ class LearnedForms:
     ratios: Mapping[tuple[str, ...], Mapping[str, float]]
     runs: tuple[Run, ...]
     held_out: Mapping[str, LearnedInteractions]
-
-
-@dataclass(frozen=True, eq=False)
-class _HeldScenes:
-    """Scenes at hand, as a source of the benchmark."""
-
-    name: str
-    scenes: Mapping[str, Scene]
-    clusters: Mapping[str, str]
-
-    def scene(self, recording: str) -> Scene:
-        return self.scenes[recording]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +106,11 @@ def learn_interactions(
     settings = settings or LearningSettings()
     gaps: dict[str, HiddenObjects | None] = {}
     for done, (name, scene) in enumerate(scenes.items()):
-        gaps[name] = hidden_objects(scene, config.tracker, config.sensors, settings.gaps)
+        gaps[name] = hidden_objects(scene, config.tracker, config.sensors, settings.longest)
         if progress is not None:
             progress(f"base motion {name}", done + 1, len(scenes))
     if not any(gaps.values()):
-        raise InputError(f"{origin}: expected objects that are followed for {settings.gaps.followed:g} s and more")
+        raise InputError(f"{origin}: expected objects that are followed for {FOLLOWED:g} s and more")
     shipped = tuple(rule for rule in config.tracker.edges if isinstance(rule, Following | Neighbours))
     templates = _forms(shipped) if start is None else {"refitted": start.edges}
     groups = coupled_classes([*shipped, *(rule for rules in templates.values() for rule in rules)])
@@ -171,7 +159,7 @@ def learn_interactions(
         for part in parts:
             if part.tested:
                 learned = Contender(LEARNED, "saga", config.with_interactions(combined(part.rules, origin)))
-                runs += _judged(part.tested, [learned], settings, progress)
+                runs += judged_on(part.tested, [learned], settings.passes, SEED, progress)
     everything = {
         group: fitted(tuple(scenes), {form: templates[form]}, group)
         for group, form in chosen.items()
@@ -235,20 +223,9 @@ def _trials(
                 learned_from=origin, edges=rules, explained_noise=config.tracker.explained_noise
             )
             contenders.append(Contender(form, "saga", config.with_interactions(learned)))
-        for run in _judged(part.tested, contenders, settings, progress):
+        for run in judged_on(part.tested, contenders, settings.passes, SEED, progress):
             found.setdefault(run.contender, []).append(run)
     return found
-
-
-def _judged(
-    scenes: Mapping[str, Scene],
-    contenders: Sequence[Contender],
-    settings: LearningSettings,
-    progress: Progress | None,
-) -> list[Run]:
-    source = _HeldScenes("held out", scenes, {})
-    bench = GapBenchSettings(settings.passes, lives=("kept",), seed=settings.seed, real=False)
-    return bench_gaps(source, tuple(scenes), contenders, bench, progress)
 
 
 def _ratio(runs: Sequence[Run], base: Sequence[Run], group: Sequence[str]) -> float:

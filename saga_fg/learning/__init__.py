@@ -1,6 +1,6 @@
 """Learn from recordings: noise, scores and detection probability of sensors, process noise, and interactions."""
 
-from saga_fg.learning.hidden_objects import GapPrediction, GapSettings, HiddenObjects, hidden_objects
+from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects, hidden_objects
 from saga_fg.learning.interaction_fit import (
     MOST_GAPS,
     TEMPLATE,
@@ -38,7 +38,6 @@ __all__ = [
     "DetectionSample",
     "FittedInteractions",
     "GapPrediction",
-    "GapSettings",
     "HiddenObjects",
     "MatchedFrame",
     "MeasuredTrajectory",

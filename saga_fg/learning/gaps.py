@@ -1,6 +1,4 @@
-"""Gaps in which objects are not detected, real or made, and the situations of objects in them.
-
-Gaps: real ones, in which a labelled object has no detection, and made ones, in which its detections are taken away.
+"""Gaps in recordings, made by taking detections away, and the situations of objects in them.
 
 A gap lasts from the last moment with a detection before it to the first moment with one after it. An object *moves* if
 it travels faster than `MOVING` over the gap.
@@ -38,8 +36,7 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.road_map import RoadMap, StopLine
 
 MOVING = 0.5  # m/s
-SHORTEST, LONGEST = 1.0, 6.0  # s: real gaps
-SEEN_BEFORE = 0.39  # s from the first to the last detection before a real gap: half a second of frames at 10 Hz
+LONGEST = 6.0  # s, of all gaps
 LENGTHS = (1.0, 2.0, 3.0, 5.0)  # s: made gaps
 FOLLOWED, FOLLOWED_SHARE = 1.5, 0.8  # s before a made gap, and the share of its moments with a detection
 SPACING = 20.0  # m between objects that are hidden at the same time
@@ -62,23 +59,6 @@ class Gap:
     length: float
     moving: bool
     run: int = 0
-
-
-def real_gaps(labelled: LabelledScene) -> list[Gap]:
-    """All gaps of `SHORTEST` to `LONGEST` s after which the object is detected again."""
-    time, found = labelled.scene.timestamps, []
-    for row in range(len(labelled.id)):
-        seen = np.flatnonzero(labelled.detected[:, row])
-        begins = np.flatnonzero(np.diff(seen) > 1)
-        spell = 0.0 if len(seen) == 0 else float(time[seen[0]])
-        for last, first in zip(seen[begins].tolist(), seen[begins + 1].tolist(), strict=True):
-            length = float(time[first] - time[last])
-            if length < SHORTEST - 1e-6:
-                continue
-            if length <= LONGEST + 1e-6 and time[last] - spell >= SEEN_BEFORE:
-                found.append(Gap(row, last, first, length, _moving(labelled, row, last, first)))
-            spell = float(time[first])
-    return found
 
 
 def reached(time: FloatArray, gap: Gap) -> dict[float, int]:
@@ -148,7 +128,7 @@ def windows(labelled: LabelledScene, rng: np.random.Generator, lengths: Sequence
                     possible.setdefault(row, []).append((length, stop))
         for row, choices in possible.items():
             length, stop = choices[int(rng.integers(len(choices)))]
-            found.append(Gap(row, start, stop, length, _moving(labelled, row, start, stop)))
+            found.append(Gap(row, start, stop, length, is_moving(labelled, row, start, stop)))
     return found
 
 
@@ -186,7 +166,7 @@ class _Taken:
         return not ((apart < FOLLOWED) & (row != gap.row) & near).any()
 
 
-def _moving(labelled: LabelledScene, row: int, start: int, stop: int) -> bool:
+def is_moving(labelled: LabelledScene, row: int, start: int, stop: int) -> bool:
     a, b = labelled.position[[start, stop], row]
     elapsed = float(labelled.scene.timestamps[stop] - labelled.scene.timestamps[start])
     return bool(np.hypot(*(b - a)) > MOVING * elapsed)

@@ -163,26 +163,11 @@ def recorded_tracks(
 APART = 5000.0  # m between gaps: no edge reaches as far
 LATER = 1e9  # s between recordings: no trail is remembered for as long
 LARGEST_ID = 10**9  # of tracks
-
-
-@dataclass(frozen=True)
-class GapSettings:
-    """Choice of the gaps to learn from.
-
-    longest     length of the longest gap, s
-    step        time between the steps of a gap, s
-    followed    time for which an object is tracked before its gap, s
-    spacing     time between the starts of an object's gaps, s
-    neighbours  largest number of tracks around a hidden one that are kept
-    reach       largest distance of these, m
-    """
-
-    longest: float = 5.0
-    step: float = 0.5
-    followed: float = 1.5
-    spacing: float = 1.0
-    neighbours: int = 24
-    reach: float = 60.0
+LONGEST = 5.0  # s: length of the longest gap
+STEP = 0.5  # s between the steps of a gap
+FOLLOWED = 1.5  # s for which an object is tracked before its gap
+SPACING = 1.0  # s between the starts of an object's gaps
+NEIGHBOURS, REACH = 24, 60.0  # most tracks around a hidden one that are kept, and their largest distance, m
 
 
 class _Onto(NamedTuple):
@@ -214,10 +199,9 @@ class GapPrediction(NamedTuple):
 
 
 class _Shared(NamedTuple):
-    """Shared by all gaps: the tracks of the recordings, the step, s, and the trails that the tracks leave."""
+    """Shared by all gaps: the tracks of the recordings, and the trails that the tracks leave."""
 
     tracks: RecordedTracks
-    step: float
     trails: Passages
 
 
@@ -228,7 +212,7 @@ class HiddenObjects(Columns):
     start       (W,) row of the hidden track in `recorded`; time (W,), s; label (W,) of the object
     neighbours  (W, S, M) rows when a step starts, -1: none; lag (W, S), s, from their moment to the start of the step
     place       (W, S, 2) of the object at the end of each step, NaN where unknown
-    recorded    the tracks of the recordings, the step, and the trails
+    recorded    the tracks of the recordings, and the trails
     """
 
     start: IntArray
@@ -264,7 +248,7 @@ class HiddenObjects(Columns):
                 start=part.start + n,
                 time=part.time + t,
                 neighbours=np.where(part.neighbours >= 0, part.neighbours + n, -1),
-                recorded=_Shared(recorded, part.recorded.step, trails),
+                recorded=_Shared(recorded, trails),
             )
             for part, n, t in zip(parts, first, after, strict=False)
         ]
@@ -284,7 +268,7 @@ class HiddenObjects(Columns):
         last = S - self.known[:, ::-1].argmax(axis=1)
         order = np.argsort(np.where(self.known.any(axis=1), -last, 1), kind="stable")
         active = [int((last[self.known.any(axis=1)] > s).sum()) for s in range(S)]
-        recorded, step, _ = self.recorded
+        recorded = self.recorded.tracks
         side = int(np.ceil(np.sqrt(max(W, 1))))
         shift = APART * np.stack(np.divmod(np.arange(W), side), axis=1) - recorded.mean[self.start, :2]
         hidden = _placed(recorded.select(self.start[order]), np.arange(W), shift[order], 0.0)
@@ -302,13 +286,13 @@ class HiddenObjects(Columns):
                 around = recorded.select(self.neighbours[rows[gap], s, column])
                 around.mean[:, :2] += around.mean[:, 2:4] * self.lag[rows[gap], s, None]
                 ids = n + np.arange(len(gap))
-                parts.append(_placed(around, ids, shift[rows[gap]], s * step))
+                parts.append(_placed(around, ids, shift[rows[gap]], s * STEP))
             scene = RecordedTracks.concatenate(parts)
             marginals = Marginals(scene.mean, scene.P, wanted=n)
             state.rules = tuple(_Onto(rule, n) for rule in rules)
-            state.time, state.table = s * step, scene.table
+            state.time, state.table = s * STEP, scene.table
             state.joint = JointTrackState(marginals, partial(motion_of, settings))
-            predict(state, (s + 1) * step)
+            predict(state, (s + 1) * STEP)
             now = state.reported_kinematics()
             found.position[rows, s], found.P[rows, s] = now.position[:n] - shift[rows], now.P[:n]
             hidden = RecordedTracks(state.table.select(slice(0, n)), marginals.means[:n], marginals.covariances[:n])
@@ -344,49 +328,48 @@ def hidden_objects(
     scene: Scene,
     tracker: TrackerSettings,
     sensors: Mapping[str, Sensor],
-    settings: GapSettings | None = None,
+    longest: float = LONGEST,
 ) -> HiddenObjects | None:
     """All gaps of the labelled objects of a scene that a tracker without edges follows; None where there are none.
 
-    Raises `InputError` for a scene without ground truth.
+    longest  of the gaps, s. Raises `InputError` for a scene without ground truth.
     """
-    settings = settings or GapSettings()
     labels = LabelledObjects.of(scene)
     parts, moments, held = recorded_tracks(scene, tracker, sensors, labels)
     if not parts:
         return None
     recorded = RecordedTracks.concatenate(parts)
     first = np.cumsum([0, *map(len, (part.mean for part in parts))])
-    steps = max(1, round(settings.longest / settings.step))
+    steps = max(1, round(longest / STEP))
     starts, latest = [], -np.inf
     for k, time in enumerate(moments):
-        if time - latest >= settings.spacing - 1e-6:
+        if time - latest >= SPACING - 1e-6:
             latest = time
             starts.append(k)
     columns: list[tuple[IntArray, FloatArray, StrArray, IntArray, FloatArray, FloatArray]] = []
     for k in starts:
-        times = moments[k] + settings.step * np.arange(steps + 1)
-        followed = -parts[k].table.initiated >= settings.followed - 1e-6
+        times = moments[k] + STEP * np.arange(steps + 1)
+        followed = -parts[k].table.initiated >= FOLLOWED - 1e-6
         rows = np.flatnonzero((held[k] >= 0) & followed)
         place = np.stack([labels.at(t)[held[k][rows]] for t in times[1:]], axis=1)
         rows, place = rows[np.isfinite(place[..., 0]).any(axis=1)], place[np.isfinite(place[..., 0]).any(axis=1)]
-        near, lag = np.full((len(rows), steps, settings.neighbours), -1), np.zeros((len(rows), steps))
+        near, lag = np.full((len(rows), steps, NEIGHBOURS), -1), np.zeros((len(rows), steps))
         for s in range(steps):
             m = int(np.argmin(np.abs(moments - times[s])))
-            if abs(moments[m] - times[s]) > settings.step:
+            if abs(moments[m] - times[s]) > STEP:
                 continue
             lag[:, s] = times[s] - moments[m]
             expected = parts[k].mean[rows, :2] + parts[k].mean[rows, 2:4] * (times[s] - times[0])
             apart = np.hypot(*np.moveaxis(parts[m].mean[None, :, :2] - expected[:, None], -1, 0))
             same = parts[m].table.id[None] == parts[k].table.id[rows][:, None]
-            apart[same | (apart > settings.reach)] = np.inf
-            nearest = np.argsort(apart, axis=1)[:, : settings.neighbours]
+            apart[same | (apart > REACH)] = np.inf
+            nearest = np.argsort(apart, axis=1)[:, :NEIGHBOURS]
             there = np.isfinite(np.take_along_axis(apart, nearest, axis=1))
             near[:, s, : nearest.shape[1]] = np.where(there, first[m] + nearest, -1)
         time = np.full(len(rows), moments[k])
         columns.append((first[k] + rows, time, parts[k].table.label[rows], near, lag, place))
     start, begin, label, near, lag, place = (np.concatenate(column) for column in zip(*columns, strict=True))
-    shared = _Shared(recorded, settings.step, _trails(parts, moments))
+    shared = _Shared(recorded, _trails(parts, moments))
     found = HiddenObjects(start, begin, label, near, lag, place, shared)
     return found if len(found) else None
 

@@ -11,14 +11,15 @@ from matplotlib.colors import to_hex
 
 from benchmarks import gaps, recording_sets
 from benchmarks.gap_picture import LIGHTS, gap_picture, telling_gap
+from benchmarks.gap_runs import GapBenchSettings, judged_run, prepared, real_gaps, run_of
 from benchmarks.gaps import rows_of, split_runs, splits_of
 from benchmarks.recording_sets import simulated_set
 from benchmarks.variants import contenders, variants
 from pipelines.config import Family, load_config
-from pipelines.learning.gaps import LIFE, GapBenchSettings, judged_run, prepared, run_of, with_life
+from pipelines.learning.gaps import LIFE
 from pipelines.learning.interactions import LearnedForms
 from saga_fg import InputError
-from saga_fg.learning.gaps import real_gaps, situations_of
+from saga_fg.learning.gaps import situations_of
 from saga_fg.model.motion import ConstantVelocity
 from saga_fg.model.stability import LearnedInteractions
 from saga_fg.model.stop_lines import RedLight
@@ -42,10 +43,9 @@ def test_contenders_and_lives_are_settings_of_every_kind_of_data(family: Family)
     base = load_config(family)
     for variant in variants(family).values():
         made = variant.contender(base)
-        config = with_life(made.config, "kept")
+        config = made.kept_alive().config
         config.new_tracker(made.method)
         assert config.tracker.max_coasting == LIFE
-        assert with_life(config, "shipped") is config
 
 
 def test_classical_contenders_differ_in_motion_alone() -> None:

@@ -12,7 +12,7 @@ import pipelines.learning.interactions as learned_module
 from pipelines.cli import app
 from pipelines.config import load_config, load_interactions
 from pipelines.configuration import read_settings, write_settings
-from pipelines.learning.gaps import Contender, GapBenchSettings, bench_gaps
+from pipelines.learning.gaps import Contender, judged_on
 from pipelines.learning.interactions import (
     BASE,
     LEARNED,
@@ -24,7 +24,7 @@ from pipelines.learning.interactions import (
     learn_interactions,
 )
 from saga_fg.errors import InputError
-from saga_fg.learning import FittedInteractions, GapSettings, fit_interactions
+from saga_fg.learning import FittedInteractions, fit_interactions
 from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
 from saga_fg.model.interactions import CarFollowing
 from saga_fg.model.stability import LearnedInteractions
@@ -32,7 +32,7 @@ from tests.saga_fg.following_pairs import RATE, following_pairs
 
 run = CliRunner().invoke
 FOLLOW = Following(CarFollowing(time_constant=float("inf")), rate=RATE, gap_scale=100.0)
-QUICK = LearningSettings(passes=1, gaps=GapSettings(longest=1.5))
+QUICK = LearningSettings(passes=1, longest=1.5)
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +67,7 @@ def test_the_form_that_does_best_on_recordings_held_out_is_the_form_that_is_writ
     for name, scene in scenes.items():
         text = write_settings(found.held_out[name])
         read = config.with_interactions(read_settings(LearnedInteractions, text, "learned.yaml"))
-        source = learned_module._HeldScenes("again", {name: scene}, {})
-        (again,) = bench_gaps(source, (name,), [Contender("again", "saga", read)], GapBenchSettings(1, lives=("kept",)))
+        (again,) = judged_on({name: scene}, [Contender("again", "saga", read)], passes=1, seed=0)
         (tried,) = (run for run in found.runs if (run.contender, run.recording) == (LEARNED, name))
         assert len(again.outcomes) >= 2
         assert again.outcomes == tried.outcomes
@@ -90,11 +89,11 @@ def test_the_base_motion_is_the_tracker_that_is_written_if_no_form_helps(monkeyp
     tracker = replace(config.tracker, edges=(), traffic=replace(config.tracker.traffic, memory=60.0))
     config, tried = replace(config, tracker=tracker), []
 
-    def bench(source, recordings, contenders, *args, **kwargs):
+    def judge(scenes, contenders, *args):
         tried.extend(contenders)
-        return bench_gaps(source, recordings, contenders, *args, **kwargs)
+        return judged_on(scenes, contenders, *args)
 
-    monkeypatch.setattr(learned_module, "bench_gaps", bench)
+    monkeypatch.setattr(learned_module, "judged_on", judge)
     found = learn_interactions(scenes, "two scenes", config, settings=QUICK)
     assert set(found.forms.values()) == {NOWHERE}
     written = config.with_interactions(found.interactions)

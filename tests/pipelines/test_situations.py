@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from pipelines.learning.gaps import GapOutcome, JudgedRun, Links, Prediction, Run, situation_figures
+from pipelines.learning.gaps import GapOutcome, JudgedRun, Prediction, Run, situation_figures
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
 from saga_fg.learning.gaps import Gap, Route, situations_of
 from saga_fg.learning.labelled_scene import LabelledScene
@@ -121,13 +121,10 @@ def test_predictions_are_judged_by_their_own_covariance() -> None:
 
 
 def run(name: str, recording: str, cluster: str, errors: list[float]) -> Run:
-    outcomes = tuple(
-        GapOutcome(True, True, True, e, {1.0: e}, {1.0: Prediction(e, e * e, e)} if np.isfinite(e) else {})
-        for e in errors
-    )
+    outcomes = tuple(GapOutcome({1.0: e}, {1.0: Prediction(e, e * e, e)} if np.isfinite(e) else {}) for e in errors)
     n, at = len(errors), {1.0: frozenset({"all", "free"})}
     gaps = (Gap(0, 5, 11, 1.0, moving=True, run=1),) * n
-    return Run(recording, cluster, name, "kept", gaps, ("car",) * n, (at,) * n, outcomes, Links())
+    return Run(recording, cluster, name, gaps, ("car",) * n, (at,) * n, outcomes)
 
 
 def test_figures_are_paired_and_overlapping_recordings_are_one() -> None:

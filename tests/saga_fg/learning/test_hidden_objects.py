@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from saga_fg import InputError
-from saga_fg.learning import GapSettings, HiddenObjects, hidden_objects
+from saga_fg.learning import HiddenObjects, hidden_objects
+from saga_fg.learning.hidden_objects import STEP
 from saga_fg.model.edge_rules import EdgeInformation, Following, Neighbours, Repulsion
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.modes import Mixture
@@ -17,7 +18,7 @@ from saga_fg.tracking.track_filters import StationaritySettings
 from tests.saga_fg.following_pairs import GAP, following_pairs, scene_of
 
 SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.02, yaw=0.02)})}
-ONCE = GapSettings(longest=1.5, spacing=1.0)
+ONCE = 1.5  # s
 FOLLOW = Following(SharedVelocity(), rate=0.5, gap_scale=20.0)
 
 
@@ -64,7 +65,7 @@ def test_the_first_step_is_that_of_a_tracker_with_the_same_settings_and_rules(sc
         kf.step(frame)
         tracker = Tracker(settings, SENSORS, rules)
         tracker.restore(kf.snapshot())
-        later = tracker.tracks(frame.timestamp + ONCE.step)
+        later = tracker.tracks(frame.timestamp + STEP)
         present = tracker.tracks(frame.timestamp)
         for w in range(len(sample)):
             start = sample.recorded.tracks.mean[sample.start[w], :2]

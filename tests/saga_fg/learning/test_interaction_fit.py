@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from saga_fg import InputError
-from saga_fg.learning import GapSettings, HiddenObjects, fit_interactions, hidden_objects, negative_log_likelihood
+from saga_fg.learning import HiddenObjects, fit_interactions, hidden_objects, negative_log_likelihood
 from saga_fg.learning.interaction_fit import RuleParameters
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
@@ -20,7 +20,7 @@ from tests.saga_fg.following_pairs import GAP, RATE, following_pairs
 SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.01)})}
 CLASSES = {"default": ClassSettings(motion=ConstantVelocity(0.5), initial_speed_deviation=8.0, max_distance=20.0)}
 SETTINGS = TrackerSettings(classes=CLASSES, edges=())
-SHORT = GapSettings(longest=1.5)
+SHORT = 1.5
 FOLLOW = Following(CarFollowing(time_constant=math.inf), rate=0.3, gap_scale=20.0)
 
 

@@ -1,0 +1,218 @@
+"""Runs of trackers through gaps of recordings, real and made, judged by identity and place.
+
+A real gap lasts from the last moment at which a labelled object has a detection to the next one. Made gaps and errors
+are those of `pipelines.learning.gaps`.
+
+kept   the track that holds the object `SETTLING` s after the gap is the one that held it before
+error  distance of that track, while it is not detected, to the label, m; `CAP` where it is not known or farther away
+link   a track that is detected again after `SHORTEST` s or more; it is right if it holds the object it held before,
+       false if it holds another, unknown if it holds none before or after
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal, Protocol
+
+import numpy as np
+
+from pipelines.learning.gaps import CAP, Contender, GapOutcome, JudgedRun, Run, gaps_of, tracks_without
+from pipelines.tracking import Progress
+from saga_fg.learning.gaps import LENGTHS, LONGEST, Gap, is_moving, made_gaps, situations_of
+from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.model.sensor import Sensor
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.dataset import Scene
+
+SHORTEST = 1.0  # s: real gaps
+SEEN_BEFORE = 0.39  # s from the first to the last detection before a real gap: half a second of frames at 10 Hz
+Life = Literal["kept", "shipped"]
+LIVES: tuple[Life, ...] = ("kept", "shipped")
+
+
+def real_gaps(labelled: LabelledScene) -> list[Gap]:
+    """All gaps of `SHORTEST` to `LONGEST` s after which the object is detected again."""
+    time, found = labelled.scene.timestamps, []
+    for row in range(len(labelled.id)):
+        seen = np.flatnonzero(labelled.detected[:, row])
+        begins = np.flatnonzero(np.diff(seen) > 1)
+        spell = 0.0 if len(seen) == 0 else float(time[seen[0]])
+        for last, first in zip(seen[begins].tolist(), seen[begins + 1].tolist(), strict=True):
+            length = float(time[first] - time[last])
+            if length < SHORTEST - 1e-6:
+                continue
+            if length <= LONGEST + 1e-6 and time[last] - spell >= SEEN_BEFORE:
+                found.append(Gap(row, last, first, length, is_moving(labelled, row, last, first)))
+            spell = float(time[first])
+    return found
+
+
+@dataclass(frozen=True)
+class Judgement(GapOutcome):
+    """The outcome of a gap with the fate of the identity.
+
+    held, kept  whether a track had the object before, and whether that track has it after
+    reported    whether that track is among the results at the last moment of the gap
+    error       mean over the gap, m
+    """
+
+    held: bool
+    kept: bool
+    reported: bool
+    error: float
+
+
+@dataclass(frozen=True)
+class Links:
+    """Tracks that were detected again after a gap, by whom they hold."""
+
+    right: int = 0
+    false: int = 0
+    unknown: int = 0
+
+
+@dataclass(frozen=True)
+class LivedRun(Run):
+    """A run whose tracks are kept alive, or end as configured. links: of the run with all detections, if that was."""
+
+    outcomes: tuple[Judgement, ...]
+    life: Life
+    links: Links | None
+
+
+class ExtrapolatedRun(JudgedRun):
+    """A run in which a track that is not reported is taken to move on as it was last reported."""
+
+    def position(self, track: int, moment: int) -> FloatArray | None:
+        """The place (2,) of a track, None before it was reported."""
+        for k in range(moment, -1, -1):
+            row, found = self.row_of[k].get(track), self.tracks[k]
+            if row is not None:
+                elapsed = float(self.tracks[moment].timestamp - found.timestamp)
+                return np.asarray(found.boxes.position[row, :2] + elapsed * found.boxes.velocity[row])
+        return None
+
+
+def judgement(run: JudgedRun, gap: Gap) -> Judgement:
+    """Judge one gap."""
+    holder, outcome = run.holder(gap), run.outcome(gap)
+    if holder is None:
+        return Judgement(outcome.at, outcome.predicted, False, False, False, CAP)
+    after = run.last(run.track_of, str(run.labelled.id[gap.row]), gap.stop, back=False)
+    errors = np.array([run.error(holder, gap.row, k) for k in range(gap.start + 1, gap.stop)])
+    known = errors[np.isfinite(errors)]
+    mean = float(known.mean()) if len(known) else float("nan")
+    reported = holder in run.row_of[gap.stop - 1]
+    return Judgement(outcome.at, outcome.predicted, True, after == holder, reported, mean)
+
+
+def links(run: JudgedRun) -> Links:
+    """Judge all tracks that were detected again."""
+    time = run.labelled.scene.timestamps
+    object_of = [{track: name for name, track in found.items()} for found in run.track_of]
+    latest: dict[int, int] = {}
+    right = false = unknown = 0
+    for k, detected in enumerate(run.detected):
+        for track in set(detected.id.tolist()):
+            since = latest.get(track)
+            latest[track] = k
+            if since is None or not SHORTEST - 1e-6 <= time[k] - time[since] <= LONGEST + 1e-6:
+                continue
+            before = run.last(object_of, track, since, back=True)
+            after = run.last(object_of, track, k, back=False)
+            if before is None or after is None:
+                unknown += 1
+            elif before == after:
+                right += 1
+            else:
+                false += 1
+    return Links(right, false, unknown)
+
+
+class SceneSource(Protocol):
+    """Recordings by name, with ground truth and detections; clusters: the first of the recordings that overlap in time
+    with each, by name, empty where none can."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def clusters(self) -> Mapping[str, str]: ...
+    def scene(self, recording: str) -> Scene: ...
+
+
+@dataclass(frozen=True)
+class GapBenchSettings:
+    """Passes over each recording with made gaps, the lives compared, lengths of made gaps, s.
+
+    real  whether the gaps of the recordings themselves are judged too, and the links
+    of    situations, one of which objects are in at the end of made gaps (`saga_fg.learning.gaps`); none: any
+    """
+
+    passes: int = 2
+    lives: tuple[Life, ...] = LIVES
+    lengths: tuple[float, ...] = LENGTHS
+    real: bool = True
+    of: tuple[str, ...] = ()
+
+
+def bench_gaps(
+    source: SceneSource,
+    recordings: Sequence[str],
+    contenders: Sequence[Contender],
+    settings: GapBenchSettings,
+    progress: Progress | None = None,
+) -> list[LivedRun]:
+    """All runs on some recordings of a set, of contenders that have the same sensors."""
+    runs = list[LivedRun]()
+    for name in recordings:
+        labelled, gaps = prepared(source, name, settings, contenders[0].config.sensors)
+        for contender, life in product(contenders, settings.lives):
+            runs.append(run_of(labelled, gaps, contender, life, settings.real, source.clusters.get(name, name)))
+            if progress is not None:
+                each = len(contenders) * len(settings.lives)
+                progress(f"{source.name} {name} {contender.name}", len(runs), len(recordings) * each)
+    return runs
+
+
+def prepared(
+    source: SceneSource, recording: str, settings: GapBenchSettings, sensors: Mapping[str, Sensor]
+) -> tuple[LabelledScene, list[Gap]]:
+    """A recording and its gaps."""
+    labelled = LabelledScene.of(source.scene(recording), sensors)
+    real = real_gaps(labelled) if settings.real else []
+
+    def wanted(gap: Gap) -> bool:
+        return not situations_of(labelled, gap).get(gap.length, frozenset()).isdisjoint(settings.of)
+
+    chosen = wanted if settings.of else None
+    return labelled, [*real, *made_gaps(labelled, settings.passes, 0, settings.lengths, chosen)]
+
+
+def run_of(
+    labelled: LabelledScene,
+    gaps: Sequence[Gap],
+    contender: Contender,
+    life: Life,
+    real: bool = True,
+    cluster: str | None = None,
+) -> LivedRun:
+    """Track without the detections of each pass, and before, for `real` gaps and links, with all; judge."""
+    outcomes: dict[int, Judgement] = {}
+    found = Links() if real else None
+    for number in sorted({*([0] if real else []), *(gap.run for gap in gaps)}):
+        mine = {k: gap for k, gap in enumerate(gaps) if gap.run == number}
+        judged = judged_run(labelled, list(mine.values()), contender, life)
+        outcomes |= {k: judgement(judged, gap) for k, gap in mine.items()}
+        if number == 0:
+            found = links(judged)
+    name, ordered = labelled.scene.name, tuple(outcomes[k] for k in range(len(gaps)))
+    return LivedRun(name, cluster or name, contender.name, *gaps_of(labelled, gaps), ordered, life, found)
+
+
+def judged_run(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> JudgedRun:
+    """Track without the detections of the made ones among the gaps of one run."""
+    made, lived = [gap for gap in gaps if gap.run > 0], contender.kept_alive() if life == "kept" else contender
+    kind = ExtrapolatedRun if contender.method == "centerpoint" else JudgedRun
+    return kind(labelled, tracks_without(labelled, made, lived))
