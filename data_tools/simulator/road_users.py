@@ -27,7 +27,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_tools.simulator.road import Road
-from data_tools.simulator.settings import CyclistSettings, PedestrianSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.types.boxes import Boxes
 
@@ -117,6 +116,10 @@ def static_objects(id: StrArray, boxes: Boxes, time: FloatArray) -> SimulatedTra
 RELAXATION = 0.6  # tau, s
 PEDESTRIAN_SWAY = 1.0  # omega, 1/s
 SPACING = 0.8  # m between people who walk abreast
+GROUP_SIZE = (1, 4)  # fewest and most people in a group
+WALKING_SPEED = (1.0, 1.7)  # preferred speed of a group, m/s
+PAUSE_INTERVAL, PAUSE_DURATION = 20.0, 4.0  # mean time between pauses of a group, and of a pause, s
+JITTER = 0.25  # standard deviation of a person's position within the group, m
 BODY = (0.65, 0.65, 1.72)  # length, width, height, m
 
 
@@ -125,12 +128,15 @@ def simulate_pedestrians(
     pavements: list[tuple[float, float]],
     window: tuple[float, float],
     time: FloatArray,
-    settings: PedestrianSettings,
+    number: tuple[int, int],
     rng: np.random.Generator,
 ) -> SimulatedTrajectories:
-    """Pedestrians on `pavements` (lowest and highest offset d, m) who start at road s within `window`, m."""
-    groups = int(rng.integers(settings.groups[0], settings.groups[1] + 1)) if pavements else 0
-    count = rng.integers(settings.group_size[0], settings.group_size[1] + 1, size=groups)
+    """Pedestrians on `pavements` (lowest and highest offset d, m) who start at road s within `window`, m.
+
+    number: fewest and most groups
+    """
+    groups = int(rng.integers(number[0], number[1] + 1)) if pavements else 0
+    count = rng.integers(GROUP_SIZE[0], GROUP_SIZE[1] + 1, size=groups)
     group = np.repeat(np.arange(groups), count)
     rank = np.arange(len(group)) - np.repeat(np.cumsum(count) - count, count)
     offset = np.stack([-(rank // 2) * SPACING * 1.2, (rank % 2 - 0.5) * SPACING], axis=1)
@@ -140,13 +146,13 @@ def simulate_pedestrians(
     low, high = np.array([pavements[k] for k in rng.integers(len(pavements), size=groups)]).reshape(-1, 2).T
     middle = rng.uniform(low, high)
     sense = rng.choice([-1.0, 1.0], size=groups)
-    preferred = rng.uniform(*settings.walking_speed, size=groups)
-    pausing = rng.random(groups) < settings.pause_duration / (settings.pause_duration + settings.pause_interval)
+    preferred = rng.uniform(*WALKING_SPEED, size=groups)
+    pausing = rng.random(groups) < PAUSE_DURATION / (PAUSE_DURATION + PAUSE_INTERVAL)
     speed = np.where(pausing, 0.0, preferred)
 
     h = float(time[1] - time[0])
-    sway = settings.jitter * rng.standard_normal((len(group), 2))
-    swing = PEDESTRIAN_SWAY * settings.jitter * rng.standard_normal((len(group), 2))
+    sway = JITTER * rng.standard_normal((len(group), 2))
+    swing = PEDESTRIAN_SWAY * JITTER * rng.standard_normal((len(group), 2))
     s, d = np.empty((2, len(time), len(group)))
     vs, vd = np.empty_like(s), np.empty_like(s)
     for k in range(len(time)):
@@ -154,12 +160,12 @@ def simulate_pedestrians(
         d[k] = middle[group] + offset[:, 1] + sway[:, 1]
         vs[k] = sense[group] * speed[group] + swing[:, 0]
         vd[k] = swing[:, 1]
-        toggle = rng.random(groups) < h / np.where(pausing, settings.pause_duration, settings.pause_interval)
+        toggle = rng.random(groups) < h / np.where(pausing, PAUSE_DURATION, PAUSE_INTERVAL)
         pausing = pausing ^ toggle
         centre = centre + h * sense * speed
         speed = speed + h / RELAXATION * (np.where(pausing, 0.0, preferred) - speed)
         sway = sway + h * swing
-        kick = np.sqrt(4 * PEDESTRIAN_SWAY**3 * h) * settings.jitter * rng.standard_normal(swing.shape)
+        kick = np.sqrt(4 * PEDESTRIAN_SWAY**3 * h) * JITTER * rng.standard_normal(swing.shape)
         swing = swing - h * (PEDESTRIAN_SWAY**2 * sway + 2 * PEDESTRIAN_SWAY * swing) + kick
     heading = road.heading_at(s)
     stretch = 1 - road.curvature_at(s) * d
@@ -191,15 +197,18 @@ def simulate_cyclists(
     borders: tuple[float, float],
     window: tuple[float, float],
     time: FloatArray,
-    settings: CyclistSettings,
+    number: tuple[int, int],
     rng: np.random.Generator,
 ) -> SimulatedTrajectories:
-    """Bicycles, then their riders, that start at road s within `window`, m, inside the outer borders (d, m)."""
+    """Bicycles, then their riders, that start at road s within `window`, m, inside the outer borders (d, m).
+
+    number: fewest and most in each direction
+    """
     h = float(time[1] - time[0])
     decay = float(np.exp(-h / CHANGE_TIME))
     parts = []
     for sense, lateral in ((1.0, borders[0] + 0.7), (-1.0, borders[1] - 0.7)):
-        n = int(rng.integers(settings.count[0], settings.count[1] + 1))
+        n = int(rng.integers(number[0], number[1] + 1))
         preferred = rng.uniform(*CYCLIST_SPEED, n)
         noise = SPEED_SPREAD * np.sqrt(1 - decay**2) * rng.standard_normal((len(time), n))
         deviation = np.zeros((len(time), n))

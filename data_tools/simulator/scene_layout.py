@@ -18,13 +18,7 @@ from data_tools.simulator.fleet import (
     sample_sizes,
 )
 from data_tools.simulator.road import Lanes, Road, curved_road
-from data_tools.simulator.settings import (
-    RoadSettings,
-    RoadworkSettings,
-    SimulatorSettings,
-    SurroundingSettings,
-    TrafficSettings,
-)
+from data_tools.simulator.settings import SimulatorSettings, TrafficSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import Boxes
 
@@ -122,7 +116,7 @@ class SceneLayout:
 
 def sample_layout(settings: SimulatorSettings, rng: np.random.Generator) -> SceneLayout:
     """A random layout."""
-    lanes, hedge = _sample_lanes(settings.road, settings.roadworks, rng)
+    lanes, hedge = _sample_lanes(settings, rng)
     focus = FOCUS * ROAD_LENGTH
     until = settings.warm_up + settings.duration
     stop_lines, slow_zones = _sample_disturbances(lanes, focus, until, settings.traffic, rng)
@@ -136,9 +130,7 @@ def _start_speed(desired_speed: float) -> float:
     return 0.6 * desired_speed
 
 
-def _sample_lanes(
-    settings: RoadSettings, roadworks: RoadworkSettings, rng: np.random.Generator
-) -> tuple[Lanes, float | None]:
+def _sample_lanes(settings: SimulatorSettings, rng: np.random.Generator) -> tuple[Lanes, float | None]:
     """Lanes, and the offset of the hedge between the directions, m, or None."""
     focus = FOCUS * ROAD_LENGTH
     bends = []
@@ -164,7 +156,7 @@ def _sample_lanes(
         opening=focus - rng.uniform(80.0, 150.0) if merge else 0.0,
         approach=float(rng.choice([0.0, 25.0])) if merge else 0.0,
     )
-    if merge and roadworks.probability > 0 and rng.random() < roadworks.probability:
+    if merge and settings.roadworks_probability > 0 and rng.random() < settings.roadworks_probability:
         taper = float(rng.uniform(*TAPER))
         opening = focus - taper - float(rng.uniform(*NOTICE))
         lanes = replace(lanes, taper=taper, opening=opening, approach=0.0)
@@ -247,14 +239,17 @@ class Surroundings:
 
 
 def sample_surroundings(
-    layout: SceneLayout, window: tuple[float, float], settings: SurroundingSettings, rng: np.random.Generator
+    layout: SceneLayout, window: tuple[float, float], parking: float, rng: np.random.Generator
 ) -> Surroundings:
-    """Random surroundings of the road for s within `window`, m; no parking and no pavement beside an ending lane."""
+    """Random surroundings of the road for s within `window`, m; no parking and no pavement beside an ending lane.
+
+    parking: probability of a strip of parked cars beside the road
+    """
     road, parked, occluders, pavements = layout.lanes.road, [], [], []
     for side, offset in zip((-1.0, 1.0), layout.borders, strict=True):
         border = abs(offset) + 0.3
         if side > 0 or layout.lanes.ending < 0:
-            if rng.random() < settings.parking_probability:
+            if rng.random() < parking:
                 parked.append(_parked(road, side * (border + PARKING_WIDTH / 2), side, window, rng))
                 border += PARKING_WIDTH
             inner, outer = side * (border + 0.9), side * (border + PAVEMENT_WIDTH - 0.9)

@@ -36,6 +36,8 @@ from saga_fg.types.frame import Detections
 
 CLUTTER = (("pedestrian", BODY), *((kind.label, kind.size) for kind in KINDS))
 CLUTTER_SHARES = (0.4, 0.4, 0.1, 0.07, 0.03)
+DRIFT_TIME = 2.0  # correlation time of the drift of a range, s
+OUTAGE_DURATION = (1.0, 3.0)  # of an outage, in which no frame comes, s
 FADING = 6.0  # width of the fall of the probability of detection around the reach, m
 
 
@@ -74,7 +76,7 @@ def points_on(resolution: tuple[float, float], origin: FloatArray, boxes: Boxes,
 def range_drifts(sensor: SensorSettings, time: FloatArray, objects: int, rng: np.random.Generator) -> FloatArray:
     """Relative errors (K, N) of the range of N objects at `time` (K,), s: a Gauss-Markov process for each."""
     drift = sensor.range_drift * rng.standard_normal((len(time), objects))
-    kept = np.exp(-np.diff(time) / sensor.drift_time)
+    kept = np.exp(-np.diff(time) / DRIFT_TIME)
     for k, share in enumerate(kept, start=1):
         drift[k] = share * drift[k - 1] + math.sqrt(1 - share**2) * drift[k]
     return drift
@@ -87,7 +89,7 @@ def outside_outages(sensor: SensorSettings, time: FloatArray, rng: np.random.Gen
     working, end = np.ones(len(time), dtype=np.bool_), time[0]
     while end <= time[-1]:
         begin = end + rng.exponential(sensor.outage_interval)
-        end = begin + rng.uniform(*sensor.outage_duration)
+        end = begin + rng.uniform(*OUTAGE_DURATION)
         working &= (time < begin) | (time >= end)
     return time[working]
 

@@ -40,23 +40,6 @@ CLEAR_SHARE = 0.35  # visible share from which occlusion has no effect
 
 
 @dataclass(frozen=True)
-class RoadSettings(Settings):
-    """Shape of the road, in m; traffic keeps to the right."""
-
-    lanes: PositiveCount = setting((2, 4), "fewest and most lanes in the ego vehicle's direction")
-    oncoming_lanes: PositiveCount = setting((1, 3), "fewest and most lanes in the other direction")
-    merge_probability: Fraction = setting(0.3, "share of scenes with a lane that ends (an on-ramp or a lane drop)")
-
-
-@dataclass(frozen=True)
-class DriverSettings(Settings):
-    """Intelligent Driver Model: means over the drivers of cars, and the spread between drivers."""
-
-    reaction_time: NonNegative = setting(0.3, "delay between a change in traffic and the driver's response, s")
-    acceleration_noise: NonNegative = setting(0.2, "standard deviation of random acceleration, m/s^2")
-
-
-@dataclass(frozen=True)
 class TrafficSettings(Settings):
     """Vehicles: kinds, platoons, and disturbances of the traffic flow."""
 
@@ -71,46 +54,6 @@ class TrafficSettings(Settings):
         super().__post_init__()
         if not VAN_SHARE + self.truck_share + self.bus_share <= 1:
             raise InputError("van_share: expected the shares of vans, trucks and buses to be at most 1 together")
-
-
-@dataclass(frozen=True)
-class PedestrianSettings(Settings):
-    """Pedestrians on the pavements, alone and in groups."""
-
-    groups: Count = setting((3, 8), "fewest and most groups within reach of the ego vehicle")
-    group_size: Count = setting((1, 4), "fewest and most people in a group")
-    walking_speed: PositiveSpan = setting((1.0, 1.7), "preferred speed of a group, m/s")
-    pause_interval: Positive = setting(20.0, "mean time between pauses of a group, s")
-    pause_duration: Positive = setting(4.0, "mean duration of a pause, s")
-    jitter: NonNegative = setting(0.25, "standard deviation of a person's position within the group, m")
-
-
-@dataclass(frozen=True)
-class CyclistSettings(Settings):
-    """Cyclists at the outer borders of the road."""
-
-    count: Count = setting((0, 0), "fewest and most cyclists in each direction")
-
-
-@dataclass(frozen=True)
-class RoadworkSettings(Settings):
-    """A right lane closed by cones: a taper that moves its traffic into the adjacent lane, then a row along it."""
-
-    probability: Fraction = setting(0.0, "share of the scenes with a lane that ends whose lane is closed by cones")
-
-
-@dataclass(frozen=True)
-class LightSettings(Settings):
-    """Traffic lights: phases, map, and visibility."""
-
-    mapped: bool = setting(False, "give frames a map of lights, stop lines and lanes")
-
-
-@dataclass(frozen=True)
-class SurroundingSettings(Settings):
-    """Static objects beside the road, which hide moving ones."""
-
-    parking_probability: Fraction = setting(0.35, "share of roadsides with a strip of parked cars")
 
 
 @dataclass(frozen=True)
@@ -161,9 +104,7 @@ class SensorSettings(Settings):
     range_drift: NonNegative = setting(
         0.0, "standard deviation of a relative error of the range that changes slowly, as of a camera; 0: none"
     )
-    drift_time: Positive = setting(2.0, "correlation time of the range drift, s")
     outage_interval: PositiveOrInf = setting(math.inf, "mean time from one outage of the sensor to the next, s")
-    outage_duration: PositiveSpan = setting((1.0, 3.0), "duration of an outage, in which no frame comes, s")
     clutter_rate: NonNegative = setting(2.0, "mean number of false detections a frame")
     true_logit: Finite = setting(2.0, "mean logit of the score of a fully visible object at close range")
     clutter_logit: Finite = setting(-1.5, "mean logit of the score of a false detection")
@@ -205,7 +146,6 @@ def sparse_lidar() -> SensorSettings:
         resolution=(0.0058, 0.0232),
         enough_points=5.0,
         outage_interval=10.0,
-        outage_duration=(1.0, 3.0),
     )
 
 
@@ -257,14 +197,17 @@ class SimulatorSettings(Settings):
     memory: Annotated[float, Range(0, infinite=True)] = setting(
         4.0, "duration for which a hidden object stays annotated after it was last visible, s; .inf: all are annotated"
     )
-    road: RoadSettings = settings_group(RoadSettings, "the road")
-    drivers: DriverSettings = settings_group(DriverSettings, "drivers")
+    lanes: PositiveCount = setting((2, 4), "fewest and most lanes in the ego vehicle's direction; traffic keeps right")
+    oncoming_lanes: PositiveCount = setting((1, 3), "fewest and most lanes in the other direction")
+    merge_probability: Fraction = setting(0.3, "share of scenes with a lane that ends (an on-ramp or a lane drop)")
+    roadworks_probability: Fraction = setting(
+        0.0, "share of these whose lane is closed by cones: a taper that moves its traffic aside, then a row along it"
+    )
+    parking_probability: Fraction = setting(0.35, "share of roadsides with a strip of parked cars")
+    pedestrian_groups: Count = setting((3, 8), "fewest and most groups of pedestrians within reach of the ego vehicle")
+    cyclists: Count = setting((0, 0), "fewest and most cyclists in each direction, at the outer borders of the road")
+    mapped: bool = setting(False, "give frames a map of traffic lights, stop lines and lanes")
     traffic: TrafficSettings = settings_group(TrafficSettings, "vehicles")
-    pedestrians: PedestrianSettings = settings_group(PedestrianSettings, "pedestrians")
-    surroundings: SurroundingSettings = settings_group(SurroundingSettings, "static objects beside the road")
-    cyclists: CyclistSettings = settings_group(CyclistSettings, "cyclists")
-    roadworks: RoadworkSettings = settings_group(RoadworkSettings, "lanes closed by cones")
-    lights: LightSettings = settings_group(LightSettings, "traffic lights")
     sensors: dict[str, SensorSettings] = settings_group(
         lambda: {"lidar": lidar(), "camera": camera()}, "sensors on the ego vehicle, by name"
     )
@@ -277,26 +220,28 @@ SCENARIOS: tuple[ScenarioName, ...] = get_args(ScenarioName)
 _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
     "traffic": SimulatorSettings(),
     "red-light": SimulatorSettings(
-        road=RoadSettings(merge_probability=0.0),
+        merge_probability=0.0,
         traffic=TrafficSettings(signal_probability=1.0),
-        lights=LightSettings(mapped=True),
+        mapped=True,
         sensors={"lidar": lidar(), "camera": replace(camera(), colour_accuracy=0.9)},
     ),
     "road-works": SimulatorSettings(
-        road=RoadSettings(lanes=(1, 1), merge_probability=1.0),
+        lanes=(1, 1),
+        merge_probability=1.0,
         traffic=TrafficSettings(platoon_size=(2, 5), platoon_gap=(15.0, 60.0)),  # light: one lane less makes no jam
-        roadworks=RoadworkSettings(probability=1.0),
-        lights=LightSettings(mapped=True),
+        roadworks_probability=1.0,
+        mapped=True,
     ),
     "towing": SimulatorSettings(traffic=TrafficSettings(truck_share=0.35, bus_share=0.02, trailer_share=0.8)),
-    "cycling": SimulatorSettings(cyclists=CyclistSettings(count=(5, 9))),
+    "cycling": SimulatorSettings(cyclists=(5, 9)),
     "two-sensors": SimulatorSettings(
         keyframe_rate=2.0,
         annotation_range=100.0,
-        road=RoadSettings(lanes=(1, 3), oncoming_lanes=(1, 2)),
+        lanes=(1, 3),
+        oncoming_lanes=(1, 2),
         traffic=TrafficSettings(platoon_size=(1, 4), platoon_gap=(20.0, 80.0)),  # light, with views far ahead
-        surroundings=SurroundingSettings(parking_probability=0.15),
-        pedestrians=PedestrianSettings(groups=(6, 12)),
+        parking_probability=0.15,
+        pedestrian_groups=(6, 12),
         sensors={"sparse_lidar": sparse_lidar(), "far_camera": far_camera()},
     ),
 }

@@ -34,11 +34,12 @@ from data_tools.simulator.fleet import (
 from data_tools.simulator.road import LaneOrder, Lanes, smooth_step, smooth_step_slope
 from data_tools.simulator.road_users import SimulatedTrajectories
 from data_tools.simulator.scene_layout import SceneLayout
-from data_tools.simulator.settings import DriverSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 
 CHANGE_INTERVAL = 0.5  # s between two decisions to change lanes
 SLOWEST_CHANGE = 2.0  # m/s, lowest speed at which a voluntary lane change starts
+REACTION_TIME = 0.3  # s between a change in traffic and the driver's response
+ACCELERATION_NOISE = 0.2  # standard deviation of the random acceleration, m/s^2
 NOISE_TIME = 3.0  # correlation time of the random acceleration, s
 
 
@@ -61,18 +62,20 @@ class Traffic:
     """Vehicles in traffic, advanced by `step`.
 
     step   time step, s
+    noise  standard deviation of the random acceleration, m/s^2; reaction: time of the drivers, s
     early  spread of the positions at which drivers leave a lane closed by cones, m
     """
 
     def __init__(
         self,
         layout: SceneLayout,
-        settings: DriverSettings,
         rng: np.random.Generator,
         step: float = 0.05,
         early: float = 0.0,
+        noise: float = ACCELERATION_NOISE,
+        reaction: float = REACTION_TIME,
     ) -> None:
-        self._lanes, self._fleet, self._settings, self._rng = layout.lanes, layout.fleet, settings, rng
+        self._lanes, self._fleet, self._deviation, self._rng = layout.lanes, layout.fleet, noise, rng
         self._stop_lines, self._slow_zones, self._step = layout.stop_lines, layout.slow_zones, step
         n = len(layout.fleet)
         self.time = 0.0
@@ -80,12 +83,12 @@ class Traffic:
         self._from = np.full(n, -1)
         self._share = np.zeros(n)
         self._change_length = np.ones(n)
-        self._noise = settings.acceleration_noise * rng.standard_normal(n)
+        self._noise = noise * rng.standard_normal(n)
         self._passes = np.zeros(
             (len(layout.stop_lines), n), dtype=np.bool_
         )  # vehicles too close to stop for a red light
         self._was_closed = [False] * len(layout.stop_lines)
-        self._pending = [np.zeros(n)] * round(settings.reaction_time / step)
+        self._pending = [np.zeros(n)] * round(reaction / step)
         self._steps = 0
         self._early = rng.uniform(0.0, early, n) if early > 0 else np.zeros(n)
 
@@ -130,7 +133,7 @@ class Traffic:
         self._pending.append(desired)
         acceleration = self._pending.pop(0)
         decay = np.exp(-h / NOISE_TIME)
-        kick = self._settings.acceleration_noise * np.sqrt(1 - decay**2)
+        kick = self._deviation * np.sqrt(1 - decay**2)
         self._noise = decay * self._noise + kick * self._rng.standard_normal(len(self.s))
         noise = self._noise * np.clip(self.speed / 3.0, 0.0, 1.0)
         speed = np.maximum(0.0, self.speed + h * np.maximum(acceleration + noise, -HARDEST_BRAKING))

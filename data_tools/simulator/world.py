@@ -93,10 +93,10 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     vehicles, trailers = split_trailers(vehicle_trajectories(layout, history), layout.lanes, history, layout.trailer)
     ego = choose_ego(layout, history, streams[2])
     surrounded = (layout.focus + SURROUNDED[0], layout.focus + SURROUNDED[1])
-    around = sample_surroundings(layout, surrounded, settings.surroundings, streams[3])
+    around = sample_surroundings(layout, surrounded, settings.parking_probability, streams[3])
     populated = (layout.focus + POPULATED[0], layout.focus + POPULATED[1])
     people = simulate_pedestrians(
-        layout.lanes.road, around.pavements, populated, history.time, settings.pedestrians, streams[4]
+        layout.lanes.road, around.pavements, populated, history.time, settings.pedestrian_groups, streams[4]
     )
     parked = static_objects(_ids("parked", len(around.parked)), around.parked, history.time)
     others = vehicles.select(np.delete(np.arange(len(vehicles)), ego))
@@ -107,7 +107,7 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     cones = static_objects(_ids("cone", len(boxes)), boxes, history.time)
     signals = signals_of(layout.lanes, layout.stop_lines)
     road_map = None
-    if settings.lights.mapped:
+    if settings.mapped:
         road_map = sample_map(layout.lanes, layout.focus, layout.stop_lines, signals, streams[7])
     return World(
         concatenated([others, trailers, people, parked, riders, cones]),
@@ -123,7 +123,7 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
 def simulate_traffic(layout: SceneLayout, settings: SimulatorSettings, rng: np.random.Generator) -> TrafficHistory:
     """Run the warm-up, then record slightly more than the scene's duration."""
     early = EARLY_MERGE if layout.lanes.taper > 0 else 0.0
-    traffic = Traffic(layout, settings.drivers, rng, STEP, early)
+    traffic = Traffic(layout, rng, STEP, early)
     for _ in range(round(settings.warm_up / STEP)):
         traffic.step()
     return record_traffic(traffic, int(np.ceil(settings.duration / STEP)) + 2)

@@ -24,7 +24,6 @@ import numpy as np
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.simulator import SimulatorSettings
-from data_tools.simulator.settings import LightSettings, SurroundingSettings
 from data_tools.trajectories import Trajectory, TrajectoryErrors, degraded_odometry, trajectory_errors
 from pipelines.config import TrackConfig
 from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, known_providers
@@ -83,8 +82,7 @@ class JointRun:
 
 def street(parked: bool = True, mapped: bool = False) -> SimulatorSettings:
     """Simulated scenes with cars parked on both sides of the road, or on none; mapped: frames bring the lanes along."""
-    surroundings = SurroundingSettings(parking_probability=1.0 if parked else 0.0)
-    return SimulatorSettings(surroundings=surroundings, lights=LightSettings(mapped=mapped))
+    return SimulatorSettings(parking_probability=1.0 if parked else 0.0, mapped=mapped)
 
 
 def run_joint(

@@ -21,11 +21,8 @@ from data_tools.simulator.fleet import (
 )
 from data_tools.simulator.road import Lanes, curved_road
 from data_tools.simulator.scene_layout import ClosingLine, SceneLayout, SlowZone, sample_intervals
-from data_tools.simulator.settings import DriverSettings
 from data_tools.simulator.traffic import Traffic, record_traffic
 from saga_fg.numerics.arrays import FloatArray
-
-SMOOTH = DriverSettings(acceleration_noise=0.0, reaction_time=0.0)
 
 
 def drivers(count: int, desired_speed: float = 14.0) -> Drivers:
@@ -42,11 +39,12 @@ def fleet(count: int, leader_desires: float) -> Fleet:
 def queue(
     count: int,
     speed: float,
-    settings: DriverSettings = SMOOTH,
     stop_lines: tuple[ClosingLine, ...] = (),
     slow_zones: tuple[SlowZone, ...] = (),
     length: float = 2000.0,
     leader_desires: float = 14.0,
+    noise: float = 0.0,
+    reaction: float = 0.0,
 ) -> Traffic:
     """`count` cars one behind the other in equilibrium at `speed`, the first, row 0, at 1000 m."""
     road = curved_road(length, [], np.zeros(2), 0.0)
@@ -58,7 +56,7 @@ def queue(
     layout = SceneLayout(
         lanes, 0.0, None, cars, lane, s, np.full(count, speed), tuple(stop_lines), tuple(slow_zones), trailer
     )
-    return Traffic(layout, settings, np.random.default_rng(0))
+    return Traffic(layout, np.random.default_rng(0), noise=noise, reaction=reaction)
 
 
 @given(speed=st.floats(0.0, 13.5), lead=st.floats(-3.0, 3.0))
@@ -130,8 +128,7 @@ def test_reaction_time_and_noise_cause_no_collision(seed: int) -> None:
     rng = np.random.default_rng(seed)
     active = sample_intervals((4.0, 8.0), (4.0, 8.0), 60.0, rng)
     zone = SlowZone(np.array([0]), 900.0, 1500.0, 1.0, active)
-    settings = DriverSettings(acceleration_noise=0.4, reaction_time=0.4)
-    history = record_traffic(queue(15, 11.0, settings, slow_zones=(zone,)), 1200)
+    history = record_traffic(queue(15, 11.0, slow_zones=(zone,), noise=0.4, reaction=0.4), 1200)
     gap = history.s[:, :-1] - history.s[:, 1:] - KINDS[CAR].size[0]
     assert gap.min() > 0.3
     assert history.speed.min() >= 0.0

@@ -72,12 +72,6 @@ def test_every_sensor_keeps_its_own_clock() -> None:
     assert slow.world_T_ego == pytest.approx(here.world_T_ego[::5], abs=1e-9)
 
 
-def test_lidar_knows_no_velocities_and_the_camera_noisy_ones() -> None:
-    for frame in scene(3).frames:
-        known = np.isfinite(frame.detections.boxes.velocity)
-        assert known.all() if frame.sensor == "camera" else not known.any()
-
-
 def test_detections_lie_near_true_objects_or_are_few() -> None:
     here = scene(3)
     world = build_world(SHORT, 3)
@@ -91,9 +85,8 @@ def test_detections_lie_near_true_objects_or_are_few() -> None:
     assert 0.5 < strays / len(frames) < 4.0  # two false ones a frame
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_ground_truth_velocity_is_the_derivative_of_position(seed: int) -> None:
-    truth = scene(seed).ground_truth
+def test_ground_truth_velocity_is_the_derivative_of_position() -> None:
+    truth = scene(3).ground_truth
     assert truth is not None
     for a, b, c in zip(truth[:-2], truth[1:-1], truth[2:], strict=True):
         _, i, k = np.intersect1d(a.id, c.id, return_indices=True)
@@ -116,7 +109,7 @@ def test_objects_stand_on_the_ground_and_have_real_sizes() -> None:
 def test_hidden_objects_were_in_view_not_long_ago() -> None:
     glimpses_count = replace(SimulatorSettings(), shortest_view=0.0, sensors={"lidar": lidar()})
     hidden = lasting_views = 0
-    for seed in range(3):
+    for seed in (1,):
         here = simulate_scene(glimpses_count, seed)
         last_seen: dict[str, float] = {}
         assert here.ground_truth is not None
@@ -132,8 +125,8 @@ def test_hidden_objects_were_in_view_not_long_ago() -> None:
             assert a.id.tolist() == b.id.tolist()
             assert not (b.visible & ~a.visible).any()
             lasting_views += int(b.visible.sum())
-    assert hidden > 300
-    assert lasting_views > 5000
+    assert hidden > 100
+    assert lasting_views > 1500
 
 
 def test_hidden_objects_are_not_detected() -> None:

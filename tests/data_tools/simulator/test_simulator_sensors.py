@@ -18,7 +18,6 @@ from data_tools.simulator.sensors import (
     sensor_position,
 )
 from data_tools.simulator.settings import SensorSettings, camera, far_camera, lidar, radar, sparse_lidar
-from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -47,8 +46,7 @@ def within(value: float, expected: float, standard_error: float) -> bool:
     return abs(value - expected) < 4 * standard_error
 
 
-@pytest.mark.parametrize("distance", [10.0, 40.0])
-@pytest.mark.parametrize("sensor", [lidar(), camera()], ids=["lidar", "camera"])
+@pytest.mark.parametrize(("sensor", "distance"), [(lidar(), 40.0), (camera(), 10.0)], ids=["lidar", "camera"])
 def test_errors_along_and_across_the_line_of_sight(sensor: SensorSettings, distance: float) -> None:
     sensor = replace(sensor, position=(0.0, 0.0, 1.5), clutter_rate=0.0, detection_probability=1.0, reach=1e6)
     bearing = 0.5
@@ -74,7 +72,7 @@ def test_errors_along_and_across_the_line_of_sight(sensor: SensorSettings, dista
         assert within(velocity_error.std(), sensor.velocity_noise, sensor.velocity_noise / math.sqrt(12000))
 
 
-@pytest.mark.parametrize(("share", "distance"), [(1.0, 10.0), (0.25, 10.0), (0.1, 10.0), (1.0, 59.0)])
+@pytest.mark.parametrize(("share", "distance"), [(0.25, 10.0), (0.1, 10.0), (1.0, 59.0)])
 def test_the_rate_of_misses(share: float, distance: float) -> None:
     sensor = replace(CENTRED, clutter_rate=0.0)
     angle = np.linspace(0, 2 * np.pi, 50, endpoint=False)
@@ -112,8 +110,8 @@ def test_nothing_is_seen_outside_the_field_of_view() -> None:
     assert not any(map(len, detections(sensor, far, frames=20)))
 
 
-@pytest.mark.parametrize("sensor", [lidar(), camera()], ids=["lidar", "camera"])
-def test_scores_tell_true_from_false_but_not_always(sensor: SensorSettings) -> None:
+def test_scores_tell_true_from_false_but_not_always() -> None:
+    sensor = camera()
     boxes = cars(np.array([[15.0, 0.0], [30.0, 5.0]]))
     true = np.concatenate([d.score for d in detections(replace(sensor, clutter_rate=0.0), boxes)])
     hidden = np.concatenate([d.score for d in detections(replace(sensor, clutter_rate=0.0), boxes, 0.3)])
@@ -122,16 +120,6 @@ def test_scores_tell_true_from_false_but_not_always(sensor: SensorSettings) -> N
     assert true.mean() > hidden.mean() > false.mean()
     better = (true[:, None] > false[None, :]).mean()
     assert 0.85 < better < 0.999  # area under the ROC curve
-
-
-def test_settings_without_sense_are_refused(subtests: pytest.Subtests) -> None:
-    for change, text in [
-        ({"rate": 0.0}, "rate: expected a finite number > 0"),
-        ({"field_of_view": 7.0}, "field_of_view: expected a number above 0 to 6.28"),
-        ({"detection_probability": 1.2}, "detection_probability: expected a number from 0 to 1"),
-    ]:
-        with subtests.test(change=change, text=text), pytest.raises(InputError, match=text):
-            replace(lidar(), **change)
 
 
 def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes() -> None:
@@ -167,7 +155,7 @@ def test_a_camera_sees_a_person_where_a_lidar_has_too_few_points() -> None:
 
 def test_range_drifts_are_of_their_deviation_and_last_for_their_time() -> None:
     time = np.arange(0, 40, 0.1)
-    drift = range_drifts(replace(camera(), range_drift=0.03, drift_time=2.0), time, 2000, np.random.default_rng(0))
+    drift = range_drifts(replace(camera(), range_drift=0.03), time, 2000, np.random.default_rng(0))
     assert drift.std(axis=1) == pytest.approx(np.full(len(time), 0.03), rel=0.1)
     later = [np.corrcoef(drift[0], drift[k])[0, 1] for k in (20, 300)]
     assert later == pytest.approx([math.exp(-1), 0.0], abs=0.09)
@@ -176,9 +164,7 @@ def test_range_drifts_are_of_their_deviation_and_last_for_their_time() -> None:
 
 def test_no_frame_comes_in_an_outage() -> None:
     time = np.arange(0, 5000, 0.1)
-    left = outside_outages(
-        replace(lidar(), outage_interval=10.0, outage_duration=(1.0, 3.0)), time, np.random.default_rng(0)
-    )
+    left = outside_outages(replace(lidar(), outage_interval=10.0), time, np.random.default_rng(0))
     assert np.isin(left, time).all()
     assert len(left) / len(time) == pytest.approx(10 / 12, abs=0.03)
     gaps = np.diff(left)
