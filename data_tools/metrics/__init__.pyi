@@ -29,7 +29,6 @@ from .label_errors import (
     track_summaries,
     whole_tracks,
 )
-from .matching import FrameMatch, match_scene
 from .nuscenes_sweep import NuScenesClassMetrics, RecallCurves
 from .nuscenes_tracking import (
     NuScenesTrackingMetrics,
@@ -37,7 +36,7 @@ from .nuscenes_tracking import (
     NuScenesTrackingSettings,
     nuscenes_tracking_metrics,
 )
-from .scene import SceneMetrics, scene_metrics, scene_metrics_by_label
+from .scene import FrameMatch, SceneMetrics, match_scene, scene_metrics, scene_metrics_by_label
 from .scene_boxes import SceneBoxes
 
 __all__ = [

@@ -1,6 +1,20 @@
 """Metrics of the tracks of a scene: errors, identity switches, and errors at hidden objects.
 
-Over the matching of `data_tools.metrics.matching` (CLEAR):
+One-to-one correspondences between true objects and tracks over a scene, as the CLEAR MOT metrics define them.
+
+In every frame, in this order:
+
+1. an object keeps the track it was matched to last while that track is within the gate, so that objects which come
+   close to each other cause no identity switches;
+2. the others are assigned by the Hungarian method: as many pairs within the gate as possible, and among those the
+   assignment with the least sum of distances.
+
+Distances are between centres in the horizontal plane; only equal classes can match.
+
+Source: Bernardin and Stiefelhagen, Evaluating Multiple Object Tracking Performance: The CLEAR MOT Metrics, EURASIP
+Journal on Image and Video Processing, 2008, section 2.1.
+
+Over this matching (CLEAR):
 
     MOTA   = 1 - (misses + false positives + identity switches) / objects      objects: visible true boxes
     MOTP   = mean distance of the matched pairs of visible objects, m
@@ -26,12 +40,80 @@ from typing import Any, Self
 import numpy as np
 
 from data_tools.metrics.error_sample import ErrorSample, nees
-from data_tools.metrics.matching import FoundBoxes, FrameMatch, match_scene
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from data_tools.metrics.matching import Candidates, best_pairs
+from data_tools.metrics.scene_boxes import SceneBoxes
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.types.dataset import Annotations
+from saga_fg.types.track import Tracks
 
+Found = Tracks | SceneBoxes  # of one frame: a tracker's output, or rows of a result file
 CAP = 5.0  # largest carried error, also that of a hidden object whose track is lost, m
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMatch:
+    """The M pairs of one frame.
+
+    object_row  (M,) rows of the annotations
+    track_row   (M,) rows of the tracks
+    distance    (M,) m, horizontal
+    switched    (M,) identity switches: the object was last matched to another track
+    """
+
+    object_row: IntArray
+    track_row: IntArray
+    distance: FloatArray
+    switched: BoolArray
+
+
+def match_scene(ground_truth: Sequence[Annotations], tracks: Sequence[Found], gate: float = 2.0) -> list[FrameMatch]:
+    """The matching at each of the K frames of a scene; pairs further apart than `gate` (m) never match.
+
+    Raises `InputError` when the two sequences differ in length.
+    """
+    if len(ground_truth) != len(tracks):
+        raise InputError(
+            f"tracks: expected one entry per frame of the ground truth ({len(ground_truth)}), got {len(tracks)}"
+        )
+    numbers = {
+        name: n for n, name in enumerate(np.unique([name for truth in ground_truth for name in truth.id.tolist()]))
+    }
+    ids = {found.id.dtype for found in tracks} or {np.dtype(np.int64)}
+    last_track = np.zeros(len(numbers), dtype=np.result_type(*ids))
+    seen = np.zeros(len(numbers), dtype=np.bool_)
+    result = []
+    for truth, found in zip(ground_truth, tracks, strict=True):
+        objects = np.array([numbers[name] for name in truth.id.tolist()], dtype=np.int64)
+        offset = truth.boxes.position[:, None, :2] - found.boxes.position[None, :, :2]
+        distance = np.hypot(offset[..., 0], offset[..., 1])
+        distance[(distance > gate) | (truth.boxes.label[:, None] != found.boxes.label[None, :])] = np.inf
+        rows, columns = _assign(distance, seen[objects, None] & (last_track[objects, None] == found.id[None, :]))
+        matched = objects[rows]
+        switched = seen[matched] & (last_track[matched] != found.id[columns])
+        last_track[matched], seen[matched] = found.id[columns], True
+        result.append(FrameMatch(rows, columns, distance[rows, columns], switched))
+    return result
+
+
+def _assign(distance: FloatArray, previous: BoolArray) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the pairs: previous pairs within the gate (finite) first, then the optimal assignment.
+
+    Two objects may have been matched last to the same track; the nearer one keeps it.
+    """
+    kept = np.where(previous, distance, np.inf)
+    kept[kept > kept.min(axis=0, initial=np.inf)] = np.inf
+    kept_rows, kept_columns = np.nonzero(np.isfinite(kept))
+    kept_columns, first = np.unique(kept_columns, return_index=True)
+    kept_rows = kept_rows[first]
+    free = np.isfinite(distance)
+    free[kept_rows], free[:, kept_columns] = False, False
+    rows, columns = np.nonzero(free)
+    chosen = best_pairs(Candidates(rows, columns, distance[rows, columns], np.zeros(len(rows), dtype=np.int64)))
+    rows, columns = np.append(kept_rows, rows[chosen]), np.append(kept_columns, columns[chosen])
+    order = np.argsort(rows)
+    return rows[order], columns[order]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +179,7 @@ class SceneMetrics:
         return self.hidden_matches / self.hidden_objects if self.hidden_objects else float("nan")
 
 
-def scene_metrics(ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes]) -> SceneMetrics:
+def scene_metrics(ground_truth: Sequence[Annotations], tracks: Sequence[Found]) -> SceneMetrics:
     """The metrics of one scene: K annotations and the K `Tracks` of the same frames, both in world coordinates.
 
     Raises `InputError` when their numbers differ.
@@ -125,9 +207,7 @@ def scene_metrics(ground_truth: Sequence[Annotations], tracks: Sequence[FoundBox
     )
 
 
-def scene_metrics_by_label(
-    ground_truth: Sequence[Annotations], tracks: Sequence[FoundBoxes]
-) -> dict[str, SceneMetrics]:
+def scene_metrics_by_label(ground_truth: Sequence[Annotations], tracks: Sequence[Found]) -> dict[str, SceneMetrics]:
     """`scene_metrics` of each class, by name; pooling them gives the metrics of the whole scene."""
     boxes = [truth.boxes for truth in ground_truth] + [found.boxes for found in tracks]
     labels = {label for table in boxes for label in table.label.tolist()}
@@ -140,7 +220,7 @@ def scene_metrics_by_label(
     }
 
 
-def _pair_errors(truth: Annotations, found: FoundBoxes, matching: FrameMatch) -> FloatArray:
+def _pair_errors(truth: Annotations, found: Found, matching: FrameMatch) -> FloatArray:
     """(4, M): position, velocity, heading errors and NEES of the pairs of one frame; NaN where unknown."""
     a, b = truth.boxes.select(matching.object_row), found.boxes.select(matching.track_row)
     velocity = b.velocity - a.velocity
@@ -149,7 +229,7 @@ def _pair_errors(truth: Annotations, found: FoundBoxes, matching: FrameMatch) ->
     return np.stack([matching.distance, np.hypot(velocity[:, 0], velocity[:, 1]), heading, consistency])
 
 
-def _carried_errors(frames: Sequence[tuple[Annotations, FoundBoxes, FrameMatch]]) -> FloatArray:
+def _carried_errors(frames: Sequence[tuple[Annotations, Found, FrameMatch]]) -> FloatArray:
     """Carried errors of all hidden objects, see the module."""
     carrier: dict[str, int | str] = {}
     errors: list[float] = []

@@ -1,6 +1,6 @@
 """A tracker's runs through gaps that are made in recordings, judged gap by gap and by situation.
 
-Labels and tracks that were detected at the moment are matched one to one (`data_tools.metrics.matching`). An object is
+Labels and tracks that were detected at the moment are matched one to one (`data_tools.metrics.scene`). An object is
 *held* by the track it was matched to last, at most `SETTLING` s ago. That track, which is kept alive while it has no
 detections, is compared with the label: its error, m, which is `CAP` where it is not known or farther away, and how
 likely the true place is by its covariance.
@@ -19,7 +19,7 @@ from data_tools.figures import FigureTable, cell
 from data_tools.metrics import Interval, coverage, paired_bootstrap
 from data_tools.metrics.bootstrap import Comparison, difference, ratio_of_sums, relative_change
 from data_tools.metrics.error_sample import nees, negative_log_density
-from data_tools.metrics.matching import match_scene
+from data_tools.metrics.scene import match_scene
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.learning.gaps import LENGTHS, LONGEST, SITUATIONS, Gap, made_gaps, reached, situations_of
