@@ -263,19 +263,11 @@ def _used(kept: BoolArray, row: IntArray) -> BoolArray:
     return np.asarray(used[row - first])
 
 
-@dataclass(frozen=True, eq=False)
-class TrackCoverage:
-    """Coverage of the objects of one class at T thresholds, each (T,)."""
+def track_coverage(tracked: BoolArray, identity: IntArray, period: float) -> dict[str, FloatArray]:
+    """Coverage of the objects of one class at T thresholds, each (T,), see `NuScenesClassMetrics`.
 
-    mostly_tracked: IntArray
-    mostly_lost: IntArray
-    fragments: IntArray
-    initialisation: FloatArray
-    longest_gap: FloatArray
-
-
-def track_coverage(tracked: BoolArray, identity: IntArray, period: float) -> TrackCoverage:
-    """Coverage from `tracked` (N, T), whose rows are sorted by `identity` (N,), then time; `period` in s. N > 0."""
+    tracked (N, T), N > 0, its rows sorted by `identity` (N,), then time; period in s
+    """
     start = np.flatnonzero(np.diff(identity, prepend=identity[0] - 1))
     length = np.diff(start, append=len(identity))
     owner = np.repeat(np.arange(len(start)), length)
@@ -295,9 +287,13 @@ def track_coverage(tracked: BoolArray, identity: IntArray, period: float) -> Tra
     with np.errstate(invalid="ignore"):
         initialisation = period * np.where(ever, first - start[:, None], 0).sum(axis=0) / objects
         longest_gap = period * np.where(ever, longest, 0).sum(axis=0) / objects
-    return TrackCoverage(
-        (ratio >= 0.8).sum(axis=0), (ratio < 0.2).sum(axis=0), dropped.sum(axis=0), initialisation, longest_gap
-    )
+    return {
+        "mt": (ratio >= 0.8).sum(axis=0),
+        "ml": (ratio < 0.2).sum(axis=0),
+        "frag": dropped.sum(axis=0),
+        "tid": initialisation,
+        "lgd": longest_gap,
+    }
 
 
 SUMMED = frozenset({"gt", "tp", "fp", "fn", "ids", "frag", "mt", "ml"})

@@ -165,7 +165,6 @@ def _columns(
     tp, fn = detections - ids, len(rows) - detections
     frames, present = _frames_and_boxes(true, found, thresholds, label)
     fp = present - detections
-    spans = track_coverage(tracked, true.boxes.identity[rows], settings.sample_period)
     gt = len(rows)
     recall = tp / gt
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -176,16 +175,12 @@ def _columns(
             "gt": np.full(len(thresholds), gt),
             "mota": np.maximum(0.0, 1.0 - (fn + ids + fp) / gt),
             "motp": matched.distance[label] / detections,
-            "mt": spans.mostly_tracked,
-            "ml": spans.mostly_lost,
             "faf": fp / frames * 100.0,
             "tp": tp,
             "fp": fp,
             "fn": fn,
             "ids": ids,
-            "frag": spans.fragments,
-            "tid": spans.initialisation,
-            "lgd": spans.longest_gap,
+            **track_coverage(tracked, true.boxes.identity[rows], settings.sample_period),
         }
     if np.isnan(thresholds).all():
         worst = _never_matched(gt, len(np.unique(true.boxes.identity[rows])))
