@@ -38,14 +38,15 @@ def short_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording_sets, "simulated_set", lambda scenes: simulated_set(scenes, settings=SEVEN_SECONDS))
 
 
-@pytest.mark.parametrize("family", ["nuscenes", "kitti", "simulated", "file"])
-def test_contenders_and_lives_are_settings_of_every_kind_of_data(family: Family) -> None:
-    base = load_config(family)
-    for variant in variants(family).values():
-        made = variant.contender(base)
-        config = made.kept_alive().config
-        config.new_tracker(made.method)
-        assert config.tracker.max_coasting == LIFE
+def test_contenders_and_lives_are_settings_of_every_kind_of_data() -> None:
+    families: tuple[Family, ...] = ("nuscenes", "kitti", "simulated", "file")
+    for family in families:
+        base = load_config(family)
+        for variant in variants(family).values():
+            made = variant.contender(base)
+            config = made.kept_alive().config
+            config.new_tracker(made.method)
+            assert config.tracker.max_coasting == LIFE
 
 
 def test_classical_contenders_differ_in_motion_alone() -> None:
@@ -158,9 +159,8 @@ def test_recordings_without_gaps_are_refused(refused, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.usefixtures("short_scenes")
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_the_command_refuses(refused, subtests: pytest.Subtests) -> None:
+    for arguments, message in [
         ("--contenders nobody", "--contenders: unknown name"),
         ("--contender own", "expected a new NAME=FILE"),
         ("--against turn --contenders saga,kf", "--against: unknown name"),
@@ -173,10 +173,9 @@ def test_recordings_without_gaps_are_refused(refused, monkeypatch: pytest.Monkey
         ("--folds 1", "--folds: expected a number of 2 or more, or place, got '1'"),
         ("--lengths 4", "--lengths: unknown name '4'"),
         ("--sets foo", "--sets: unknown name 'foo'"),
-    ],
-)
-def test_the_command_refuses(refused, arguments: str, message: str) -> None:
-    assert message in refused(f"gaps --sets simulated --scenes 1 {arguments}")
+    ]:
+        with subtests.test(arguments):
+            assert message in refused(f"gaps --sets simulated --scenes 1 {arguments}")
 
 
 def test_the_picture_shows_the_gap_that_tells_most() -> None:

@@ -6,7 +6,6 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from benchmarks.service.good_client import GoodClient
 from benchmarks.service.hostile_messages import EPOCH, KINDS, MOST, SENSORS, hostile_line
@@ -34,9 +33,8 @@ def test_what_falls_short_is_named():
     ]
 
 
-@pytest.mark.parametrize(
-    ("taken", "answers", "counted", "expected"),
-    [
+def test_what_is_lost_does_not_make_up_for_what_is_doubled():
+    for taken, answers, counted, expected in [
         ([0, 1, 2], ["tracks", "late", "tracks"], 3, (0, 0)),
         ([0, 2], ["tracks", "unconfirmed", "tracks"], 2, (0, 0)),
         ([0, 2], ["tracks", "repeat", "tracks"], 3, (0, 0)),
@@ -44,14 +42,10 @@ def test_what_falls_short_is_named():
         ([0, 0, 1, 2], ["tracks"] * 3, 3, (1, 1)),  # one was taken in twice, and another is not counted
         ([0, 0, 1], ["tracks"] * 2, 3, (1, 1)),
         ([0, 1, 2], ["tracks"] * 3, 4, (0, 1)),
-    ],
-)
-def test_what_is_lost_does_not_make_up_for_what_is_doubled(
-    taken: list[int], answers: list[str], counted: int, expected: tuple[int, int]
-):
-    client = GoodClient.__new__(GoodClient)
-    client.frames, client.taken, client.answers = 3, Counter(taken), dict(enumerate(answers))
-    assert client.lost_and_doubled(counted) == expected
+    ]:
+        client = GoodClient.__new__(GoodClient)
+        client.frames, client.taken, client.answers = 3, Counter(taken), dict(enumerate(answers))
+        assert client.lost_and_doubled(counted) == expected, (taken, answers, counted)
 
 
 def test_no_message_in_the_name_of_a_good_sensor_takes_its_numbers():
@@ -79,10 +73,9 @@ def test_hostile_messages_are_lines_of_every_kind():
     assert hostile_line(np.random.default_rng(5), EPOCH) == hostile_line(np.random.default_rng(5), EPOCH)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_clocks_of_others_leave_out_hardly_any_frame(seed: int):
+def test_clocks_of_others_leave_out_hardly_any_frame():
     """Three seconds of hostile messages, four of them between two good frames; nobody resets."""
-    config, rng, answers = load_config("file"), np.random.default_rng([seed, 7]), Counter[str]()
+    config, rng, answers = load_config("file"), np.random.default_rng([0, 7]), Counter[str]()
     service = StreamTracker[None](lambda: config.new_tracker("kf"))
     for seq in range(150):
         for number, sensor in enumerate(SENSORS):

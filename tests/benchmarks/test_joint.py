@@ -66,7 +66,7 @@ def test_options_go_together(refused) -> None:
 
 
 def test_the_command_prints_the_changes(bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "street", lambda parked, mapped: replace(SHORT, lights=street(mapped=mapped).lights))
+    monkeypatch.setattr(module, "street", lambda parked, mapped: replace(SHORT, mapped=mapped))
     compared = {row.get("compared") for row in bench("joint --scenes 2 --lanes")}
     assert {"joint against decoupled", "joint against held"} <= compared
 

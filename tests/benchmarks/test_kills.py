@@ -16,9 +16,8 @@ FIXED = {name: FIRST[name] for name in ("labels/a.csv", "tracks.json")}
 STEP, PARTS = Killed((), "labels"), Killed((), "labels", in_parts=True)
 
 
-@pytest.mark.parametrize(
-    ("left", "command", "wrong"),
-    [
+def test_what_is_not_whole_is_damage(subtests: pytest.Subtests) -> None:
+    for left, command, wrong in [
         ({}, STEP, ()),
         (FIRST, STEP, ()),
         ({**FIRST, "labels/b.json": b'{"time": 2}'}, STEP, ()),
@@ -30,10 +29,9 @@ STEP, PARTS = Killed((), "labels"), Killed((), "labels", in_parts=True)
         ({"other.json": b"[]"}, STEP, ("other.json",)),
         ({"labels/manifest/s.json": b"{"}, PARTS, ("labels/manifest/s.json",)),
         ({"labels/manifest/s.json": b"{}"}, PARTS, ()),
-    ],
-)
-def test_what_is_not_whole_is_damage(left, command, wrong):
-    assert tuple(text.partition(":")[0] for text in _damage(left, FIXED, FIRST, command)) == wrong
+    ]:
+        with subtests.test(left=str(left)):
+            assert tuple(text.partition(":")[0] for text in _damage(left, FIXED, FIRST, command)) == wrong
 
 
 def test_all_that_a_command_has_started_is_killed(monkeypatch, tmp_path: Path):

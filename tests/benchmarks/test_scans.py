@@ -18,19 +18,16 @@ WORLD = StaticWorld(
 )
 
 
-@pytest.mark.parametrize(
-    ("direction", "expected"),
-    [
+def test_ranges_are_those_of_geometry() -> None:
+    for direction, expected in [
         ((1.0, 0.0, 0.0), 9.0),  # the car, turned: its side is 1 m before its centre
         ((0.0, 1.0, 0.0), 4.5),  # the pole
         ((0.0, 0.0, -1.0), 1.5),  # the ground
         ((0.0, 0.6, 0.8), np.inf),  # over the pole
         ((-1.0, 0.0, 0.0), np.inf),
-    ],
-)
-def test_ranges_are_those_of_geometry(direction: tuple[float, float, float], expected: float) -> None:
-    ((distance,),) = ranges(WORLD, np.array([[0.0, 0.0, 1.5]]), np.array([[direction]]))
-    assert distance == pytest.approx(expected)
+    ]:
+        ((distance,),) = ranges(WORLD, np.array([[0.0, 0.0, 1.5]]), np.array([[direction]]))
+        assert distance == pytest.approx(expected)
 
 
 def test_scans_repeat_with_their_seed_and_have_the_noise_asked_for() -> None:

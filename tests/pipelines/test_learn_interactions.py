@@ -133,16 +133,13 @@ def test_nothing_to_learn_from_is_an_error():
         learn_interactions(short, "nothing", load_config("file"), settings=QUICK)
 
 
-@pytest.mark.parametrize(
-    ("classes", "groups"),
-    [
+def test_classes_between_which_there_are_edges_are_one_group():
+    for classes, groups in (
         ([("car", "bus"), ("pedestrian",)], [("bus", "car"), ("pedestrian",)]),
         ([("car",), ("bus",), ("bus", "car")], [("bus", "car")]),
         ([], []),
-    ],
-)
-def test_classes_between_which_there_are_edges_are_one_group(classes, groups):
-    assert coupled_classes([Neighbours(classes=each) for each in classes]) == groups
+    ):
+        assert coupled_classes([Neighbours(classes=each) for each in classes]) == groups
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from data_tools.datasets.detection_files import read_detections
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from data_tools.simulator.settings import SensorSettings
 from pipelines.cli import app
 from pipelines.config import TrackConfig, load_config
 from pipelines.learning import LearnedNoise, learn_noise, learned_fragment
@@ -42,22 +41,14 @@ def acceleration_noise(config: TrackConfig) -> float:
     return motion.acceleration_noise
 
 
-@pytest.mark.parametrize("name", ["lidar", "camera"])
-def test_positions(learned: LearnedNoise, name: str) -> None:
-    truth: SensorSettings = WORLD.sensors[name]
-    noise = learned.config.sensors[name].noise[DEFAULT]
-    for distance in (12.0, 25.0, 40.0):
-        for slope, (base, growth) in (
-            (noise.range_noise, truth.range_noise),
-            (noise.bearing_noise, truth.bearing_noise),
-        ):
-            ratio = math.hypot(noise.position, slope * distance) / (base + growth * distance)
-            assert 1 / WORST < ratio < WORST
-
-
-def test_headings_heights_and_velocities(learned: LearnedNoise) -> None:
+def test_deviations(learned: LearnedNoise) -> None:
     for name, truth in WORLD.sensors.items():
         noise = learned.config.sensors[name].noise[DEFAULT]
+        pairs = (noise.range_noise, truth.range_noise), (noise.bearing_noise, truth.bearing_noise)
+        for distance in (12.0, 25.0, 40.0):
+            for slope, (base, growth) in pairs:
+                ratio = math.hypot(noise.position, slope * distance) / (base + growth * distance)
+                assert 1 / WORST < ratio < WORST
         assert noise.yaw == pytest.approx(truth.yaw_noise, rel=0.2)
         assert noise.height == pytest.approx(truth.height_noise, rel=0.2)
     assert learned.config.sensors["camera"].noise[DEFAULT].velocity == pytest.approx(1.0, rel=0.2)

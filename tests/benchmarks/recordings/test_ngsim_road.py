@@ -30,15 +30,9 @@ def test_lanelets_without_a_branch_are_one_lane_and_lines_side_by_side_one_line(
     assert shown.tolist() == ["red", "green", "green", "amber", "amber", "red", "red", "green", "green"]
 
 
-def test_a_lane_that_ends_at_the_edge_of_the_map_ends_there() -> None:
-    entry = crossing()
-    entry["lanelets"][2]["successor"] = [99]  # not in the map
-    road, _ = road_of(entry, "map", steps=STEPS)
-    assert road.lanes[0].centre[-1] == (50.0, 4.0)
-
-
 def test_a_branch_ends_a_lane_and_a_circle_is_one() -> None:
     branch = [lanelet(1, 0.0, (0.0, 9.0), successor=[2, 3]), lanelet(2, 0.0, (9.0, 20.0)), lanelet(3, 1.0, (9.0, 20.0))]
+    branch[1]["successor"] = [99]  # not in the map, which ends there
     circle = [lanelet(4, 0.0, (9.0, 20.0), successor=[5]), lanelet(5, 8.0, (20.0, 9.0), successor=[4])]
     road, _ = road_of({"lanelets": branch + circle, "lights": []}, "map", steps=STEPS)
     assert {lane.name: len(lane.centre) for lane in road.lanes} == {"lane-1": 2, "lane-2": 2, "lane-3": 2, "lane-4": 4}
@@ -58,9 +52,8 @@ def turning(directions: dict[int, str], successors: list[int], lights: list[int]
     }
 
 
-@pytest.mark.parametrize(
-    ("directions", "successors", "name", "shown"),
-    [
+def test_a_line_is_governed_by_the_lights_of_the_movements_possible_from_it(subtests: pytest.Subtests) -> None:
+    for directions, successors, name, shown in [
         ({10: "straight", 11: "right"}, [2], "light-10", "red"),
         ({10: "straight", 11: "right"}, [3], "light-11", "green"),
         ({10: "straightRight", 11: "right"}, [2, 3], "light-10", "red"),
@@ -68,15 +61,12 @@ def turning(directions: dict[int, str], successors: list[int], lights: list[int]
         ({10: "all", 12: "right"}, [3], "light-10-12", "red"),  # an arrow that shows nothing decides nothing
         ({10: "left", 11: "left"}, [2], "light-10-11", "green"),  # none for this movement: all of the line
         ({12: "right"}, [3], "light-12", ""),
-    ],
-)
-def test_a_line_is_governed_by_the_lights_of_the_movements_possible_from_it(
-    directions: dict[int, str], successors: list[int], name: str, shown: str
-) -> None:
-    road, cycles = road_of(turning(directions, successors, list(directions)), "map", steps=STEPS)
-    assert road.stop_lines[0].light == name
-    assert cycles[name].tolist() == [shown] * 2
-    assert road.stop_lines[0].heading == pytest.approx(0.0)  # its ends were given from right to left
+    ]:
+        with subtests.test(name):
+            road, cycles = road_of(turning(directions, successors, list(directions)), "map", steps=STEPS)
+            assert road.stop_lines[0].light == name
+            assert cycles[name].tolist() == [shown] * 2
+            assert road.stop_lines[0].heading == pytest.approx(0.0)  # its ends were given from right to left
 
 
 def test_a_signal_without_a_cycle_is_an_error_that_says_how_to_go_without() -> None:

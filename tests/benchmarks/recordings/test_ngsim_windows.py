@@ -46,12 +46,6 @@ def test_steps_that_start_late_keep_the_phase_of_the_lights(tmp_path: Path) -> N
     assert colours.tolist() == ["green"] * 3 + ["amber"] * 5 + ["red"] * 4
 
 
-def test_vehicles_that_overlap_stay_as_they_are(tmp_path: Path) -> None:
-    inside = [f"X,A,9,{k},car,-3.2,0.1,0,0,,4.5,1.8" for k in range(4, 12)]
-    traffic = ngsim_windows(write_ngsim(tmp_path, rows() + inside, {"A": crossing()})).read("A")
-    assert traffic.vehicles.present[:, traffic.vehicles.id == "9"].sum() == 8
-
-
 def test_what_is_wrong_in_a_row_is_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
     for line, message in [
         ("X,A,4,0,car,1,2,0,1,,4.5", r"windows.csv.gz: line 33: expected 12 columns, got 11"),

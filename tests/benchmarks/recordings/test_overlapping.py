@@ -1,4 +1,4 @@
-"""Recordings that hold the same traffic at a shift of time and place."""
+"""Recordings that hold the same traffic at a shift of time and place, and the middle of long ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.recordings.traffic import SHARED_MOMENTS, RecordedTraffic, overlapping
+from benchmarks.recordings.traffic import SHARED_MOMENTS, RecordedTraffic, Recordings, overlapping
 from data_tools.simulator.road_users import SimulatedTrajectories
 from saga_fg.numerics.arrays import FloatArray
 
@@ -49,3 +49,13 @@ def test_one_vehicle_or_a_constant_speed_in_common_is_chance() -> None:
     steady = [with_velocity(each, np.ones_like(velocity)) for each in (one, other)]
     assert overlapping(steady) == {"one": "one", "other": "other"}
     assert overlapping([traffic("short", seed=3, moments=SHARED_MOMENTS - 1)]) == {"short": "short"}
+
+
+def test_the_middle_of_a_recording() -> None:
+    one = Recordings(("one",), lambda name: traffic(name, seed=1, moments=101))
+    whole = one.read("one").vehicles.position
+    for longest, moments, first in ((4.0, 41, 30), (np.inf, 101, 0)):
+        found = one.middle(longest).read("one")
+        assert len(found) == moments
+        assert (found.vehicles.position == whole[first : first + moments]).all()
+        assert found.vehicles.time[0] == 0.0

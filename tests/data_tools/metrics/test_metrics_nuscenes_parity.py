@@ -38,9 +38,8 @@ def assert_equal(ours: NuScenesTrackingMetrics, theirs: dict[str, Any]) -> None:
     assert not apart
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_random_drives(devkit: str, tmp_path: Path, seed: int) -> None:
-    result = write_random_drive(tmp_path / "drive", seed)
+def test_a_random_drive(devkit: str, tmp_path: Path) -> None:
+    result = write_random_drive(tmp_path / "drive", seed=0)
     ours = nuscenes_tracking_metrics(
         [each.tracking for each in read_scored_scenes(result, tmp_path / "drive", VERSION).values()]
     )

@@ -45,17 +45,19 @@ def turning(moments=60):
     return dataclasses.replace(scene, frames=frames, ground_truth=truth)
 
 
-@pytest.mark.parametrize("settings", [VELOCITY, FADING], ids=["velocity", "fading acceleration and turns"])
+GAINED = (dataclasses.replace(FOLLOW, information_gain=EdgeInformation(0.5, 2.0)), Neighbours(rate=0.4))
+
+
 @pytest.mark.parametrize(
-    "rules",
+    ("scene", "settings", "rules"),
     [
-        (),
-        (FOLLOW,),
-        (dataclasses.replace(FOLLOW, information_gain=EdgeInformation(0.5, 2.0)), Neighbours(rate=0.4)),
+        (following_pairs(pairs=2, moments=60), VELOCITY, (FOLLOW,)),
+        (following_pairs(pairs=2, moments=60), FADING, GAINED),
+        (turning(), FADING, ()),
+        (turning(), VELOCITY, GAINED),
     ],
-    ids=["alone", "following", "by information gain"],
+    ids=["following", "by information gain", "turning alone", "turning by gain"],
 )
-@pytest.mark.parametrize("scene", [following_pairs(pairs=2, moments=60), turning()], ids=["pairs", "circle"])
 def test_the_first_step_is_that_of_a_tracker_with_the_same_settings_and_rules(scene, settings, rules):
     sample = hidden_objects(scene, settings, SENSORS, ONCE)
     found = sample.predict(settings, rules)

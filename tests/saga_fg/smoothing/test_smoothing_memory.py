@@ -79,8 +79,7 @@ def peak(run: Callable[[], object]) -> int:
     return found
 
 
-@pytest.mark.parametrize("kept", ["all", "in stretches", "in windows"])
-@pytest.mark.parametrize("tied", [False, True])
+@pytest.mark.parametrize(("kept", "tied"), [("all", False), ("in stretches", True), ("in windows", True)])
 def test_states_take_no_more_memory_for_twenty_times_as_many_tracks(
     tied: bool, kept: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
