@@ -15,23 +15,22 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic
 from data_tools.files.input_files import unknown_name
 from data_tools.simulator.road_users import SimulatedTrajectories
-from data_tools.simulator.sensed_world import HEIGHT, Signal, objects_seen_from
+from data_tools.simulator.sensed_world import HEIGHT, SensedWorld
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, lidar
 from data_tools.simulator.world import scene_from_world
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import MAX_POSITION, Boxes
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.road_map import RoadMap
 
 MAST, ABOVE, VEHICLE = "mast", "above", "vehicle"
 MAST_HEIGHT, ABOVE_HEIGHT = 6.0, 100.0  # m
@@ -42,30 +41,6 @@ REPORT_INTERVAL = 1.0  # s between reports of the lights
 def default_sensors() -> SimulatorSettings:
     """A LiDAR, and ground truth of all objects, seen or not."""
     return SimulatorSettings(sensors={"lidar": lidar()}, annotation_range=np.inf, memory=np.inf)
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedWorld:
-    """Recorded objects and, over the moments (K,), the pose of what carries the sensors (K, 3): x, y, yaw."""
-
-    objects: SimulatedTrajectories
-    ego: FloatArray
-    road_map: RoadMap | None
-    signals: tuple[Signal, ...] = ()
-    start: float = 0.0
-    _seen: dict[tuple[float, ...], tuple[Boxes, BoolArray, FloatArray]] = field(default_factory=dict)
-
-    def ego_pose(self, time: float) -> FloatArray:
-        """world_T_ego (4, 4) at `time`."""
-        x, y, yaw = (float(np.interp(time, self.objects.time, column)) for column in self.ego.T)
-        return yaw_transform(x, y, 0.0, yaw)
-
-    def visible_from(self, point: FloatArray, time: float, reach: float) -> tuple[Boxes, BoolArray, FloatArray]:
-        """Objects as seen from a point, see `objects_seen_from`; frames and annotations ask for the same."""
-        key = (*point.tolist(), round(time, 6), reach)
-        if key not in self._seen:
-            self._seen[key] = objects_seen_from(self.objects, Boxes.empty(), point, time, reach)
-        return self._seen[key]
 
 
 def sensed_scene(traffic: RecordedTraffic, viewpoint: str, settings: SimulatorSettings | None, seed: int) -> Scene:
@@ -86,7 +61,13 @@ def sensed_scene(traffic: RecordedTraffic, viewpoint: str, settings: SimulatorSe
     duration = PERIOD * (len(traffic) - 1) + 1e-6
     settings = replace(settings, sensors=sensors, duration=duration, keyframe_rate=1 / PERIOD)
     number = int(np.random.SeedSequence([seed, zlib.crc32(traffic.name.encode())]).generate_state(1)[0])
-    world = RecordedWorld(traffic.vehicles, ego, traffic.road_map)
+    time = traffic.vehicles.time
+
+    def ego_pose(at: float) -> FloatArray:
+        x, y, yaw = (float(np.interp(at, time, column)) for column in ego.T)
+        return yaw_transform(x, y, 0.0, yaw)
+
+    world = SensedWorld(traffic.vehicles, Boxes.empty(), ego_pose, (), traffic.road_map)
     scene = scene_from_world(world, settings, number, traffic.name, epoch=0.0)
     return replace(scene, frames=_with_colours(scene.frames, traffic)) if traffic.colours else scene
 

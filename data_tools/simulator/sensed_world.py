@@ -13,8 +13,8 @@ counts as visible only in views of some duration; a shorter view does not reveal
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -38,6 +38,7 @@ MAPPED = (-200.0, 150.0)  # m along the road from the focus: extent of the map
 SPACING = 8.0  # m between the points of a mapped lane
 AMBER_DURATION = 3.0  # duration of amber, the first part of the red phase, s
 MAP_NOISE = 0.2  # standard deviation of positions in the map, m
+OCCLUDER_MARGIN = 20.0  # m, half the length of the largest occluder and more
 VISIBLE_RANGE = 80.0  # largest distance at which the colour of a light is visible, m
 
 
@@ -149,40 +150,38 @@ def detect_lights(
     return Detections(boxes, 1 / (1 + np.exp(-logit)))
 
 
-class SensedWorld(Protocol):
-    """Objects that can be detected and annotated, lights, a map given with the frames, and a vehicle with sensors."""
+@dataclass(frozen=True, eq=False)
+class SensedWorld:
+    """The ground truth of one scene, and a vehicle with sensors in it.
 
-    @property
-    def objects(self) -> SimulatedTrajectories: ...
-    @property
-    def signals(self) -> tuple[Signal, ...]: ...
-    @property
-    def road_map(self) -> RoadMap | None: ...
+    objects    objects that can be detected and annotated
+    occluders  objects that only hide others
+    ego_pose   world_T_ego (4, 4) at a time, s, on the ground z = 0
+    signals    traffic lights
+    road_map   map of lights, stop lines and lanes given with the frames, or None
+    """
+
+    objects: SimulatedTrajectories
+    occluders: Boxes
+    ego_pose: Callable[[float], FloatArray]
+    signals: tuple[Signal, ...]
+    road_map: RoadMap | None
+
     @property
     def start(self) -> float:
         """Time of the first state, s."""
-        ...
-
-    def ego_pose(self, time: float) -> FloatArray:
-        """world_T_ego (4, 4) at `time`."""
-        ...
+        return float(self.objects.time[0])
 
     def visible_from(self, point: FloatArray, time: float, reach: float) -> tuple[Boxes, BoolArray, FloatArray]:
-        """Objects as seen from a point, see `objects_seen_from`."""
-        ...
+        """Objects as seen from a point (3,) at `time`, behind one another and behind occluders.
 
-
-def objects_seen_from(
-    objects: SimulatedTrajectories, occluders: Boxes, point: FloatArray, time: float, reach: float
-) -> tuple[Boxes, BoolArray, FloatArray]:
-    """Objects as seen from a point (3,) at `time`, behind one another and behind `occluders`.
-
-    Returns all N objects, a mask (N,) of those within `reach`, m, and the visible share of each of these.
-    """
-    boxes, present = objects.at(time)
-    near = present & (np.linalg.norm(boxes.position[:, :2] - point[:2], axis=1) <= reach)
-    around = Boxes.concatenate([boxes.select(near), occluders])
-    return boxes, near, visible_share(point, around, np.arange(int(near.sum())))
+        Returns all N objects, a mask (N,) of those within `reach`, m, and the visible share of each of these.
+        """
+        away = np.linalg.norm(self.occluders.position[:, :2] - point[:2], axis=1)
+        boxes, present = self.objects.at(time)
+        near = present & (np.linalg.norm(boxes.position[:, :2] - point[:2], axis=1) <= reach)
+        around = Boxes.concatenate([boxes.select(near), self.occluders.select(away <= reach + OCCLUDER_MARGIN)])
+        return boxes, near, visible_share(point, around, np.arange(int(near.sum())))
 
 
 VISIBLE_SHARE = 0.25  # least share of an object that a sensor must see for it to count as visible

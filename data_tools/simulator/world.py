@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -18,10 +19,8 @@ from data_tools.simulator.road_users import (
 from data_tools.simulator.scene_layout import SceneLayout, sample_cones, sample_layout, sample_surroundings
 from data_tools.simulator.sensed_world import (
     SensedWorld,
-    Signal,
     annotate,
     detect_lights,
-    objects_seen_from,
     sample_map,
     signals_of,
 )
@@ -29,60 +28,36 @@ from data_tools.simulator.sensors import detect, outside_outages, range_drifts, 
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.traffic import Traffic, TrafficHistory, record_traffic, split_trailers
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics.arrays import FloatArray, StrArray
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.road_map import RoadMap
 
 SURROUNDED = (-300.0, 400.0)  # m along the road from the focus: extent of buildings, hedges, parked cars
 POPULATED = (-150.0, 100.0)  # m along the road from the focus: start positions of pedestrians and cyclists
 UPSTREAM = (15.0, 140.0)  # m before the focus: start positions of the ego vehicle
-OCCLUDER_MARGIN = 20.0  # m, half the length of the largest occluder and more
 EARLY_MERGE = 10.0  # distance between the earliest and the latest positions of leaving the lane, m
 STEP = 0.05  # integration step, s
 
 
 @dataclass(frozen=True, eq=False)
-class World:
-    """The ground truth of one scene.
+class World(SensedWorld):
+    """A world made from settings.
 
-    objects    objects that can be detected and annotated
-    occluders  objects that only hide others
-    ego        the vehicle that carries the sensors
-    signals    traffic lights
-    road_map   map of lights, stop lines and lanes given with the frames, or None
-    layout     road, lanes, disturbances and fleet
-    history    states of all vehicles over time
+    ego      the vehicle that carries the sensors
+    layout   road, lanes, disturbances and fleet
+    history  states of all vehicles over time
     """
 
-    objects: SimulatedTrajectories
-    occluders: Boxes
     ego: SimulatedTrajectories
-    signals: tuple[Signal, ...]
-    road_map: RoadMap | None
     layout: SceneLayout
     history: TrafficHistory
 
-    @property
-    def start(self) -> float:
-        """Time of the first state, s."""
-        return float(self.objects.time[0])
 
-    def ego_pose(self, time: float) -> FloatArray:
-        """world_T_ego (4, 4) at `time`, on the ground z = 0 below the middle of the vehicle."""
-        boxes, _ = self.ego.at(time)
-        return yaw_transform(float(boxes.position[0, 0]), float(boxes.position[0, 1]), 0.0, float(boxes.yaw[0]))
-
-    def visible_from(self, point: FloatArray, time: float, reach: float) -> tuple[Boxes, BoolArray, FloatArray]:
-        """Objects as seen from a point (3,) at `time`.
-
-        Returns all N objects, a mask (N,) of those within `reach`, m, and the visible share of each of these.
-        """
-        away = np.linalg.norm(self.occluders.position[:, :2] - point[:2], axis=1)
-        around = self.occluders.select(away <= reach + OCCLUDER_MARGIN)
-        return objects_seen_from(self.objects, around, point, time, reach)
+def pose_on_ground(vehicle: SimulatedTrajectories, time: float) -> FloatArray:
+    """world_T_vehicle (4, 4) of the only vehicle at `time`, on the ground z = 0 below its middle."""
+    boxes, _ = vehicle.at(time)
+    return yaw_transform(float(boxes.position[0, 0]), float(boxes.position[0, 1]), 0.0, float(boxes.yaw[0]))
 
 
 def build_world(settings: SimulatorSettings, seed: int) -> World:
@@ -109,15 +84,10 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     road_map = None
     if settings.mapped:
         road_map = sample_map(layout.lanes, layout.focus, layout.stop_lines, signals, streams[7])
-    return World(
-        concatenated([others, trailers, people, parked, riders, cones]),
-        around.occluders,
-        vehicles.select(np.array([ego])),
-        signals,
-        road_map,
-        layout,
-        history,
-    )
+    carrier = vehicles.select(np.array([ego]))
+    objects = concatenated([others, trailers, people, parked, riders, cones])
+    ego_pose = partial(pose_on_ground, carrier)
+    return World(objects, around.occluders, ego_pose, signals, road_map, carrier, layout, history)
 
 
 def simulate_traffic(layout: SceneLayout, settings: SimulatorSettings, rng: np.random.Generator) -> TrafficHistory:
