@@ -57,7 +57,6 @@ class RecordingSet:
 
     score     judges a tracker's output on all scenes
     clusters  for each scene the first of those that overlap with it in time; none where none do
-    exact     whether the truth is known at every frame
     """
 
     name: str
@@ -65,7 +64,6 @@ class RecordingSet:
     dataset: Dataset
     score: Callable[[Runs], Score]
     clusters: Mapping[str, str] = field(default_factory=dict)
-    exact: bool = False
 
     def scene(self, recording: str) -> Scene:
         """Read a recording."""
@@ -132,7 +130,7 @@ def _kitti(data: Path) -> RecordingSet:
 
 def exact_set(name: str, family: Family, dataset: Dataset, clusters: Mapping[str, str] | None = None) -> RecordingSet:
     """Scenes with the exact truth at every frame, hidden objects by the track that last followed them."""
-    return RecordingSet(name, family, dataset, _against_truth, clusters or {}, exact=True)
+    return RecordingSet(name, family, dataset, _against_truth, clusters or {})
 
 
 def _against_truth(runs: Runs) -> Score:

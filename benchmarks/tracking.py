@@ -7,27 +7,20 @@ scenes anew.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from benchmarks.gaps import chosen_lengths
-from benchmarks.recording_sets import RecordingSet, Score, chosen_sets, exact_set
+from benchmarks.recording_sets import RecordingSet, Score, chosen_sets
 from benchmarks.runner import Data, Row, Rows, clocked, each, resampled
 from benchmarks.variants import COMPONENTS, SHIPPED, contenders
 from data_tools.metrics import Interval, LabelErrors, calibration, error_summary, errors_by_class, paired_bootstrap
 from pipelines.cli.options import Config
 from pipelines.config import load_config
-from pipelines.learning.gaps import Contender, hidden
+from pipelines.learning.gaps import Contender
 from pipelines.tracking import TrackedScene, track_scene
-from saga_fg.errors import InputError
-from saga_fg.learning.gaps import made_gaps
-from saga_fg.learning.labelled_scene import LabelledScene
-from saga_fg.model.sensor import Sensor
-from saga_fg.types.dataset import Dataset, Scene
 
 KF, BASELINE = "kf", "centerpoint"
 ERRORS = ("position", "velocity", "heading")
@@ -54,16 +47,6 @@ def tracking(
     test: Annotated[
         str | None, typer.Option("--test", help="Track these recordings alone, with commas.  [default: all]")
     ] = None,
-    passes: Annotated[
-        int,
-        typer.Option(
-            "--passes",
-            min=0,
-            help="Track each recording so often with made gaps, in the sets simulated, ngsim and openacc; 0: as "
-            "detected.",
-        ),
-    ] = 0,
-    lengths: Annotated[str, typer.Option("--lengths", help="Of these gaps, s, with commas.")] = "1,2,3,5",
     compared: Annotated[
         str | None,
         typer.Option("--contenders", help="Methods and components, by name, with commas.  [default: all]"),
@@ -81,14 +64,11 @@ def tracking(
       python -m benchmarks tracking --sets simulated --scenes 4 --draws 0
       python -m benchmarks tracking --data data --json figures.json --markdown tables.md
       python -m benchmarks tracking --data data --sets kitti --no-components
-      python -m benchmarks tracking --data data --sets ngsim --passes 4 --lengths 2,3 --no-components
       python -m benchmarks tracking --data data --sets megvii --contenders 'saga,kf,graph matching'
     """
     wanted = compared or ",".join(variant.name for variant in (*SHIPPED, *(COMPONENTS if components else ())))
     for recordings in chosen_sets(sets, data, scenes, test, viewpoint):
         base = load_config(recordings.family, config)
-        if passes:
-            recordings = with_made_gaps(recordings, base.sensors, passes, chosen_lengths(lengths))
         yield from set_rows(recordings, contenders(recordings.family, base, wanted, ()), draws)
 
 
@@ -142,39 +122,3 @@ def changes(score: Score, base: Score, units: Sequence[Sequence[int]], draws: in
         )
         result[f"{name} RMSE"] = paired_bootstrap(a, b)
     return result
-
-
-class HiddenRecordings:
-    """Each scene of a dataset in several passes, with other gaps in each. Windows of recorded traffic are short, and an
-    object seldom returns in one."""
-
-    def __init__(self, dataset: Dataset, sensors: Mapping[str, Sensor], passes: int, lengths: Sequence[float]) -> None:
-        self._dataset, self._sensors, self._passes, self._lengths = dataset, sensors, passes, lengths
-        every = ((name, k) for name in dataset.scenes for k in range(1, passes + 1))
-        self.pass_of = {f"{name}, pass {k}": (name, k) for name, k in every}
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """Names of the recordings with the numbers of the passes."""
-        return tuple(self.pass_of)
-
-    def scene(self, name: str) -> Scene:
-        """One pass; its name is that of the recording."""
-        recording, number = self.pass_of[name]
-        labelled = LabelledScene.of(self._dataset.scene(recording), self._sensors)
-        gaps = [gap for gap in made_gaps(labelled, self._passes, 0, self._lengths) if gap.run == number]
-        return replace(labelled.scene, frames=hidden(labelled, gaps))
-
-
-def with_made_gaps(
-    recordings: RecordingSet, sensors: Mapping[str, Sensor], passes: int, lengths: Sequence[float]
-) -> RecordingSet:
-    """The set in several passes, each with made gaps of some lengths, s; those of one recording are one for intervals.
-
-    Raises `InputError` for a set whose truth is not known at every frame.
-    """
-    if not recordings.exact:
-        raise InputError(f"--passes: set {recordings.name}: expected simulated or recorded traffic, of exact truth")
-    dataset = HiddenRecordings(recordings.dataset, sensors, passes, lengths)
-    clusters = {name: recordings.clusters.get(of, of) for name, (of, _) in dataset.pass_of.items()}
-    return exact_set(recordings.name, recordings.family, dataset, clusters)

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.runner import Rows, Seed
-from benchmarks.service.clocks import bench_steady_offsets, bench_wrong_clocks, clock_rows, clock_shortcomings
+from benchmarks.service.clocks import fault_rows, offset_rows
 from benchmarks.service.hostile_service import bench_hostile_service, shortcomings
 from pipelines.cli.console import progress_bar
 from saga_fg.errors import SagaError
@@ -44,20 +44,12 @@ def service(
       python -m benchmarks service --clocks
     """
     if clocks:
-        yield from _clocks(seed)
+        logging.getLogger("saga_fg.tracking").setLevel(logging.ERROR)  # each frame that is left out is warned of
+        yield from fault_rows(seed)
+        yield from offset_rows(seed)
         return
     with progress_bar() as progress:
         figures = bench_hostile_service(messages, objects, pace, seed, progress)
     yield from (("service", {"figure": name, "value": value}) for name, value in figures.items())
     if short := shortcomings(figures):
-        raise SagaError("; ".join(short))
-
-
-def _clocks(seed: int) -> Rows:
-    logging.getLogger("saga_fg.tracking").setLevel(logging.ERROR)  # each frame that is left out is warned of
-    wrong = bench_wrong_clocks(seed)
-    yield from clock_rows(wrong, [])
-    steady = bench_steady_offsets(seed)
-    yield from clock_rows([], steady)
-    if short := clock_shortcomings(wrong, steady):
         raise SagaError("; ".join(short))

@@ -12,14 +12,16 @@ standard deviations, and the root mean square error of the positions in the last
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
 
 from benchmarks.runner import Rows, each
 from pipelines.config import load_config
+from saga_fg.errors import SagaError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
@@ -72,32 +74,6 @@ FAULTS = (
 )
 
 
-@dataclass(frozen=True)
-class WrongClock:
-    """One sensor with a wrong clock: `tracked` shares of the frames of the others from then on, by name."""
-
-    sensor: str
-    radar_rate: float
-    fault: ClockFault
-    tracked: dict[str, float]
-
-
-@dataclass(frozen=True)
-class SteadyOffset:
-    """A steady offset, s, in several recordings; times in s.
-
-    errors       (n,) of the estimates after `OBSERVATIONS` shared observations
-    within       share of them within two standard deviations
-    rmse         root mean square error of positions in the last third, m, and that without an offset
-    """
-
-    sensor: str
-    offset: float
-    errors: FloatArray
-    within: float
-    rmse: tuple[float, float]
-
-
 class RoundAbout:
     """Cars within 100 m, each on a circle of 20 m at 4 to 10 m/s; their positions (n, 2) at a time, s."""
 
@@ -138,8 +114,8 @@ def _tracker() -> Tracker:
     return tracker
 
 
-def wrong_clock(objects: int, wrong: str, radar_rate: float, fault: ClockFault, seed: int) -> WrongClock:
-    """Track one recording with a wrong clock."""
+def wrong_clock(objects: int, wrong: str, radar_rate: float, fault: ClockFault, seed: int) -> float:
+    """Track one recording with a wrong clock; the least share of frames of a right sensor that were tracked."""
     rates, tracker = {**RATES, "radar": radar_rate}, _tracker()
     tracked, sent = dict.fromkeys(rates, 0), dict.fromkeys(rates, 0)
     for time, frame in frames_of(RoundAbout(objects, seed), rates, wrong, fault, START, END, seed):
@@ -147,7 +123,7 @@ def wrong_clock(objects: int, wrong: str, radar_rate: float, fault: ClockFault, 
         if time >= START:
             sent[frame.sensor] += 1
             tracked[frame.sensor] += tracker.time_verdict not in ("late", "unconfirmed")
-    return WrongClock(wrong, radar_rate, fault, {n: tracked[n] / sent[n] for n in rates if n != wrong})
+    return min(tracked[name] / sent[name] for name in rates if name != wrong)
 
 
 def offset_run(objects: int, wrong: str, offset: float, seed: int) -> tuple[float, float, float]:
@@ -166,59 +142,59 @@ def offset_run(objects: int, wrong: str, offset: float, seed: int) -> tuple[floa
     return error, deviation, math.sqrt(float(np.mean(squares)))
 
 
-def bench_wrong_clocks(seed: int) -> list[WrongClock]:
-    """All faults of the radar and of the lidar, at all rates of the radar."""
-    cases = [(wrong, rate, fault) for wrong in ("radar", "lidar") for rate in RADAR_RATES for fault in FAULTS]
-    return [wrong_clock(OBJECTS, wrong, rate, fault, seed) for wrong, rate, fault in each(cases, "wrong clocks")]
+def fault_rows(seed: int) -> Rows:
+    """A row for each fault: of the radar and of the lidar, at all rates of the radar. Raises `SagaError` at the end for
+    figures out of bounds."""
+    short = []
+    for fault in each(FAULTS, "wrong clocks"):
+        cases = list(product(("radar", "lidar"), RADAR_RATES))
+        least = {case: wrong_clock(OBJECTS, *case, fault, seed) for case in cases}
+        figures = {f"of the {wrong}, radar at {rate:g} Hz": 100 * share for (wrong, rate), share in least.items()}
+        yield "frames of right sensors tracked, the worse of two, %", {"fault of the clock": str(fault), **figures}
+        short += [f"{fault}, {name}: {share:.1f} % tracked" for name, share in figures.items() if share < 100 * TRACKED]
+    if short:
+        raise SagaError("; ".join(short))
 
 
-def bench_steady_offsets(first_seed: int) -> list[SteadyOffset]:
-    """Steady offsets of the radar and of the lidar from the start, either way in turn."""
-    seeds = range(first_seed, first_seed + REPETITIONS)
+def offset_rows(first_seed: int) -> Rows:
+    """A row for each steady offset of the radar and of the lidar from the start, either way in turn. Raises `SagaError`
+    at the end for figures out of bounds."""
+    seeds, short, shares = range(first_seed, first_seed + REPETITIONS), list[str](), list[float]()
     without = math.sqrt(float(np.mean(np.square([offset_run(OBJECTS, "radar", 0.0, seed)[2] for seed in seeds]))))
-    cases, found = [(wrong, offset) for wrong in ("radar", "lidar") for offset in OFFSETS], []
-    for wrong, offset in each(cases, "steady offsets"):
+    for wrong, offset in each(list(product(("radar", "lidar"), OFFSETS)), "steady offsets"):
         runs = np.array([offset_run(OBJECTS, wrong, offset * (-1) ** seed, seed) for seed in seeds])
         errors, deviations, rmse = runs.T
-        within = float(np.mean(np.abs(errors) <= 2 * deviations))
-        found.append(SteadyOffset(wrong, offset, errors, within, (math.sqrt(float(np.mean(rmse**2))), without)))
-    return found
-
-
-def clock_shortcomings(wrong: list[WrongClock], steady: list[SteadyOffset]) -> list[str]:
-    """One text for each figure that is out of bounds."""
-    found = [
-        f"{w.sensor} {w.fault}, radar at {w.radar_rate:g} Hz: {100 * least:.1f} % tracked, expected {100 * TRACKED:g} %"
-        for w in wrong
-        if (least := min(w.tracked.values())) < TRACKED
-    ]
-    for one in steady:
-        name, largest = f"{one.sensor} {one.offset:g} s", float(np.abs(one.errors).max())
-        if not largest <= MOST_ERROR:
-            found.append(f"{name}: estimate off by {1e3 * largest:.1f} ms, expected {1e3 * MOST_ERROR:g} ms")
-        if one.rmse[0] > MOST_RATIO * one.rmse[1]:
-            found.append(f"{name}: error of positions {one.rmse[0] / one.rmse[1]:.3f} times that without an offset")
-    if steady and (within := float(np.mean([one.within for one in steady]))) < WITHIN:
-        found.append(f"{100 * within:.0f} % of estimates within two deviations, expected {100 * WITHIN:g} %")
-    return found
-
-
-def clock_rows(wrong: list[WrongClock], steady: list[SteadyOffset]) -> Rows:
-    """The rows of both tables: a fault of the clock, and a steady offset."""
-    share = {(w.sensor, w.radar_rate, w.fault): 100 * min(w.tracked.values()) for w in wrong}
-    for fault in dict.fromkeys(w.fault for w in wrong):
-        mine = {(sensor, rate): figure for (sensor, rate, which), figure in share.items() if which == fault}
-        figures = {f"of the {sensor}, radar at {rate:g} Hz": figure for (sensor, rate), figure in mine.items()}
-        yield "frames of right sensors tracked, the worse of two, %", {"fault of the clock": str(fault), **figures}
-    for one in steady:
+        row = offset_figures(errors, deviations, rmse, without)
         yield (
             f"offsets after {OBSERVATIONS} shared observations",
-            {
-                "steady offset": f"{one.sensor}, +-{one.offset:g} s",
-                "largest error, ms": 1e3 * float(np.nanmax(np.abs(one.errors))),
-                "rms error, ms": 1e3 * float(np.sqrt(np.nanmean(one.errors**2))),
-                "within two deviations, %": 100 * one.within,
-                "error of positions, m": one.rmse[0],
-                "by that without an offset": one.rmse[0] / one.rmse[1],
-            },
+            {"steady offset": f"{wrong}, +-{offset:g} s", **row},
         )
+        short += [f"{wrong} {offset:g} s: {text}" for text in offset_shortcomings(row)]
+        shares.append(row["within two deviations, %"])
+    if (within := float(np.mean(shares))) < 100 * WITHIN:
+        short.append(f"{within:.0f} % of estimates within two deviations, expected {100 * WITHIN:g} %")
+    if short:
+        raise SagaError("; ".join(short))
+
+
+def offset_figures(errors: FloatArray, deviations: FloatArray, rmse: FloatArray, without: float) -> dict[str, float]:
+    """Figures of an offset in n recordings: errors (n,) of the estimates and their deviations (n,), s; root mean square
+    errors of positions (n,), and that without an offset, m."""
+    error = math.sqrt(float(np.mean(rmse**2)))
+    return {
+        "largest error, ms": 1e3 * float(np.abs(errors).max()),
+        "rms error, ms": 1e3 * float(np.sqrt(np.mean(errors**2))),
+        "within two deviations, %": 100 * float(np.mean(np.abs(errors) <= 2 * deviations)),
+        "error of positions, m": error,
+        "by that without an offset": error / without,
+    }
+
+
+def offset_shortcomings(row: Mapping[str, float]) -> list[str]:
+    """One text for each figure that is out of bounds."""
+    error, ratio = row["largest error, ms"], row["by that without an offset"]
+    checks = {
+        f"estimate off by {error:.1f} ms, expected {1e3 * MOST_ERROR:g} ms": not error <= 1e3 * MOST_ERROR,
+        f"error of positions {ratio:.3f} times that without an offset": ratio > MOST_RATIO,
+    }
+    return [text for text, wrong in checks.items() if wrong]

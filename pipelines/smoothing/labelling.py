@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,7 +30,6 @@ from saga_fg.smoothing import (
     SmoothingSettings,
     StateTable,
     constant_sizes,
-    is_reversed,
     lifespans_of,
     quality_of,
     scalar_readings,
@@ -198,125 +196,63 @@ RESOLUTION = 5e-4  # m, of the sizes that are kept
 MOST_VALUES = 4096  # kept before equal ones are put together
 
 
-class ObjectAttributes(NamedTuple):
-    """Final attributes of an object: size (3,) m, score, and whether its headings are half a turn off."""
-
-    size: FloatArray
-    score: float
-    reversed: bool
-
-
-@dataclass
-class _WeightedValues:
-    """Measured values (m,), m, of a dimension with their weights (m,); equal ones are put together."""
-
-    value: FloatArray = field(default_factory=lambda: np.empty(0))
-    weight: FloatArray = field(default_factory=lambda: np.empty(0))
-
-    def add(self, value: FloatArray, weight: FloatArray) -> None:
-        self.value = np.concatenate([self.value, value])
-        self.weight = np.concatenate([self.weight, weight])
-        if len(self.value) > MOST_VALUES:
-            steps, index = np.unique(np.rint(self.value / RESOLUTION), return_inverse=True)
-            self.value = steps * RESOLUTION
-            self.weight = np.bincount(index, self.weight).astype(np.float64)
-
-    def median(self) -> float:
-        return float(weighted_medians(np.zeros(len(self.value), dtype=np.int64), 1, self.value, self.weight)[0])
-
-
-def _unmeasured() -> tuple[_WeightedValues, ...]:
-    """Length, width and height without any value."""
-    return _WeightedValues(), _WeightedValues(), _WeightedValues()
-
-
 @dataclass(slots=True)
-class _Summary:
-    """One object so far: sums for the score and the front; lengths, widths and heights."""
+class ObjectSummary:
+    """One object so far: sums for the score and the front, and its sizes.
+
+    yaw, sign  latest heading written, rad, and -1 where the latest headings are half a turn off those at its start
+    sizes      lengths, widths and heights: of each, measured values, m, and their weights (2, m)
+    """
 
     probability: float = 0.0
     detections: int = 0
     opportunities: int = 0
     path: float = 0.0
     votes: float = 0.0
-    yaw: float = np.nan  # latest heading written
-    sign: float = 1.0  # -1 where the latest headings are half a turn off those at the object's start
-    sizes: tuple[_WeightedValues, ...] = field(default_factory=_unmeasured)
+    yaw: float = np.nan
+    sign: float = 1.0
+    sizes: list[FloatArray] = field(default_factory=lambda: [np.empty((2, 0))] * 3)
 
-    def measure(self, size: FloatArray, weight: FloatArray) -> None:
-        """Sizes (m, 3), m, with weights (m,)."""
-        for column, values in zip(self.sizes, size.T, strict=True):
-            column.add(values, weight)
-
-    def median_size(self) -> FloatArray:
-        """(3,) m, NaN where none was measured."""
-        return np.array([column.median() for column in self.sizes])
-
-
-class ObjectSummaries:
-    """The objects of a recording by id. Of closed ones the attributes alone are kept."""
-
-    def __init__(self) -> None:
-        self._open: dict[int, _Summary] = {}
-        self._closed: dict[int, tuple[FloatArray, _Summary]] = {}
-
-    @property
-    def ids(self) -> list[int]:
-        """Ids of all objects so far, ascending."""
-        return sorted([*self._open, *self._closed])
-
-    def heading_sign(self, id_: int, yaw: float) -> float:
+    def heading_sign(self, yaw: float) -> float:
         """-1 where a chunk's headings are half a turn off those at the object's start, else 1.
 
         yaw: the chunk's heading at the moment of the latest one written, rad
         """
-        summary = self._open.get(id_)
-        if summary is None or not np.isfinite(summary.yaw) or not np.isfinite(yaw):
-            return 1.0 if summary is None else summary.sign
-        return summary.sign * (-1.0 if np.cos(yaw - summary.yaw) < 0 else 1.0)
+        if not np.isfinite(self.yaw) or not np.isfinite(yaw):
+            return self.sign
+        return self.sign * (-1.0 if np.cos(yaw - self.yaw) < 0 else 1.0)
 
-    def add_detections(self, id_: int, probability: FloatArray, size: FloatArray, weight: FloatArray) -> None:
-        """Add detections (m,) of an object: probability, size (m, 3) in m, NaN for unmeasured, and its weight."""
-        summary = self._summary(id_)
-        summary.probability += float(probability.sum())
-        summary.detections += len(probability)
+    def add_detections(self, probability: FloatArray, size: FloatArray, weight: FloatArray) -> None:
+        """Add detections (m,): probability, size (m, 3) in m, NaN for unmeasured, and its weight."""
+        self.probability += float(probability.sum())
+        self.detections += len(probability)
         known = np.isfinite(size).all(axis=1)
-        summary.measure(size[known], weight[known])
+        for axis, values in enumerate(self.sizes):
+            more = np.concatenate([values, np.stack([size[known, axis], weight[known]])], axis=1)
+            if more.shape[1] > MOST_VALUES:
+                steps, index = np.unique(np.rint(more[0] / RESOLUTION), return_inverse=True)
+                more = np.stack([steps * RESOLUTION, np.bincount(index, more[1])])
+            self.sizes[axis] = more
 
-    def add_opportunities(self, id_: int, count: int) -> None:
-        """Add frames with the object in their field of view."""
-        self._summary(id_).opportunities += count
-
-    def add_headings(self, id_: int, sign: float, yaw: float, path: float, votes: float) -> None:
+    def add_headings(self, sign: float, yaw: float, path: float, votes: float) -> None:
         """Add headings up to `yaw` (rad), of a `heading_sign`, with the metres moved along them and their votes."""
-        summary = self._summary(id_)
-        summary.path += sign * path
-        summary.votes += sign * votes
-        summary.sign, summary.yaw = sign, yaw
+        self.path += sign * path
+        self.votes += sign * votes
+        self.sign, self.yaw = sign, yaw
 
-    def close(self, present: IntArray) -> None:
-        """Reduce the summaries of objects that are no longer present to their attributes."""
-        for id_ in self._open.keys() - set(present.tolist()):
-            summary = self._open.pop(id_)
-            size = summary.median_size()
-            summary.sizes = ()
-            self._closed[id_] = (size, summary)
+    @property
+    def size(self) -> FloatArray:
+        """(3,) m, the medians, NaN where none was measured."""
+        return np.array([_median(*values) for values in self.sizes])
 
-    def attributes(self, id_: int, prior: float) -> ObjectAttributes:
-        """Attributes of a closed object; prior: opportunities without a detection that every object starts with."""
-        size, summary = self._closed[id_]
-        score = summary.probability / (max(summary.opportunities, summary.detections, 1) + prior)
-        reversed_ = is_reversed(np.array([summary.path]), np.array([summary.votes]))
-        return ObjectAttributes(size, score, bool(reversed_[0]))
+    def close(self) -> None:
+        """Keep the medians of the sizes alone, weighted by the number of detections."""
+        if self.sizes[0].shape[1]:
+            self.sizes = [np.array([[_median(*values)], [float(self.detections)]]) for values in self.sizes]
 
-    def _summary(self, id_: int) -> _Summary:
-        if id_ in self._closed and id_ not in self._open:  # it appears again
-            size, summary = self._closed.pop(id_)
-            summary.sizes = _unmeasured()
-            if np.isfinite(size).all():
-                summary.measure(size[None], np.array([float(max(summary.detections, 1))]))
-            self._open[id_] = summary
-        return self._open.setdefault(id_, _Summary())
+
+def _median(value: FloatArray, weight: FloatArray) -> float:
+    return float(weighted_medians(np.zeros(len(value), dtype=np.int64), 1, value, weight)[0])
 
 
 class Identities:

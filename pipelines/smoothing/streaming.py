@@ -21,6 +21,7 @@ and work follow the detections in a chunk and its margins, so that crowds are cu
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -35,7 +36,7 @@ from pipelines.smoothing.labelling import (
     Identities,
     LabelColumns,
     LabelledStates,
-    ObjectSummaries,
+    ObjectSummary,
     dropped_boxes,
     label_states,
     source_counts,
@@ -51,6 +52,7 @@ from saga_fg.smoothing import (
     Labels,
     SmoothingSettings,
     gather_evidence,
+    is_reversed,
     measured_in_order,
     opportunities,
     quality_of,
@@ -193,15 +195,18 @@ class LabelSpool:
         )
         self._chunks += 1
 
-    def finish(self, summaries: ObjectSummaries, prior: float) -> None:
-        """Take the final attributes of all objects; prior: see `ObjectSummaries.attributes`."""
-        ids = np.array(summaries.ids, dtype=np.int64)
-        found = [summaries.attributes(id_, prior) for id_ in ids.tolist()]
+    def finish(self, summaries: Mapping[int, ObjectSummary], prior: float) -> None:
+        """Take the final attributes of all objects.
+
+        prior: opportunities without a detection that every object starts with
+        """
+        ids = sorted(summaries)
+        found = [summaries[id_] for id_ in ids]
+        score = [each.probability / (max(each.opportunities, each.detections, 1) + prior) for each in found]
+        turned = is_reversed(np.array([each.path for each in found]), np.array([each.votes for each in found]))
+        size = np.array([each.size for each in found]).reshape(-1, 3)
         self._attributes = _AttributeTable(
-            ids,
-            np.array([each.size for each in found]).reshape(-1, 3),
-            np.array([each.score for each in found]),
-            np.array([np.pi * each.reversed for each in found]),
+            np.array(ids, dtype=np.int64), size, np.array(score), np.where(turned, np.pi, 0.0)
         )
 
     def labels(self) -> Iterator[tuple[Scene, tuple[Labels, ...]]]:
@@ -299,7 +304,8 @@ class _Run:
         self._coming: list[Frame] = []
         self._backlog = Backlog(chunks)
         self._identities = Identities()
-        self._summaries = ObjectSummaries()
+        self._summaries: defaultdict[int, ObjectSummary] = defaultdict(ObjectSummary)
+        self._present: set[int] = set()  # in the latest chunk
         self._sums = _Sums()
 
     def over(self, parts: Iterable[Scene], progress: Progress | None) -> StreamedScene:
@@ -320,9 +326,8 @@ class _Run:
         with one_thread():
             self._track(np.inf)
             self._smooth(np.inf)
-            self._summaries.close(np.empty(0, dtype=np.int64))
         self._spool.finish(self._summaries, PRIOR_OPPORTUNITY_TIME * self._sums.rate)
-        counts = replace(self._sums.counts, objects=len(self._summaries.ids), joined=self._identities.joined)
+        counts = replace(self._sums.counts, objects=len(self._summaries), joined=self._identities.joined)
         return StreamedScene(self._name, counts, frames, cpu + time.perf_counter() - begin, self._spool)
 
     def _track(self, until: float) -> None:
@@ -360,7 +365,10 @@ class _Run:
         names = self._identities.name(here, objects.object_of, objects.track_of, times, span)
         self._gather(chunk, names)
         self._write(chunk, names, wanted)
-        self._summaries.close(np.array(list(names.values()), dtype=np.int64))
+        present = set(names.values())
+        for id_ in self._present - present:
+            self._summaries[id_].close()
+        self._present = present
         self._identities.forget(chunk.begin - 2 * (self._chunks.length + self._chunks.margin))
 
     def _gather(self, chunk: _Chunk, names: Mapping[int, int]) -> None:
@@ -371,13 +379,13 @@ class _Run:
         for id_, mine in _by_id(objects.object_of, rows):
             if id_ in names:
                 seen = evidence.boxes.size[mine]
-                self._summaries.add_detections(names[id_], evidence.probability[mine], seen, weight[mine])
+                self._summaries[names[id_]].add_detections(evidence.probability[mine], seen, weight[mine])
         frames = tuple(frame for frame in evidence.frames if inside[frame.moment])
         states = chunk.labelled.states.within(objects.lifespans)
         count = opportunities(replace(evidence, frames=frames), objects.lifespans, states)
         for id_, looked in zip(objects.lifespans.id.tolist(), count.tolist(), strict=True):
             if id_ in names:
-                self._summaries.add_opportunities(names[id_], looked)
+                self._summaries[names[id_]].opportunities += looked
         times = evidence.times[[frame.moment for frame in frames]].tolist()
         sums = self._sums
         sums.frames += len(frames)
@@ -399,7 +407,7 @@ class _Run:
             for id_, rows in _by_id(states.id, inside):
                 if id_ in signs:
                     path, votes = float(headings.path[rows].sum()), float(headings.votes[rows].sum())
-                    self._summaries.add_headings(names[id_], signs[id_], float(headings.yaw[rows[-1]]), path, votes)
+                    self._summaries[names[id_]].add_headings(signs[id_], float(headings.yaw[rows[-1]]), path, votes)
             self._spool.add(wanted, at, labelled, names, signs)
         begun = (at[:1] <= objects.dropped.first) & (objects.dropped.first <= at[-1:])
         new = LabelCounts(
@@ -411,7 +419,7 @@ class _Run:
 
     def _heading_sign(self, labelled: LabelledStates, name: int, id_: int, before: int) -> float:
         row = labelled.states.rows_of(np.array([before]), np.array([id_]))[0] if before >= 0 else -1
-        return self._summaries.heading_sign(name, float(labelled.headings.yaw[row]) if row >= 0 else np.nan)
+        return self._summaries[name].heading_sign(float(labelled.headings.yaw[row]) if row >= 0 else np.nan)
 
 
 def _by_id(id_: IntArray, rows: IntArray) -> Iterator[tuple[int, IntArray]]:

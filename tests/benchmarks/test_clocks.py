@@ -1,45 +1,50 @@
-"""The benchmark of wrong clocks: its tables, and what falls short."""
+"""The benchmark of wrong clocks: its figures, and what falls short."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks.runner import tables
-from benchmarks.service.clocks import ClockFault, SteadyOffset, WrongClock, clock_rows, clock_shortcomings, wrong_clock
+from benchmarks.service import clocks
+from benchmarks.service.clocks import ClockFault, fault_rows, offset_figures, offset_shortcomings, wrong_clock
+from saga_fg.errors import SagaError
 
-AHEAD, GLITCH = ClockFault("steady", 1.0), ClockFault("glitch", 8.0, 2)
-WRONG = [
-    WrongClock("radar", 5.0, AHEAD, {"lidar": 1.0, "camera": 0.995}),
-    WrongClock("lidar", 5.0, AHEAD, {"camera": 1.0, "radar": 1.0}),
-    WrongClock("radar", 5.0, GLITCH, {"lidar": 1.0, "camera": 1.0}),
-]
-STEADY = SteadyOffset("lidar", 0.5, np.array([0.003, -0.004]), 1.0, (0.102, 0.1))
+SIGMA = np.full(2, 0.002)
 
 
-def test_a_row_for_each_fault_and_each_offset() -> None:
-    tracked, offsets = tables(list(clock_rows(WRONG, [STEADY])))
-    assert tracked.columns == ("fault of the clock", "of the radar, radar at 5 Hz", "of the lidar, radar at 5 Hz")
-    assert tracked.rows == (("+1 s", "99.5", "100"), ("+8 s, 2 frames", "100", ""))
-    assert offsets.rows == (("lidar, +-0.5 s", "4", "3.536", "100", "0.102", "1.02"),)
+def test_a_row_for_each_fault_and_a_word_for_what_falls_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clocks, "FAULTS", (ClockFault("steady", 1.0), ClockFault("glitch", 8.0, 2)))
+    monkeypatch.setattr(clocks, "RADAR_RATES", (5.0,))
+    monkeypatch.setattr(clocks, "wrong_clock", lambda _, wrong, rate, fault, seed: 0.5 if wrong == "radar" else 1.0)
+    found = fault_rows(0)
+    assert [figures for _, figures in (next(found), next(found))] == [
+        {"fault of the clock": name, "of the radar, radar at 5 Hz": 50.0, "of the lidar, radar at 5 Hz": 100.0}
+        for name in ("+1 s", "+8 s, 2 frames")
+    ]
+    with pytest.raises(SagaError, match=r"\+1 s, of the radar, radar at 5 Hz: 50.0 % tracked; \+8 s, 2 frames"):
+        next(found)
 
 
-def test_what_falls_short_is_named() -> None:
-    assert clock_shortcomings(WRONG, [STEADY]) == []
-    few = replace(WRONG[0], tracked={"lidar": 0.5, "camera": 1.0})
-    poor = replace(STEADY, errors=np.array([0.02, np.nan]), within=0.5, rmse=(0.2, 0.1))
-    found = clock_shortcomings([few], [poor])
-    assert [text.split(",")[0] for text in found] == [
-        *("radar +1 s", "lidar 0.5 s: estimate off by nan ms"),
-        *("lidar 0.5 s: error of positions 2.000 times that without an offset",),
-        *("50 % of estimates within two deviations",),
+def test_offsets_are_judged_by_estimate_and_positions() -> None:
+    good = offset_figures(np.array([0.003, -0.004]), SIGMA, np.full(2, 0.102), 0.1)
+    assert good == pytest.approx(
+        {
+            "largest error, ms": 4.0,
+            "rms error, ms": 3.5355339,
+            "within two deviations, %": 100.0,
+            "error of positions, m": 0.102,
+            "by that without an offset": 1.02,
+        }
+    )
+    assert offset_shortcomings(good) == []
+    poor = offset_figures(np.array([0.02, np.nan]), SIGMA, np.full(2, 0.2), 0.1)
+    assert poor["within two deviations, %"] == 0.0
+    assert [text.split(",")[0] for text in offset_shortcomings(poor)] == [
+        "estimate off by nan ms",
+        "error of positions 2.000 times that without an offset",
     ]
 
 
 @pytest.mark.parametrize("fault", [ClockFault("steady", 3600.0), ClockFault("jumps")], ids=str)
 def test_right_sensors_are_tracked_beside_a_wrong_one(fault: ClockFault) -> None:
-    found = wrong_clock(3, "radar", 5.0, fault, seed=0)
-    assert set(found.tracked) == {"lidar", "camera"}
-    assert min(found.tracked.values()) >= 0.99
+    assert wrong_clock(3, "radar", 5.0, fault, seed=0) >= 0.99

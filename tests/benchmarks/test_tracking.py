@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.recording_sets import Score, chosen_sets, simulated_set
-from benchmarks.tracking import changes, set_rows, with_made_gaps
+from benchmarks.tracking import changes, set_rows
 from benchmarks.variants import COMPONENTS, changed, contenders, variants
 from data_tools.metrics import LabelErrors
 from data_tools.simulator import SimulatorSettings
@@ -85,21 +85,6 @@ def test_a_set_is_tracked_by_every_variant() -> None:
     assert against["saga"]["position RMSE"].estimate == pytest.approx(expected)
 
 
-def test_recordings_with_made_gaps_are_one_for_intervals() -> None:
-    config = load_config("simulated")
-    whole = simulated_set(2, settings=replace(SHORT, duration=8.0))
-    hidden = with_made_gaps(whole, config.sensors, 2, (1.0, 2.0))
-    names = hidden.dataset.scenes
-    assert names == tuple(f"scene-000{n}, pass {k}" for n in (1, 2) for k in (1, 2))
-    assert hidden.units == [[0, 1], [2, 3]]
-    scenes = [whole.scene("scene-0002"), *map(hidden.scene, names[2:])]
-    assert {scene.name for scene in scenes} == {"scene-0002"}
-    counts = [sum(len(frame.detections) for frame in scene.frames) for scene in scenes]
-    assert max(counts[1:]) < counts[0]
-    with pytest.raises(InputError, match="--passes: set kitti: expected simulated or recorded traffic"):
-        with_made_gaps(replace(whole, name="kitti", exact=False), config.sensors, 1, (1.0,))
-
-
 def test_recordings_are_chosen_by_name() -> None:
     (chosen,) = chosen_sets("simulated", None, 3, "scene-0003")
     assert (chosen.name, chosen.family, chosen.dataset.scenes) == ("simulated", "simulated", ("scene-0003",))
@@ -129,6 +114,5 @@ def test_mistakes_are_one_line(refused) -> None:
     for arguments, message in [
         ("--sets moon", "--sets: unknown name 'moon'"),
         ("--sets kitti", "expected --data DIR"),
-        ("--sets simulated --passes 1 --lengths 7", "--lengths: unknown name '7'"),
     ]:
         assert message in refused(f"tracking {arguments}")

@@ -13,7 +13,7 @@ from data_tools.datasets.detection_files import read_detections, read_scenes_in_
 from data_tools.datasets.label_table import read_label_table
 from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
-from pipelines.smoothing.labelling import Identities, ObjectSummaries
+from pipelines.smoothing.labelling import Identities, ObjectSummary
 from pipelines.smoothing.streaming import Backlog, TrackedFrame
 from saga_fg import Detections, Frame, InputError
 
@@ -172,30 +172,30 @@ def test_objects_that_were_one_have_names_of_their_own_when_they_part() -> None:
 
 
 def test_what_lasts_of_an_object_is_gathered_over_its_chunks() -> None:
-    summaries = ObjectSummaries()
-    for size, probability, looks in ((4.0, 0.5, 3), (4.2, 0.9, 2), (9.0, 0.1, 5)):
-        summaries.add_detections(7, np.array([probability]), np.array([[size, 2.0, np.nan]]), np.array([probability]))
-        summaries.add_detections(7, np.array([probability]), np.array([[size, 2.0, 1.5]]), np.array([probability]))
-        summaries.add_opportunities(7, looks)
-    summaries.add_headings(7, summaries.heading_sign(7, 0.1), yaw=0.1, path=-3.0, votes=3.0)
-    assert summaries.heading_sign(7, 0.2) == 1
-    turned = summaries.heading_sign(7, 0.1 - np.pi)  # the next chunk sees it the other way round
+    summary = ObjectSummary()
+    for size, probability in ((4.0, 0.5), (4.2, 0.9), (9.0, 0.1)):
+        for height in (np.nan, 1.5):
+            summary.add_detections(np.array([probability]), np.array([[size, 2.0, height]]), np.array([probability]))
+    summary.add_headings(summary.heading_sign(0.1), yaw=0.1, path=-3.0, votes=3.0)
+    assert summary.heading_sign(0.2) == 1
+    turned = summary.heading_sign(0.1 - np.pi)  # the next chunk sees it the other way round
     assert turned == -1
-    summaries.add_headings(7, turned, yaw=0.1 - np.pi, path=12.0, votes=1.0)
-    summaries.close(np.array([7]))
-    summaries.close(np.array([], dtype=np.int64))
-    size, score, backwards = summaries.attributes(7, prior=2.0)
+    summary.add_headings(turned, yaw=0.1 - np.pi, path=12.0, votes=1.0)
+    size = summary.size
     assert 4.0 < size[0] < 4.2  # the far guess of 9 m does not count for more than its weight
     assert size[1:] == pytest.approx([2.0, 1.5])
-    assert score == pytest.approx(3.0 / 12)
-    assert backwards  # 15 m against the direction of its start
+    assert (summary.probability, summary.detections) == (pytest.approx(3.0), 6)
+    assert summary.path == -15.0  # against the direction of its start
+    summary.close()
+    np.testing.assert_array_equal(summary.size, size)
+    summary.add_detections(np.array([0.9]), np.array([[5.0, 2.0, 1.5]]), np.array([0.9]))  # it appears again
+    assert size[0] < summary.size[0] < 4.5
 
 
 def test_many_values_are_kept_by_their_weights() -> None:
     rng = np.random.default_rng(0)
     sizes = rng.normal([4.5, 1.8, 1.5], 0.1, (20_000, 3))
-    summaries = ObjectSummaries()
+    summary = ObjectSummary()
     for part in np.split(sizes, 20):
-        summaries.add_detections(0, np.ones(1000), part, np.ones(1000))
-    summaries.close(np.array([], dtype=np.int64))
-    np.testing.assert_allclose(summaries.attributes(0, 1.0).size, np.median(sizes, axis=0), atol=1e-3)
+        summary.add_detections(np.ones(1000), part, np.ones(1000))
+    np.testing.assert_allclose(summary.size, np.median(sizes, axis=0), atol=1e-3)
