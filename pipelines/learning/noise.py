@@ -91,12 +91,8 @@ def _reported(dataset: Dataset, names: Sequence[str], suffix: str, progress: Pro
 
 
 def _from_truth(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
-    samples: dict[str, list[DetectionSample]] = {}
     kept, groups = list(scenes), config.tracker.class_groups
-    for scene in kept:
-        for name, sample in sample_with_truth(scene, config.sensors, groups=groups).items():
-            samples.setdefault(name, []).append(sample)
-    pooled = {name: DetectionSample.pool(parts) for name, parts in samples.items()}
+    pooled = sample_with_truth(kept, config.sensors, groups)
     learned = {name: fit_sensor(sample, sensor_model(config.sensors, name), GATE) for name, sample in pooled.items()}
     for name, tables in (learn_confusion(kept, config.sensors, groups) if groups else {}).items():
         learned[name] = replace(learned[name], confusion={**learned[name].confusion, **tables})

@@ -50,7 +50,6 @@ from saga_fg.smoothing import (
     Evidence,
     LabelCounts,
     Labels,
-    SmoothingSettings,
     gather_evidence,
     is_reversed,
     measured_in_order,
@@ -164,9 +163,9 @@ class _AttributeTable:
 class LabelSpool:
     """The labels of a recording, added chunk by chunk, and read back when it is over."""
 
-    def __init__(self, folder: Path, name: str, settings: SmoothingSettings) -> None:
+    def __init__(self, folder: Path, name: str) -> None:
         folder.mkdir()
-        self._folder, self._name, self._settings = folder, name, settings
+        self._folder, self._name = folder, name
         self._chunks = 0
         self._attributes: _AttributeTable | None = None
 
@@ -254,7 +253,7 @@ def smooth_stream(
     `InputError` for what the parts are refused for.
     """
     for number, (name, scene) in enumerate(groupby(parts, key=lambda part: part.name)):
-        spool = LabelSpool(folder / f"{number:06d}", name, config.smoothing)
+        spool = LabelSpool(folder / f"{number:06d}", name)
         run = _Run(name, config, method, chunks or ChunkSettings(), spool)
         yield run.over(scene, progress)
 

@@ -228,13 +228,14 @@ def match_to_truth(
 
 
 def sample_with_truth(
-    scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE, groups: Sequence[Sequence[str]] = ()
+    scenes: Iterable[Scene], sensors: Mapping[str, Sensor], groups: Sequence[Sequence[str]] = ()
 ) -> dict[str, DetectionSample]:
-    """A sample of each sensor of an annotated scene. Raises `InputError` for a scene without ground truth."""
+    """A sample of each sensor of annotated scenes. Raises `InputError` for a scene without ground truth."""
     parts: dict[str, list[DetectionSample]] = {}
-    for matched in match_to_truth(scene, sensors, gate, groups):
-        sensor = sensor_model(sensors, matched.frame.sensor)
-        parts.setdefault(matched.frame.sensor, []).append(_sample(matched, sensor))
+    for scene in scenes:
+        for matched in match_to_truth(scene, sensors, groups=groups):
+            sensor = sensor_model(sensors, matched.frame.sensor)
+            parts.setdefault(matched.frame.sensor, []).append(_sample(matched, sensor))
     return {name: DetectionSample.pool(part) for name, part in parts.items()}
 
 

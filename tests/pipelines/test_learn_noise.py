@@ -59,7 +59,7 @@ def test_scores_are_worth_on_another_scene_what_was_learned(
 ) -> None:
     with_truth = request.node.callspec.params["learned"]
     other = SimulatedTraffic(WORLD, scenes=1, seed=8)
-    for name, (sample, _) in sample_with_truth(other.scene(other.scenes[0]), learned.config.sensors).items():
+    for name, (sample, _) in sample_with_truth([other.scene(other.scenes[0])], learned.config.sensors).items():
         p, raw = (sensor.calibrated(sample.logit, sample.label) for sensor in (learned.config.sensors[name], Sensor()))
         loss, before = (-np.log(np.where(sample.true, q, 1 - q)).mean() for q in (p, raw))
         assert loss < (1.0 if with_truth else 1.1) * before  # what comes back counts as true, be it clutter

@@ -120,7 +120,7 @@ def test_detections_are_compared_with_the_truth_of_their_own_time():
     (matched,) = match_to_truth(recording(), {"camera": sensor})
     assert matched.annotations.boxes.position[:, 0].tolist() == [25.0, 5.0]  # half way
     assert (matched.detection.tolist(), matched.truth.tolist()) == ([0], [0])
-    sample, objects = sample_with_truth(recording(), {"camera": sensor})["camera"]
+    sample, objects = sample_with_truth([recording()], {"camera": sensor})["camera"]
     assert sample.true.tolist() == [True, False]
     sight = np.array([22.5, 1.4]) / np.hypot(22.5, 1.4)
     assert sample.along[0] == pytest.approx(np.array([0.5, 0.4]) @ sight)
@@ -133,4 +133,4 @@ def test_detections_are_compared_with_the_truth_of_their_own_time():
 def test_without_annotations_there_is_no_truth():
     scene = recording()
     with pytest.raises(InputError, match="scene two: expected ground truth"):
-        sample_with_truth(replace(scene, ground_truth=None), {})
+        sample_with_truth([replace(scene, ground_truth=None)], {})
