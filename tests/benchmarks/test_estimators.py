@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.estimators import Vehicles, estimators
-from benchmarks.filters import GtsamWindow, Ours, OurWindow, Textbook
 from benchmarks.flocks import Kind, flock
-from saga_fg.estimators import IncrementalSmoother, JointKalmanFilter
+from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import OBJECT
 
 
@@ -72,24 +71,3 @@ def test_flocks_are_what_their_names_say() -> None:
         assert not (edges.target == edges.source).any()
     first, second = (frame.transition.graph.edges[0] for frame in scene.frames[:2])
     assert first.rate.tolist()[:5] != second.rate.tolist()[:5]
-
-
-def test_the_windows_of_both_smoothers_hold_the_same_moments() -> None:
-    scene = flock("components", 6, 9, seed=2)
-    ours, theirs = OurWindow(5, scene), GtsamWindow(5, scene)
-    for frame in scene.frames:
-        for contender in (ours, theirs):
-            contender.prepare(frame)()
-        assert len(ours.window) == len(theirs.window)
-    np.testing.assert_allclose(np.array(ours.window), theirs.window, atol=1e-8)
-    np.testing.assert_allclose(ours.read()[1], theirs.read()[1], atol=1e-9)
-
-
-def test_the_textbook_is_driven_as_our_filter_is() -> None:
-    scene = flock("connected", 7, 4, seed=3)
-    ours, textbook = Ours(JointKalmanFilter(), scene), Textbook(scene)
-    for frame in scene.frames:
-        for contender in (ours, textbook):
-            contender.prepare(frame)()
-    for mine, theirs in zip(ours.read(), textbook.read(), strict=True):
-        np.testing.assert_allclose(mine, theirs, atol=1e-10)

@@ -96,11 +96,6 @@ def test_only_labels_that_a_detection_matches_count() -> None:
     assert f.detection == pytest.approx(0.1)
 
 
-def test_other_classes_and_moments_do_not_match() -> None:
-    e = errors(DRIVE, [(0, "7", 0.0, 0.0, {"label": "truck"}), (3, "8", 0.0, 0.0)])
-    assert not e.tracked.any()
-
-
 def test_pooled_scenes_have_objects_of_their_own() -> None:
     e = errors(DRIVE, DRIVE, covariance=np.eye(2))
     pooled = LabelErrors.pool([e, e])

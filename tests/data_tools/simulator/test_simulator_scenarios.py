@@ -10,7 +10,6 @@ import pytest
 
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.settings import (
-    SCENARIOS,
     ScenarioName,
     scenario_settings,
 )
@@ -135,7 +134,7 @@ def test_riders_sit_on_their_bicycles() -> None:
     assert np.abs(moved - bicycles.velocity[:-1]).max() < 0.6
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", ["red-light", "two-sensors"])
 def test_a_scene_is_the_same_for_the_same_seed(name: ScenarioName) -> None:
     short = replace(scenario_settings(name), duration=0.5, warm_up=2.0)
     one, other = (scene_from_world(build_world(short, 5), short, 5) for _ in range(2))
