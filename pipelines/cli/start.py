@@ -34,7 +34,7 @@ FIRST = {
     ),
     "smoothing": (
         "smoothing.classes.*.acceleration_noise",
-        "smoothing.stitching.max_gap",
+        "smoothing.max_gap",
         "smoothing.loss",
         "smoothing.min_score",
         "sensors.*.noise.*.position",

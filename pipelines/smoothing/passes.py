@@ -137,7 +137,7 @@ def smooth_objects(
     passes = _Passes(evidence, settings, tracker, providers)
     label, moment = evidence.boxes.label, evidence.moment
     everything = lifespans_of(track_of, label, moment)
-    ahead = max(EXTENSION, settings.stitching.max_gap)
+    ahead = max(EXTENSION, settings.max_gap)
     alone = passes.alone(everything, track_of, ahead)
     score = evidence_scores(evidence, track_of, everything, alone.within(everything), PRIOR_OPPORTUNITY_TIME)
     tracklets = everything.select(score >= WEAK_SCORE)
@@ -145,7 +145,7 @@ def smooth_objects(
     object_of = np.where(strong, track_of, -1)
     is_strong = np.isin(alone.id, tracklets.id)
     states = passes.coupled(tracklets, object_of, ahead, alone.select(is_strong))
-    first = stitch_tracklets(tracklets, states, passes.motion(tracklets).velocity_prior, evidence, settings.stitching)
+    first = stitch_tracklets(tracklets, states, passes.motion(tracklets).velocity_prior, evidence, settings.max_gap)
     object_of[strong] = first[tracklets.rows_of(track_of[strong])]
 
     joined = lifespans_of(object_of, label, moment)
@@ -160,7 +160,7 @@ def smooth_objects(
     score = evidence_scores(evidence, object_of, lifespans, within, PRIOR_OPPORTUNITY_TIME)
     kept = score >= settings.min_score
     object_of = np.where(np.isin(object_of, lifespans.id[kept]), object_of, -1)
-    stationary = stationary_states(within, lifespans, evidence, object_of, settings.stationary, settings.classes)
+    stationary = stationary_states(within, lifespans, evidence, object_of, settings.position_drift, settings.classes)
     longer = passes.reaching_back(lifespans.select(kept), object_of, score[kept])
     final = passes.final(longer, object_of, states, stationary)
     return SmoothedObjects(
@@ -183,7 +183,7 @@ def smooth_known_objects(
     passes = _Passes(evidence, settings, tracker, ())
     lifespans = lifespans_of(object_of, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, object_of, lifespans, passes.motion(lifespans))
-    return passes.final(lifespans, object_of, states, StationaryStates(settings.stationary))
+    return passes.final(lifespans, object_of, states, StationaryStates(settings.position_drift))
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,6 @@ from .boxes import (
 from .settings import (
     OfflineClass,
     SmoothingSettings,
-    StationarySettings,
-    StitchingSettings,
 )
 from .states import LabelCounts, Labels, Lifespans, Quality, SmoothedEdges, Source, StateTable, lifespans_of, quality_of
 
@@ -43,9 +41,7 @@ __all__ = [
     "SmoothingSettings",
     "Source",
     "StateTable",
-    "StationarySettings",
     "StationaryStates",
-    "StitchingSettings",
     "assign_detections",
     "assign_free_detections",
     "constant_sizes",

@@ -48,7 +48,6 @@ from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import gate, least_total, mahalanobis_of_pairs
 from saga_fg.numerics.gating import near_pairs
-from saga_fg.smoothing.settings import StitchingSettings
 from saga_fg.smoothing.states import Lifespans, StateTable
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.settings import ClassSettings
@@ -260,15 +259,15 @@ def assign_free_detections(
 
 
 def stitch_tracklets(
-    seen: Lifespans, states: StateTable, velocity_prior: FloatArray, evidence: Evidence, settings: StitchingSettings
+    seen: Lifespans, states: StateTable, velocity_prior: FloatArray, evidence: Evidence, max_gap: float
 ) -> IntArray:
     """(n,) the object of each tracklet: the id of the first tracklet of its chain.
 
     seen: the tracklets, from first to last detection; states: theirs, reaching beyond both ends; velocity_prior
-    (n, 2, 2): covariance of the velocity of a new object
+    (n, 2, 2): covariance of the velocity of a new object; max_gap: longest between two tracklets of an object, s
     """
     limit = gate(GATE, 4)
-    end, begin, a, b = _meetings(seen, states, evidence.times, settings.max_gap, limit)
+    end, begin, a, b = _meetings(seen, states, evidence.times, max_gap, limit)
     d = states.mean[a] - states.mean[b]
     S = states.covariance[a] + states.covariance[b]
     d2 = np.einsum("ni,ni->n", d, np.linalg.solve(S, d[..., None])[..., 0])

@@ -58,7 +58,7 @@ from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.smoothing.association import Evidence
-from saga_fg.smoothing.settings import OfflineClass, StationarySettings
+from saga_fg.smoothing.settings import OfflineClass
 from saga_fg.smoothing.states import Lifespans, StateTable
 from saga_fg.types.by_class import class_settings, class_values
 
@@ -124,9 +124,12 @@ def states_in_graph(
 
 @dataclass(frozen=True, eq=False)
 class StationaryStates:
-    """States (m,) of stationary objects: moments in ascending order, and ids; settings of how firmly they are held."""
+    """States (m,) of stationary objects: moments in ascending order, and ids.
 
-    settings: StationarySettings = field(default_factory=StationarySettings)
+    position_drift  standard deviation of their place after one second, m
+    """
+
+    position_drift: float
     moment: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     id: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
@@ -141,10 +144,10 @@ def stationary_states(
     lifespans: Lifespans,
     evidence: Evidence,
     object_of: IntArray,
-    settings: StationarySettings,
+    position_drift: float,
     classes: Mapping[str, OfflineClass],
 ) -> StationaryStates:
-    """The states in which objects are stationary."""
+    """The states in which objects are stationary, held by a `position_drift`, m."""
     order = np.lexsort((states.moment, states.id))
     ids, moments = states.id[order], states.moment[order]
     label = lifespans.label[lifespans.rows_of(ids)]
@@ -158,7 +161,7 @@ def stationary_states(
     owner, seen_at = object_of[rows], evidence.moment[rows]
     kept: list[IntArray] = []
     for a, b in zip(begins.tolist(), ends.tolist(), strict=True):
-        if times[moments[b]] - times[moments[a]] < settings.min_time:
+        if times[moments[b]] - times[moments[a]] < MIN_STATIONARY:
             continue
         mine = slice(np.searchsorted(owner, ids[a]), np.searchsorted(owner, ids[a], side="right"))
         within = rows[mine][(seen_at[mine] >= moments[a]) & (seen_at[mine] <= moments[b])]
@@ -166,7 +169,7 @@ def stationary_states(
             kept.append(np.arange(a, b + 1))
     chosen = np.concatenate([np.empty(0, dtype=np.int64), *kept])
     chosen = chosen[np.argsort(moments[chosen], kind="stable")]
-    return StationaryStates(settings, moments[chosen], ids[chosen])
+    return StationaryStates(position_drift, moments[chosen], ids[chosen])
 
 
 def _drift(evidence: Evidence, rows: IntArray) -> float:
@@ -181,6 +184,7 @@ def _drift(evidence: Evidence, rows: IntArray) -> float:
     return float(np.hypot(*slope) * (t[-1] - t[0]))
 
 
+MIN_STATIONARY = 1.0  # shortest stationary interval, s
 LONG_RECORDING = 120.0  # s from which it is smoothed in windows
 MOST_JOINT = 64  # objects that are smoothed jointly: their covariance takes half a megabyte
 UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of an object, m
@@ -234,7 +238,7 @@ def smooth_states(
         _node_types(lifespans, motion.classes),
         motion.graph_of,
         np.ones(len(evidence)) if weight is None else weight,
-        motion.stationary or StationaryStates(),
+        motion.stationary or StationaryStates(np.nan),
     )
     epochs = list(parts) if providers else parts
     long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING
@@ -279,7 +283,7 @@ def _epochs(
         if len(pinned):
             later = max(k, 1)
             interval = evidence.times[later] - evidence.times[later - 1] if len(evidence.times) > 1 else 1.0
-            H, R = types[0].selector(VELOCITY), stationary.settings.position_drift**2 / interval * np.eye(2)
+            H, R = types[0].selector(VELOCITY), stationary.position_drift**2 / interval * np.eye(2)
             measured.append(Measurements(pinned, np.zeros((len(pinned), 2)), H, R))
         gone = lifespans.last[present] == k
         yield RecordingEpoch(k, transition, new_objects, measured, lifespans.id[present[gone]])

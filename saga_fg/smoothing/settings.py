@@ -57,37 +57,20 @@ class OfflineClass(Settings):
 
 
 @dataclass(frozen=True)
-class StitchingSettings(Settings):
-    """Stitching of the tracklets of one object."""
-
-    max_gap: NonNegative = setting(
-        3.0, "longest gap between two tracklets of one object, s; higher: more links, right and wrong"
-    )
-
-
-@dataclass(frozen=True)
-class StationarySettings(Settings):
-    """Intervals in which objects are stationary, and how firmly they are held."""
-
-    min_time: NonNegative = setting(
-        1.0, "shortest stationary interval, s; usual 0.5 to 3; higher: short stops stay in motion"
-    )
-    position_drift: Positive = setting(
-        0.03,
-        "standard deviation of the place after one second while stationary, m: by the drift of the vehicle's poses; "
-        "usual 0.01 to 0.1; lower: held more firmly",
-    )
-
-
-@dataclass(frozen=True)
 class SmoothingSettings(Settings):
     """All settings that turn online tracks into labels."""
 
     classes: Mapping[str, OfflineClass] = settings_group(
         lambda: {DEFAULT: OfflineClass()}, "settings by class of object; the entry named default serves all others"
     )
-    stitching: StitchingSettings = settings_group(StitchingSettings, "linking of tracklets across gaps")
-    stationary: StationarySettings = settings_group(StationarySettings, "stationary objects")
+    max_gap: NonNegative = setting(
+        3.0, "longest gap between two tracklets of one object, s; higher: more links, right and wrong"
+    )
+    position_drift: Positive = setting(
+        0.03,
+        "standard deviation of the place after one second while stationary, m: by the drift of the vehicle's poses; "
+        "usual 0.01 to 0.1; lower: held more firmly",
+    )
     loss: Literal["none", "huber", "cauchy", "geman-mcclure", "tukey"] = setting(
         "huber", "robust loss of the detections"
     )

@@ -19,8 +19,6 @@ from saga_fg.smoothing import (
     OfflineClass,
     SmoothedEdges,
     StateTable,
-    StationarySettings,
-    StitchingSettings,
     assign_free_detections,
     evidence_scores,
     frame_rate,
@@ -60,15 +58,14 @@ def line(first: int, last: int, start: tuple[float, float], velocity: tuple[floa
     return path
 
 
-def joined(paths: dict[int, FloatArray], settings: StitchingSettings | None = None) -> dict[int, int]:
+def joined(paths: dict[int, FloatArray], max_gap: float = 3.0) -> dict[int, int]:
     evidence, numbers = gathered(paths)
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
     prior = np.tile(25.0 * np.eye(2), (len(lifespans), 1, 1))
-    settings = settings or StitchingSettings()
-    longer = lifespans.reaching(evidence.times, 1.0, settings.max_gap)
+    longer = lifespans.reaching(evidence.times, 1.0, max_gap)
     states = smooth_states(evidence, numbers, longer, ObjectMotion(prior, CLASSES))
     return dict(
-        zip(lifespans.id.tolist(), stitch_tracklets(lifespans, states, prior, evidence, settings).tolist(), strict=True)
+        zip(lifespans.id.tolist(), stitch_tracklets(lifespans, states, prior, evidence, max_gap).tolist(), strict=True)
     )
 
 
@@ -89,7 +86,7 @@ def test_what_moves_otherwise_or_comes_too_late_is_new() -> None:
     paths = {0: line(0, 6, (0, 0), (5, 0)), 1: line(9, 19, (0, 30), (5, 0))}
     assert joined(paths) == {0: 0, 1: 1}
     paths = {0: line(0, 6, (0, 0), (5, 0)), 1: line(12, 19, (0, 0), (5, 0))}
-    assert joined(paths, StitchingSettings(max_gap=1.0)) == {0: 0, 1: 1}
+    assert joined(paths, max_gap=1.0) == {0: 0, 1: 1}
 
 
 def test_an_object_claims_detections_before_its_initiation_but_not_those_of_others() -> None:
@@ -111,7 +108,7 @@ def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not() -> None:
     evidence, numbers = gathered(paths)
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, numbers, lifespans, ObjectMotion(np.tile(25.0 * np.eye(2), (3, 1, 1)), CLASSES))
-    standing = stationary_states(states, lifespans, evidence, numbers, StationarySettings(), CLASSES)
+    standing = stationary_states(states, lifespans, evidence, numbers, 0.03, CLASSES)
     assert sorted(standing.moment[standing.id == 0].tolist()) == list(range(20))
     assert set(standing.moment[standing.id == 1].tolist()) <= set(range(9))
     assert (standing.id == 1).sum() >= 5
@@ -168,9 +165,9 @@ def test_many_tracklets_are_stitched_without_an_array_of_all_pairs() -> None:
     )
     evidence, _ = gathered({0: line(0, 19, (0, 0), (0, 0))})
     prior = np.tile(25.0 * np.eye(2), (count, 1, 1))
-    stitch_tracklets(seen, states, prior, evidence, StitchingSettings())
+    stitch_tracklets(seen, states, prior, evidence, 3.0)
     tracemalloc.start()
-    found = stitch_tracklets(seen, states, prior, evidence, StitchingSettings())
+    found = stitch_tracklets(seen, states, prior, evidence, 3.0)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     begin, end = TIMES[seen.first], TIMES[seen.last]

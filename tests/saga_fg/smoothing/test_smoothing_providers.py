@@ -16,7 +16,6 @@ from saga_fg.smoothing import (
     ObjectMotion,
     SmoothedEdges,
     StateTable,
-    StationarySettings,
     StationaryStates,
     gather_evidence,
     lifespans_of,
@@ -90,7 +89,7 @@ def states(providers: Sequence[FactorProvider] = ()) -> StateTable:
     rules = (Neighbours(min_speed=0.2, classes=("pedestrian",)),)
     edges = SmoothedEdges(rules, 0.0, lifespans, alone, np.full(n, np.nan), np.full(n, 0.5))
     moments = np.arange(len(evidence.times))
-    stands = StationaryStates(StationarySettings(), moments, np.full(len(moments), 2))
+    stands = StationaryStates(0.03, moments, np.full(len(moments), 2))
     weight = np.where(object_of == 1, 0.5, 1.0)
     return smooth_states(evidence, object_of, lifespans, ObjectMotion(V, CLASSES, edges, stands), weight, providers)
 

@@ -16,7 +16,6 @@ from saga_fg.smoothing import (
     Lifespans,
     OfflineClass,
     StateTable,
-    StationarySettings,
     StationaryStates,
     batch_states,
     gather_evidence,
@@ -122,21 +121,21 @@ def test_a_pinned_object_stays_where_it_is() -> None:
     evidence = evidence_of(times.tolist(), path[:, None].tolist())
     mine = np.zeros(20, dtype=np.int64)
     lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
-    stands = StationaryStates(StationarySettings(position_drift=0.01), np.arange(20), mine)
+    stands = StationaryStates(0.01, np.arange(20), mine)
     states = smooth_states(evidence, mine, lifespans, ObjectMotion(25 * np.eye(2)[None], CLASSES, stationary=stands))
     assert np.ptp(states.mean[:, :2], axis=0).max() < 0.1 * SIGMA
     assert np.allclose(states.mean[:, :2] + evidence.origin, path.mean(axis=0), atol=0.1 * SIGMA)
 
 
 def test_a_pinned_object_wanders_by_the_drift_of_the_poses_whatever_the_rate() -> None:
-    settings, deviations = StationarySettings(position_drift=0.2), []
+    deviations = []
     for rate in (2, 20):
         times = np.arange(20 * rate + 1) / rate
         places: list[list[list[float]]] = [[] for _ in times]
         places[0] = [[10.0, 5.0]]
         evidence = evidence_of(times.tolist(), places)
         lifespans = Lifespans(np.array([0]), np.array(["car"]), np.array([0]), np.array([len(times) - 1]))
-        stands = StationaryStates(settings, np.arange(len(times)), np.zeros(len(times), dtype=np.int64))
+        stands = StationaryStates(0.2, np.arange(len(times)), np.zeros(len(times), dtype=np.int64))
         first = np.zeros(1, dtype=np.int64)
         motion = ObjectMotion(25 * np.eye(2)[None], CLASSES, stationary=stands)
         states = smooth_states(evidence, first, lifespans, motion)
@@ -161,9 +160,9 @@ def test_an_outlier_counts_little_after_reweighting() -> None:
 
 def test_a_stationary_object_of_a_recording_of_one_moment() -> None:
     evidence, mine = evidence_of([0.0], [[[3.0, 4.0]]]), np.zeros(1, dtype=np.int64)
-    stands = StationaryStates(StationarySettings(min_time=0.0), mine, mine)
+    stands = StationaryStates(0.03, mine, mine)
     lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, mine, lifespans, ObjectMotion(25 * np.eye(2)[None], CLASSES, stationary=stands))
     assert np.allclose(states.mean[0, :2] + evidence.origin, [3.0, 4.0])
     assert np.allclose(states.mean[0, 2:], 0.0)
-    assert (np.sqrt(np.diag(states.covariance[0])[2:]) <= stands.settings.position_drift).all()
+    assert (np.sqrt(np.diag(states.covariance[0])[2:]) <= stands.position_drift).all()
