@@ -159,7 +159,7 @@ def evaluate_labels(
                 )
                 for system in SYSTEMS
             }
-            same[distance] = CommonBoxes.pool(common_boxes(scene, distance) for scene in labelled)
+            same[distance] = CommonBoxes.concatenate([common_boxes(scene, distance) for scene in labelled])
     return LabelEvaluation(tuple(scenes), curves, same, consistency)
 
 

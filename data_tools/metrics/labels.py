@@ -29,15 +29,15 @@ residual        mean of r^T R^-1 r / 2 over the detections nearest to a box, r t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
 from data_tools.metrics.error_sample import ErrorSample, nees
 from data_tools.metrics.scene_boxes import SceneBoxes, near_pairs, nearest_pairs
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.types.boxes import Boxes
 
@@ -75,54 +75,31 @@ class LabelledScene:
 
 
 @dataclass(frozen=True, eq=False)
-class CommonBoxes:
-    """M true boxes that every system matches.
+class CommonBoxes(Columns):
+    """M true boxes that every one of S systems matches.
 
     label (M,), distance (M,) m, visible (M,)
-    errors  by system and quantity (M,): position m, heading rad, size m (mean of length, width, height), velocity m/s,
-            nees (squared position error over its covariance, 2 degrees of freedom); NaN where unknown
+    errors   (M, S, Q) of `QUANTITIES`: position m, heading rad, size m (mean of length, width, height), velocity m/s,
+             nees (squared position error over its covariance, 2 degrees of freedom); NaN where unknown
+    systems  names of the S systems
     """
 
     label: StrArray
     distance: FloatArray
     visible: BoolArray
-    errors: Mapping[str, Mapping[str, FloatArray]]
-
-    def __len__(self) -> int:
-        return len(self.label)
-
-    def select(self, rows: BoolArray | IntArray) -> Self:
-        """The boxes of a mask or of row indices."""
-        errors = {name: {q: column[rows] for q, column in of.items()} for name, of in self.errors.items()}
-        return type(self)(self.label[rows], self.distance[rows], self.visible[rows], errors)
-
-    @classmethod
-    def pool(cls, parts: Iterable[CommonBoxes]) -> Self:
-        """The boxes of all scenes, which have the same systems."""
-        scenes = list(parts)
-        errors = {
-            name: {q: np.concatenate([scene.errors[name][q] for scene in scenes]) for q in QUANTITIES}
-            for name in (scenes[0].errors if scenes else ())
-        }
-        return cls(
-            np.concatenate([np.empty(0, dtype="<U1"), *(scene.label for scene in scenes)]),
-            np.concatenate([np.empty(0), *(scene.distance for scene in scenes)]),
-            np.concatenate([np.empty(0, dtype=np.bool_), *(scene.visible for scene in scenes)]),
-            errors,
-        )
+    errors: FloatArray
+    systems: tuple[str, ...]
 
     def sample(self, system: str, quantity: str) -> ErrorSample:
         """The known errors of a system."""
-        return ErrorSample.known(self.errors[system][quantity])
+        return ErrorSample.known(self.errors[:, self.systems.index(system), QUANTITIES.index(quantity)])
 
 
 def common_boxes(scene: LabelledScene, gate: float) -> CommonBoxes:
     """The true boxes that every system matches within `gate` (m), with the errors of each system."""
-    errors = {name: _errors(scene, table, gate) for name, table in scene.systems.items()}
-    found = np.ones(len(scene.truth), dtype=np.bool_)
-    for of in errors.values():
-        found &= np.isfinite(of["position"])
-    whole = CommonBoxes(scene.truth.boxes.label, scene.distance, scene.visible, errors)
+    errors = np.stack([_errors(scene, table, gate) for table in scene.systems.values()], axis=1)
+    found = np.asarray(np.isfinite(errors[:, :, 0]).all(axis=1))
+    whole = CommonBoxes(scene.truth.boxes.label, scene.distance, scene.visible, errors, tuple(scene.systems))
     return whole.select(found)
 
 
@@ -140,20 +117,20 @@ def visible_then_hidden(
     return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
 
 
-def _errors(scene: LabelledScene, found: SceneBoxes, gate: float) -> dict[str, FloatArray]:
-    """The errors of one system at all true boxes, NaN where it has none."""
-    columns = {name: np.full(len(scene.truth), np.nan) for name in QUANTITIES}
+def _errors(scene: LabelledScene, found: SceneBoxes, gate: float) -> FloatArray:
+    """(N, Q) the errors of one system at all true boxes, NaN where it has none."""
     row, column = visible_then_hidden(scene.truth, scene.visible, found, gate)
     own = _holds_most(scene.truth.id[row], found.id[column])
     row, column = row[own], column[own]
     a, b = scene.truth.boxes.select(row), found.boxes.select(column)
     offset = (b.position - a.position)[:, :2]
-    columns["position"][row] = np.hypot(*offset.T)
-    columns["heading"][row] = np.abs(wrap_angle(b.yaw - a.yaw))
-    columns["size"][row] = np.abs(b.size - a.size).mean(axis=1)
-    columns["velocity"][row] = np.hypot(*(b.velocity - scene.velocity[row]).T)
-    columns["nees"][row] = nees(offset, found.position_covariance[column])
-    return columns
+    errors = np.full((len(scene.truth), len(QUANTITIES)), np.nan)
+    errors[row, 0] = np.hypot(*offset.T)
+    errors[row, 1] = np.abs(wrap_angle(b.yaw - a.yaw))
+    errors[row, 2] = np.abs(b.size - a.size).mean(axis=1)
+    errors[row, 3] = np.hypot(*(b.velocity - scene.velocity[row]).T)
+    errors[row, 4] = nees(offset, found.position_covariance[column])
+    return errors
 
 
 def _holds_most(objects: StrArray, tracks: StrArray) -> BoolArray:

@@ -43,7 +43,7 @@ def compared(scene: Scene, family: str) -> CommonBoxes:
 @pytest.mark.parametrize("family", list(SCENES))
 def test_labels_are_nearer_than_online_tracks_in_every_class(recordings: Path, family: str) -> None:
     dataset = dataset_of(family, recordings)
-    boxes = CommonBoxes.pool(compared(dataset.scene(name), family) for name in dataset.scenes)
+    boxes = CommonBoxes.concatenate([compared(dataset.scene(name), family) for name in dataset.scenes])
     names, count = np.unique(boxes.label, return_counts=True)
     classes = names[count >= FEWEST].tolist()
     assert len(classes) >= 3

@@ -73,9 +73,9 @@ def test_systems_are_compared_where_all_have_a_box() -> None:
     same = common_boxes(scene, 2.0)
     assert same.distance.tolist() == [5.0, 6.0]
     assert same.visible.tolist() == [True, False]
-    assert same.errors["one"]["position"].tolist() == pytest.approx([0.3, 0.0])
-    assert same.errors["one"]["nees"].tolist() == pytest.approx([1.0, 0.0])
-    pooled = CommonBoxes.pool([same, same])
+    assert same.sample("one", "position").values.tolist() == pytest.approx([0.3, 0.0])
+    assert same.sample("one", "nees").values.tolist() == pytest.approx([1.0, 0.0])
+    pooled = CommonBoxes.concatenate([same, same])
     assert len(pooled) == 4
     assert pooled.sample("one", "position").rmse == pytest.approx(0.3 / np.sqrt(2))
     assert np.isnan(pooled.select(pooled.distance > 100).sample("one", "position").rmse)
@@ -85,7 +85,7 @@ def test_a_box_stays_with_the_visible_object() -> None:
     truth = table([0, 0], ["a", "b"], [0.0, 0.5])
     systems = {"one": table([0], ["1"], [0.4])}
     same = common_boxes(LabelledScene(truth, np.array([True, False]), np.zeros((2, 2)), np.zeros(2), systems), 2.0)
-    assert same.errors["one"]["position"].tolist() == pytest.approx([0.4])
+    assert same.sample("one", "position").values.tolist() == pytest.approx([0.4])
     assert same.visible.all()
 
 
@@ -93,7 +93,7 @@ def test_the_box_of_a_neighbour_is_not_that_of_the_object() -> None:
     truth = table([0, 0, 1, 1, 2], ["a", "b", "a", "b", "a"], [0.0, 1.5, 0.0, 1.5, 0.0])
     systems = {"one": table([0, 0, 1, 1, 2], ["1", "2", "1", "2", "2"], [0.1, 1.5, 0.1, 1.5, 1.5])}
     same = common_boxes(LabelledScene(truth, np.ones(5, dtype=bool), np.zeros((5, 2)), np.zeros(5), systems), 2.0)
-    assert same.errors["one"]["position"].tolist() == pytest.approx([0.1, 0.0, 0.1, 0.0])
+    assert same.sample("one", "position").values.tolist() == pytest.approx([0.1, 0.0, 0.1, 0.0])
 
 
 def test_self_consistency_sees_jumps_turns_and_gaps() -> None:
