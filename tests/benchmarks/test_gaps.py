@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 
 from benchmarks import gaps, recording_sets
-from benchmarks.gap_picture import LIGHTS, gap_picture, telling_gap
+from benchmarks.gap_picture import gap_picture, telling_gap
 from benchmarks.gap_runs import GapBenchSettings, judged_run, prepared, real_gaps, run_of
 from benchmarks.gaps import rows_of, split_runs, splits_of
 from benchmarks.recording_sets import simulated_set
@@ -20,14 +18,8 @@ from pipelines.learning.gaps import LIFE
 from pipelines.learning.interactions import LearnedForms
 from saga_fg import InputError
 from saga_fg.learning.gaps import situations_of
-from saga_fg.model.motion import ConstantVelocity
 from saga_fg.model.stability import LearnedInteractions
-from saga_fg.model.stop_lines import RedLight
-from saga_fg.model.turning import CoordinatedTurn
-from saga_fg.types.road_map import Lane
 from tests.pipelines.sampled_gaps import HIDDEN, SHORT, labelled, straight, without
-from tests.pipelines.test_situations import GAP, ROAD, STEADY, along
-from tests.pipelines.test_situations import labelled as labelled_on_road
 
 SEVEN_SECONDS = replace(SHORT, duration=7.0)
 
@@ -47,25 +39,6 @@ def test_contenders_and_lives_are_settings_of_every_kind_of_data() -> None:
             config = made.kept_alive().config
             config.new_tracker(made.method)
             assert config.tracker.max_coasting == LIFE
-
-
-def test_classical_contenders_differ_in_motion_alone() -> None:
-    base, known = load_config("kitti"), variants("kitti")
-    turn = known["stationary + turn"].contender(base).config.tracker
-    assert isinstance(turn.classes["default"].motion, CoordinatedTurn)
-    assert isinstance(turn.classes["pedestrian"].motion, ConstantVelocity)
-    assert turn.stationarity.prior == 0.5
-    alone = known["constant velocity"].contender(base).config.tracker
-    assert alone.stationarity.prior == 0
-    assert alone.classes["default"].max_deviation == base.tracker.classes["default"].max_deviation
-
-
-def test_parts_of_the_graph_are_contenders_where_they_are_configured() -> None:
-    base = load_config("heterogeneous")
-    rules = variants("heterogeneous")["without lights"].contender(base).config.tracker.edges
-    assert {type(rule) for rule in base.tracker.edges} - {type(rule) for rule in rules} == {RedLight}
-    shipped = load_config("kitti")
-    assert [one.name for one in contenders("kitti", shipped, "saga,without lights,kf", ())] == ["saga", "kf"]
 
 
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive() -> None:
@@ -151,13 +124,6 @@ def test_the_command_compares_on_the_same_gaps(bench, tmp_path: Path) -> None:
     assert everything["gaps"] + everything["lost"] == sum(row["gaps"] for row in counts)
 
 
-def test_recordings_without_gaps_are_refused(refused, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = replace(SHORT, duration=1.0)
-    monkeypatch.setattr(recording_sets, "simulated_set", lambda scenes: simulated_set(scenes, settings=settings))
-    said = refused("gaps --sets simulated --scenes 1 --passes 1 --contenders kf")
-    assert "set simulated: expected recordings with gaps" in said
-
-
 @pytest.mark.usefixtures("short_scenes")
 def test_the_command_refuses(refused, subtests: pytest.Subtests) -> None:
     for arguments, message in [
@@ -189,20 +155,3 @@ def test_the_picture_shows_the_gap_that_tells_most() -> None:
     assert titles == ["centerpoint: identity kept", "kf: identity kept"]
     with pytest.raises(InputError, match="--picture: expected recordings with gaps"):
         telling_gap([], [])
-
-
-def test_lanes_and_stop_lines_show_what_their_lights_show() -> None:
-    lane, made = Lane("lane", ((-50.0, 0.0), (80.0, 0.0))), [replace(GAP, run=1)]
-    ways = {"a": STEADY, "b": along(STEADY[:, 0] + 8)}
-    scene = labelled_on_road(ways, colour="red", road=replace(ROAD, lanes=(lane,)))
-    kf = variants("file")["kf"].contender(load_config("file"))
-    (ax,) = gap_picture(scene, made[0], {"kf": judged_run(scene, made, kf, "kept")}).axes
-    wide = [to_hex(line.get_color()) for line in ax.lines if line.get_linewidth() == 3.0]
-    assert LIGHTS["red"] in wide
-    assert any(np.ptp(line.get_xdata()) == pytest.approx(130.0) for line in ax.lines), "the lane"
-    (track,) = [line for line in ax.lines if line.get_marker() == "o"]
-    assert np.isnan(track.get_xdata()).sum() == 1, "it breaks off where the object returns"
-    run = run_of(scene, made, kf, "kept", real=False)
-    assert telling_gap([run], [run], ("at red",))[1] == made[0]
-    with pytest.raises(InputError, match="--picture"):
-        telling_gap([run], [run], ("starting",))

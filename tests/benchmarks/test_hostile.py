@@ -66,13 +66,6 @@ def test_no_message_in_the_name_of_a_good_sensor_takes_its_numbers():
     assert heavy > 0
 
 
-def test_hostile_messages_are_lines_of_every_kind():
-    rng = np.random.default_rng(0)
-    for kind in KINDS:
-        assert all(0 < line.count(b"\n") + 1 < 3 for line in [kind(rng, EPOCH)])
-    assert hostile_line(np.random.default_rng(5), EPOCH) == hostile_line(np.random.default_rng(5), EPOCH)
-
-
 def test_clocks_of_others_leave_out_hardly_any_frame():
     """Three seconds of hostile messages, four of them between two good frames; nobody resets."""
     config, rng, answers = load_config("file"), np.random.default_rng([0, 7]), Counter[str]()

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks import joint as module
-from benchmarks.joint import batch_run, joint_rows, online_run, poles_at
+from benchmarks.joint import batch_run, joint_rows, online_run
 from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
 from pipelines.slam.joint import run_joint, street
-from saga_fg import Frame, InputError
-from saga_fg.numerics.geometry import yaw_transform
+from saga_fg import InputError
 from saga_fg.slam.joint import JointSettings
 
 SHORT = replace(street(), duration=2.0)
@@ -69,18 +68,3 @@ def test_the_command_prints_the_changes(bench, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(module, "street", lambda parked, mapped: replace(SHORT, mapped=mapped))
     compared = {row.get("compared") for row in bench("joint --scenes 2 --lanes")}
     assert {"joint against decoupled", "joint against held"} <= compared
-
-
-def test_poles_are_seen_within_reach_with_the_noise_stated() -> None:
-    poses = np.stack([yaw_transform(0.5 * k) for k in range(60)])
-    frames = [Frame.__new__(Frame) for _ in poses]
-    for frame, pose in zip(frames, poses, strict=True):
-        object.__setattr__(frame, "world_T_ego", pose)
-    seen = poles_at(frames, 1, reach=20.0)
-    assert len(seen) == len(poses)
-    places = np.array([pose[:2, 3] + o.value[:2] for pose, now in zip(poses, seen, strict=True) for o in now])
-    assert max(np.hypot(*o.value[:2]) for now in seen for o in now) < 21
-    first = places[np.linalg.norm(places - places[0], axis=1) < 2]
-    assert 0.05 < first.std(axis=0).mean() < 0.2
-    again = poles_at(frames, 1, reach=20.0)
-    assert [len(now) for now in seen] == [len(now) for now in again]

@@ -20,13 +20,6 @@ def test_cars_come_in_platoons_and_are_hidden_at_times(tmp_path: Path) -> None:
     assert len(roads) > 4  # a new platoon takes another road
 
 
-def test_missed_detections_and_clutter_are_as_many_as_asked_for(tmp_path: Path) -> None:
-    write_traffic(tmp_path / "table.csv", 20, 20.0, 1, 0.5, 7.0)
-    dataset = read_detections(tmp_path / "table.csv")
-    frames = dataset.scene(dataset.scenes[0]).frames
-    assert sum(map(len, frames)) / len(frames) == pytest.approx(0.5 * 0.94 * 20 + 7, rel=0.1)
-
-
 def test_memory_is_read_and_the_labels_are_those_of_the_whole(bench) -> None:
     *read, whole, short = bench("streaming --objects 5 --seconds 12 --compared 12")
     assert whole["boxes"] > 100

@@ -17,8 +17,6 @@ from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from pipelines.config import load_config
 from pipelines.tracking import track_scene
 from saga_fg.errors import InputError
-from saga_fg.model.lanes import InLane
-from saga_fg.model.stop_lines import RedLight
 from saga_fg.types.dataset import Scene
 from tests.benchmarks.recordings.ngsim_example import crossing, rows, write_ngsim
 
@@ -85,17 +83,6 @@ def test_the_vehicle_that_carries_the_sensors_is_not_an_object_and_the_scene_las
     assert set(visible(chosen)) in ({"1", "3"}, {"2", "3"})
 
 
-def test_the_seed_determines_the_detections(traffic: RecordedTraffic) -> None:
-    def detections(seed: int) -> list[list[float]]:
-        return [
-            frame.detections.boxes.position.ravel().tolist()
-            for frame in sensed_scene(traffic, "mast", None, seed).frames
-        ]
-
-    assert detections(1) == detections(1)
-    assert detections(1) != detections(2)
-
-
 def test_ground_truth_alone_has_everybody_and_no_frames(traffic: RecordedTraffic) -> None:
     scene = true_scene(traffic)
     assert not scene.frames
@@ -117,17 +104,6 @@ def test_colours_are_reported_at_first_and_when_they_change(traffic: RecordedTra
         0.3: "traffic_light_green",
     }
     assert all(frame.road_map is traffic.road_map for frame in scene.frames)
-
-
-def test_a_tracker_believes_the_colours_and_knows_the_map(traffic: RecordedTraffic) -> None:
-    scene = sensed_scene(traffic, "mast", perfect(), seed=0)
-    config = load_config("traffic")
-    rules = RedLight(), InLane()
-    tracker = replace(config, tracker=replace(config.tracker, edges=rules)).new_tracker("saga")
-    for frame in scene.frames:
-        tracker.step(frame)
-    assert tracker.map_nodes.belief("light-7")["green"] > 0.75  # type: ignore[union-attr]
-    assert {"light-7", "line-0", "lane-1", "lane-2"} == set(tracker.map_nodes.name)  # type: ignore[union-attr]
 
 
 def test_a_vehicle_that_appears_inside_another_is_tracked_with_the_rest(tmp_path: Path) -> None:

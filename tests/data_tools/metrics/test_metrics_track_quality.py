@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from data_tools.metrics import SceneBoxes, WholeTracks, track_summaries, whole_tracks
+from data_tools.metrics import SceneBoxes, track_summaries, whole_tracks
 from saga_fg import Boxes
 from saga_fg.types.boxes import bev_iou
 
@@ -68,11 +68,6 @@ def test_a_ghost_overlaps_at_more_than_half_of_its_frames() -> None:
         assert summary(table(car("a", 0.0, 0.9, frames), car("b", 0.0, 0.3))).ghosts == ghosts
 
 
-def test_the_better_track_may_change() -> None:
-    found = table(car("a", 0.0, 0.9, range(2)), car("c", 0.0, 0.8, range(2, 4)), car("b", 0.0, 0.3))
-    assert summary(found).ghosts == 1
-
-
 def test_of_equal_scores_the_shorter_track_is_the_ghost() -> None:
     tracks = whole_tracks(table(), table(car("a", 0.0, 0.7, range(3)), car("b", 0.0, 0.7, range(7))))
     assert tracks.score.tolist() == [0.7, 0.7]  # to the last bit: neither is ranked before the other
@@ -109,11 +104,6 @@ def test_an_identity_of_two_classes_is_two_tracks() -> None:
         "car": (1, 1),
         "truck": (1, 0),
     }
-
-
-def test_equal_names_of_different_scenes_are_different_tracks() -> None:
-    scene = whole_tracks(table(car("x", 0.0, 0.0)), table(car("a", 0.0, 0.9)))
-    assert track_summaries(WholeTracks.concatenate([scene, scene]))["car"].tracks == 2
 
 
 def test_without_tracks_or_true_ones_figures_are_undefined() -> None:

@@ -96,16 +96,6 @@ def test_ground_truth_velocity_is_the_derivative_of_position() -> None:
         assert np.abs(difference - b.boxes.velocity[j]).max() < 0.8  # accelerations of up to 8 m/s^2
 
 
-def test_objects_stand_on_the_ground_and_have_real_sizes() -> None:
-    truth = scene(3).ground_truth
-    assert truth is not None
-    for moment in truth:
-        assert moment.boxes.position[:, 2] == pytest.approx(moment.boxes.size[:, 2] / 2)
-        assert set(moment.boxes.label.tolist()) <= {"car", "truck", "bus", "pedestrian"}
-        assert (moment.boxes.size[moment.boxes.label == "pedestrian"] < 2.2).all()
-        assert (moment.boxes.size[moment.boxes.label == "bus", 0] > 9).all()
-
-
 def test_hidden_objects_were_in_view_not_long_ago() -> None:
     glimpses_count = replace(SimulatorSettings(), shortest_view=0.0, sensors={"lidar": lidar()})
     hidden = lasting_views = 0
