@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class Candidates(Columns):
     """P candidate pairs: `row` and `column` (P,), `cost` (P,) >= 0, `group` (P,).
 
     Pairs of different groups share neither row nor column.
@@ -26,9 +26,6 @@ class Candidates:
     column: IntArray
     cost: FloatArray
     group: IntArray
-
-    def __len__(self) -> int:
-        return len(self.row)
 
 
 def optimal_pairs(candidates: Candidates, present: BoolArray) -> BoolArray:

@@ -140,7 +140,7 @@ TRAILER_LENGTH = (6.0, 11.0)  # m
 
 
 @dataclass(frozen=True, eq=False)
-class Fleet:
+class Fleet(Columns):
     """N vehicles: kind (N,) rows of `KINDS`, size (N, 3) m, and drivers of shape (N,)."""
 
     kind: IntArray
@@ -154,9 +154,6 @@ class Fleet:
     @property
     def length(self) -> FloatArray:
         return self.size[:, 0]
-
-    def __len__(self) -> int:
-        return len(self.kind)
 
 
 def sample_sizes(kind: IntArray, rng: np.random.Generator) -> FloatArray:

@@ -210,8 +210,7 @@ def _sample_vehicles(
             s.append(place + fleet.length[row] / 2)
             row, left = row + 1, left - 1
     chosen = np.array(rows)
-    fleet = Fleet(fleet.kind[chosen], fleet.size[chosen], fleet.drivers.select(chosen))
-    return fleet, trailer[chosen], np.array(lane), np.array(s)
+    return fleet.select(chosen), trailer[chosen], np.array(lane), np.array(s)
 
 
 _HEDGE_LENGTH = (4.0, 14.0)  # length of a hedge, m
