@@ -24,7 +24,6 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Self
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from saga_fg.learning.labelled_scene import LabelledScene
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import feet, wrap_angle
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.road_map import RoadMap, StopLine
+from saga_fg.types.road_map import Lane, LanesAcross, RoadMap, StopLine
 
 MOVING = 0.5  # m/s
 LONGEST = 6.0  # s, of all gaps
@@ -176,63 +175,20 @@ STEP = 0.5  # m between points: shorter ones are noise
 ONWARD = 80.0  # m beyond the last label
 
 
-@dataclass(frozen=True, eq=False)
-class Route:
-    """A line of S segments: ends (S + 1, 2), m, world; way (S + 1,) along it, m; direction (S,), rad."""
-
-    ends: FloatArray
-    way: FloatArray
-    direction: FloatArray
-
-    @classmethod
-    def of(cls, labelled: LabelledScene, row: int, start: int) -> Self | None:
-        """The route of an object from a moment on; None where neither labels nor heading tell a direction."""
-        labels = labelled.position[start:, row]
-        points = [labels[0]]
-        for point in labels[np.isfinite(labels[:, 0])]:
-            if np.hypot(*(point - points[-1])) >= STEP:
-                points.append(point)
-        if len(points) > 2:
-            onward = points[-1] - points[-3]
-        else:
-            yaw = labelled.yaw[start, row]
-            onward = np.array([np.cos(yaw), np.sin(yaw)]) if np.isfinite(yaw) else points[-1] - points[0]
-        length = float(np.hypot(*onward))
-        if length == 0:
-            return None
-        return cls.through(np.array([*points, points[-1] + ONWARD / length * onward]))
-
-    @classmethod
-    def through(cls, ends: FloatArray) -> Self:
-        """The route through points (S + 1, 2), neighbours apart."""
-        step = np.diff(ends, axis=0)
-        way = np.append(0.0, np.cumsum(np.hypot(step[:, 0], step[:, 1])))
-        return cls(ends, way, np.arctan2(step[:, 1], step[:, 0]))
-
-    def project(self, place: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Arc length (N,), m, lateral offset (N,), m, left is positive, and direction (N,), rad, of places (N, 2).
-
-        NaN for places of NaN. The way of places behind the start is negative, the last segment runs on.
-        """
-        known = np.isfinite(place[:, 0])
-        at = feet(self.ends, place[known])
-        found = np.full((3, len(place)), np.nan)
-        found[:, known] = at.s, at.e, np.arctan2(at.direction[:, 1], at.direction[:, 0])
-        return found[0], found[1], found[2]
-
-    def crossing(self, line: FloatArray) -> tuple[float, float]:
-        """The way to a line (2, 2) that the route crosses, m, and its direction there; infinite where it does not."""
-        a, step, across = self.ends[:-1], np.diff(self.ends, axis=0), line[1] - line[0]
-        area = step[:, 0] * across[1] - step[:, 1] * across[0]
-        offset = line[0] - a
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (offset[:, 0] * across[1] - offset[:, 1] * across[0]) / area
-            u = (offset[:, 0] * step[:, 1] - offset[:, 1] * step[:, 0]) / area
-        hit = np.flatnonzero((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1))
-        if len(hit) == 0:
-            return float("inf"), 0.0
-        k = int(hit[0])
-        return float(self.way[k] + t[k] * (self.way[k + 1] - self.way[k])), float(self.direction[k])
+def route_of(labelled: LabelledScene, row: int, start: int) -> FloatArray | None:
+    """Points (k, 2), m, world, of an object's route from a moment on; None where nothing tells a direction."""
+    labels = labelled.position[start:, row]
+    points = [labels[0]]
+    for point in labels[np.isfinite(labels[:, 0])]:
+        if np.hypot(*(point - points[-1])) >= STEP:
+            points.append(point)
+    if len(points) > 2:
+        onward = points[-1] - points[-3]
+    else:
+        yaw = labelled.yaw[start, row]
+        onward = np.array([np.cos(yaw), np.sin(yaw)]) if np.isfinite(yaw) else points[-1] - points[0]
+    length = float(np.hypot(*onward))
+    return np.array([*points, points[-1] + ONWARD / length * onward]) if length > 0 else None
 
 
 SITUATIONS = ("all", "moving", "stationary", "visible leader", "free", "halting", "starting", "turning", "at red")
@@ -254,13 +210,13 @@ def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset
     speed = np.hypot(*labelled.velocity[:, row].T)
     always = {"all", "moving" if gap.moving else "stationary"}
     leader: int | None = None
-    if labelled.label[row] in ROAD_USERS and (route := Route.of(labelled, row, start)) is not None:
+    if labelled.label[row] in ROAD_USERS and (route := route_of(labelled, row, start)) is not None:
         leader = leader_on(labelled, row, start, route)
         if leader is None:
             always.add("free")
         road, closed = lights_at(labelled, float(labelled.scene.timestamps[start]))
         line = first_line(road, route)
-        if line is not None and line[1].light in closed:
+        if line is not None and line.light in closed:
             always.add("at red")
     found = {}
     for length, end in reached(labelled.scene.timestamps, gap).items():
@@ -277,28 +233,27 @@ def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset
     return found
 
 
-def leader_on(labelled: LabelledScene, row: int, start: int, route: Route) -> int | None:
+def leader_on(labelled: LabelledScene, row: int, start: int, route: FloatArray) -> int | None:
     """The row of the nearest vehicle ahead of an object, None where there is none."""
-    along, aside, direction = route.project(labelled.position[start])
-    ahead = (along > TOUCHING) & (along <= LEADER_REACH) & (np.abs(aside) <= PATH_HALF_WIDTH)
-    ahead &= ~(np.cos(labelled.yaw[start] - direction) < 0.5)  # a heading that is not known is none against it
+    place = labelled.position[start]
+    at = feet(route, np.nan_to_num(place))
+    ahead = np.isfinite(place[:, 0]) & (at.s > TOUCHING) & (at.s <= LEADER_REACH) & (np.abs(at.e) <= PATH_HALF_WIDTH)
+    turned = labelled.yaw[start] - np.arctan2(at.direction[:, 1], at.direction[:, 0])
+    ahead &= ~(np.cos(turned) < 0.5)  # a heading that is not known is none against it
     ahead &= np.isin(labelled.label, ROAD_USERS)
     ahead[row] = False
     rows = np.flatnonzero(ahead)
-    return int(rows[np.argmin(along[rows])]) if len(rows) else None
+    return int(rows[np.argmin(at.s[rows])]) if len(rows) else None
 
 
-def first_line(road: RoadMap | None, route: Route) -> tuple[float, StopLine] | None:
-    """The first stop line that a route comes to within `LINE_REACH`, and the way to it, m."""
+def first_line(road: RoadMap | None, route: FloatArray) -> StopLine | None:
+    """The first stop line that a route crosses within `LINE_REACH`, in the direction of travel."""
     lines = road.stop_lines if road is not None else ()
-    crossed = [(way, line) for line in lines if (way := _way_to(line, route)) <= LINE_REACH]
-    return min(crossed, key=lambda each: each[0]) if crossed else None
-
-
-def _way_to(line: StopLine, route: Route) -> float:
-    """m along the route to a line that it crosses in the direction of travel; infinite where it does not."""
-    way, direction = route.crossing(line.ends)
-    return way if np.cos(direction - line.heading) > 0 else float("inf")
+    if not lines:
+        return None
+    across = LanesAcross.of([Lane("route", tuple((x, y) for x, y in route.tolist()))], lines)
+    ahead = np.flatnonzero((across.s >= 0) & (across.s <= LINE_REACH))
+    return lines[across.line[ahead[np.argmin(across.s[ahead])]]] if len(ahead) else None
 
 
 def lights_at(labelled: LabelledScene, time: float) -> tuple[RoadMap | None, frozenset[str]]:

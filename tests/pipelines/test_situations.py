@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.learning.gaps import GapOutcome, JudgedRun, Prediction, Run, situation_figures
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
-from saga_fg.learning.gaps import Gap, Route, situations_of
+from saga_fg.learning.gaps import Gap, route_of, situations_of
 from saga_fg.learning.labelled_scene import LabelledScene
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.road_map import RoadMap, StopLine, TrafficLight
@@ -101,7 +101,7 @@ def test_at_red_is_who_comes_to_the_line_while_it_is_closed() -> None:
 def test_an_object_without_direction_has_no_route() -> None:
     scene = labelled({"a": along(0 * TIMES)})
     scene.yaw[:] = np.nan
-    assert Route.of(scene, 0, 5) is None
+    assert route_of(scene, 0, 5) is None
     assert situations_of(scene, GAP)[1.0] == {"all", "moving"}
 
 
