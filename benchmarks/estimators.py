@@ -29,11 +29,11 @@ from benchmarks.runner import Row, Rows, Seed, counts, each, growth, in_turn, ti
 from factors import gaussian_factors, prior_factors
 from pipelines.tracking import one_thread, resident_memory
 from saga_fg.estimators import (
-    BatchSmoother,
     Gaussian,
     GraphFilter,
     IncrementalSmoother,
     JointKalmanFilter,
+    RecordingSmoother,
     kalman_predict,
     kalman_update,
     rts_smooth,
@@ -110,7 +110,7 @@ def _filters(kind: Kind, n: int, frames: int, seconds: float, seed: int) -> Iter
         bounds = tracker.tolerance, tracker.max_component
         filters["kalman, as in the tracker"] = Ours(JointKalmanFilter((), *bounds), scene)
     if kind == "components" or n <= DENSE:
-        filters["isam2"] = Ours(GraphFilter(likelihoods=False), scene)
+        filters["isam2"] = Ours(GraphFilter(), scene)
     anees: dict[str, list[float]] = {name: [] for name in filters}
 
     def judged() -> Iterator[FlockFrame]:
@@ -160,12 +160,12 @@ def _batch(kind: Kind, n: int, frames: int, seed: int) -> Iterator[Row]:
 
 
 def _batch_smoother(scene: Flock) -> list[Read]:
-    smoother = BatchSmoother(likelihoods=False)
+    smoother = RecordingSmoother()
     smoother.add(scene.nodes, scene.means, scene.covariances)
     for frame in scene.frames:
         smoother.predict(frame.transition)
         smoother.update(frame.measurements)
-    return [(now.state.reshape(len(scene), -1), now.covariance(scene.nodes)) for now in smoother.smoothed()]
+    return [(now.mean(scene.nodes), now.covariance(scene.nodes)) for now in smoother.finish()]
 
 
 def _textbook_smoother(scene: Flock) -> list[Read]:
@@ -194,7 +194,7 @@ def _running_graph(kind: Kind, n: int, frames: int, seconds: float) -> Iterator[
 
 def _endless(scene: Flock) -> Callable[[int], None]:
     """The linear filter on the same frames over and over."""
-    ours = Ours(GraphFilter(likelihoods=False), scene)
+    ours = Ours(GraphFilter(), scene)
     return lambda k: ours.step(scene.frames[k % len(scene.frames)])
 
 

@@ -72,12 +72,12 @@ class OurWindow(Ours):
     """The running graph over a window; the means of the whole window and the newest covariances are read."""
 
     def __init__(self, lag: int, flock: Flock) -> None:
-        self._smoother = GraphFilter(lag=lag * DT, likelihoods=False)
+        self._smoother = GraphFilter(lag=lag * DT)
         super().__init__(self._smoother, flock)
 
     def step(self, frame: FlockFrame) -> None:
         super().step(frame)
-        self.window = [moment.state for moment in self._smoother.smoothed(covariances=False)]
+        self.window = [moment.x.mean for moment in self._smoother.smoothed()]
 
 
 class Textbook:

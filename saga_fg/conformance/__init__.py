@@ -38,7 +38,7 @@ from saga_fg.conformance.programs import (
 )
 from saga_fg.errors import SagaError
 from saga_fg.estimators import Estimator, Measurements
-from saga_fg.estimators.base import missing
+from saga_fg.estimators.estimator import missing
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.scene_graph import SceneGraph
 

@@ -1,29 +1,24 @@
-"""Estimators behind one protocol, and the textbook reference they must agree with."""
+"""Estimators behind one base class, and the textbook reference they must agree with."""
 
-from saga_fg.estimators.backward import GaussNewtonSettings
-from saga_fg.estimators.base import EstimatorBase
-from saga_fg.estimators.batch import BatchSmoother, BatchSolver
+from saga_fg.estimators.batch import BatchSolver
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.estimator import Estimator
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_filter import GraphFilter
 from saga_fg.estimators.graph_window import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.estimators.kalman import JointKalmanFilter
-from saga_fg.estimators.measurements import Observations
+from saga_fg.estimators.measurements import Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
-from saga_fg.estimators.protocol import Estimator, Measurements
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
-from saga_fg.estimators.windowed import SmoothedState, WindowedSmoother, WindowSettings
+from saga_fg.estimators.smoother import RecordingSmoother, SmoothedState
 
 __all__ = [
-    "BatchSmoother",
     "BatchSolver",
     "BlockGaussian",
     "DetectionFactors",
     "Estimator",
-    "EstimatorBase",
-    "GaussNewtonSettings",
     "Gaussian",
     "GraduatedNonConvexity",
     "GraphFilter",
@@ -34,10 +29,9 @@ __all__ = [
     "Measurements",
     "NewObjects",
     "Observations",
+    "RecordingSmoother",
     "RelinearisationSettings",
     "SmoothedState",
-    "WindowSettings",
-    "WindowedSmoother",
     "kalman_predict",
     "kalman_update",
     "rts_smooth",

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.estimators.partition import BlockDiagonal, Partition, StateLayout, flattened, regrouped
-from saga_fg.kernels.components import node_blocks, uncorrelated_labels
+from saga_fg.kernels.components import uncorrelated_labels
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
 
 UNCORRELATED = 1e-12  # correlations below this have decayed to nothing: a share of the mean error, in sigmas
@@ -111,13 +111,29 @@ class BlockGaussian:
         parts = Partition(layout, joined)
         return self.partition if parts.count == self.partition.count else parts
 
+    def means_of(self, nodes: ArrayLike) -> FloatArray:
+        """(k, d) means of nodes of equal size d, by their ids."""
+        mean: FloatArray = self.mean[self.layout.spans(self.layout.rows(nodes))]
+        return mean
+
+    def covariances_of(self, nodes: ArrayLike) -> FloatArray:
+        """(k, d, d) covariances of nodes of equal size d, by their ids."""
+        rows = self.layout.rows(nodes)
+        self.layout.spans(rows)  # states of equal size, or an error that says so
+        return self.covariances(rows)
+
     def covariances(self, rows: IntArray) -> FloatArray:
         """(k, d, d) of the nodes at `rows`, whose states have equal size d."""
-        return diagonal_blocks(self.blocks, self.partition, rows)
+        return self.between(rows, rows)
 
     def joint(self, rows: IntArray) -> FloatArray:
         """Joint covariance of the nodes at `rows`, in this order, of any sizes."""
-        return joint_block(self.blocks, self.partition, rows)
+        if len(rows) == 0:
+            return np.empty((0, 0))
+        some = StateLayout(np.arange(len(rows)), self.layout.dims[rows])
+        together = Partition(some, np.zeros(len(rows), dtype=np.int64))
+        joint: FloatArray = regrouped(self.blocks, self.partition, together, rows)[0][0]
+        return joint
 
     def correlated(self, rows: IntArray) -> tuple[IntArray, IntArray]:
         """Pairs of the nodes `rows` (k,), distinct, that share a component: first < second (E,), places in `rows`."""
@@ -131,13 +147,12 @@ class BlockGaussian:
 
     def between(self, first: IntArray, second: IntArray) -> FloatArray:
         """Covariances (E, a, b) of nodes `first` (E,) of size a with `second` of size b, of the same components."""
-        dims, old = self.layout.dims, self.partition
+        dims, place = self.layout.dims, self.partition.block_places
         a, b = (int(dims[rows[0]]) if len(rows) else 0 for rows in (first, second))
-        result = np.empty((len(first), a, b))
-        for number, mine, at in old.members(first, a):
-            rows, columns = old.row[first[mine]], old.offset[second[mine]][:, None] + np.arange(b)
-            result[mine] = self.blocks[number][rows[:, None, None], at[:, :, None], columns[:, None, :]]
-        return result
+        corner = place.start[first] + place.size[first] * place.offset[first] + place.offset[second]
+        row = place.size[first][:, None, None] * np.arange(a)[:, None]
+        block: FloatArray = self.flat[corner[:, None, None] + row + np.arange(b)]
+        return block
 
     def variances(self) -> FloatArray:
         """(D,)"""
@@ -145,31 +160,6 @@ class BlockGaussian:
         for places, P in zip(self.partition.groups, self.blocks, strict=True):
             variances[places] = np.diagonal(P, axis1=1, axis2=2)
         return variances
-
-
-def diagonal_blocks(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
-    """(k, d, d) blocks of the nodes at `rows`, whose states have equal size d."""
-    if len(rows) == 0:
-        return np.empty((0, 0, 0))
-    place, d = partition.block_places, int(partition.layout.dims[rows[0]])
-    return node_blocks(flattened(blocks), place.start, place.size, place.offset, rows, d)
-
-
-def joint_block(blocks: BlockDiagonal, partition: Partition, rows: IntArray) -> FloatArray:
-    """The block of all nodes at `rows`, in this order, of any sizes: (D', D')."""
-    if len(rows) == 0:
-        return np.empty((0, 0))
-    some = StateLayout(np.arange(len(rows)), partition.layout.dims[rows])
-    joint: FloatArray = regrouped(blocks, partition, Partition(some, np.zeros(len(rows), dtype=np.int64)), rows)[0][0]
-    return joint
-
-
-def block_product(blocks: BlockDiagonal, partition: Partition, x: FloatArray) -> FloatArray:
-    """The product with a vector (D,)."""
-    result = np.empty(len(x))
-    for places, block in zip(partition.groups, blocks, strict=True):
-        result[places] = (block @ x[places][:, :, None])[:, :, 0]
-    return result
 
 
 def not_smaller(x: BlockGaussian, least: BlockGaussian, nodes: IntArray) -> BlockGaussian:

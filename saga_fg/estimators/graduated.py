@@ -9,8 +9,8 @@ standard deviations and c the largest that an inlier may have:
                         0                    s^2 >= (mu+1)/mu c^2       mu from c^2 / (2 s_max^2 - c^2) up, by 1.4,
                         c/s sqrt(mu(mu+1)) - mu  in between              until every weight is 0 or 1
 
-A recording is weighed by `BatchSmoother`; in a factor graph, factors with such a loss (`robust=`) are reached so by
-`solve_graduated`, while other solvers take the loss itself, mu at its end.
+Factors with such a loss (`robust=`) are reached so by `saga_fg.estimators.BatchSolver`, while other solvers take the
+loss itself, mu at its end.
 
 Source: Yang, Antonante, Tzoumas, Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020.
 """

@@ -22,21 +22,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors import Robust
 from factors.gaussian import Elimination
 from saga_fg.errors import InputError, UnknownNodeError, require_type
-from saga_fg.estimators.base import EstimatorBase
 from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian, not_smaller
-from saga_fg.estimators.dynamics import Dynamics, predict
+from saga_fg.estimators.estimator import Estimator
+from saga_fg.estimators.filtering import Dynamics, predict
 from saga_fg.estimators.graph_window import SAME_TIME, GraphWindow, WindowEpoch, linear_solution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.independent import IndependentObjects, IndependentVariables
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, by_covariance, lossy, merged, replace_by_prior
-from saga_fg.estimators.measurements import Observations, RecordedMeasurements, log_likelihood
+from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
-from saga_fg.estimators.partition import StateLayout, checked_prior
-from saga_fg.estimators.protocol import Measurements
-from saga_fg.estimators.windowed import JointCovariance, SmoothedState
+from saga_fg.estimators.partition import Partition, StateLayout, checked_prior
+from saga_fg.estimators.smoother import SmoothedState
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
 from saga_fg.graph.variables import MAP_NODE, OBJECT, node_key, node_kind
@@ -63,13 +61,12 @@ class GraphState:
     before: tuple[BlockGaussian, Dynamics] | None = None  # see there; without nodes in iSAM2 not needed
 
 
-class GraphFilter(EstimatorBase):
-    """The joint state of all nodes in a running graph. See `saga_fg.estimators.protocol.Estimator` for the methods.
+class GraphFilter(Estimator):
+    """The joint state of all nodes in a running graph. See `saga_fg.estimators.Estimator` for the methods.
 
     providers  of users' factors, asked by `ask_providers` once a frame
     lag        s; how long epochs stay in the graph. The last interval stays in any case, so that nonlinear motion is
                linearised where measurements put it
-    likelihoods  False: `update` returns NaN, and saves reading the state before and after it
 
     Estimates are those of the newest states, at any lag; `smoothed` has all epochs. A node whose state an interval
     leaves unchanged keeps its variable. Components whose noise is so small that factors would lose digits are predicted
@@ -79,8 +76,8 @@ class GraphFilter(EstimatorBase):
     `saga_fg.estimators.block_gaussian`: what was measured meanwhile counts for their place alone.
     """
 
-    def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0, likelihoods: bool = True) -> None:
-        self.providers, self.lag, self._likelihoods = tuple(providers), float(lag), likelihoods
+    def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0) -> None:
+        self.providers, self.lag = tuple(providers), float(lag)
         self._smoother = IncrementalSmoother(lag=lag)
         self._smoother.step(0.0)
         self._layout = StateLayout()
@@ -220,31 +217,27 @@ class GraphFilter(EstimatorBase):
         self,
         measurements: Measurements | Observations | Sequence[Measurements | Observations],
         time: float | None = None,
-        robust: Robust | None = None,
     ) -> float:
         """Take in measurements, several kinds of them by one solution, made at `time`, s, None for now.
 
         Those made late are put in their place, and all that came since comes again, providers' factors as well, which
-        are asked for again. Returns the log-likelihood of the measurements given all before.
+        are asked for again. Returns NaN.
         """
-        if robust is not None:
-            require_type("robust", robust, Robust)
-        given = measurements if isinstance(measurements, Sequence) else [measurements]
-        kinds = [RecordedMeasurements(each, robust) for each in given]
-        for recorded in kinds:
-            recorded.check(self._layout)
+        kinds = list(measurements) if isinstance(measurements, Sequence) else [measurements]
+        for one in kinds:
+            require_type("measurements", one, Measured)
+            one.rows(self._layout)
         k = None if time is None else self._window.place(time, self.start)
-        kinds = [recorded for recorded in kinds if len(recorded.measured)]
+        kinds = [one for one in kinds if len(one)]
         if not kinds:
             return 0.0
-        late = time is not None and time < self.time - SAME_TIME
-        before = self.posterior() if self._likelihoods and not late else None
         with self._changing():
-            if time is not None and k is not None and late:
-                return self._update_past(kinds, k, time)
-            likelihood = self._update_now(kinds, before)
-            self._note("update", [one.measured for one in kinds], None, robust, likelihood=likelihood)
-        return likelihood
+            if time is not None and k is not None and time < self.time - SAME_TIME:
+                self._update_past(kinds, k, time)
+            else:
+                self._update_now(kinds)
+                self._note("update", kinds)
+        return math.nan
 
     def remembered(self, nodes: ArrayLike, time: float) -> BoolArray:
         """(k,) whether measurements of nodes at `time`, s, can still be put there."""
@@ -309,23 +302,22 @@ class GraphFilter(EstimatorBase):
                 keys[epoch.number] = {**keys.get(epoch.number, {}), **own}
         return graph, [keys[epoch.number] for epoch in self._window.epochs]
 
-    def smoothed(self, covariances: bool = True) -> tuple[SmoothedState, ...]:
+    def smoothed(self) -> tuple[SmoothedState, ...]:
         """Every epoch within the lag, oldest first, of the nodes that are there now: given all measurements.
 
-        A node is in those epochs only in which the graph has its variable. Without `covariances` means only.
+        A node is in those epochs only in which the graph has its variable.
         """
         (graph, every), result = self._whole(), list[SmoothedState]()
-        solution, present = linear_solution(graph) if covariances else None, self._layout.nodes.tolist()
+        solution, present = linear_solution(graph), self._layout.nodes.tolist()
         for epoch, keys in zip(self._window.epochs, every, strict=True):
             if epoch.time < self.start - SAME_TIME:
                 continue
             layout = self._layout.select(np.array([keys.get(node) in graph.variables for node in present], dtype=bool))
             here = [keys[node] for node in layout.nodes.tolist()]
             mean = np.concatenate([np.empty(0), *(graph.state(key) for key in here)])
-            joint = None
-            if solution is not None:
-                joint = JointCovariance(layout, solution.covariance(here) if here else np.empty((0, 0)))
-            result.append(SmoothedState(epoch.time, layout, mean, joint))
+            joint = Partition(layout, np.zeros(len(layout), dtype=np.int64))
+            blocks = (solution.covariance(here)[None],) if here else ()
+            result.append(SmoothedState(epoch.time, BlockGaussian(joint, mean, blocks)))
         return tuple(result)
 
     def snapshot(self) -> GraphState:
@@ -357,10 +349,10 @@ class GraphFilter(EstimatorBase):
             self._before if self._keys else None,
         )
 
-    def _note(self, method: str, *arguments: Any, likelihood: float = 0.0) -> None:
+    def _note(self, method: str, *arguments: Any) -> None:
         """Note a call, to come again after a late measurement."""
         if self.lag:
-            self._window = self._window.called(method, *arguments, likelihood=likelihood)
+            self._window = self._window.called(method, *arguments)
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
@@ -454,7 +446,8 @@ class GraphFilter(EstimatorBase):
         change = None
         if tied.any():
             rows = np.flatnonzero(tied)
-            of_tied, x = dynamics.restricted(rows), x.without(np.flatnonzero(~tied))
+            x = x.without(np.flatnonzero(~tied))
+            of_tied = dynamics.of_nodes(x.layout)
             chosen = lossy(x, of_tied, still[rows], self._smoother.graph().elimination)
             if chosen.any():
                 change = self._predict_by_covariance(x, of_tied, chosen, keys)
@@ -514,41 +507,29 @@ class GraphFilter(EstimatorBase):
             layout = layout.extended([key], every[key].dim)
         return self._smoother.joint_gaussian(layout, [self._keys.get(node, node) for node in layout.nodes.tolist()])
 
-    def _update_now(self, kinds: Sequence[RecordedMeasurements], before: BlockGaussian | None) -> float:
-        """Take in measurements of the present epoch; returns their log-likelihood given `before`."""
-        likelihood = 0.0
-        self._tie(np.concatenate([one.measured.nodes for one in kinds if not one.linear] or [np.empty(0, int)]))
-        held: list[RecordedMeasurements] = []
-        for recorded in kinds:
-            tied = np.array([node in self._keys for node in recorded.measured.nodes.tolist()])
+    def _update_now(self, kinds: Sequence[Measurements | Observations]) -> None:
+        """Take in measurements of the present epoch."""
+        self._tie(np.concatenate([np.empty(0, dtype=np.int64), *(one.nodes for one in kinds if not one.linear)]))
+        held: list[Measurements | Observations] = []
+        for one in kinds:
+            tied = np.array([node in self._keys for node in one.nodes.tolist()])
             if tied.any():
-                held.append(recorded.only(tied))
+                held.append(one if tied.all() else one.only(tied))
             if not tied.all():
-                own = recorded.only(~tied).measured
-                assert isinstance(own, Measurements)
-                self._independent, more = self._independent.updated(own)
-                likelihood += more
-        return likelihood + self._measure(held, before) if held else likelihood
+                assert isinstance(one, Measurements)
+                self._independent = self._independent.updated(one.only(~tied))
+        if held:
+            alike = self._tied is not None and not self._smoother.nonlinear
+            self._smoother.extend([DetectionFactors(one, self._keys) for one in held])
+            nodes = {node for one in held for node in one.nodes.tolist()}
+            self._tied, self._stale = (self._tied, self._stale | nodes) if alike else (None, frozenset())
 
-    def _measure(self, kinds: Sequence[RecordedMeasurements], before: BlockGaussian | None) -> float:
-        """Add detection factors; returns their log-likelihood given `before`."""
-        nodes = np.unique(np.concatenate([one.measured.nodes for one in kinds]))
-        alike = self._tied is not None and not self._smoother.nonlinear
-        self._smoother.extend([DetectionFactors(one, self._keys) for one in kinds])
-        self._tied, self._stale = (self._tied, self._stale | set(nodes.tolist())) if alike else (None, frozenset())
-        if before is None:
-            return math.nan
-        layout = self._layout.select(np.sort(self._layout.rows(nodes)))
-        after = self._smoother.joint_gaussian(layout, [self._keys[node] for node in layout.nodes.tolist()])
-        return log_likelihood(before.only(layout.nodes), after, kinds)
-
-    def _update_past(self, kinds: Sequence[RecordedMeasurements], k: int, time: float) -> float:
-        """Go back to epoch k, take in measurements made at `time`, and go on again; returns their log-likelihood."""
-        epochs, known = self._window.epochs[k:], self._window.there
-        for recorded in kinds:
-            nodes = recorded.measured.nodes
-            if not (there := known(nodes, k)).all():
-                raise UnknownNodeError(f"node {nodes[~there][0]} is not remembered at {time:.6f} s")
+    def _update_past(self, kinds: Sequence[Measurements | Observations], k: int, time: float) -> None:
+        """Go back to epoch k, take in measurements made at `time`, and go on again."""
+        epochs = self._window.epochs[k:]
+        for one in kinds:
+            if not (there := self._window.there(one.nodes, k)).all():
+                raise UnknownNodeError(f"node {one.nodes[~there][0]} is not remembered at {time:.6f} s")
         now, transition = (self._smoother.frame, self._smoother.origin), epochs[0].transition
         assert transition is not None
         state = epochs[0].state
@@ -557,15 +538,14 @@ class GraphFilter(EstimatorBase):
             first, rest = IntervalDynamics(transition).split(time - epochs[0].time)
             self.predict(first.transition)
             transition = rest.transition
-        likelihood = self.update([one.measured for one in kinds], robust=kinds[0].loss)
+        self.update(kinds)
         for epoch in epochs[1:]:
             assert transition is not None
             self.predict(transition)
             for call in epoch.calls:
-                likelihood += (getattr(self, call.method)(*call.arguments) or 0.0) - call.likelihood
+                getattr(self, call.method)(*call.arguments)
             transition = epoch.transition
         self._smoother.frame, self._smoother.origin = now
-        return likelihood
 
 
 def _coupled(interval: IntervalDynamics, dynamics: Dynamics) -> BoolArray:

@@ -101,11 +101,10 @@ LEFT = "marginalise"  # the call by which nodes leave
 
 @dataclass(frozen=True, eq=False)
 class Call:
-    """A call that changed the filter: a method with its arguments, and the log-likelihood that it returned."""
+    """A call that changed the filter: a method with its arguments."""
 
     method: str
     arguments: tuple[Any, ...]
-    likelihood: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,11 +139,10 @@ class GraphWindow:
         """Time of the oldest epoch, s."""
         return self.epochs[0].time
 
-    def called(self, method: str, *arguments: Any, likelihood: float = 0.0) -> GraphWindow:
+    def called(self, method: str, *arguments: Any) -> GraphWindow:
         """Note a call."""
         newest = self.newest
-        call = Call(method, arguments, likelihood)
-        return GraphWindow((*self.epochs[:-1], replace(newest, calls=(*newest.calls, call))))
+        return GraphWindow((*self.epochs[:-1], replace(newest, calls=(*newest.calls, Call(method, arguments)))))
 
     @property
     def without_states(self) -> GraphWindow:

@@ -5,7 +5,7 @@ Objects that nothing ties to others, over the epochs of a window: all of them in
     x_i' = F_ii x_i + b_i + q_i,    z = H x_i + v        P = blockdiag( P_1, ..., P_n )
 
 Eliminating the chain of such an object in the order of time is the Kalman filter, whose kernels do it here for all
-objects at once (`saga_fg.estimators.correction`). What would be their factors are arrays; those of an object that is
+objects at once (`saga_fg.estimators.filtering`). What would be their factors are arrays; those of an object that is
 tied to others, or that somebody looks at, are made then, over all of its epochs in the window.
 """
 
@@ -15,21 +15,17 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import gtsam
 import numpy as np
 
-from factors import GaussianFactors, Vector, joint_prior_factor, stacked_gaussian_factors, stacked_prior_factors
+from factors import GaussianFactors, Vector, stacked_gaussian_factors
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.correction import corrected, predicted
-from saga_fg.estimators.dynamics import Dynamics, noise_ratio
+from saga_fg.estimators.filtering import Dynamics, corrected, noise_ratio, predict
 from saga_fg.estimators.interval_dynamics import LARGEST_RATIO, merged
-from saga_fg.estimators.measurements import LinearisedMeasurements, RecordedMeasurements
-from saga_fg.estimators.object_factors import measurement_factors
+from saga_fg.estimators.measurements import Measurements
+from saga_fg.estimators.object_factors import measurement_factors, prior_factors
 from saga_fg.estimators.partition import StateLayout
-from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable, NewVariable, VariableKind, node_key, node_kind
-from saga_fg.model.discretisation import Blocks
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
 
@@ -97,18 +93,20 @@ class IndependentObjects:
     def predicted(self, dynamics: Dynamics, number: int, time: float, since: float | None) -> IndependentObjects:
         """Begin the next epoch; dynamics: of all nodes; since: time from which epochs are kept, s, None for none."""
         last = self.epochs[-1]
-        own = _own_motion(dynamics, last.x.layout)
-        newest = IndependentEpoch(number, time, _moved(last.x, own))
+        own = dynamics.of_nodes(last.x.layout, alone=True)
+        newest = IndependentEpoch(number, time, predict(last.x, own) if len(last.x.layout) else last.x)
         if since is None:
             return IndependentObjects((newest,))
         first = max((k for k, epoch in enumerate(self.epochs) if epoch.time <= since), default=0)
         return IndependentObjects((*self.epochs[first:-1], replace(last, dynamics=own), newest))
 
-    def updated(self, measured: Measurements) -> tuple[IndependentObjects, float]:
-        """Take in measurements made now; returns also their log-likelihood."""
+    def updated(self, measured: Measurements) -> IndependentObjects:
+        """Take in measurements made now."""
         last = self.epochs[-1]
-        x, likelihood = _corrected(last.x, measured)
-        return self._with_newest(replace(last, x=x, measurements=(*last.measurements, measured))), likelihood
+        if len(measured) == 0:
+            return self
+        x, _ = corrected(last.x, measured.linearised(last.x.layout, last.x.mean))
+        return self._with_newest(replace(last, x=x, measurements=(*last.measurements, measured)))
 
     def since(self, node: int) -> int:
         """The place of the first epoch of the window from which on an object has been there."""
@@ -146,13 +144,13 @@ class IndependentObjects:
             ]
             graph.add_variables("new objects", new, (epoch.number, epoch.time))
             begun = np.array([node for node in here.tolist() if node not in earlier], dtype=np.int64)
-            graph.add_factors("new objects", list(_prior_factors(epoch.x.only(begun), keys)))
+            graph.add_factors("new objects", list(prior_factors(epoch.x.only(begun), keys)))
             if dynamics is not None and earlier:
                 going = np.array(list(earlier), dtype=np.int64)
                 factors = list(_motion_factors(dynamics, np.setdiff1d(going, list(kept)), earlier, keys))
                 graph.add_factors("interactions", factors, (epoch.number, int(going[0])))
                 for one in epoch.measurements:
-                    seen = RecordedMeasurements(_only(one, going))
+                    seen = one.only(np.isin(one.nodes, going))
                     graph.add_factors("detections", measurement_factors(keys, seen))
             every.append(keys)
         number = self.epochs[-1].number
@@ -164,43 +162,11 @@ class IndependentObjects:
         return IndependentObjects((*self.epochs[:-1], epoch))
 
 
-def _own_motion(dynamics: Dynamics, layout: StateLayout) -> Dynamics:
-    """The dynamics of some nodes, on which nobody acts, in the order of `layout`."""
-    rows = dynamics.layout.rows(layout.nodes)
-    place = np.full(len(dynamics.layout), -1)
-    place[rows] = np.arange(len(rows))
-    F, Q = (
-        tuple(
-            Blocks(place[group.target[mine]], place[group.target[mine]], group.values[mine])
-            for group in groups
-            if (mine := (place[group.target] >= 0) & (group.target == group.source)).any()
-        )
-        for groups in (dynamics.F, dynamics.Q)
-    )
-    return Dynamics(layout, F, dynamics.b[dynamics.layout.places(rows)], Q)
-
-
-def _moved(x: BlockGaussian, own: Dynamics) -> BlockGaussian:
-    return predicted(x, own, None, False) if len(x.layout) else x
-
-
-def _corrected(x: BlockGaussian, measured: Measurements) -> tuple[BlockGaussian, float]:
-    if len(measured) == 0:
-        return x, 0.0
-    return corrected(x, LinearisedMeasurements(x.layout.rows(measured.nodes), measured.z, measured.H, measured.R))
-
-
-def _only(measured: Measurements, nodes: IntArray) -> Measurements:
-    """The measurements of some nodes."""
-    mine = np.isin(measured.nodes, nodes)
-    return Measurements.unchecked(measured.nodes[mine], measured.z[mine], measured.H[mine], measured.R[mine])
-
-
 def _without_factor(dynamics: Dynamics | None, x: BlockGaussian) -> list[int]:
     """Ids of the nodes of `x` that move in the interval before with too little noise for a factor."""
     if dynamics is None or len(x.layout) == 0:
         return []
-    own = _own_motion(dynamics, x.layout)
+    own = dynamics.of_nodes(x.layout, alone=True)
     ratio = np.full(len(x.layout), np.inf)
     for Q in own.Q:
         ratio[Q.target] = noise_ratio(x.covariances(Q.target), Q.values)
@@ -208,25 +174,11 @@ def _without_factor(dynamics: Dynamics | None, x: BlockGaussian) -> list[int]:
     return list(x.layout.nodes[none].tolist())
 
 
-def _prior_factors(x: BlockGaussian, keys: Mapping[int, int]) -> Iterator[GaussianFactors | gtsam.JacobianFactor]:
-    """One prior a component."""
-    label, ids = x.partition.label, x.layout.nodes
-    alone = np.bincount(label)[label] == 1
-    for d in np.unique(x.layout.dims[alone]).tolist():
-        rows = np.flatnonzero(alone & (x.layout.dims == d))
-        names = [keys[node] for node in ids[rows].tolist()]
-        yield stacked_prior_factors(names, x.mean[x.layout.spans(rows)], x.covariances(rows))
-    for number in np.unique(label[~alone]).tolist():
-        rows = np.flatnonzero(label == number)
-        means = [x.mean[x.layout.offsets[row] : x.layout.offsets[row + 1]] for row in rows.tolist()]
-        yield joint_prior_factor([keys[node] for node in ids[rows].tolist()], means, x.joint(rows))
-
-
 def _motion_factors(
     dynamics: Dynamics, nodes: IntArray, earlier: Mapping[int, int], keys: Mapping[int, int]
 ) -> Iterator[GaussianFactors]:
     """|| x_i' - F_ii x_i - b_i ||_{Q_i} of some nodes."""
-    own = _own_motion(dynamics, dynamics.layout.select(np.isin(dynamics.layout.nodes, nodes)))
+    own = dynamics.of_nodes(dynamics.layout.select(np.isin(dynamics.layout.nodes, nodes)), alone=True)
     for F in own.F:
         rows, ids = F.target, own.layout.nodes[F.target].tolist()
         noise = np.zeros((len(own.layout), *F.values.shape[1:]))

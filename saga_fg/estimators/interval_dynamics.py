@@ -35,7 +35,7 @@ from factors.gaussian import Elimination
 from factors.validation import KeyArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.dynamics import Dynamics, identity, noise_ratio, predict
+from saga_fg.estimators.filtering import Dynamics, noise_ratio, predict
 from saga_fg.estimators.partition import Partition, StateLayout, zeros
 from saga_fg.graph.factor_checks import solver_error, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -48,10 +48,9 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 
 @dataclass(frozen=True, eq=False)
 class IntervalDynamics:
-    """The record of an interval. most: number of nodes beyond which components are not joined, see `FilterStep`."""
+    """The record of an interval."""
 
     transition: Transition
-    most: int | None = None
 
     @property
     def dt(self) -> float:
@@ -73,15 +72,11 @@ class IntervalDynamics:
         place = layout.rows(self.transition.nodes)
         return [(group, place[group.rows]) for group in self.nonlinear]
 
-    def check(self, layout: StateLayout) -> None:
-        """Raise `InputError` or `UnknownNodeError` unless it is about exactly the nodes of `layout`, each once."""
-        Dynamics.of(self.transition, layout)
-
     def split(self, dt: float) -> tuple[IntervalDynamics, IntervalDynamics]:
         """The first `dt` seconds of the interval and the rest, with the same edges."""
         graph = self.transition.graph
         first, rest = discretise(graph, dt), discretise(graph.after(dt), self.transition.dt - dt)
-        return IntervalDynamics(first, self.most), IntervalDynamics(rest, self.most)
+        return IntervalDynamics(first), IntervalDynamics(rest)
 
     def linearised(self, layout: StateLayout, mean: FloatArray) -> Dynamics:
         """The linear dynamics over the nodes of `layout`, nonlinear ones linearised at the joint state `mean`."""
@@ -106,19 +101,6 @@ class IntervalDynamics:
             b[layout.spans(rows[:, 0])] = moved
             F += [Blocks(rows[:, 0], column, block) for column, block in zip(rows.T, J, strict=True)]
         return Dynamics(layout, tuple(F), b, linear.Q)
-
-
-@dataclass(frozen=True, eq=False)
-class ZeroInterval:
-    """An interval of 0 s, between two epochs at the same time."""
-
-    dt: float = 0.0
-    linear: bool = True
-    most: int | None = None
-
-    def linearised(self, layout: StateLayout, mean: FloatArray) -> Dynamics:
-        """The identity."""
-        return Dynamics(layout, identity(layout, np.arange(len(layout))), np.zeros(len(mean)), ())
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +328,8 @@ def by_covariance(x: BlockGaussian, dynamics: Dynamics, chosen: BoolArray) -> Bl
     """The prediction of those components of `x` that have one of the first nodes, which are `chosen` (n,)."""
     label = dynamics.joined(x.partition).label
     mine = np.isin(label, label[: len(chosen)][chosen])
-    return predict(x.without(np.flatnonzero(~mine)), dynamics.restricted(np.flatnonzero(mine)))
+    moving = x.without(np.flatnonzero(~mine))
+    return predict(moving, dynamics.of_nodes(moving.layout))
 
 
 def replace_by_prior(

@@ -34,19 +34,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike
 
 from factors import SingularSystemError
 from saga_fg.errors import InputError, require_type
-from saga_fg.estimators.base import EstimatorBase
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.correction import WhitenedFactor, correct_whitened, corrected, predicted
-from saga_fg.estimators.dynamics import ComponentBounds, Dynamics, identity, predict
+from saga_fg.estimators.estimator import Estimator
+from saga_fg.estimators.filtering import ComponentBounds, Dynamics, corrected, identity, lost_in_rounding, predict
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, replace_by_prior
-from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.partition import Partition, StateLayout, checked_prior
-from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -139,17 +138,47 @@ def asked(
         bare.add_variables("", [_again(one, one.type.read(base, key)) for key, one in new.items()])
         x, factors = _with_new_variables(graph, x, ids, new, factors)
         ids |= {key: key for key in new}
-    increment, others, measured = np.zeros(len(x.mean)), x.layout.places(AuxiliaryVariables(bare).rows(x.layout)), []
+    increment, others = np.zeros(len(x.mean)), x.layout.places(AuxiliaryVariables(bare).rows(x.layout))
     increment[others] = x.mean[others]
-    for keys, A in factors:
-        rows = x.layout.rows([ids[key] for key in keys])
-        measured.append(WhitenedFactor(rows, A[:, :-1], A[:, -1] - A[:, :-1] @ increment[x.layout.places(rows)]))
-    x = correct_whitened(x, measured)
+    x = _corrected(x, [(x.layout.rows([ids[key] for key in keys]), A) for keys, A in factors], increment)
     leaving = [key for key, one in bare.variables.items() if last and one.epoch not in (None, bare.epoch)]
     bare.marginalise(leaving)
     x = x.without(x.layout.rows([key for key in leaving if key in ids]))
     _move(bare, x, ids)
     return x, AuxiliaryVariables(bare, auxiliary.labels)
+
+
+def _corrected(
+    x: BlockGaussian, factors: Sequence[tuple[IntArray, FloatArray]], increment: FloatArray
+) -> BlockGaussian:
+    """The posterior given factors [A | b] on the nodes at some rows, whose components become one; noise of variance 1.
+
+    increment (D,): where the factors on increments count from, 0 for those on states
+    """
+    for rows, _ in factors:
+        x = x.over(x.partition.joined(rows[:1].repeat(len(rows)), rows))
+    partition, mean, blocks = x.partition, x.mean.copy(), [P.copy() for P in x.blocks]
+    label = np.array([partition.label[rows[0]] for rows, _ in factors])
+    for number in np.unique(label).tolist():
+        mine = [factors[k] for k in np.flatnonzero(label == number).tolist()]
+        group, row = partition.group[mine[0][0][0]], partition.row[mine[0][0][0]]
+        places, P = partition.groups[group][row], blocks[group][row]
+        H, innovation = [], []
+        for rows, A in mine:
+            at = x.layout.places(rows)
+            H.append(np.zeros((len(A), len(places))))
+            H[-1][:, np.searchsorted(places, at)] = A[:, :-1]
+            innovation.append(A[:, -1] - A[:, :-1] @ increment[at])
+        J = np.concatenate(H)
+        S = J @ P @ J.T + np.eye(len(J))
+        try:
+            K = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), J @ P).T
+        except (np.linalg.LinAlgError, ValueError):
+            raise lost_in_rounding(S.max()) from None
+        kept = np.eye(len(P)) - K @ J
+        mean[places] += K @ np.concatenate(innovation)
+        blocks[group][row] = kept @ P @ kept.T + K @ K.T
+    return BlockGaussian(partition, mean, tuple(blocks))
 
 
 def _move(graph: SceneFactorGraph, x: BlockGaussian, ids: Mapping[int, int]) -> None:
@@ -268,8 +297,8 @@ class KalmanState:
     auxiliary: AuxiliaryVariables | None
 
 
-class JointKalmanFilter(EstimatorBase):
-    """The exact filter on the joint state. See `saga_fg.estimators.protocol.Estimator` for the methods.
+class JointKalmanFilter(Estimator):
+    """The exact filter on the joint state. See `saga_fg.estimators.Estimator` for the methods.
 
     providers  asked by `ask_providers`, once a frame, for factors on the newest variables: an extended Kalman filter
     tolerance  correlation up to which nodes are taken for independent, and neighbours for independent inputs; 0: none
@@ -347,8 +376,12 @@ class JointKalmanFilter(EstimatorBase):
 
     def predict(self, transition: Transition) -> None:
         dynamics = self._auxiliary.dynamics(transition, self._state)
-        look = self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1
-        self._state = predicted(self._state, dynamics, self.bounds, look)
+        x, partition = self._state, None
+        if self.bounds is not None:
+            partition = self.bounds.components(x, dynamics)
+        elif self._predictions % _DECOUPLE_EVERY == _DECOUPLE_EVERY - 1:
+            x = dynamics.separated(x)
+        self._state = predict(x, dynamics, partition)
         self._predictions += 1
         self._time += transition.dt
 
@@ -362,9 +395,9 @@ class JointKalmanFilter(EstimatorBase):
             raise InputError("time: the filter has no past; expected measurements moved to the present")
         x, total = self._state, 0.0
         for each in measurements if isinstance(measurements, Sequence) else (measurements,):
-            recorded = RecordedMeasurements(each)
-            if len(rows := recorded.check(x.layout)):
-                x, log_likelihood = corrected(x, recorded.linearised(x.layout, x.mean, rows))
+            require_type("measurements", each, Measured)
+            if len(rows := each.rows(x.layout)):
+                x, log_likelihood = corrected(x, each.linearised(x.layout, x.mean, rows))
                 total += log_likelihood
         self._state = x
         return total

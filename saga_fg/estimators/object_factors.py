@@ -1,16 +1,16 @@
-"""Objects in the running graph: their factors, the providers of these, and the graph of a recording.
+"""Objects in the running graph: their factors, the providers of these, and the graph of what a filter knows.
 
     prior        || x_i - m ||_P                             `NewObjects`; one joint factor for a component at the start
     interaction  || x_i' - sum_j F_ij x_j - b_i ||_{Q_i}     `Interactions`, one n-ary factor a node and interval
     detection    || z - H x_i ||_R                           `DetectionFactors`, one a measurement
 
-In the graph of a recording every node has a variable of its own at every epoch, but for one that nothing moves or
-disturbs, such as a pole: it keeps the variable of the epoch before, since a direction without noise has no factor.
+A node that nothing moves or disturbs, such as a pole, keeps the variable of the epoch before, since a direction without
+noise has no factor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -30,11 +30,9 @@ from factors import (
 )
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.epoch import Epoch
-from saga_fg.estimators.interval_dynamics import IntervalDynamics, ZeroInterval
-from saga_fg.estimators.measurements import Observations, RecordedMeasurements
+from saga_fg.estimators.interval_dynamics import IntervalDynamics
+from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.partition import StateLayout
-from saga_fg.estimators.protocol import Measurements
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import NewVariable, node_key, node_kind
@@ -45,125 +43,49 @@ _SINGULAR = 1e-13  # share of the variances of axes below which a direction has 
 Factors = list[gtsam.JacobianFactor | GaussianFactors | ResidualFactors]
 
 
-@dataclass(frozen=True, eq=False)
-class EpochFactors:
-    """keys: of the variable of each node at an epoch; factors that come in with it, by what they are."""
-
-    keys: dict[int, int]
-    factors: dict[str, Factors]
-
-
 def prior_graph(x: BlockGaussian, time: float) -> SceneFactorGraph:
-    """The graph of what a filter knows at `time`, s: one joint prior for each component."""
-    return recording_graph(x, [Epoch(time)], [x.layout], [x.mean])
+    """The graph of what a filter knows at `time`, s: one joint prior for each component.
 
-
-def recording_graph(
-    prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[StateLayout], means: Sequence[FloatArray]
-) -> SceneFactorGraph:
-    """The graph of `epochs` after `prior`; layouts and smoothed means of each epoch's joint state.
-
-    Raises `InputError` where a covariance has become singular, or a node that moves has no noise in some direction, so
-    that no factor can be made of it.
+    Raises `InputError` where a covariance has become singular.
     """
+    graph, names = SceneFactorGraph(), x.layout.nodes.tolist()
+    graph.advance(time)
+    states = np.split(x.mean, x.layout.offsets[1:-1]) if names else []
+    keys = graph.add_variables("", [NewVariable(*node_kind(n), state) for n, state in zip(names, states, strict=True)])
     try:
-        recorded = recording_factors(prior, epochs, layouts, means)
+        priors = list(prior_factors(x, dict(zip(names, keys, strict=True))))
     except FactorError as error:
         raise InputError(f"graph: {error}") from error
-    graph = SceneFactorGraph()
-    for epoch, layout, mean, one in zip(epochs, layouts, means, recorded, strict=True):
-        time = max(epoch.time, float(np.nextafter(graph.time, np.inf)))  # two may be at the same time
-        graph.advance(time, [key for key in one.keys.values() if key in graph.variables])
-        new = [
-            NewVariable(*node_kind(node), mean[layout.offsets[row] : layout.offsets[row + 1]])
-            for row, node in enumerate(layout.nodes.tolist())
-            if one.keys[node] not in graph.variables
-        ]
-        graph.add_variables("recording", new)
-        for name, factors in one.factors.items():
-            graph.add_factors(name, factors)
+    graph.add_factors("prior", priors)
     return graph
 
 
-def recording_factors(
-    prior: BlockGaussian, epochs: Sequence[Epoch], layouts: Sequence[StateLayout], means: Sequence[FloatArray]
-) -> list[EpochFactors]:
-    """The factors epoch by epoch, nonlinear ones and noise at the means. Raises `FactorError`, as the graph."""
-    result: list[EpochFactors] = []
-    keys: dict[int, int] = {}  # of nodes that have a variable already
-    moved: Factors = []
-    for k, (epoch, layout) in enumerate(zip(epochs, layouts, strict=True)):
-        keys = {node: keys.get(node) or node_key(node, k) for node in layout.nodes.tolist()}
-        factors: dict[str, Factors] = {
-            "interactions": moved,
-            "prior": _prior_factors(prior, keys) if k == 0 and len(prior.layout) else [],
-            "new objects": [
-                stacked_prior_factors([keys[n] for n in new.nodes.tolist()], new.means, new.covariances)
-                for new in epoch.new_nodes
-            ],
-            "detections": [factor for one in epoch.measurements for factor in measurement_factors(keys, one)],
-        }
-        result.append(EpochFactors(keys, factors))
-        if epoch.interval is not None:
-            leaving = layout.rows(epoch.leaving)
-            stay = layout.without(leaving) if len(leaving) else layout
-            at = means[k][layout.places(layout.rows(stay.nodes))]
-            resting = stay.nodes[epoch.interval.linearised(stay, at).unchanged].tolist()
-            now, keys = keys, {node: keys[node] for node in resting}
-            then = {node: node_key(node, k + 1) for node in stay.nodes.tolist()} | keys
-            native, nonlinear = interval_factors(epoch.interval, stay, at, now, then)
-            moved = [*native, *nonlinear]
-    return result
+def prior_factors(x: BlockGaussian, keys: Mapping[int, int]) -> Iterator[GaussianFactors | gtsam.JacobianFactor]:
+    """One prior a component."""
+    label, ids = x.partition.label, x.layout.nodes
+    alone = np.bincount(label)[label] == 1
+    for d in np.unique(x.layout.dims[alone]).tolist():
+        rows = np.flatnonzero(alone & (x.layout.dims == d))
+        names = [keys[node] for node in ids[rows].tolist()]
+        yield stacked_prior_factors(names, x.mean[x.layout.spans(rows)], x.covariances(rows))
+    for number in np.unique(label[~alone]).tolist():
+        rows = np.flatnonzero(label == number)
+        means = [x.mean[x.layout.offsets[row] : x.layout.offsets[row + 1]] for row in rows.tolist()]
+        yield joint_prior_factor([keys[node] for node in ids[rows].tolist()], means, x.joint(rows))
 
 
-def _prior_factors(x: BlockGaussian, keys: dict[int, int]) -> Factors:
-    """One joint factor a component."""
-    factors: Factors = []
-    for label in range(x.partition.count):
-        rows = np.flatnonzero(x.partition.label == label)
-        means = [x.mean[x.layout.places(rows[k : k + 1])] for k in range(len(rows))]
-        names = [keys[node] for node in x.layout.nodes[rows].tolist()]
-        factors.append(joint_prior_factor(names, means, x.joint(rows)))
-    return factors
-
-
-def measurement_factors(keys: Mapping[int, int], recorded: RecordedMeasurements) -> Factors:
-    """Return the factors of measurements, native where they are linear; keys: of the variables by id.
-
-    Measurements of weight 0 have none.
-    """
-    measured = recorded.measured
-    weights = np.ones(len(measured)) if recorded.weights is None else recorded.weights
-    kept = np.flatnonzero(weights > 0)
-    names = np.array([keys[node] for node in measured.nodes[kept].tolist()], dtype=np.uint64)
-    z, R = measured.z[kept], measured.R[kept] / weights[kept, None, None]
-    if not isinstance(measured, Measurements):
-        return [detection_factors(names, measured.model, z, R, recorded.loss)]
-    H = measured.H[kept]
-    if recorded.loss is None:
-        informative = H.any(axis=(1, 2))
-        return [stacked_gaussian_factors(names[informative, None], [H[informative]], z[informative], R[informative])]
-    difference, rows, dims = _LinearDifference(H, z), names[:, None], (H.shape[2],)
-    name = "robust detections"
-    return [ResidualFactors(rows, dims, difference.residual, R, difference.jacobians, recorded.loss, name=name)]
-
-
-@dataclass(frozen=True, eq=False)
-class _LinearDifference:
-    """H x - z of n measurements: H (n, m, d), z (n, m)."""
-
-    H: FloatArray
-    z: FloatArray
-
-    def residual(self, x: FloatArray) -> FloatArray:
-        return np.asarray((self.H @ x[:, :, None])[:, :, 0] - self.z)
-
-    def jacobians(self, x: FloatArray) -> list[FloatArray]:
-        return [self.H]
+def measurement_factors(keys: Mapping[int, int], measured: Measured) -> Factors:
+    """Return the factors of measurements, native where they are linear; keys: of the variables by id."""
+    names = np.array([keys[node] for node in measured.nodes.tolist()], dtype=np.uint64)
+    if isinstance(measured, Observations):
+        return [detection_factors(names, measured.model, measured.z, measured.R)]
+    assert isinstance(measured, Measurements)
+    told = measured.H.any(axis=(1, 2))
+    return [stacked_gaussian_factors(names[told, None], [measured.H[told]], measured.z[told], measured.R[told])]
 
 
 def interval_factors(
-    interval: IntervalDynamics | ZeroInterval,
+    interval: IntervalDynamics,
     layout: StateLayout,
     mean: FloatArray,
     keys: Mapping[int, int],
@@ -188,7 +110,7 @@ def interval_factors(
         block_shapes[np.unique(blocks.target)] += 1
     nonlinear: list[ResidualFactors] = []
     moves_nonlinearly = same.copy()
-    for group, rows in interval.nonlinear_rows(layout) if isinstance(interval, IntervalDynamics) else ():
+    for group, rows in interval.nonlinear_rows(layout):
         moves_nonlinearly[rows[:, 0]] = True
         nonlinear.append(group.factors(then[rows[:, 0]], now[rows]))
     together = regular & (block_shapes == 1) & ~moves_nonlinearly
@@ -295,13 +217,11 @@ class Interactions:
 class DetectionFactors:
     """Measurements of objects; keys: of their variables by id, by default those of this epoch."""
 
-    measurements: Measurements | Observations | RecordedMeasurements
+    measured: Measured
     keys: Mapping[int, int] | None = None
     name: str = "detections"
     internal: ClassVar[bool] = True
 
     def factors(self, view: GraphView) -> Additions:
-        given = self.measurements
-        recorded = given if isinstance(given, RecordedMeasurements) else RecordedMeasurements(given)
-        now = self.keys or {node: node_key(node, view.epoch) for node in recorded.measured.nodes.tolist()}
-        return Additions(factors=measurement_factors(now, recorded))
+        now = self.keys or {node: node_key(node, view.epoch) for node in self.measured.nodes.tolist()}
+        return Additions(factors=measurement_factors(now, self.measured))

@@ -193,29 +193,6 @@ class Partition:
         return self.block_places.offset
 
     @cached_property
-    def size(self) -> int | None:
-        """d where all nodes have states of equal size d, else None."""
-        dims = self.layout.dims
-        return int(dims[0]) if len(dims) and (dims == dims[0]).all() else None
-
-    def by_nodes(self, blocks: FloatArray) -> FloatArray:
-        """A view (c, s/d, s/d, d, d) of blocks (c, s, s): [k, i, j] is that of two nodes. Only with `size`.
-
-        Indexing nodes in it is several times as fast as indexing the entries of their blocks.
-        """
-        d = self.size
-        assert d is not None
-        assert blocks.flags.c_contiguous  # or it would be a copy
-        c, s, _ = blocks.shape
-        return blocks.reshape(c, s // d, d, s // d, d).swapaxes(2, 3)
-
-    @cached_property
-    def slot(self) -> IntArray:
-        """(n,) the place of each node within its component, counted in nodes. Only with `size`."""
-        assert self.size is not None
-        return self.offset // self.size
-
-    @cached_property
     def _tables(self) -> tuple[tuple[IntArray, ...], IntArray, IntArray, BlockPlaces]:
         """Groups, group and row of each node, and what kernels need."""
         group, row, offset, start, size, first, sizes, counts, places = component_tables(self.label, self.layout.dims)
@@ -229,19 +206,6 @@ class Partition:
     def block_places(self) -> BlockPlaces:
         """Index of the blocks, for kernels."""
         return self._tables[3]
-
-    def members(self, rows: IntArray, dim: int) -> list[tuple[int, IntArray, IntArray]]:
-        """Node rows (m,) of states of size `dim`, by group of components: its number, which of them, where.
-
-        Where: (., dim), the places of each state within its component.
-        """
-        at = self.offset[rows][:, None] + np.arange(dim)
-        if len(self.groups) == 1 and len(rows):
-            return [(0, np.arange(len(rows)), at)]
-        group = self.group[rows]
-        numbers = np.unique(group).tolist()
-        members = [(group == number).nonzero()[0] for number in numbers]
-        return [(number, mine, at[mine]) for number, mine in zip(numbers, members, strict=True)]
 
     def joined(self, target: IntArray, source: IntArray) -> Partition:
         """Join the components of node rows target[k] and source[k]; itself where they are one already."""

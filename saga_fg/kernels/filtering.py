@@ -281,7 +281,7 @@ def tie_strengths(
 ) -> FloatArray:
     """(m,) largest correlation that each block of F between two parts brings about, 0 within one.
 
-    In deviations before the interval, see `saga_fg.estimators.dynamics`; part (n,) of each node
+    In deviations before the interval, see `saga_fg.estimators.filtering`; part (n,) of each node
     """
     strength = np.zeros(len(target))
     for e in range(len(target)):

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
-from saga_fg.estimators.base import EstimatorBase
+from saga_fg.estimators import Estimator
 from saga_fg.model.discretisation import Transition
 from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import Interaction, NodeTable
@@ -48,7 +48,7 @@ from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings
 from saga_fg.types.dataset import LabelledObjects, Scene
 
 
-class Marginals(EstimatorBase):
+class Marginals(Estimator):
     """n nodes with the ids 0 to n - 1 as far as a tracker's prediction needs an estimator.
 
     means (n, D), covariances (n, D, D): padded to the largest state

@@ -7,10 +7,10 @@ States of all objects at all moments of a recording, given all of its detections
     detection     rho( || z - H x_i(k) ||_R )                              every assigned detection
     stationary    || v_i(k) ||_{d^2/dt I}, Q_i scaled                       while the object is stationary
 
-over one factor graph (`saga_fg.estimators.BatchSmoother`; long recordings in windows, by `WindowedSmoother`, which
-comes to the same within a millimetre and does not keep all matrices of an hour; with factors of users' own the running
-graph itself). The edges of an interval follow from given states at its start: those
-of an earlier, simpler pass. Robust losses (`factors.robust`) are reached by reweighting between passes.
+over one factor graph (`saga_fg.estimators.RecordingSmoother`; long recordings in windows, which comes to the same
+within a millimetre and does not keep all matrices of an hour; with factors of users' own the running graph itself). The
+edges of an interval follow from given states at its start: those of an earlier, simpler pass. Robust losses
+(`factors.robust`) are reached by reweighting between passes.
 
 The velocity of a stationary object is zero with the covariance d^2/dt in every interval dt, by which its position
 wanders by d in a second, whatever the rate of frames: as far as the vehicle's own poses drift. A recording of one
@@ -36,20 +36,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
 from factors import Robust
 from saga_fg.estimators import (
-    BatchSmoother,
     BatchSolver,
     DetectionFactors,
     Interactions,
     Measurements,
     NewObjects,
+    RecordingSmoother,
     SmoothedState,
-    WindowedSmoother,
 )
 from saga_fg.graph import OBJECT, Additions, FactorProvider, GraphView, key_of
 from saga_fg.model.discretisation import Transition, discretise
@@ -242,8 +240,7 @@ def smooth_states(
     )
     epochs = list(parts) if providers else parts
     long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING
-    batch = partial(BatchSmoother, likelihoods=False, order="time")
-    states = _smoothed(epochs, (WindowedSmoother if long else batch)(max_component=MOST_JOINT))
+    states = _smoothed(epochs, RecordingSmoother(long, MOST_JOINT))
     if not providers:
         return states
     labels = dict(zip(lifespans.id.tolist(), lifespans.label.tolist(), strict=True))
@@ -290,24 +287,25 @@ def _epochs(
         present = present[~gone]
 
 
-def _smoothed(epochs: Iterable[RecordingEpoch], smoother: BatchSmoother | WindowedSmoother) -> StateTable:
+def _smoothed(epochs: Iterable[RecordingEpoch], smoother: RecordingSmoother) -> StateTable:
     """By recursions over the joint state, in NumPy."""
-    states: list[SmoothedState] = []
-    begin = 0
+    parts: list[tuple[IntArray, FloatArray, FloatArray]] = []
+    first = 0
     for count, epoch in enumerate(epochs):
-        begin = epoch.moment - count
+        first = epoch.moment - count
         if epoch.transition is not None:
             smoother.predict(epoch.transition)
         smoother.add(epoch.new_objects.nodes, epoch.new_objects.means, epoch.new_objects.covariances)
         for measurements in epoch.measurements:
             smoother.update(measurements)
         smoother.marginalise(epoch.gone)
-        if isinstance(smoother, WindowedSmoother):
-            states += smoother.final()
-    states += smoother.finish() if isinstance(smoother, WindowedSmoother) else smoother.smoothed()
-    del smoother  # and the whole recording, before the states are copied
-    parts = [(begin + k, s.nodes, s.mean(s.nodes), s.covariance(s.nodes)) for k, s in enumerate(states) if len(s.nodes)]
-    return StateTable.of_moments(parts)
+        parts += map(_marginals, smoother.final())
+    parts += map(_marginals, smoother.finish())
+    return StateTable.of_moments([(first + k, *part) for k, part in enumerate(parts) if len(part[0])])
+
+
+def _marginals(state: SmoothedState) -> tuple[IntArray, FloatArray, FloatArray]:
+    return state.nodes, state.mean(state.nodes), state.covariance(state.nodes)
 
 
 def robust_weights(evidence: Evidence, object_of: IntArray, states: StateTable, loss: Robust) -> FloatArray:

@@ -18,7 +18,7 @@ from typing import Any
 
 from saga_fg.errors import InputError
 from saga_fg.estimators import Estimator, GraphFilter, JointKalmanFilter
-from saga_fg.estimators.base import missing
+from saga_fg.estimators.estimator import missing
 from saga_fg.graph import FactorProvider
 
 GROUP = "saga_fg.estimators"
@@ -27,12 +27,12 @@ GROUP = "saga_fg.estimators"
 
 def _isam2(providers: Sequence[FactorProvider] = ()) -> GraphFilter:
     """The running graph of the last interval."""
-    return GraphFilter(providers, likelihoods=False)
+    return GraphFilter(providers)
 
 
 def _fixed_lag(providers: Sequence[FactorProvider] = (), lag: float = 0.0) -> GraphFilter:
     """The running graph of the last `lag` s."""
-    return GraphFilter(providers, lag, likelihoods=False)
+    return GraphFilter(providers, lag)
 
 
 OWN_ESTIMATORS: Mapping[str, Callable[..., Estimator]] = {
@@ -74,6 +74,8 @@ def new_estimator(
         raise InputError(f"{where}: {error}") from error
     except Exception as error:
         raise InputError(f"{where}: cannot be made: {type(error).__name__}: {error}") from error
+    if not isinstance(estimator, Estimator):
+        raise InputError(f"{where}: expected a class derived from saga_fg.estimators.Estimator, got {estimator!r:.60}")
     if lacking := missing(estimator):
         raise InputError(f"{where}: lacks {', '.join(lacking)} of saga_fg.estimators.Estimator")
     if poses and missing(estimator, poses=True):

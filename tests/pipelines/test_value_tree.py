@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factors import PlanarPose, RangeBearing, Robust
+from factors import PlanarPose, RangeBearing
 from pipelines.config import load_config
 from pipelines.serving.state import TreeWriter, read_tree
 from saga_fg import Detection, Detections, Frame, InputError, SceneGraph
@@ -169,14 +169,14 @@ NODES = [1, 2, 3]
 
 
 def drive(estimator: GraphFilter, seeds: range) -> GraphFilter:
-    """Two cars that avoid each other, one who is alone; robust, nonlinear and late measurements."""
+    """Two cars that avoid each other, one who is alone; nonlinear and late measurements."""
     away = NonlinearEdges(SocialForce(), [0, 1], [1, 0], np.ones(2), np.zeros((2, 1, 4)))
     graph = SceneGraph(np.array(NODES), (CAR,) * 3, nonlinear=(away,))
     for seed in seeds:
         rng = np.random.default_rng(seed)
         estimator.predict(discretise(graph, 0.2))
         z = estimator.mean(NODES)[:, :2] + rng.normal(0, 0.1, (3, 2))
-        estimator.update(Measurements(NODES, z, np.eye(2, 4), 0.01 * np.eye(2)), robust=Robust("huber", 1.0))
+        estimator.update(Measurements(NODES, z, np.eye(2, 4), 0.01 * np.eye(2)))
         radar = RangeBearing(4, sensor_pose=(20.0, 0.0, 0.0))
         estimator.update(Observations([3], radar.predict(estimator.mean([3])), radar, 0.01 * np.eye(2)))
         late = estimator.time - (0.1 if estimator.lag else 0.0)

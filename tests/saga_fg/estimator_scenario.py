@@ -215,31 +215,29 @@ def admissible(textbook, call, estimator):
 
 
 def assert_smoothed(estimator, textbook, joint=True, everything=False):
-    """Epochs of the estimator, which are the last ones, as the textbook has them; `joint`: joint covariances, too.
+    """Epochs of the window, which are the last ones, as the textbook has them; `joint`: joint covariances, too.
 
-    A window has the nodes that are there now, each of them in all epochs from one on; `everything`: from that on in
-    which it appeared.
+    It has the nodes that are there now, each of them in all epochs from one on; `everything`: from that on in which it
+    appeared.
     """
     steps, _ = textbook.solve()
     epochs, born = estimator.smoothed(), textbook.appearances()
     assert epochs[-1].time == estimator.time
-    window = isinstance(estimator, GraphFilter)
     possible = set(estimator.nodes.tolist())
     for k, (epoch, (time, places, _, reference)) in enumerate(zip(epochs[::-1], steps[::-1], strict=False)):
         assert epoch.time == pytest.approx(time, abs=1e-12)
         nodes = set(epoch.nodes.tolist())
-        if not window:
-            assert nodes == set(places)
-        elif everything or k == 0:
+        if everything or k == 0:
             assert nodes == {node for node in possible if born[node] <= time + 1e-9}
         else:
             assert nodes <= possible
             assert estimator.remembered(epoch.nodes, time).all()
             possible = nodes
         expected = part(reference, places, epoch.nodes)
-        assert mean_error(epoch.joint_mean(epoch.nodes), expected) < EXACT
+        assert mean_error(epoch.x.mean, expected) < EXACT
         if joint:
-            assert covariance_error(epoch.joint_covariance(epoch.nodes), expected.covariance) < EXACT
+            P = epoch.x.joint(np.arange(len(epoch.nodes)))
+            assert covariance_error(P, expected.covariance) < EXACT
         for node in epoch.nodes:
             own = part(reference, places, [node])
             assert mean_error(epoch.mean([node])[0], own) < EXACT

@@ -9,7 +9,6 @@ ESTIMATORS = [
     pytest.param("saga_fg.estimators:JointKalmanFilter()", id="kalman"),
     pytest.param("saga_fg.estimators:GraphFilter()", id="isam2"),
     pytest.param("saga_fg.estimators:GraphFilter(lag=1.0)", id="fixed-lag"),
-    pytest.param("saga_fg.estimators:BatchSmoother()", id="batch"),
 ]
 
 

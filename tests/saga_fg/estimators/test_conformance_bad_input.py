@@ -101,7 +101,7 @@ BAD = {
     ),
     "update: no measurements": (
         lambda e: e.update(([4], [[0.0, 0.0]])),
-        "measurements: expected Measurements",
+        "measurements: expected Measured",
     ),
     "restore: no snapshot": (lambda e: e.restore((1, 2, 3.0)), "state: expected .*State, got tuple"),
     "update: unknown node": (lambda e: e.update(measured([4, 99])), "node 99 is not in the estimator"),

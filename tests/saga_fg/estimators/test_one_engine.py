@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, NodeType, SceneGraph
-from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements, correction, dynamics
+from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements, filtering
 from saga_fg.graph import OBJECT
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.motion import ConstantVelocity
@@ -19,7 +19,7 @@ from tests.saga_fg.estimator_scenario import Textbook, assert_newest, random_cov
 from tests.saga_fg.estimators.soak import LAGS, drive
 from tests.saga_fg.random_graphs import CAR, random_graph
 
-JOINT_STEPS = (correction.predicted, correction.corrected, dynamics.predict, correction.correct)
+JOINT_STEPS = (filtering.predict, filtering.corrected)
 
 
 def replace_everywhere(monkeypatch, functions, by):
@@ -89,7 +89,7 @@ def test_objects_alone_take_the_steps_of_the_kalman_filter(lag, monkeypatch):
 
         return counted
 
-    replace_everywhere(monkeypatch, JOINT_STEPS[:2], count)
+    replace_everywhere(monkeypatch, JOINT_STEPS, count)
     for estimator in (JointKalmanFilter(), GraphFilter(lag=lag)):
         calls.clear()
         apart.append((run(program, estimator)[0], dict(calls)))

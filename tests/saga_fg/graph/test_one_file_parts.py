@@ -12,7 +12,6 @@ from factors import interaction_factor, prior_factor, relative_factors
 from factors.manifolds import stacked_differences
 from saga_fg import ConstantVelocity, Detection, Detections, Frame, NodeType, SceneGraph, Tracker, TrackerSettings
 from saga_fg.estimators import (
-    BatchSmoother,
     BatchSolver,
     GraphFilter,
     IncrementalSmoother,
@@ -168,8 +167,8 @@ def test_a_factor(new_file):
 
 @pytest.mark.parametrize(
     "make",
-    [JointKalmanFilter, GraphFilter, lambda: GraphFilter(lag=1.0), BatchSmoother],
-    ids=["kalman", "isam2", "fixed-lag", "batch"],
+    [JointKalmanFilter, GraphFilter, lambda: GraphFilter(lag=1.0)],
+    ids=["kalman", "isam2", "fixed-lag"],
 )
 def test_a_sensor_model(new_file, make):
     """Each back end takes in its measurements; the same model is measured from a moving vehicle."""

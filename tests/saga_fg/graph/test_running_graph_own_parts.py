@@ -8,7 +8,6 @@ import pytest
 
 from saga_fg import ConstantVelocity, NodeType, SceneGraph
 from saga_fg.estimators import (
-    BatchSmoother,
     GraphFilter,
     JointKalmanFilter,
     Observations,
@@ -21,7 +20,6 @@ BACK_ENDS = {
     "kalman": JointKalmanFilter,
     "isam2": GraphFilter,
     "fixed-lag": lambda: GraphFilter(lag=1.0),
-    "batch": BatchSmoother,
 }
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.sampled_traffic import providers, sample_traffic
 from factors import SolverSettings, gaussian_factor, marginal_moments, pose_prior_factor, prior_factor
-from saga_fg.estimators import BatchSmoother, IncrementalSmoother, RelinearisationSettings
+from saga_fg.estimators import IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import (
     EGO_POSE,
     LANDMARK,
@@ -228,21 +228,3 @@ def test_a_threshold_of_nothing_is_a_filter_that_never_linearises_anew():
         for key, one in smoother.graph().variables.items()
     ]
     assert max(off) > 0.01
-
-
-def test_noise_of_a_millisecond_is_noise(one_bus_for_a_millisecond):
-    """Noise of constant acceleration falls with the fifth power of the interval, but is regular."""
-    kinds = [factor.provider for factor in one_bus_for_a_millisecond.graph().factors()]
-    assert sorted(kinds) == ["interactions", "new objects"]
-
-
-@pytest.fixture
-def one_bus_for_a_millisecond():
-    from saga_fg import SceneGraph
-    from saga_fg.model.discretisation import discretise
-    from tests.saga_fg.random_graphs import BUS
-
-    smoother = BatchSmoother()
-    smoother.add([1], np.zeros((1, 6)), np.eye(6)[None])
-    smoother.predict(discretise(SceneGraph([1], (BUS,)), 1e-3))
-    return smoother

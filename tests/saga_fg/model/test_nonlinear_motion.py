@@ -10,7 +10,6 @@ import pytest
 
 from saga_fg import ConstantVelocity, Edges, InputError, NodeType, SagaError, SceneGraph
 from saga_fg.estimators import (
-    BatchSmoother,
     GraphFilter,
     JointKalmanFilter,
     Measurements,
@@ -41,7 +40,6 @@ BACK_ENDS = {
     "kalman": JointKalmanFilter,
     "isam2": GraphFilter,
     "fixed-lag": lambda: GraphFilter(lag=0.5),
-    "batch": BatchSmoother,
 }
 
 
@@ -82,7 +80,7 @@ def difference(a, b):
     return max(np.abs(apart).max(), np.linalg.norm(a.joint_covariance(NODES) - P) / np.linalg.norm(P))
 
 
-@pytest.mark.parametrize("name", ["isam2", "fixed-lag", "batch"])
+@pytest.mark.parametrize("name", ["isam2", "fixed-lag"])
 def test_the_first_linearisation_of_smoothers_is_the_filters(name):
     """Before anything is measured nothing moves."""
     estimators = [make() for make in (BACK_ENDS[name], JointKalmanFilter)]
@@ -104,8 +102,8 @@ def test_interactions_and_turns_act(name):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_smoothers_reach_the_minimum_of_the_graph(seed):
-    """Gauss-Newton over the recording, Levenberg-Marquardt of GTSAM on the exported graph, from the filter's answer."""
-    smoother = driven(BatchSmoother(), seed=seed)
+    """The window, and Levenberg-Marquardt of GTSAM on the exported graph, from the window's answer."""
+    smoother = driven(GraphFilter(lag=100.0), seed=seed)
     exported = smoother.graph()
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-14)
@@ -114,9 +112,7 @@ def test_smoothers_reach_the_minimum_of_the_graph(seed):
     for epoch, moment in enumerate(smoother.smoothed()):
         for node, key in keys_of(exported, epoch).items():
             sigma = np.sqrt(np.diag(moment.covariance([node])[0]))
-            assert np.abs((moment.mean([node])[0] - solved.atVector(key)) / sigma).max() < 1e-5
-    window = driven(GraphFilter(lag=100.0), seed=seed)
-    assert difference(window, smoother) < 1e-3  # it linearises again what has moved by a thousandth of sigma
+            assert np.abs((moment.mean([node])[0] - solved.atVector(key)) / sigma).max() < 1e-3
     assert difference(driven(JointKalmanFilter(), seed=seed), smoother) > 1e-4  # the filter does not look back
 
 

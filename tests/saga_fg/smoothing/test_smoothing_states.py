@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factors import Robust
-from saga_fg.estimators import Gaussian, WindowedSmoother, kalman_predict, kalman_update, rts_smooth
+from saga_fg.estimators import Gaussian, RecordingSmoother, kalman_predict, kalman_update, rts_smooth
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
@@ -81,8 +81,8 @@ def test_a_long_recording_is_smoothed_in_windows_and_comes_to_the_same(monkeypat
     lifespans = lifespans_of(owner, evidence.boxes.label, evidence.moment)
     V = np.tile(25 * np.eye(2), (2, 1, 1))
     windows = []
-    final = WindowedSmoother.final
-    monkeypatch.setattr(WindowedSmoother, "final", lambda self: windows.append(out := final(self)) or out)
+    final = RecordingSmoother.final
+    monkeypatch.setattr(RecordingSmoother, "final", lambda self: windows.append(out := final(self)) or out)
     in_windows = smooth_states(evidence, owner, lifespans, ObjectMotion(V, CLASSES))
     assert sum(map(len, windows)) > 200
     monkeypatch.setattr(batch_states, "LONG_RECORDING", 1000.0)

@@ -5,81 +5,64 @@
 
 Every estimator agrees with `saga_fg.estimators.reference` (see docs/model.md for the figures).
 
-A tracker needs nothing of its estimator but this protocol. An estimator of your own derives from
-`saga_fg.estimators.EstimatorBase`, which has all but `time`, `add`, `predict`, `update`, `marginalise`, `posterior`.
+A tracker needs nothing of its estimator but this class. An estimator of your own derives from it and has
+
+    time         an attribute of the class, or a property, s; `predict` adds `transition.dt` to it
+    add          nodes that appear
+    predict      x <- F x + b + q, q ~ N(0, Q), with `transition.F_matrix`, `transition.b` and `transition.Q_matrix`
+    update       measurements, which may be a sequence of several kinds
+    marginalise  nodes that disappear
+    posterior    the joint Gaussian; from matrices, `BlockGaussian.from_dense` makes one
+
+What is read of it comes from `posterior`; copies and snapshots copy all attributes but `providers`, so that these
+methods may change arrays in place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.measurements import Measurements, Observations
+from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.graph.providers import FactorProvider
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.kernels.components import planar_marginals
 from saga_fg.model.discretisation import Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_covariances, checked_rows
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.frame import Frame
+
+ESSENTIAL = ("time", "add", "predict", "update", "marginalise", "posterior")
+"""What an estimator cannot do without."""
+POSES = ("extend", "covariance_with")
+"""What an estimator needs further where the vehicle's pose is a variable beside the nodes."""
 
 
 @dataclass(frozen=True, eq=False)
-class Measurements:
-    """m independent linear measurements of nodes whose states have equal size d: z = H x_node + v, v ~ N(0, R).
+class EstimatorState:
+    """An estimator as a value: the name of its class, and its attributes."""
 
-    nodes (m,) ids, may repeat; z (m, k); H (m, k, d) or (k, d) for all; R (m, k, k) or (k, k) for all
-
-    Raises `InputError` for wrong shapes, numbers that are not finite, or an R that is not symmetric positive definite.
-    """
-
-    nodes: IntArray
-    z: FloatArray
-    H: FloatArray
-    R: FloatArray
-
-    def __post_init__(self) -> None:
-        nodes = checked_rows("nodes", self.nodes)
-        m = len(nodes)
-        z = checked("z", self.z, (m, None))
-        k = z.shape[1]
-        H = checked("H", _one_each(self.H, m), (m, k, None))
-        R = checked_covariances("R", _one_each(self.R, m), m, k)
-        for name, array in (("nodes", nodes), ("z", z), ("H", H), ("R", R)):
-            object.__setattr__(self, name, array)
-
-    @classmethod
-    def unchecked(cls, nodes: IntArray, z: FloatArray, H: FloatArray, R: FloatArray) -> Measurements:
-        """Measurements of arrays that were checked where they came in: H (m, k, d), R (m, k, k)."""
-        made = object.__new__(cls)
-        vars(made).update(nodes=nodes, z=z, H=H, R=R)
-        return made
-
-    def __len__(self) -> int:
-        return len(self.nodes)
+    kind: str
+    attributes: Mapping[str, Any]
 
 
-def _one_each(value: ArrayLike, m: int) -> ArrayLike:
-    """A matrix that serves all m measurements, repeated; anything else as it is."""
-    try:
-        array = np.asarray(value)
-    except ValueError:  # lists of different lengths, which `checked` will name
-        return value
-    return np.broadcast_to(array, (m, *array.shape)) if array.ndim == 2 else value
-
-
-class Estimator(Protocol):
+class Estimator:
     """The joint state of all nodes. Every method raises `InputError` or `UnknownNodeError` and then changes nothing.
 
     `copy.copy` returns an estimator that changes independently of this one. Beside the nodes there may be others, such
     as the vehicle's poses and landmarks, which factor providers add.
     """
 
-    lag: float
+    lag: float = 0.0
     """Age up to which `update` puts measurements at their own time, s; 0: it takes those of the present alone."""
-    providers: Sequence[FactorProvider]
+    providers: Sequence[FactorProvider] = ()
     """Asked for factors once a frame by `ask_providers`; empty for none."""
 
     # the Gaussian, moved and corrected
@@ -87,123 +70,150 @@ class Estimator(Protocol):
     @property
     def time(self) -> float:
         """Sum of all intervals since the start, s."""
-        ...
+        raise NotImplementedError
 
     @property
     def nodes(self) -> IntArray:
         """(n,) ids in the order of the joint state."""
-        ...
+        return self.posterior().layout.nodes
 
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
     ) -> None:
         """Add nodes independent of all others: ids (k,), means (k, d), covariances (k, d, d); classes by id."""
-        ...
+        raise NotImplementedError
 
     def add_unchecked(
         self, nodes: IntArray, means: FloatArray, covariances: FloatArray, labels: Mapping[int, str] | None = None
     ) -> None:
         """Add nodes as `add` does, whose numbers were checked where they came in."""
-        ...
+        self.add(nodes, means, covariances, labels)
 
     def predict(self, transition: Transition) -> None:
         """Move all nodes by a transition over exactly the present nodes, in any order."""
-        ...
+        raise NotImplementedError
 
-    def update(self, measurements: Measurements | Sequence[Measurements], time: float | None = None) -> float:
+    def update(
+        self,
+        measurements: Measurements | Observations | Sequence[Measurements | Observations],
+        time: float | None = None,
+    ) -> float:
         """Take in measurements, several kinds at once if need be; return the log-likelihood of their innovation.
 
         time: when they were made, s, on this clock, which `remembered` is true of; None: now. NaN is returned where
         nothing is computed before it is asked for.
         """
-        ...
+        raise NotImplementedError
 
     def marginalise(self, nodes: ArrayLike) -> None:
         """Integrate out nodes that disappear, so that their information on their neighbours stays."""
-        ...
+        raise NotImplementedError
 
     def remembered(self, nodes: ArrayLike, time: float) -> BoolArray:
         """(k,) whether measurements of nodes at `time`, s, can still be put there; asked where `lag` is above 0."""
-        ...
+        return np.zeros(len(np.asarray(nodes)), dtype=bool)
 
     # what is read
 
     def posterior(self) -> BlockGaussian:
         """The joint Gaussian: of the nodes, and perhaps of others."""
-        ...
+        raise NotImplementedError
 
     @property
     def unsettled(self) -> IntArray:
         """Nodes whose nonlinear solution has not settled; the answer of closed forms always has."""
-        ...
+        return np.empty(0, dtype=np.int64)
 
     def mean(self, nodes: ArrayLike) -> FloatArray:
         """(k, d) means of nodes of equal size d."""
-        ...
+        return self.posterior().means_of(nodes)
 
     def covariance(self, nodes: ArrayLike) -> FloatArray:
         """(k, d, d) marginal covariances of nodes of equal size d."""
-        ...
+        return self.posterior().covariances_of(nodes)
 
     def joint_mean(self, nodes: ArrayLike) -> FloatArray:
         """Stacked mean of some nodes, in the order given, of any sizes."""
-        ...
+        x = self.posterior()
+        mean: FloatArray = x.mean[x.layout.places(x.layout.rows(nodes))]
+        return mean
 
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         """Joint covariance of some nodes, in the order given, of any sizes."""
-        ...
+        x = self.posterior()
+        return x.joint(x.layout.rows(nodes))
 
     def planar_marginals(self, nodes: ArrayLike, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """Positions and velocities (k, 4) with their covariances (k, 4, 4), by a kernel.
 
         places (k, 4): where x, y, vx, vy are in the states, -1 for none, which gives zeros
         """
-        ...
+        x = self.posterior()
+        at, rows = x.partition.block_places, x.layout.rows(nodes)
+        return planar_marginals(x.mean, x.flat, x.layout.offsets, at.start, at.size, at.offset, rows, places)
 
     def graph(self) -> SceneFactorGraph:
         """The equivalent factor graph, its values the solution; `solve()` and GTSAM's own solvers come to the same.
 
-        `graph.of(OBJECT, graph.epoch)` are the present nodes. Raises `InputError` that names a node on which edges act
-        without process noise in all directions of its state: its interaction is no factor.
+        `graph.of(OBJECT, graph.epoch)` are the present nodes.
         """
-        ...
+        return prior_graph(self.posterior(), self.time)
 
     def snapshot(self) -> Any:
         """The whole state as a value, which can be pickled."""
-        ...
+        return EstimatorState(_kind(self), self._own_attributes())
 
     def restore(self, state: Any) -> None:
         """Continue from a snapshot of an estimator of the same kind; raises `InputError` for anything else."""
-        ...
+        require_type("state", state, EstimatorState)
+        if state.kind != _kind(self):
+            raise InputError(f"state: expected one of {_kind(self)}, got one of {state.kind}")
+        vars(self).update(deepcopy(dict(state.attributes)))
+
+    def __copy__(self) -> Self:
+        twin = object.__new__(type(self))
+        vars(twin).update(vars(self) | self._own_attributes())
+        return twin
 
     def handed_over(self) -> Self:
         """A copy that takes over what would be long to build again; this one is rarely needed after it."""
-        ...
+        return copy(self)
 
     # factors of providers, for those that have any
 
     def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
         """Set the frame that providers see, and the origin (2,) of the states' positions in the world, m."""
-        ...
 
     def ask_providers(self) -> None:
         """Take in the factors of all providers, once a frame."""
-        ...
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
         """Take in the factors of some providers at once, at the present epoch."""
-        ...
+        raise InputError(f"{type(self).__name__} takes no factors of providers at once")
 
     @property
     def others(self) -> Sequence[int] | IntArray:
         """The variables beside the nodes, by numbers of the estimator's own."""
-        ...
+        return ()
 
     @property
     def auxiliary(self) -> SceneFactorGraph:
         """A graph that has the variables beside the nodes with their values, with or without factors."""
-        ...
+        return SceneFactorGraph()
 
     def covariance_with(self, keys: Sequence[int], nodes: ArrayLike) -> FloatArray:
         """Joint covariance of variables of `auxiliary`, by key, and of some nodes, in the order given."""
-        ...
+        raise InputError(f"{type(self).__name__} has no variables beside the nodes")
+
+    def _own_attributes(self) -> dict[str, Any]:
+        return deepcopy({name: value for name, value in vars(self).items() if name != "providers"})
+
+
+def missing(estimator: Estimator, poses: bool = False) -> list[str]:
+    """Names of methods that an estimator lacks; with `poses`, of those too that an estimated ego pose needs."""
+    needed = (*ESSENTIAL, *(POSES if poses else ()))
+    return [name for name in needed if getattr(type(estimator), name) is getattr(Estimator, name)]
+
+
+def _kind(estimator: object) -> str:
+    return f"{type(estimator).__module__}:{type(estimator).__qualname__}"

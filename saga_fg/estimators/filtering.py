@@ -1,0 +1,237 @@
+"""Prediction and correction of a joint state by components, by the kernels of `saga_fg.kernels.filtering`.
+
+    predict   m <- F m + b              P <- F P F^T + Q                    F block-sparse, Q block-diagonal
+    correct   S = H P H^T + R = L L^T   W = L^-1 H P    m <- m + W^T L^-1 (z - H m)    P <- P - W^T W
+
+A component grows by the interactions that enter it. Components are worked on one after the other, and so are
+measurements. Where a measurement is so much better than what was known (a millionfold in variance) that P - W^T W
+cancels, one refinement with K = W^T L^-1 restores what must hold, H P = R K^T, so that the measured rows are as exact
+as in Joseph's form.
+
+Bounds on the components of a joint state, for speed: which correlations a prediction leaves out.
+
+    x_i' = sum_{j with i} F_ij x_j + sum_{j not with i} F_ij x_j + b_i + q_i        i and j are "with" in one component
+
+A node j of another component is an independent input: F_ij m_j is taken over exactly, F_ij P_jj F_ij^T is further noise
+of x_i', and the correlation of the two is left out. Covariances are blocks of exact ones, and stay positive definite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from saga_fg.errors import InputError, require_type
+from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.measurements import LinearisedMeasurements
+from saga_fg.estimators.partition import Partition, StateLayout, unflattened
+from saga_fg.kernels.filtering import corrected_state, predicted_state, tie_strengths
+from saga_fg.model.discretisation import Blocks, Transition
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+
+CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
+
+
+class FlatBlocks(NamedTuple):
+    """m blocks of any sizes: target, source (m,), where each begins (m,), and all values one after the other."""
+
+    target: IntArray
+    source: IntArray
+    begin: IntArray
+    values: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """x <- F x + b + q, q ~ N(0, Q) over the nodes of `layout` in its order; see
+    `saga_fg.model.discretisation.Transition`."""
+
+    layout: StateLayout
+    F: tuple[Blocks, ...]
+    b: FloatArray
+    Q: tuple[Blocks, ...]
+
+    @staticmethod
+    def of(transition: Transition, layout: StateLayout) -> Dynamics:
+        """Dynamics of a transition over exactly the nodes of `layout`; raises `InputError` for any other."""
+        require_type("transition", transition, Transition)
+        rows = layout.rows(transition.nodes)
+        if len(rows) != len(layout):
+            raise InputError(f"transition: expected {len(layout)} nodes, got {len(rows)}")
+        if (layout.dims[rows] != transition.graph.dims).any():
+            raise InputError("transition: the sizes of its states differ from those of the estimator")
+        if (rows == np.arange(len(rows))).all():
+            return Dynamics(layout, transition.F, transition.b, transition.Q)
+        b = np.empty(layout.size)
+        b[layout.places(rows)] = transition.b
+        return Dynamics(layout, _renamed(transition.F, rows), b, _renamed(transition.Q, rows))
+
+    def with_static(self, layout: StateLayout, others: IntArray) -> Dynamics:
+        """Extend to `layout`, which has further nodes at the rows `others`: these stay as they are."""
+        rows, b = np.delete(np.arange(len(layout)), others), np.zeros(layout.size)
+        b[layout.places(rows)] = self.b
+        return Dynamics(layout, (*_renamed(self.F, rows), *identity(layout, others)), b, _renamed(self.Q, rows))
+
+    def of_nodes(self, layout: StateLayout, alone: bool = False) -> Dynamics:
+        """Restrict to the nodes of `layout`, in its order, on which no others act; alone: not even each other."""
+        if not alone and np.array_equal(layout.nodes, self.layout.nodes):
+            return self
+        rows = self.layout.rows(layout.nodes)
+        place = np.full(len(self.layout), -1)
+        place[rows] = np.arange(len(rows))
+        b = self.b[self.layout.places(rows)]
+        return Dynamics(layout, _within(self.F, place, alone), b, _within(self.Q, place, alone))
+
+    def times(self, x: FloatArray) -> FloatArray:
+        """F x of a joint state (D,)."""
+        starts, result = self.layout.offsets[:-1], np.zeros(self.layout.size)
+        for F in self.F:
+            _, d_i, d_j = F.values.shape
+            products = F.values @ x[starts[F.source][:, None] + np.arange(d_j)][:, :, None]
+            at = starts[F.target][:, None] + np.arange(d_i)
+            result += np.bincount(at.ravel(), weights=products.ravel(), minlength=len(result))
+        return result
+
+    @cached_property
+    def flat(self) -> FlatBlocks:
+        """The blocks of F, as kernels take them."""
+        return _flat(self.F)
+
+    @property
+    def unchanged(self) -> BoolArray:
+        """(n,) true for nodes that stay exactly as they are, x' = x without noise, whatever the others do."""
+        n = len(self.layout)
+        same, driven = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        for F in self.F:
+            own = F.target == F.source
+            same[F.target[own & (F.values == np.eye(*F.values.shape[1:])).all(axis=(1, 2))]] = True
+            driven[F.target[~own & F.values.any(axis=(1, 2))]] = True
+        for Q in self.Q:
+            driven[Q.target[Q.values.any(axis=(1, 2))]] = True
+        driven[np.repeat(np.arange(n), self.layout.dims)[self.b != 0]] = True
+        return same & ~driven
+
+    def joined(self, partition: Partition) -> Partition:
+        """The components that a prediction leaves of those of `partition`."""
+        return partition.joined(self.flat.target, self.flat.source)
+
+    def within(self, partition: Partition) -> Dynamics:
+        """Leave out the blocks of F between components."""
+        label, F = partition.label, []
+        for one in self.F:
+            mine = label[one.target] == label[one.source]
+            F.append(Blocks(one.target[mine], one.source[mine], one.values[mine]))
+        return replace(self, F=tuple(F))
+
+    def separated(self, x: BlockGaussian) -> BlockGaussian:
+        """Separate the uncorrelated parts of components that no interaction of this interval ties."""
+        tied = self.joined(Partition.apart(x.layout))
+        return x if tied.count == self.joined(x.partition).count else x.decoupled()
+
+
+@dataclass(frozen=True)
+class ComponentBounds:
+    """Nodes that become, or remain, one component.
+
+    tolerance  correlation up to which nodes count as independent
+    most       largest number of nodes of a component; the strongest ties come first
+    """
+
+    tolerance: float
+    most: int
+
+    def components(self, x: BlockGaussian, dynamics: Dynamics) -> Partition:
+        """The components that a prediction leaves; blocks of F between them are inputs."""
+        parts, at, F = x.uncorrelated(self.tolerance), x.partition.block_places, dynamics.flat
+        strength = tie_strengths(x.flat, at.start, at.size, at.offset, x.layout.dims, parts.label, *F)
+        strong = (strength > self.tolerance).nonzero()[0]
+        strong = strong[np.argsort(-strength[strong], kind="stable")]
+        return parts.joined_up_to(parts.label[F.target[strong]], parts.label[F.source[strong]], self.most)
+
+
+def predict(x: BlockGaussian, dynamics: Dynamics, partition: Partition | None = None) -> BlockGaussian:
+    """The prior after the interval. Raises `InputError` where it is not finite.
+
+    partition: the components it has; nodes that it separates lose their correlation, and blocks of F between them are
+    inputs. None: those joined by F
+    """
+    partition = dynamics.joined(x.partition) if partition is None else partition
+    x = x.over(partition.packed)  # which keeps what little correlation there is among the nodes of a pack
+    layout, at, Q = x.layout, x.partition.block_places, _flat(dynamics.Q)
+    where = x.partition.label, at.start, at.size, at.offset, layout.dims, layout.offsets
+    finite, mean, flat = predicted_state(
+        x.mean, x.flat, *where, partition.label, *dynamics.flat, dynamics.b, Q.target, Q.begin, Q.values
+    )
+    if not finite:
+        raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
+    return BlockGaussian(x.partition, mean, unflattened(flat, x.partition))
+
+
+def corrected(x: BlockGaussian, seen: LinearisedMeasurements) -> tuple[BlockGaussian, float]:
+    """The posterior and the log-likelihood of the innovation.
+
+    Raises `InputError` where a covariance has grown so large that R no longer counts among its digits.
+    """
+    at, offsets = x.partition.block_places, x.layout.offsets
+    where = at.start, at.size, at.offset, offsets, at.first, at.places
+    definite, mean, flat, log_likelihood = corrected_state(x.mean, x.flat, *where, *seen, CANCELLATION)
+    if not definite:
+        raise lost_in_rounding(x.variances().max())
+    return BlockGaussian(x.partition, mean, unflattened(flat, x.partition)), log_likelihood
+
+
+def lost_in_rounding(variance: float) -> InputError:
+    """The error of a correction whose R no longer counts among the digits of a `variance`."""
+    return InputError(
+        f"measurements: their noise is lost in the rounding of what is predicted, variances up to {variance:.3g}"
+    )
+
+
+def identity(layout: StateLayout, rows: IntArray) -> tuple[Blocks, ...]:
+    """Blocks of the nodes at `rows` that stay as they are."""
+    alike = [rows[layout.dims[rows] == d] for d in np.unique(layout.dims[rows])]
+    return tuple(Blocks(k, k, np.tile(np.eye(layout.dims[k[0]]), (len(k), 1, 1))) for k in alike)
+
+
+def noise_ratio(P: FloatArray, Q: FloatArray) -> FloatArray:
+    """(m,) size of covariances P (m, d, d) in units of noise Q (m, d, d), the trace of Q^-1 P; infinite without any."""
+    try:
+        L = np.linalg.cholesky(Q)
+    except np.linalg.LinAlgError:
+        if len(Q) == 1:
+            return np.array([np.inf])
+        half = len(Q) // 2
+        return np.concatenate([noise_ratio(P[:half], Q[:half]), noise_ratio(P[half:], Q[half:])])
+    half_done = np.linalg.solve(L, P)
+    return np.asarray(np.trace(np.linalg.solve(L, np.swapaxes(half_done, 1, 2)), axis1=1, axis2=2))
+
+
+def _renamed(groups: tuple[Blocks, ...], rows: IntArray) -> tuple[Blocks, ...]:
+    return tuple(Blocks(rows[blocks.target], rows[blocks.source], blocks.values) for blocks in groups)
+
+
+def _within(groups: tuple[Blocks, ...], place: IntArray, alone: bool) -> tuple[Blocks, ...]:
+    """The blocks between nodes that have a place >= 0, at their places; alone: of nodes with themselves."""
+    found = []
+    for one in groups:
+        target, source = place[one.target], place[one.source]
+        mine = (target >= 0) & (target == source if alone else source >= 0)
+        if mine.any():
+            found.append(Blocks(target[mine], source[mine], one.values[mine]))
+    return tuple(found)
+
+
+def _flat(groups: Sequence[Blocks]) -> FlatBlocks:
+    none = np.empty(0, dtype=np.int64)
+    target, source, begin, size = [none], [none], [none], 0
+    for group in groups:
+        target.append(group.target)
+        source.append(group.source)
+        begin.append(size + group.values[:1].size * np.arange(len(group.target)))
+        size += group.values.size
+    values = np.concatenate([np.empty(0), *(group.values.ravel() for group in groups)])
+    return FlatBlocks(np.concatenate(target), np.concatenate(source), np.concatenate(begin), values)
