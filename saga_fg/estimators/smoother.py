@@ -28,7 +28,9 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import tee
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +40,7 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.filtering import ComponentBounds, Dynamics, corrected, predict
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.measurements import Measurements, Observations
-from saga_fg.estimators.partition import Partition, StateLayout, checked_prior, regrouped
+from saga_fg.estimators.partition import BlockDiagonal, Partition, StateLayout, checked_prior, regrouped
 from saga_fg.model.discretisation import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -107,6 +109,59 @@ class _Step:
         """Bytes of its covariances."""
         return sum(P.nbytes for P in (*self.x.blocks, *self.prior.blocks))
 
+    @cached_property
+    def _places(self) -> tuple[Partition, IntArray]:
+        """The components in which the prior after it looks back, and the rows (n,) in the prior, -1 for who leaves."""
+        layout, prior = self.x.layout, self.prior.partition
+        if len(prior.layout) == len(layout):
+            return prior, np.arange(len(layout))
+        stay, first = layout.rows(prior.layout.nodes), np.unique(prior.label, return_index=True)[1]
+        rows = np.full(len(layout), -1)
+        rows[stay] = np.arange(len(stay))
+        return self.x.decoupled().partition.joined(stay, stay[first[prior.label]]), rows
+
+    @cached_property
+    def _gain(self) -> tuple[FloatArray, ...]:
+        """G (c, s, s) of each group of components. Those that leave stand beside, with variance 1, and learn none."""
+        (partition, rows), dynamics = self._places, self.dynamics
+        assert dynamics is not None
+        layout, stay, gains = self.x.layout, np.flatnonzero(rows >= 0), []
+        x, after = self.x.over(partition), self._widened(self.prior.blocks)
+        gone = np.ones(layout.size)
+        gone[layout.places(stay)] = 0.0
+        for number, places in enumerate(partition.groups):
+            F, P = np.zeros_like(after[number]), after[number]
+            for group in dynamics.F:
+                target, source = stay[group.target], stay[group.source]
+                mine = np.flatnonzero(partition.group[target] == number)
+                target, source, (_, d_i, d_j) = target[mine], source[mine], group.values.shape
+                i = partition.offset[target][:, None, None] + np.arange(d_i)[:, None]
+                j = partition.offset[source][:, None, None] + np.arange(d_j)
+                F[partition.row[target][:, None, None], i, j] = group.values[mine]
+            if len(stay) < len(layout):
+                P = P + gone[places][:, :, None] * np.eye(P.shape[1])
+            gains.append(np.swapaxes(np.linalg.solve(P, F @ x.blocks[number]), 1, 2))
+        return tuple(gains)
+
+    def _widened(self, blocks: BlockDiagonal) -> BlockDiagonal:
+        """Blocks over the components of the prior, with zeros for those that leave."""
+        partition, rows = self._places
+        return blocks if partition is self.prior.partition else regrouped(blocks, self.prior.partition, partition, rows)
+
+    def pulled_back(self, d: FloatArray, D: BlockDiagonal) -> tuple[BlockGaussian, BlockGaussian]:
+        """The filter's Gaussian by the components of the prior after it, and N(G d, G D G^T) over these.
+
+        d, D: at the next epoch, of the nodes that stay, by the components of the prior there
+        """
+        (partition, rows), layout = self._places, self.x.layout
+        difference, mean, changed = np.zeros(layout.size), np.empty(layout.size), []
+        difference[layout.places(np.flatnonzero(rows >= 0))] = d
+        for places, G, block in zip(partition.groups, self._gain, self._widened(D), strict=True):
+            mean[places] = (G @ difference[places][:, :, None])[:, :, 0]
+            product = G @ block @ np.swapaxes(G, 1, 2)
+            changed.append((product + np.swapaxes(product, 1, 2)) / 2)
+        return self.x.over(partition), BlockGaussian(partition, mean, tuple(changed))
+
 
 class RecordingSmoother:
     """Takes in a recording, and gives out smoothed epochs, oldest first, each once.
@@ -174,29 +229,37 @@ class RecordingSmoother:
         if self.time < self._next_look:
             return []
         self._next_look = self.time + STEP
-        spread = [np.sqrt(C.variances().max(initial=0.0)) for C in _influence(self._steps_backwards())]
-        influence, times = _SURE * np.array(spread[::-1]), [epoch.time for epoch in self._epochs]
-        waiting = np.flatnonzero(influence > TOLERANCE)
-        newest = len(times) - 1
+        times = [epoch.time for epoch in self._epochs]
+        settled = newest = len(times) - 1  # epochs before `settled` are final, and those before `forced`
         forced = min(int(np.searchsorted(times, self.time - LONGEST)), newest)
-        count = max(int(waiting[0]) if len(waiting) else newest, forced)
-        self.bound = max(self.bound, float(influence[:count].max(initial=0.0)))
-        states = self._smoothed()[:count] if count else []
-        for step in _filtered(self._prior, self._epochs[:count], self._most, self._means):
-            self._prior = step.prior
+        states, influence = list[SmoothedState](), list[float]()
+        steps, *copies = tee(self._steps_backwards(), 3)
+        for step, x, moved in zip(steps, _smoothed(copies[0]), _influence(copies[1]), strict=True):
+            k = newest - len(states)
+            if k + 1 == settled:
+                after_settled = step.prior
+            if k + 1 == forced:
+                after_forced = step.prior
+            states.append(self._state(k, x))
+            influence.append(_SURE * float(np.sqrt(moved.variances().max(initial=0.0))))
+            settled = k if influence[-1] > TOLERANCE else settled
+        count = max(settled, forced)
+        if count:
+            self._prior = after_settled if settled >= forced else after_forced
+            self.bound = max(self.bound, *influence[::-1][:count])
         del self._epochs[:count], self._means[:count]
-        return states
+        return states[::-1][:count]
 
     def finish(self) -> list[SmoothedState]:
         """All epochs that are left. Nothing can be taken in afterwards."""
-        states = self._smoothed()
+        numbers = range(len(self._epochs) - 1, -1, -1)
+        states = [self._state(k, x) for k, x in zip(numbers, _smoothed(self._steps_backwards()), strict=True)]
         del self._epochs[:]
-        return states
+        return states[::-1]
 
-    def _smoothed(self) -> list[SmoothedState]:
-        times = [epoch.time for epoch in self._epochs]
-        states = (x.over(Partition.apart(x.layout)) for x in _smoothed(self._steps_backwards()))
-        return [SmoothedState(time, x) for time, x in zip(times[::-1], states, strict=True)][::-1]
+    def _state(self, k: int, x: BlockGaussian) -> SmoothedState:
+        """The marginals of an epoch."""
+        return SmoothedState(self._epochs[k].time, x.over(Partition.apart(x.layout)))
 
     def _steps_backwards(self) -> Iterator[_Step]:
         """The filter's pass from the last epoch to the first, linearised where it should be."""
@@ -273,19 +336,14 @@ def _smoothed(steps: Iterable[_Step]) -> Iterator[BlockGaussian]:
     """The Gaussian of every epoch given all measurements, from the last to the first, as the steps are."""
     later: BlockGaussian | None = None
     for step in steps:
-        if later is None or step.dynamics is None:
+        if later is None:
             later = step.x
         else:
-            later = _carried(later, step.prior)
-            difference = replace(
-                later,
-                mean=later.mean - step.prior.mean,
-                blocks=tuple(S - P for S, P in zip(later.blocks, step.prior.blocks, strict=True)),
-            )
-            x, change = _pulled_back(step, difference)
-            later = replace(
-                x, mean=x.mean + change.mean, blocks=tuple(P + D for P, D in zip(x.blocks, change.blocks, strict=True))
-            )
+            later, prior = _carried(later, step.prior), step.prior
+            difference = tuple(S - P for S, P in zip(later.blocks, prior.blocks, strict=True))
+            x, change = step.pulled_back(later.mean - prior.mean, difference)
+            blocks = tuple(P + D for P, D in zip(x.blocks, change.blocks, strict=True))
+            later = BlockGaussian(x.partition, x.mean + change.mean, blocks)
         yield later
 
 
@@ -293,50 +351,14 @@ def _influence(steps: Iterable[_Step]) -> Iterator[BlockGaussian]:
     """What may still be measured moves the smoothed means of every epoch by no more than this, from the last on."""
     later: BlockGaussian | None = None
     for step in steps:
-        later = step.x if later is None else _pulled_back(step, _carried(later, step.prior))[1]
+        if later is None:
+            later = step.x
+        else:
+            later = _carried(later, step.prior)
+            _, later = step.pulled_back(later.mean, later.blocks)
         yield later
 
 
 def _carried(later: BlockGaussian, prior: BlockGaussian) -> BlockGaussian:
     """The Gaussian of an epoch over those nodes that have come from the epoch before, and their components."""
-    new = np.arange(len(prior.layout), len(later.layout))
-    return later.without(new).over(prior.partition)
-
-
-def _pulled_back(step: _Step, difference: BlockGaussian) -> tuple[BlockGaussian, BlockGaussian]:
-    """The filter's Gaussian of an epoch by the components of the prior after it, and N(G d, G D G^T) over these.
-
-    difference: N(d, D) at the next epoch, of the nodes that stay, by the components of the prior there
-    """
-    x, prior, dynamics = step.x, step.prior, step.dynamics
-    assert dynamics is not None
-    layout, partition = x.layout, prior.partition
-    stay = layout.rows(prior.layout.nodes)
-    P_next, D, d = prior.blocks, difference.blocks, difference.mean
-    if len(stay) < len(layout):  # those that leave stand beside, with variance 1 and nothing to learn
-        x = x.decoupled()
-        first = np.unique(partition.label, return_index=True)[1]
-        partition = x.partition.joined(stay, stay[first[partition.label]])
-        source = np.full(len(layout), -1)
-        source[stay] = np.arange(len(stay))
-        P_next, D = (regrouped(blocks, prior.partition, partition, source) for blocks in (P_next, D))
-        gone, d = np.ones(layout.size), np.zeros(layout.size)
-        gone[layout.places(stay)], d[layout.places(stay)] = 0.0, difference.mean
-        for places, P in zip(partition.groups, P_next, strict=True):
-            P.reshape(len(P), -1)[:, :: P.shape[1] + 1] += gone[places]
-    x, mean, blocks = x.over(partition), np.empty(layout.size), []
-    for number, places in enumerate(partition.groups):
-        F = np.zeros_like(P_next[number])
-        for group in dynamics.F:
-            target, source = stay[group.target], stay[group.source]
-            mine = np.flatnonzero(partition.group[target] == number)
-            target, source, (_, d_i, d_j) = target[mine], source[mine], group.values.shape
-            i = partition.offset[target][:, None, None] + np.arange(d_i)[:, None]
-            j = partition.offset[source][:, None, None] + np.arange(d_j)
-            F[partition.row[target][:, None, None], i, j] = group.values[mine]
-        G_T = np.linalg.solve(P_next[number], F @ x.blocks[number])
-        G = np.swapaxes(G_T, 1, 2)
-        mean[places] = (G @ d[places][:, :, None])[:, :, 0]
-        block = G @ D[number] @ G_T
-        blocks.append((block + np.swapaxes(block, 1, 2)) / 2)
-    return x, BlockGaussian(partition, mean, tuple(blocks))
+    return later.without(np.arange(len(prior.layout), len(later.layout))).over(prior.partition)
