@@ -35,13 +35,12 @@ def test_position_is_the_centre_and_size_is_length_width_height() -> None:
     assert np.isnan(world.velocity).all()
 
 
-@pytest.mark.parametrize(
-    ("rotation_y", "yaw"), [(0.0, -np.pi / 2), (-np.pi / 2, 0.0), (np.pi / 2, -np.pi), (-np.pi / 4, -np.pi / 4)]
-)
-def test_yaw_of_a_level_camera(rotation_y: float, yaw: float) -> None:
-    # rotation_y 0 heads to the right of the camera, -90 degrees straight ahead
-    world = camera_boxes_to_world(boxes(rotation_y), ["car"], yaw_transform(yaw=0.0) @ LEVEL)
-    assert np.cos(world.yaw[0] - yaw) == pytest.approx(1)
+def test_yaw_of_a_level_camera(subtests: pytest.Subtests) -> None:
+    for rotation_y, yaw in [(0.0, -np.pi / 2), (-np.pi / 2, 0.0), (np.pi / 2, -np.pi), (-np.pi / 4, -np.pi / 4)]:
+        with subtests.test(rotation_y=rotation_y, yaw=yaw):
+            # rotation_y 0 heads to the right of the camera, -90 degrees straight ahead
+            world = camera_boxes_to_world(boxes(rotation_y), ["car"], yaw_transform(yaw=0.0) @ LEVEL)
+            assert np.cos(world.yaw[0] - yaw) == pytest.approx(1)
 
 
 angle = st.floats(-0.2, 0.2)

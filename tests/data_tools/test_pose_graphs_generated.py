@@ -15,24 +15,26 @@ from saga_fg.slam.pose_graph import PoseGraph, factor_graph, optimise_poses, pos
 Generator = Callable[..., tuple[PoseGraph, FloatArray]]
 
 
-@pytest.mark.parametrize("make", [city, torus, sphere, grid, cube])
-def test_residuals_at_the_truth_are_the_noise(make: Generator) -> None:
-    graph, true = make(1200, seed=0)
-    residuals = len(graph.first) * graph.information.shape[1]
-    error = factor_graph(graph).error(pose_values(true))
-    assert 2 * error / residuals == pytest.approx(1, abs=6 * np.sqrt(2 / residuals))
-    assert (graph.components() == 0).all()
-    assert len(graph.first) > 1.1 * len(graph)  # there are loops to close
+def test_residuals_at_the_truth_are_the_noise(subtests: pytest.Subtests) -> None:
+    for make in [city, torus, sphere, grid, cube]:
+        with subtests.test(make=make):
+            graph, true = make(1200, seed=0)
+            residuals = len(graph.first) * graph.information.shape[1]
+            error = factor_graph(graph).error(pose_values(true))
+            assert 2 * error / residuals == pytest.approx(1, abs=6 * np.sqrt(2 / residuals))
+            assert (graph.components() == 0).all()
+            assert len(graph.first) > 1.1 * len(graph)  # there are loops to close
 
 
-@pytest.mark.parametrize("make", [city, torus, sphere, grid, cube])
-def test_the_optimum_has_the_expected_error_where_the_guess_is_far_off(make: Generator) -> None:
-    graph, true = make(600, seed=1, noise=0.15)
-    optimised = optimise_poses(graph)
-    k = graph.information.shape[1]
-    freedom = k * (len(graph.first) - len(graph) + 1)
-    assert 2 * optimised.error / freedom == pytest.approx(1, abs=6 * np.sqrt(2 / freedom))
-    assert optimised.error < factor_graph(graph).error(pose_values(true))
+def test_the_optimum_has_the_expected_error_where_the_guess_is_far_off(subtests: pytest.Subtests) -> None:
+    for make in [city, torus, sphere, grid, cube]:
+        with subtests.test(make=make):
+            graph, true = make(600, seed=1, noise=0.15)
+            optimised = optimise_poses(graph)
+            k = graph.information.shape[1]
+            freedom = k * (len(graph.first) - len(graph) + 1)
+            assert 2 * optimised.error / freedom == pytest.approx(1, abs=6 * np.sqrt(2 / freedom))
+            assert optimised.error < factor_graph(graph).error(pose_values(true))
 
 
 def test_the_guess_is_dead_reckoning() -> None:
@@ -42,14 +44,13 @@ def test_the_guess_is_dead_reckoning() -> None:
     np.testing.assert_array_equal(graph.world_T_pose[0], true[0])
 
 
-@pytest.mark.parametrize(
-    ("make", "poses", "measurements"), [(sphere, 2500, 4949), (grid, 2500, 4900), (cube, 1000, 2700)]
-)
-def test_measurements_join_the_neighbours(make: Generator, poses: int, measurements: int) -> None:
-    graph, true = make(poses, seed=0)
-    assert len(graph.first) == pytest.approx(measurements, rel=0.01)
-    steps = np.linalg.norm(true[graph.first, :-1, -1] - true[graph.second, :-1, -1], axis=1)
-    assert 0.9 < steps.max() < 1.1
+def test_measurements_join_the_neighbours(subtests: pytest.Subtests) -> None:
+    for make, poses, measurements in [(sphere, 2500, 4949), (grid, 2500, 4900), (cube, 1000, 2700)]:
+        with subtests.test(make=make, poses=poses, measurements=measurements):
+            graph, true = make(poses, seed=0)
+            assert len(graph.first) == pytest.approx(measurements, rel=0.01)
+            steps = np.linalg.norm(true[graph.first, :-1, -1] - true[graph.second, :-1, -1], axis=1)
+            assert 0.9 < steps.max() < 1.1
 
 
 def test_the_same_seed_makes_the_same_graph() -> None:

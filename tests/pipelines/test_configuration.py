@@ -179,12 +179,13 @@ def test_settings_start_from_the_given_base() -> None:
     assert settings == WholeSettings(fast=True, gate=GateSettings(0.5, 3))
 
 
-@pytest.mark.parametrize("value", [1e-9, 1e22, 0.1, -0.0, float("inf"), 5e-324])
-def test_written_floats_stay_floats_for_any_yaml_reader(value: float) -> None:
-    text = write_settings(DistanceRule(scale=value), comments=False)
-    read = yaml.safe_load(text)["scale"]
-    assert isinstance(read, float)
-    assert read == value
+def test_written_floats_stay_floats_for_any_yaml_reader(subtests: pytest.Subtests) -> None:
+    for value in [1e-9, 1e22, 0.1, -0.0, float("inf"), 5e-324]:
+        with subtests.test(value=value):
+            text = write_settings(DistanceRule(scale=value), comments=False)
+            read = yaml.safe_load(text)["scale"]
+            assert isinstance(read, float)
+            assert read == value
 
 
 def test_aliases_that_stand_for_millions_of_entries_are_not_printed() -> None:

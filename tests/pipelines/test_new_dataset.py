@@ -165,11 +165,12 @@ def test_help_lists_what_can_be_evaluated() -> None:
     assert "mcap" not in listed
 
 
-@pytest.mark.parametrize("name", source.BUILT_IN)
-def test_those_that_come_along_are_sources(name: str) -> None:
-    found = source.dataset_source(name)
-    assert issubclass(found, DatasetSource)
-    assert found.name == name
+def test_those_that_come_along_are_sources(subtests: pytest.Subtests) -> None:
+    for name in source.BUILT_IN:
+        with subtests.test(name=name):
+            found = source.dataset_source(name)
+            assert issubclass(found, DatasetSource)
+            assert found.name == name
 
 
 @pytest.mark.parametrize(

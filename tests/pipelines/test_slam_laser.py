@@ -160,15 +160,12 @@ def test_other_lasers_and_robots(kind: LaserKind, near: float, far: float) -> No
     assert path.rejected <= 3
 
 
-@pytest.mark.parametrize(
-    ("points", "odometry", "message"),
-    [
+def test_a_bad_step_is_refused(subtests: pytest.Subtests) -> None:
+    for points, odometry, message in [
         (np.zeros((5, 3)), np.zeros(3), "points: expected shape"),
         (np.full((5, 2), np.nan), np.zeros(3), r"points.*: expected a finite number"),
         (np.zeros((5, 2)), np.zeros(2), "odometry: expected shape"),
         (np.zeros((5, 2)), np.array([0.0, np.nan, 0.0]), r"odometry.*: expected a finite number"),
-    ],
-)
-def test_a_bad_step_is_refused(points: np.ndarray, odometry: np.ndarray, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        LaserSlam().step(points, odometry)
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            LaserSlam().step(points, odometry)

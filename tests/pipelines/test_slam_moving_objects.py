@@ -86,12 +86,13 @@ def test_detections_in_another_frame_are_noticed(turned: float, said: int, caplo
     )
 
 
-@pytest.mark.parametrize(("speeds", "moving"), [([4.0] * 2, 0), ([4.0] * 4, 1), ([1.2] * 12, 0)])
-def test_an_object_moves_when_its_speed_is_sure(speeds: list[float], moving: int) -> None:
+def test_an_object_moves_when_its_speed_is_sure(subtests: pytest.Subtests) -> None:
     """Speeds above the limit, but by no more than the detections can tell."""
-    objects, x = MovingObjects(path_tracker(load_config("kitti"))), 10.0
-    for k, speed in enumerate(speeds):
-        x += 0.1 * speed
-        seen = Boxes.of(["car"], [[x, 0.0, 0.75]], SIZE[None], [0.0])
-        found = objects.boxes(0.1 * k, Detections(seen, np.array([3.0])), np.eye(4))
-    assert len(found) == moving
+    for speeds, moving in [([4.0] * 2, 0), ([4.0] * 4, 1), ([1.2] * 12, 0)]:
+        with subtests.test(speeds=speeds, moving=moving):
+            objects, x = MovingObjects(path_tracker(load_config("kitti"))), 10.0
+            for k, speed in enumerate(speeds):
+                x += 0.1 * speed
+                seen = Boxes.of(["car"], [[x, 0.0, 0.75]], SIZE[None], [0.0])
+                found = objects.boxes(0.1 * k, Detections(seen, np.array([3.0])), np.eye(4))
+            assert len(found) == moving

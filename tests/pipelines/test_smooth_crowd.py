@@ -128,12 +128,13 @@ def approaching(first: float, config: SmoothConfig, with_pose: bool = True) -> l
     return [len(moment) for moment in smooth_scene(scene, config).tracks]
 
 
-@pytest.mark.parametrize(("first", "with_pose", "begins"), [(60.0, True, 10), (20.0, True, 20), (60.0, False, 20)])
-def test_an_object_from_far_away_reaches_back(first: float, with_pose: bool, begins: int) -> None:
-    config = load_smooth_config("kitti")
-    smoothing = replace(config.smoothing, backward_time=1.0, backward_distance=50.0)
-    there = approaching(first, replace(config, smoothing=smoothing), with_pose)
-    assert there == [0] * begins + [1] * (50 - begins)
+def test_an_object_from_far_away_reaches_back(subtests: pytest.Subtests) -> None:
+    for first, with_pose, begins in [(60.0, True, 10), (20.0, True, 20), (60.0, False, 20)]:
+        with subtests.test(first=first, with_pose=with_pose, begins=begins):
+            config = load_smooth_config("kitti")
+            smoothing = replace(config.smoothing, backward_time=1.0, backward_distance=50.0)
+            there = approaching(first, replace(config, smoothing=smoothing), with_pose)
+            assert there == [0] * begins + [1] * (50 - begins)
 
 
 def test_labels_of_a_recorded_crowd_are_better_than_its_detections(recordings: Path) -> None:

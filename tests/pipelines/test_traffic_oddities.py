@@ -27,20 +27,21 @@ def new_tracker() -> Tracker:
     return tracker
 
 
-@pytest.mark.parametrize("apart", [0.0, 1e-9, 0.5, 2.0])
-def test_a_vehicle_that_appears_in_the_middle_of_another_is_predicted_all_the_same(apart: float) -> None:
-    tracker = new_tracker()
-    for k in range(20):
-        x = SPEED * k / 10
-        tracker.step(frame(k / 10, [(x, 0.0)] if k < 10 else [(x, 0.0), (x + apart, 0.0)]))
-    predicted = tracker.predict([1.0, 5.0], joint=True)
-    assert len(predicted) >= 1
-    assert np.isfinite(predicted.position).all()
-    assert (np.linalg.eigvalsh(predicted.position_covariance) > 0).all()
-    assert predicted.joint_covariance is not None
-    assert (np.linalg.eigvalsh(predicted.joint_covariance) > -1e-6).all()
-    first = predicted.position[:, np.argmin(predicted.id), 0]
-    assert SPEED * 1.9 < first[0] < first[1] < SPEED * 1.9 + 1.2 * SPEED * 5
+def test_a_vehicle_that_appears_in_the_middle_of_another_is_predicted_all_the_same(subtests: pytest.Subtests) -> None:
+    for apart in [0.0, 1e-9, 0.5, 2.0]:
+        with subtests.test(apart=apart):
+            tracker = new_tracker()
+            for k in range(20):
+                x = SPEED * k / 10
+                tracker.step(frame(k / 10, [(x, 0.0)] if k < 10 else [(x, 0.0), (x + apart, 0.0)]))
+            predicted = tracker.predict([1.0, 5.0], joint=True)
+            assert len(predicted) >= 1
+            assert np.isfinite(predicted.position).all()
+            assert (np.linalg.eigvalsh(predicted.position_covariance) > 0).all()
+            assert predicted.joint_covariance is not None
+            assert (np.linalg.eigvalsh(predicted.joint_covariance) > -1e-6).all()
+            first = predicted.position[:, np.argmin(predicted.id), 0]
+            assert SPEED * 1.9 < first[0] < first[1] < SPEED * 1.9 + 1.2 * SPEED * 5
 
 
 def test_where_a_lane_ends_vehicles_are_predicted_straight_on() -> None:

@@ -29,9 +29,10 @@ def test_box_is_clipped_to_the_image() -> None:
     assert 0 < top < bottom < 374
 
 
-@pytest.mark.parametrize("place", [(0, 1, -10), (-30, 1, 10), (30, 1, 10), (0, 40, 10), (0, -40, 10), (0, 1, -0.95)])
-def test_box_that_does_not_show(place: tuple[float, float, float]) -> None:
-    assert np.isnan(image_boxes(box(*place), P2, IMAGE)).all()
+def test_box_that_does_not_show(subtests: pytest.Subtests) -> None:
+    for place in [(0, 1, -10), (-30, 1, 10), (30, 1, 10), (0, 40, 10), (0, -40, 10), (0, 1, -0.95)]:
+        with subtests.test(place=place):
+            assert np.isnan(image_boxes(box(*place), P2, IMAGE)).all()
 
 
 def test_box_beside_the_camera_reaches_to_the_edge() -> None:

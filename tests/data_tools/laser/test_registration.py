@@ -21,15 +21,16 @@ def seen_from(points: FloatArray, pose: FloatArray) -> FloatArray:
     return (points - pose[:2]) @ np.array([[c, -s], [s, c]])
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_point_to_line_finds_the_pose(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    true = np.array([2.0, 2.0, 0.3])
-    lines = LineMap.of(room(rng))
-    fit = lines.fit(seen_from(room(rng, 180), true), true + np.array([0.15, -0.1, 0.05]), np.eye(3), reach=0.5)
-    assert (np.abs(fit.pose - true) < [0.01, 0.01, 0.005]).all()
-    assert fit.share > 0.97  # the sampled walls have gaps
-    assert np.linalg.eigvalsh(fit.information[:2, :2])[0] > 0
+def test_point_to_line_finds_the_pose(subtests: pytest.Subtests) -> None:
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            true = np.array([2.0, 2.0, 0.3])
+            lines = LineMap.of(room(rng))
+            fit = lines.fit(seen_from(room(rng, 180), true), true + np.array([0.15, -0.1, 0.05]), np.eye(3), reach=0.5)
+            assert (np.abs(fit.pose - true) < [0.01, 0.01, 0.005]).all()
+            assert fit.share > 0.97  # the sampled walls have gaps
+            assert np.linalg.eigvalsh(fit.information[:2, :2])[0] > 0
 
 
 def test_along_a_bare_corridor_odometry_decides() -> None:
@@ -43,17 +44,18 @@ def test_along_a_bare_corridor_odometry_decides() -> None:
     assert values[0] < 0.02 * values[1]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_branch_and_bound_finds_what_all_poses_of_the_window_would(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    true = np.array([2.2, 1.7, 0.4])
-    grid = ScoreGrid.of(room(rng))
-    scan = seen_from(room(rng, 150), true)
-    found = grid.search(scan, true + np.array([1.3, -0.9, 0.25]), 2.0, 0.4, 0.5)
-    assert found is not None
-    assert (np.abs(found.pose - true) < [0.11, 0.11, 0.06]).all()
-    assert found.rival < 0.9 * found.score
-    assert grid.search(scan, true + np.array([4.0, 3.0, 0.0]), 1.0, 0.1, 0.8) is None
+def test_branch_and_bound_finds_what_all_poses_of_the_window_would(subtests: pytest.Subtests) -> None:
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            true = np.array([2.2, 1.7, 0.4])
+            grid = ScoreGrid.of(room(rng))
+            scan = seen_from(room(rng, 150), true)
+            found = grid.search(scan, true + np.array([1.3, -0.9, 0.25]), 2.0, 0.4, 0.5)
+            assert found is not None
+            assert (np.abs(found.pose - true) < [0.11, 0.11, 0.06]).all()
+            assert found.rival < 0.9 * found.score
+            assert grid.search(scan, true + np.array([4.0, 3.0, 0.0]), 1.0, 0.1, 0.8) is None
 
 
 def test_bounds_hold_on_every_level() -> None:

@@ -40,15 +40,16 @@ def boxes(*rows: tuple[float, ...]) -> Boxes:
     return Boxes.of(["thing"] * len(rows), table[:, :3], table[:, 3:6], table[:, 6], np.zeros((len(rows), 2)))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_ground_is_what_lies_at_height_zero(seed: int) -> None:
-    points = seen(street(seed), seed).points
-    ground = segment_ground(points)
-    height = points[:, 2] + SENSOR_HEIGHT
-    assert np.mean(ground.is_ground[np.abs(height) < 0.08]) > 0.99
-    assert np.mean(ground.is_ground[height > 0.5]) < 0.02  # far houses, whose feet are hidden
-    near = np.hypot(points[:, 0], points[:, 1]) < 30
-    assert np.median(np.abs(ground.height - height)[near]) < 0.05
+def test_ground_is_what_lies_at_height_zero(subtests: pytest.Subtests) -> None:
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            points = seen(street(seed), seed).points
+            ground = segment_ground(points)
+            height = points[:, 2] + SENSOR_HEIGHT
+            assert np.mean(ground.is_ground[np.abs(height) < 0.08]) > 0.99
+            assert np.mean(ground.is_ground[height > 0.5]) < 0.02  # far houses, whose feet are hidden
+            near = np.hypot(points[:, 0], points[:, 1]) < 30
+            assert np.median(np.abs(ground.height - height)[near]) < 0.05
 
 
 def test_ground_follows_a_slope() -> None:
@@ -139,17 +140,18 @@ def test_curbs_are_the_edges_of_the_road() -> None:
     assert len(extract_curbs(flat, segment_ground(flat).height)) == 0
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_parked_cars_are_found_as_boxes(seed: int) -> None:
-    world = street(seed)
-    pose = yaw_transform(4.0, 0.0, SENSOR_HEIGHT, 0.1)
-    found = detect_clusters(seen(world, seed, pose).points)
-    cars = world.boxes.select((world.boxes.label == "car") & (np.abs(world.boxes.position[:, 0] - 4.0) < 20))
-    places = transform_points(pose, found.boxes.position)[found.boxes.label == "car"]
-    distance = np.linalg.norm(cars.position[:, None, :2] - places[None, :, :2], axis=2)
-    assert np.mean(distance.min(axis=1) < 1.0) >= 0.8
-    assert ((found.score > 0) & (found.score <= 1)).all()
-    assert not len(detect_clusters(np.empty((0, 3))))
+def test_parked_cars_are_found_as_boxes(subtests: pytest.Subtests) -> None:
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            world = street(seed)
+            pose = yaw_transform(4.0, 0.0, SENSOR_HEIGHT, 0.1)
+            found = detect_clusters(seen(world, seed, pose).points)
+            cars = world.boxes.select((world.boxes.label == "car") & (np.abs(world.boxes.position[:, 0] - 4.0) < 20))
+            places = transform_points(pose, found.boxes.position)[found.boxes.label == "car"]
+            distance = np.linalg.norm(cars.position[:, None, :2] - places[None, :, :2], axis=2)
+            assert np.mean(distance.min(axis=1) < 1.0) >= 0.8
+            assert ((found.score > 0) & (found.score <= 1)).all()
+            assert not len(detect_clusters(np.empty((0, 3))))
 
 
 @given(st.floats(0.0, np.pi / 2 - 0.01), st.integers(0, 1000))

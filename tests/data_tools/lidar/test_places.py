@@ -25,19 +25,20 @@ def places() -> list[FloatArray]:
     return [submap(course, way) for way in np.arange(0.0, 660.0, 60.0)]
 
 
-@pytest.mark.parametrize(("yaw", "x", "y"), [(0.0, 0.0, 0.0), (1.1, 6.0, -4.0), (np.pi, -9.0, 3.0)])
-def test_a_place_is_found_turned_and_shifted(places: list[FloatArray], yaw: float, x: float, y: float) -> None:
-    index = PlaceIndex()
-    for number, points in enumerate(places):
-        index.add(number, PlaceImage.of(points))
-    T = yaw_transform(x, y, 0.3, yaw)
-    again = transform_points(inverse_transform(T), places[4][::2])
-    best, second, *_ = index.candidates(PlaceImage.of(again), most=4)
-    assert best.number == 4
-    assert best.score > 1.4 * max(second.score, best.rival)
-    off = inverse_transform(T) @ best.place_T_query
-    assert np.linalg.norm(off[:3, 3]) < 1.5
-    assert abs(yaw_of(off[:3, :3])) < np.deg2rad(3.1)
+def test_a_place_is_found_turned_and_shifted(places: list[FloatArray], subtests: pytest.Subtests) -> None:
+    for yaw, x, y in [(0.0, 0.0, 0.0), (1.1, 6.0, -4.0), (np.pi, -9.0, 3.0)]:
+        with subtests.test(yaw=yaw, x=x, y=y):
+            index = PlaceIndex()
+            for number, points in enumerate(places):
+                index.add(number, PlaceImage.of(points))
+            T = yaw_transform(x, y, 0.3, yaw)
+            again = transform_points(inverse_transform(T), places[4][::2])
+            best, second, *_ = index.candidates(PlaceImage.of(again), most=4)
+            assert best.number == 4
+            assert best.score > 1.4 * max(second.score, best.rival)
+            off = inverse_transform(T) @ best.place_T_query
+            assert np.linalg.norm(off[:3, 3]) < 1.5
+            assert abs(yaw_of(off[:3, :3])) < np.deg2rad(3.1)
 
 
 def test_heights_count_from_the_ground_of_a_slope(places: list[FloatArray]) -> None:

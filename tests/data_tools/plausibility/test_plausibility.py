@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 
@@ -36,9 +34,8 @@ def option(doubt: Doubt | None) -> str | None:
     return None if doubt is None else TableImport().option_for(doubt.mend, {"length": "len", "width": "wid"})
 
 
-@pytest.mark.parametrize(
-    ("yaw", "found"),
-    [
+def test_headings_in_degrees(subtests: pytest.Subtests) -> None:
+    for yaw, found in [
         (RNG.uniform(0, 360, 60), "--units angle=deg"),
         (RNG.uniform(-180, 180, 60), "--units angle=deg"),
         (np.r_[np.full(50, np.nan), RNG.uniform(0, 360, 30)], "--units angle=deg"),
@@ -47,47 +44,41 @@ def option(doubt: Doubt | None) -> str | None:
         (np.r_[RNG.uniform(-3, 3, 99), 7.0], None),  # one that was not wrapped
         (np.full(60, np.nan), None),
         (np.array([90.0]), None),  # too few to tell
-    ],
-)
-def test_headings_in_degrees(yaw: np.ndarray, found: str | None) -> None:
-    assert option(headings_in_degrees(yaw)) == found
+    ]:
+        with subtests.test(yaw=yaw, found=found):
+            assert option(headings_in_degrees(yaw)) == found
 
 
-@pytest.mark.parametrize(
-    ("score", "what"),
-    [
+def test_scores_beyond_one(subtests: pytest.Subtests) -> None:
+    for score, what in [
         (RNG.uniform(5, 99, 60), "percent"),
         (RNG.normal(0, 4, 60), "logits"),
         (RNG.uniform(0, 1, 60), None),
         (np.ones(60), None),
         (np.full(5, 90.0), None),
-    ],
-)
-def test_scores_beyond_one(score: np.ndarray, what: str | None) -> None:
-    doubt = scores_beyond_one(score)
-    assert (doubt is None) == (what is None)
-    assert doubt is None or f"look like {what}" in doubt.what
+    ]:
+        with subtests.test(what):
+            doubt = scores_beyond_one(score)
+            assert (doubt is None) == (what is None)
+            assert doubt is None or f"look like {what}" in doubt.what
 
 
-@pytest.mark.parametrize(
-    ("label", "size", "found"),
-    [
+def test_length_below_width(subtests: pytest.Subtests) -> None:
+    for label, size, found in [
         ("car", (1.9, 4.5, 1.6), True),
         ("REGULAR_VEHICLE", (1.9, 4.5, 1.6), True),
         ("car", (4.5, 1.9, 1.6), False),
         ("pedestrian", (0.6, 0.8, 1.7), False),
         ("barrier", (0.5, 2.6, 1.0), False),  # these are wider than long
         ("car", (np.nan, np.nan, np.nan), False),
-    ],
-)
-def test_length_below_width(label: str, size: tuple[float, ...], found: bool) -> None:
-    doubt = length_below_width(np.full(60, label), np.tile(size, (60, 1)))
-    assert option(doubt) == ("--columns length=wid,width=len" if found else None)
+    ]:
+        with subtests.test(label=label, size=size, found=found):
+            doubt = length_below_width(np.full(60, label), np.tile(size, (60, 1)))
+            assert option(doubt) == ("--columns length=wid,width=len" if found else None)
 
 
-@pytest.mark.parametrize(
-    ("label", "size", "unit"),
-    [
+def test_unlikely_sizes(subtests: pytest.Subtests) -> None:
+    for label, size, unit in [
         ("car", (4500.0, 1900.0, 1600.0), "mm"),
         ("car", (450.0, 190.0, 160.0), "cm"),
         ("car", (0.0045, 0.0019, 0.0016), "km"),
@@ -96,11 +87,10 @@ def test_length_below_width(label: str, size: tuple[float, ...], found: bool) ->
         ("truck", (16.0, 2.6, 3.5), None),
         ("pedestrian", (0.5, 0.5, 1.7), None),
         ("tram", (40.0, 2.6, 3.5), None),
-    ],
-)
-def test_unlikely_sizes(label: str, size: tuple[float, ...], unit: str | None) -> None:
-    found = option(unlikely_sizes(np.full(60, label), np.tile(size, (60, 1))))
-    assert found == (None if unit is None else f"--units length={unit}")
+    ]:
+        with subtests.test(label=label, size=size, unit=unit):
+            found = option(unlikely_sizes(np.full(60, label), np.tile(size, (60, 1))))
+            assert found == (None if unit is None else f"--units length={unit}")
 
 
 def test_within_a_metre() -> None:
@@ -118,32 +108,37 @@ def test_within_a_metre() -> None:
     assert within_a_metre(np.arange(100), lonely) is None  # one parked object
 
 
-@pytest.mark.parametrize(
-    ("label", "speed", "found"),
-    [
+def test_far_too_fast(subtests: pytest.Subtests) -> None:
+    for label, speed, found in [
         ("car", 100.0, True),
         ("pedestrian", 15.0, True),
         ("car", 45.0, False),
         ("pedestrian", 2.0, False),
         ("drone", 90.0, False),
-    ],
-)
-def test_far_too_fast(label: str, speed: float, found: bool) -> None:
-    velocity = np.column_stack([np.full(60, speed), np.zeros(60)])
-    assert option(far_too_fast(np.full(60, label), velocity)) == ("--units speed=km/h" if found else None)
-    velocity[3:] = 1.0  # a few strange ones are no rule
-    assert far_too_fast(np.full(60, label), velocity) is None
+    ]:
+        with subtests.test(label=label, speed=speed, found=found):
+            velocity = np.column_stack([np.full(60, speed), np.zeros(60)])
+            assert option(far_too_fast(np.full(60, label), velocity)) == ("--units speed=km/h" if found else None)
+            velocity[3:] = 1.0  # a few strange ones are no rule
+            assert far_too_fast(np.full(60, label), velocity) is None
 
 
-@pytest.mark.parametrize(
-    ("step", "found"),
-    [(100.0, "ms"), (5e5, "ms"), (1e5, "us"), (1e8, "ns"), (0.1, None), (0.4, None), (2.0, None), (10.0, None)],
-)
-def test_strange_time_steps(step: float, found: str | None) -> None:
-    doubt = strange_time_steps(np.arange(20) * step, np.full(20, "lidar"))
-    assert (doubt is None) == (found is None)
-    if step != 5e5:
-        assert doubt is None or option(doubt) == f"--units time={found}"
+def test_strange_time_steps(subtests: pytest.Subtests) -> None:
+    for step, found in [
+        (100.0, "ms"),
+        (5e5, "ms"),
+        (1e5, "us"),
+        (1e8, "ns"),
+        (0.1, None),
+        (0.4, None),
+        (2.0, None),
+        (10.0, None),
+    ]:
+        with subtests.test(step=step, found=found):
+            doubt = strange_time_steps(np.arange(20) * step, np.full(20, "lidar"))
+            assert (doubt is None) == (found is None)
+            if step != 5e5:
+                assert doubt is None or option(doubt) == f"--units time={found}"
 
 
 def test_a_long_pause_is_no_strange_step() -> None:
@@ -168,9 +163,8 @@ def drive(coordinates: str, start: float, speed: float = 10.0, traffic: float = 
     return frames
 
 
-@pytest.mark.parametrize(
-    ("frames", "found"),
-    [
+def test_ego_taken_for_world(subtests: pytest.Subtests) -> None:
+    for frames, found in [
         (drive("ego", 0.0), True),  # it moves with the vehicle
         (drive("ego", 3000.0, 0.0), True),  # it stands far away from all of it
         (drive("world", 0.0), False),
@@ -178,12 +172,11 @@ def drive(coordinates: str, start: float, speed: float = 10.0, traffic: float = 
         (drive("world", 0.0, traffic=12.0), False),
         (drive("world", 0.0, traffic=10.0), False),  # all go along with the vehicle
         (drive("ego", 0.0, 0.0), False),  # nothing tells
-    ],
-)
-def test_ego_taken_for_world(frames: Sequence[Frame], found: bool) -> None:
-    s = Sample.of(frames)
-    doubt = ego_taken_for_world(s.frame, s.boxes.position, s.world_T_ego, s.in_world, s.sensor)
-    assert option(doubt) == ("--coordinates ego" if found else None)
+    ]:
+        with subtests.test(frames=frames, found=found):
+            s = Sample.of(frames)
+            doubt = ego_taken_for_world(s.frame, s.boxes.position, s.world_T_ego, s.in_world, s.sensor)
+            assert option(doubt) == ("--coordinates ego" if found else None)
 
 
 def test_a_sample_has_all_doubts_and_none_where_scores_are_declared() -> None:
@@ -195,9 +188,8 @@ def test_a_sample_has_all_doubts_and_none_where_scores_are_declared() -> None:
     assert doubts_of(Sample.of([])) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "ours"),
-    [
+def test_names_of_classes(subtests: pytest.Subtests) -> None:
+    for name, ours in [
         ("REGULAR_VEHICLE", "car"),
         ("LARGE_VEHICLE", "truck"),
         ("BOX_TRUCK", "truck"),
@@ -212,10 +204,9 @@ def test_a_sample_has_all_doubts_and_none_where_scores_are_declared() -> None:
         ("person_sitting", "pedestrian"),
         ("dog", None),
         ("carton", None),
-    ],
-)
-def test_names_of_classes(name: str, ours: str | None) -> None:
-    assert usual_class(name) == ours
+    ]:
+        with subtests.test(name=name, ours=ours):
+            assert usual_class(name) == ours
 
 
 def test_rules_that_meet_no_class() -> None:

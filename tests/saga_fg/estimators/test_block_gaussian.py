@@ -1,5 +1,7 @@
 """A block-diagonal Gaussian against the same Gaussian as one dense matrix."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -29,17 +31,18 @@ def gaussian(request):
     return rng, random_gaussian(rng, np.arange(n) * 3, dims, rng.integers(6, size=n))
 
 
-@pytest.mark.parametrize("size", [2, 4, 6])
-def test_new_nodes_are_independent_and_leave_the_others_as_they_are(gaussian, size):
-    rng, x = gaussian
-    means, P = rng.normal(size=(2, size)), np.stack([np.eye(size) * 2, np.eye(size) * 3])
-    new = x.extended(x.layout.extended([100, 101], size), means, P)
-    D = x.layout.size
-    expected = np.zeros((D + 2 * size,) * 2)
-    expected[:D, :D] = dense(x)
-    expected[D:, D:] = np.diag(np.repeat([2.0, 3.0], size))
-    assert np.array_equal(dense(new), expected)
-    assert np.array_equal(new.mean, np.concatenate([x.mean, means.ravel()]))
+def test_new_nodes_are_independent_and_leave_the_others_as_they_are(gaussian, subtests):
+    for size in [2, 4, 6]:
+        with subtests.test(size=size):
+            rng, x = gaussian
+            means, P = rng.normal(size=(2, size)), np.stack([np.eye(size) * 2, np.eye(size) * 3])
+            new = x.extended(x.layout.extended([100, 101], size), means, P)
+            D = x.layout.size
+            expected = np.zeros((D + 2 * size,) * 2)
+            expected[:D, :D] = dense(x)
+            expected[D:, D:] = np.diag(np.repeat([2.0, 3.0], size))
+            assert np.array_equal(dense(new), expected)
+            assert np.array_equal(new.mean, np.concatenate([x.mean, means.ravel()]))
 
 
 def test_no_new_nodes_change_nothing(gaussian):
@@ -107,18 +110,18 @@ def entry_by_entry(blocks, partition):
     return whole
 
 
-@pytest.mark.parametrize("sizes", [[4], [2, 4, 6]])
-@pytest.mark.parametrize("seed", range(10))
-def test_regrouping_copies_what_shares_a_component_before_and_after(sizes, seed):
-    rng = np.random.default_rng(seed)
-    dims = rng.choice(sizes, 20)
-    number = rng.integers(0, 8, 20)
-    old = Partition(StateLayout(np.arange(20), dims), np.unique(number, return_inverse=True)[1])
-    blocks = tuple(rng.normal(size=(*places.shape, places.shape[1])) for places in old.groups)
-    source = rng.permutation(20)[:15] if seed % 2 else np.arange(20)
-    later = np.where(rng.random(len(source)) < 0.8, old.label[source], rng.integers(0, 8, len(source)))
-    new = Partition(StateLayout(np.arange(len(source)), dims[source]), np.unique(later, return_inverse=True)[1])
-    places = old.layout.places(source)
-    label = np.repeat(new.label, dims[source])
-    expected = entry_by_entry(blocks, old)[np.ix_(places, places)] * (label[:, None] == label)
-    np.testing.assert_array_equal(entry_by_entry(regrouped(blocks, old, new, source), new), expected)
+def test_regrouping_copies_what_shares_a_component_before_and_after(subtests):
+    for sizes, seed in product([[4], [2, 4, 6]], range(10)):
+        with subtests.test(sizes=sizes, seed=seed):
+            rng = np.random.default_rng(seed)
+            dims = rng.choice(sizes, 20)
+            number = rng.integers(0, 8, 20)
+            old = Partition(StateLayout(np.arange(20), dims), np.unique(number, return_inverse=True)[1])
+            blocks = tuple(rng.normal(size=(*places.shape, places.shape[1])) for places in old.groups)
+            source = rng.permutation(20)[:15] if seed % 2 else np.arange(20)
+            later = np.where(rng.random(len(source)) < 0.8, old.label[source], rng.integers(0, 8, len(source)))
+            new = Partition(StateLayout(np.arange(len(source)), dims[source]), np.unique(later, return_inverse=True)[1])
+            places = old.layout.places(source)
+            label = np.repeat(new.label, dims[source])
+            expected = entry_by_entry(blocks, old)[np.ix_(places, places)] * (label[:, None] == label)
+            np.testing.assert_array_equal(entry_by_entry(regrouped(blocks, old, new, source), new), expected)

@@ -59,23 +59,28 @@ def in_step(program, estimator, tolerance=TOLERANCE, textbook=None):
 # equal to the textbook
 
 
-@pytest.mark.parametrize("seed", range(15))
-def test_random_programs_agree_with_the_textbook(make, seed):
+def test_random_programs_agree_with_the_textbook(make, subtests):
     """Changing graphs of nodes of mixed sizes, several sensors, misses, new and leaving nodes, irregular intervals."""
-    in_step(random_program(np.random.default_rng(seed), moments=7), make())
+    for seed in range(15):
+        with subtests.test(seed=seed):
+            in_step(random_program(np.random.default_rng(seed), moments=7), make())
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_long_program_does_not_drift_away(make, seed):
-    in_step(random_program(np.random.default_rng(100 + seed), moments=40, kinds=(CAR, TRAM), density=0.15), make())
+def test_a_long_program_does_not_drift_away(make, subtests):
+    for seed in range(4):
+        with subtests.test(seed=seed):
+            in_step(
+                random_program(np.random.default_rng(100 + seed), moments=40, kinds=(CAR, TRAM), density=0.15), make()
+            )
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_nodes_that_turn_agree_with_the_textbook(make, seed):
+def test_nodes_that_turn_agree_with_the_textbook(make, subtests):
     """Courses with known headings and turn rates, recorded with every interval."""
-    rng = np.random.default_rng(seed)
-    program = random_program(rng, moments=7, kinds=(CAR, VAN, CONE))
-    in_step([with_courses(rng, operation) for operation in program], make())
+    for seed in range(8):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            program = random_program(rng, moments=7, kinds=(CAR, VAN, CONE))
+            in_step([with_courses(rng, operation) for operation in program], make())
 
 
 def with_courses(rng, operation):
@@ -89,17 +94,19 @@ def with_courses(rng, operation):
     return Predict(discretise(dataclasses.replace(graph, modes=(record,)), dt))
 
 
-@pytest.mark.parametrize("dt", [0.0, 1e-6, 1e-3])
-def test_tiny_intervals(make, dt):
+def test_tiny_intervals(make, subtests):
     """At dt = 0 nothing moves and there is no process noise."""
-    rng = np.random.default_rng(3)
-    in_step(random_program(rng, moments=6, intervals=(dt, 0.4)), make())
+    for dt in [0.0, 1e-6, 1e-3]:
+        with subtests.test(dt=dt):
+            rng = np.random.default_rng(3)
+            in_step(random_program(rng, moments=6, intervals=(dt, 0.4)), make())
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_milliseconds_beside_seconds(make, seed):
+def test_milliseconds_beside_seconds(make, subtests):
     """Nodes of all kinds: the noise of constant acceleration falls with the fifth power of the interval."""
-    in_step(random_program(np.random.default_rng(seed), moments=9, intervals=(1e-3, 0.05, 1.0)), make())
+    for seed in range(6):
+        with subtests.test(seed=seed):
+            in_step(random_program(np.random.default_rng(seed), moments=9, intervals=(1e-3, 0.05, 1.0)), make())
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -126,27 +133,30 @@ def test_a_thousand_seconds_without_a_word(make, seed):
     assert (np.linalg.eigvalsh(estimator.joint_covariance(nodes)) > 0).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_nodes_that_stand_still_for_ever(make, seed):
+def test_nodes_that_stand_still_for_ever(make, subtests):
     """Stop lines and poles have no process noise: Q is singular."""
-    rng = np.random.default_rng(40 + seed)
-    in_step(random_program(rng, moments=7, kinds=(CAR, POLE)), make())
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(40 + seed)
+            in_step(random_program(rng, moments=7, kinds=(CAR, POLE)), make())
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_scene_of_lights_lanes_cones_and_trailers(make, seed):
+def test_a_scene_of_lights_lanes_cones_and_trailers(make, subtests):
     """Standing and moving nodes whose edges go between kinds, with rates that follow the belief on a light."""
-    rng = np.random.default_rng(seed)
-    in_step(road_program(rng), make())
+    for seed in range(4):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            in_step(road_program(rng), make())
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_measurements_far_better_than_the_prior(make, seed):
-    rng = np.random.default_rng(seed)
-    prior = Add(np.array([1, 2]), rng.normal(size=(2, 4)) * 1e3, np.stack([1e6 * np.eye(4)] * 2))
-    sharp = Update(Measurements(np.array([1]), np.array([[3.0, 4.0]]), np.eye(2, 4), 1e-2 * np.eye(2)))
-    tolerance = max(TOLERANCE, 20 * np.finfo(float).eps * 1e6 / 1e-2)
-    in_step([prior, sharp], make(), tolerance)
+def test_measurements_far_better_than_the_prior(make, subtests):
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            prior = Add(np.array([1, 2]), rng.normal(size=(2, 4)) * 1e3, np.stack([1e6 * np.eye(4)] * 2))
+            sharp = Update(Measurements(np.array([1]), np.array([[3.0, 4.0]]), np.eye(2, 4), 1e-2 * np.eye(2)))
+            tolerance = max(TOLERANCE, 20 * np.finfo(float).eps * 1e6 / 1e-2)
+            in_step([prior, sharp], make(), tolerance)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -229,17 +239,18 @@ def test_gtsam_solves_the_estimators_graph_to_the_same_answer(make, seed):
         assert np.linalg.norm(marginals.marginalCovariance(key) - P) < 1e-6 * np.linalg.norm(P)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_batch_solver_solves_the_estimators_graph_to_the_same_answer(make, seed):
+def test_the_batch_solver_solves_the_estimators_graph_to_the_same_answer(make, subtests):
     """Its graph is a running graph: nodes of a map by their kind, moments by their time, poles with one variable."""
-    estimator, _ = run(random_program(np.random.default_rng(seed), moments=6), make())
-    estimator.add([-4], np.array([[3.0, 1.0]]), 0.1 * np.eye(2)[None])
-    solver = BatchSolver(graph=estimator.graph())
-    for node in estimator.nodes.tolist():
-        key, P = newest_key(estimator.graph(), node), estimator.covariance([node])[0]
-        assert np.abs((solver.state(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 5e-9
-        assert np.linalg.norm(solver.covariance(key) - P) < 5e-9 * np.linalg.norm(P)
-    assert str(solver.graph().variable(key)) == f"map node 4 at {estimator.time:.2f} s"
+    for seed in range(3):
+        with subtests.test(seed=seed):
+            estimator, _ = run(random_program(np.random.default_rng(seed), moments=6), make())
+            estimator.add([-4], np.array([[3.0, 1.0]]), 0.1 * np.eye(2)[None])
+            solver = BatchSolver(graph=estimator.graph())
+            for node in estimator.nodes.tolist():
+                key, P = newest_key(estimator.graph(), node), estimator.covariance([node])[0]
+                assert np.abs((solver.state(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 5e-9
+                assert np.linalg.norm(solver.covariance(key) - P) < 5e-9 * np.linalg.norm(P)
+            assert str(solver.graph().variable(key)) == f"map node 4 at {estimator.time:.2f} s"
 
 
 def test_any_subset_in_any_order_can_be_read(make):

@@ -19,18 +19,19 @@ def smallest_eigenvalue(P: FloatArray) -> float:
     return float(np.linalg.eigvalsh((P + P.T) / 2)[0])
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_what_is_missing_makes_it_no_smaller_in_any_direction(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    P, least = covariance(rng, 4), covariance(rng, 4)
-    missing = missing_covariance(P, least)
-    assert smallest_eigenvalue(missing) >= -1e-12
-    assert smallest_eigenvalue(P + missing - least) >= -1e-10
-    T = np.diag(10.0 ** rng.uniform(-3, 3, 4)) @ rng.normal(size=(4, 4))  # other units, other axes
-    theirs = missing_covariance(T @ P @ T.T, T @ least @ T.T)
-    expected = T @ missing @ T.T
-    sigma = np.sqrt(np.diag(T @ least @ T.T))
-    np.testing.assert_allclose(theirs / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-6)
+def test_what_is_missing_makes_it_no_smaller_in_any_direction(subtests: pytest.Subtests) -> None:
+    for seed in range(20):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            P, least = covariance(rng, 4), covariance(rng, 4)
+            missing = missing_covariance(P, least)
+            assert smallest_eigenvalue(missing) >= -1e-12
+            assert smallest_eigenvalue(P + missing - least) >= -1e-10
+            T = np.diag(10.0 ** rng.uniform(-3, 3, 4)) @ rng.normal(size=(4, 4))  # other units, other axes
+            theirs = missing_covariance(T @ P @ T.T, T @ least @ T.T)
+            expected = T @ missing @ T.T
+            sigma = np.sqrt(np.diag(T @ least @ T.T))
+            np.testing.assert_allclose(theirs / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-6)
 
 
 def test_nothing_is_missing_where_it_is_larger_already() -> None:

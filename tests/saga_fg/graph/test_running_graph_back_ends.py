@@ -356,12 +356,13 @@ def test_what_fails_is_named_and_the_tracker_goes_on(name):
 
 
 @pytest.mark.parametrize("name", BACK_ENDS)
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))])
-def test_copies_go_on_alike(name, copied):
+def test_copies_go_on_alike(name, subtests):
     """With a pose and a landmark in the graph; what looks ahead changes nothing."""
-    one = tracker(name, Drive())
-    run(one, FRAMES[:6])
-    one.tracks(FRAMES[5].timestamp + 0.7)
-    other = copied(one)
-    for f in FRAMES[6:]:
-        assert state(one.step(f)) == pytest.approx(state(other.step(f)), abs=1e-4)
+    for copied in [copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))]:
+        with subtests.test(copied=copied):
+            one = tracker(name, Drive())
+            run(one, FRAMES[:6])
+            one.tracks(FRAMES[5].timestamp + 0.7)
+            other = copied(one)
+            for f in FRAMES[6:]:
+                assert state(one.step(f)) == pytest.approx(state(other.step(f)), abs=1e-4)

@@ -270,16 +270,19 @@ def in_the_tracker(back_end, function, message):
     np.testing.assert_allclose(estimator.joint_covariance([7, 12]), before[1], atol=1e-10)
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_one_error_and_nothing_has_happened(name):
-    context = multiprocessing.get_context("forkserver")  # a library with threads in this process can't be forked
-    context.set_forkserver_preload(["pytest", "factors", "saga_fg.estimators"])
-    failures = context.Queue()
-    process = context.Process(target=case, args=(name, failures))
-    process.start()
-    process.join(60)
-    assert process.exitcode == 0, f"ended with {process.exitcode}"
-    assert failures.empty(), failures.get()
+def test_one_error_and_nothing_has_happened(subtests):
+    for name in CASES:
+        with subtests.test(name=name):
+            context = multiprocessing.get_context(
+                "forkserver"
+            )  # a library with threads in this process can't be forked
+            context.set_forkserver_preload(["pytest", "factors", "saga_fg.estimators"])
+            failures = context.Queue()
+            process = context.Process(target=case, args=(name, failures))
+            process.start()
+            process.join(60)
+            assert process.exitcode == 0, f"ended with {process.exitcode}"
+            assert failures.empty(), failures.get()
 
 
 def test_a_custom_factor_that_leaves_its_jacobians_out_is_differentiated():

@@ -30,20 +30,22 @@ class Batch(GraphEstimator):
         self.smoother.step(0.0)
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_random_programs_agree_with_the_textbook(seed):
+def test_random_programs_agree_with_the_textbook(subtests):
     """Agreement is limited by factors of the noise of 0.02 s of constant acceleration."""
-    mean, joint, single = largest_errors(
-        random_program(np.random.default_rng(seed), moments=7, intervals=USUAL), Batch()
-    )
-    assert mean < 5e-9
-    assert max(joint, single) < 1e-9
+    for seed in range(10):
+        with subtests.test(seed=seed):
+            mean, joint, single = largest_errors(
+                random_program(np.random.default_rng(seed), moments=7, intervals=USUAL), Batch()
+            )
+            assert mean < 5e-9
+            assert max(joint, single) < 1e-9
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_milliseconds_beside_seconds(seed):
-    program = random_program(np.random.default_rng(seed), moments=9, intervals=MILLISECONDS, kinds=(CAR, CONE))
-    assert max(largest_errors(program, Batch())) < 1e-9
+def test_milliseconds_beside_seconds(subtests):
+    for seed in range(10):
+        with subtests.test(seed=seed):
+            program = random_program(np.random.default_rng(seed), moments=9, intervals=MILLISECONDS, kinds=(CAR, CONE))
+            assert max(largest_errors(program, Batch())) < 1e-9
 
 
 def apart(one, other):
@@ -61,19 +63,20 @@ def driven(estimator, scene):
     return estimator
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_what_is_nonlinear_is_where_isam2_is_that_keeps_everything(seed):
-    scene = sample_traffic(np.random.default_rng(seed), frames=10)
-    batch = driven(BatchSolver(providers(scene)), scene)
-    isam2 = driven(IncrementalSmoother(providers(scene), None, RelinearisationSettings(threshold=1e-4)), scene)
-    handed = BatchSolver(graph=isam2.graph())
-    assert apart(batch, isam2) < 1e-3
-    assert apart(handed, batch) < 1e-5
-    assert batch.solve().converged
-    keys = [*(one.key for one in batch.graph().of(OBJECT, 9).values()), key_of(EGO_POSE, 0, 4)]
-    joint = batch.joint_covariance(keys)
-    assert np.linalg.norm(joint - isam2.joint_covariance(keys)) < 1e-3 * np.linalg.norm(joint)
-    assert np.allclose(joint[:4, :4], batch.covariance(keys[0]), rtol=1e-6)
+def test_what_is_nonlinear_is_where_isam2_is_that_keeps_everything(subtests):
+    for seed in range(5):
+        with subtests.test(seed=seed):
+            scene = sample_traffic(np.random.default_rng(seed), frames=10)
+            batch = driven(BatchSolver(providers(scene)), scene)
+            isam2 = driven(IncrementalSmoother(providers(scene), None, RelinearisationSettings(threshold=1e-4)), scene)
+            handed = BatchSolver(graph=isam2.graph())
+            assert apart(batch, isam2) < 1e-3
+            assert apart(handed, batch) < 1e-5
+            assert batch.solve().converged
+            keys = [*(one.key for one in batch.graph().of(OBJECT, 9).values()), key_of(EGO_POSE, 0, 4)]
+            joint = batch.joint_covariance(keys)
+            assert np.linalg.norm(joint - isam2.joint_covariance(keys)) < 1e-3 * np.linalg.norm(joint)
+            assert np.allclose(joint[:4, :4], batch.covariance(keys[0]), rtol=1e-6)
 
 
 def test_what_goes_in_acts():

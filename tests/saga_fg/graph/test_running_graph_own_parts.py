@@ -88,7 +88,8 @@ def test_what_is_ones_own_acts(name):
 
 
 @pytest.mark.parametrize("name", [name for name in BACK_ENDS if name != "kalman"])
-@pytest.mark.parametrize("motion", [ConstantVelocity, Whirl])
-def test_before_anything_is_measured_all_answer_alike(name, motion):
-    kalman = driven(JointKalmanFilter(), motion=motion, seen=False)
-    np.testing.assert_allclose(driven(BACK_ENDS[name](), motion=motion, seen=False), kalman, atol=1e-9)
+def test_before_anything_is_measured_all_answer_alike(name, subtests):
+    for motion in [ConstantVelocity, Whirl]:
+        with subtests.test(motion=motion):
+            kalman = driven(JointKalmanFilter(), motion=motion, seen=False)
+            np.testing.assert_allclose(driven(BACK_ENDS[name](), motion=motion, seen=False), kalman, atol=1e-9)

@@ -1,5 +1,7 @@
 """Discretisation: the classical one without edges, second order against the joint exponential, stable for any dt."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -80,13 +82,13 @@ def test_constant_acceleration_in_closed_form(dt):
     assert np.allclose(Q, q * np.kron(one_axis, eye), rtol=1e-11, atol=1e-300)
 
 
-@pytest.mark.parametrize("dt", [1e-6, 0.05, 0.7, 5.0, 40.0])
-@pytest.mark.parametrize("node_type", [CAR, BUS, TRAM, CONE, POLE], ids=lambda t: t.name)
-def test_every_type_without_edges_is_the_matrix_exponential(node_type, dt):
-    F, _, Q = dense(discretise(SceneGraph.of([0, 1], node_type), dt))
-    F_one, Q_one = van_loan(node_type.generator, node_type.diffusion, dt)
-    assert np.allclose(F, scipy.linalg.block_diag(F_one, F_one), rtol=1e-11, atol=1e-14)
-    assert np.allclose(Q, scipy.linalg.block_diag(Q_one, Q_one), rtol=1e-9, atol=1e-12 * Q_one.max(initial=0))
+def test_every_type_without_edges_is_the_matrix_exponential(subtests):
+    for dt, node_type in product([1e-6, 0.05, 0.7, 5.0, 40.0], [CAR, BUS, TRAM, CONE, POLE]):
+        with subtests.test(dt=dt, node_type=node_type):
+            F, _, Q = dense(discretise(SceneGraph.of([0, 1], node_type), dt))
+            F_one, Q_one = van_loan(node_type.generator, node_type.diffusion, dt)
+            assert np.allclose(F, scipy.linalg.block_diag(F_one, F_one), rtol=1e-11, atol=1e-14)
+            assert np.allclose(Q, scipy.linalg.block_diag(Q_one, Q_one), rtol=1e-9, atol=1e-12 * Q_one.max(initial=0))
 
 
 @given(seeds, intervals)
@@ -185,19 +187,19 @@ def test_leaders_that_nothing_acts_on_make_the_step_exact(seed, dt):
     assert np.allclose(b, b_exact, rtol=1e-9, atol=1e-9 * max(1, np.abs(b_exact).max()))
 
 
-@pytest.mark.parametrize("dt", [0.1, 3.0, 60.0])
-@pytest.mark.parametrize("target", MOVING, ids=lambda t: t.name)
-def test_a_leader_with_fading_acceleration(target, dt):
+def test_a_leader_with_fading_acceleration(subtests):
     """exp(A_j s) is no polynomial here: the coupling is read off the exponential of a block matrix."""
-    rng = np.random.default_rng(5)
-    nodes = node_table(rng, (target, TRAM))
-    rows = np.array([0]), np.array([1])
-    edges = Edges("shared velocity", *rows, [0.8], *SharedVelocity().triples(nodes, *rows))
-    graph = SceneGraph(nodes.id, nodes.types, (edges,))
-    F, b, _ = dense(discretise(graph, dt))
-    F_exact, b_exact, _ = exact(graph, dt)
-    assert np.allclose(F, F_exact, rtol=1e-10, atol=1e-10)
-    assert np.allclose(b, b_exact, rtol=1e-10, atol=1e-10)
+    for dt, target in product([0.1, 3.0, 60.0], MOVING):
+        with subtests.test(dt=dt, target=target):
+            rng = np.random.default_rng(5)
+            nodes = node_table(rng, (target, TRAM))
+            rows = np.array([0]), np.array([1])
+            edges = Edges("shared velocity", *rows, [0.8], *SharedVelocity().triples(nodes, *rows))
+            graph = SceneGraph(nodes.id, nodes.types, (edges,))
+            F, b, _ = dense(discretise(graph, dt))
+            F_exact, b_exact, _ = exact(graph, dt)
+            assert np.allclose(F, F_exact, rtol=1e-10, atol=1e-10)
+            assert np.allclose(b, b_exact, rtol=1e-10, atol=1e-10)
 
 
 @given(seeds, st.floats(0.01, 3))
@@ -370,26 +372,26 @@ def queue(n, heading, rate, gap=15.0, **law):
     return SceneGraph(nodes.id, nodes.types, (edges,)), np.concatenate([position, velocity], axis=1).ravel(), u
 
 
-@pytest.mark.parametrize("dt", [0.1, 1.0, 7.0, 100.0, 1000.0])
-@pytest.mark.parametrize("headway", [0.0, 1.0])
-def test_a_queue_in_formation_stays_in_formation(dt, headway):
-    graph, x, u = queue(6, 0.7, [0.1, 0.5, 1.0, 3.0, 20.0], headway=headway)
-    transition = discretise(graph, dt)
-    moved = (transition.F_matrix @ x + transition.b).reshape(6, 4)
-    expected = x.reshape(6, 4) + np.concatenate([np.tile(10.0 * dt * u, (6, 1)), np.zeros((6, 2))], axis=1)
-    assert np.allclose(moved, expected, rtol=1e-9, atol=1e-9 * max(1, dt))
+def test_a_queue_in_formation_stays_in_formation(subtests):
+    for dt, headway in product([0.1, 1.0, 7.0, 100.0, 1000.0], [0.0, 1.0]):
+        with subtests.test(dt=dt, headway=headway):
+            graph, x, u = queue(6, 0.7, [0.1, 0.5, 1.0, 3.0, 20.0], headway=headway)
+            transition = discretise(graph, dt)
+            moved = (transition.F_matrix @ x + transition.b).reshape(6, 4)
+            expected = x.reshape(6, 4) + np.concatenate([np.tile(10.0 * dt * u, (6, 1)), np.zeros((6, 2))], axis=1)
+            assert np.allclose(moved, expected, rtol=1e-9, atol=1e-9 * max(1, dt))
 
 
-@pytest.mark.parametrize("dt", [0.1, 1.0, 7.0, 100.0, 1000.0])
-@pytest.mark.parametrize("rate", [0.2, 1.0, 20.0])
-def test_a_disturbed_queue_finds_its_formation_again(dt, rate):
+def test_a_disturbed_queue_finds_its_formation_again(subtests):
     """Whatever the interval, followers settle behind a steady leader: deviations from the formation die out."""
-    graph, _, u = queue(5, -0.4, np.full(4, rate))
-    F = discretise(graph, dt).F_matrix.toarray()
-    rng = np.random.default_rng(0)
-    deviation = np.zeros((5, 4))
-    deviation[1:, :2], deviation[1:, 2:] = rng.normal(size=(4, 1)) * u, rng.normal(size=(4, 1)) * u
-    later = np.linalg.matrix_power(F, max(20, int(1000 / dt))) @ deviation.ravel()
-    assert np.abs(later).max() < 1e-6 + 1e-8 * dt
-    along = in_order_of_components(graph, ("x", "y", "vx", "vy"), F)
-    assert np.isfinite(along).all()
+    for dt, rate in product([0.1, 1.0, 7.0, 100.0, 1000.0], [0.2, 1.0, 20.0]):
+        with subtests.test(dt=dt, rate=rate):
+            graph, _, u = queue(5, -0.4, np.full(4, rate))
+            F = discretise(graph, dt).F_matrix.toarray()
+            rng = np.random.default_rng(0)
+            deviation = np.zeros((5, 4))
+            deviation[1:, :2], deviation[1:, 2:] = rng.normal(size=(4, 1)) * u, rng.normal(size=(4, 1)) * u
+            later = np.linalg.matrix_power(F, max(20, int(1000 / dt))) @ deviation.ravel()
+            assert np.abs(later).max() < 1e-6 + 1e-8 * dt
+            along = in_order_of_components(graph, ("x", "y", "vx", "vy"), F)
+            assert np.isfinite(along).all()

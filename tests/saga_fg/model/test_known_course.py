@@ -1,6 +1,7 @@
 """Curvilinear motion along known courses: linear motion along an arc, recorded with the interval."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -39,33 +40,34 @@ def noise_of(generator, diffusion, dt):
     return linear_motions(generator[None], diffusion[None], dt)[1][0]
 
 
-@pytest.mark.parametrize("rate", [0.0, 1e-9, 0.3, -0.8])
-@pytest.mark.parametrize("dt", [0.1, 0.5, 2.0])
-def test_without_acceleration_and_fading_it_is_the_coordinated_turn(rate, dt):
-    x = np.array([3.0, -1.0, 8.0, 2.0])
-    car = NodeType("car", Curvilinear(turn_time=LONG))
-    F, b, _ = own(course(car, rate=rate), dt, car)
-    assert F[:4, :4] @ x + b[:4] == pytest.approx(CoordinatedTurn().flow(np.append(x, rate), dt)[:4], abs=1e-6)
+def test_without_acceleration_and_fading_it_is_the_coordinated_turn(subtests):
+    for rate, dt in product([0.0, 1e-9, 0.3, -0.8], [0.1, 0.5, 2.0]):
+        with subtests.test(rate=rate, dt=dt):
+            x = np.array([3.0, -1.0, 8.0, 2.0])
+            car = NodeType("car", Curvilinear(turn_time=LONG))
+            F, b, _ = own(course(car, rate=rate), dt, car)
+            assert F[:4, :4] @ x + b[:4] == pytest.approx(CoordinatedTurn().flow(np.append(x, rate), dt)[:4], abs=1e-6)
 
 
-@pytest.mark.parametrize("turn_time", [0.0, 1.5, LONG])
-@pytest.mark.parametrize("dt", [0.1, 0.5])
-def test_the_turn_of_a_path_is_made_however_turns_fade(turn_time, dt):
-    motion = Curvilinear(turn_time=turn_time)
-    F, _, _ = own(course(car := NodeType("car", motion), rate=0.3 / turning_time(motion, dt), dt=dt), dt, car)
-    assert F[V, V] @ [8.0, 0.0] == pytest.approx([8 * np.cos(0.3), 8 * np.sin(0.3)], abs=1e-6)
+def test_the_turn_of_a_path_is_made_however_turns_fade(subtests):
+    for turn_time, dt in product([0.0, 1.5, LONG], [0.1, 0.5]):
+        with subtests.test(turn_time=turn_time, dt=dt):
+            motion = Curvilinear(turn_time=turn_time)
+            F, _, _ = own(course(car := NodeType("car", motion), rate=0.3 / turning_time(motion, dt), dt=dt), dt, car)
+            assert F[V, V] @ [8.0, 0.0] == pytest.approx([8 * np.cos(0.3), 8 * np.sin(0.3)], abs=1e-6)
 
 
-@pytest.mark.parametrize("heading", [0.0, 0.7, -2.5])
-def test_the_acceleration_acts_along_the_heading_alone(heading):
-    u = np.array([np.cos(heading), np.sin(heading)])
-    F, _, _ = own(course(CAR, heading), 0.4)
-    straight = discretise(SceneGraph.of([7], CAR), 0.4).F[0].values[0]
-    x = np.concatenate([np.zeros(2), 8 * u, 2 * u])
-    assert F @ x == pytest.approx(straight @ x), "along it, as a fading acceleration does"
-    gone = F[:, A] @ [-u[1], u[0]]
-    assert np.abs(gone) == pytest.approx(np.zeros(6), abs=0.1), "across it, hardly for 0.1 s"
-    assert gone[A] == pytest.approx(np.zeros(2), abs=0.02)
+def test_the_acceleration_acts_along_the_heading_alone(subtests):
+    for heading in [0.0, 0.7, -2.5]:
+        with subtests.test(heading=heading):
+            u = np.array([np.cos(heading), np.sin(heading)])
+            F, _, _ = own(course(CAR, heading), 0.4)
+            straight = discretise(SceneGraph.of([7], CAR), 0.4).F[0].values[0]
+            x = np.concatenate([np.zeros(2), 8 * u, 2 * u])
+            assert F @ x == pytest.approx(straight @ x), "along it, as a fading acceleration does"
+            gone = F[:, A] @ [-u[1], u[0]]
+            assert np.abs(gone) == pytest.approx(np.zeros(6), abs=0.1), "across it, hardly for 0.1 s"
+            assert gone[A] == pytest.approx(np.zeros(2), abs=0.02)
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.1])

@@ -23,9 +23,10 @@ def test_lists_and_integers_become_floats():
     assert checked("values", [[1, 2], [3, 4]], (None, 2)).tolist() == [[1.0, 2.0], [3.0, 4.0]]
 
 
-@pytest.mark.parametrize("shape", [(None, 3), (None, 2, 2), (None,)])
-def test_an_empty_list_is_no_rows_of_anything(shape):
-    assert checked("values", [], shape).shape == tuple(n or 0 for n in shape)
+def test_an_empty_list_is_no_rows_of_anything(subtests):
+    for shape in [(None, 3), (None, 2, 2), (None,)]:
+        with subtests.test(shape=shape):
+            assert checked("values", [], shape).shape == tuple(n or 0 for n in shape)
 
 
 def test_wrong_arrays_are_named(subtests):

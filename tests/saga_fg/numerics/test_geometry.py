@@ -50,19 +50,17 @@ def test_wrapped_angles_lie_in_one_turn_and_point_the_same_way(angle):
     assert np.allclose([np.cos(wrapped), np.sin(wrapped)], [np.cos(angle), np.sin(angle)], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("angle", "wrapped"),
-    [
+def test_angles_at_the_seam(subtests):
+    for angle, wrapped in [
         (np.pi, -np.pi),
         (-np.pi, -np.pi),
         (np.nextafter(-np.pi, -4), -np.pi),  # rounds to +pi unless told otherwise
         (3 * np.pi / 2, -np.pi / 2),
         (0.0, 0.0),
-    ],
-)
-def test_angles_at_the_seam(angle, wrapped):
-    assert float(wrap_angle(angle)) == pytest.approx(wrapped, abs=1e-12)
-    assert -np.pi <= float(wrap_angle(angle)) < np.pi
+    ]:
+        with subtests.test(angle=angle, wrapped=wrapped):
+            assert float(wrap_angle(angle)) == pytest.approx(wrapped, abs=1e-12)
+            assert -np.pi <= float(wrap_angle(angle)) < np.pi
 
 
 def test_unknown_angles_stay_unknown_and_shapes_are_kept():

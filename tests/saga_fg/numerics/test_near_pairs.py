@@ -20,14 +20,15 @@ def most_compared(request, monkeypatch):
 
 
 @pytest.mark.usefixtures("most_compared")
-@pytest.mark.parametrize("seed", range(5))
-def test_pairs_are_those_of_all_distances_in_order(seed):
-    rng = np.random.default_rng(seed)
-    a, b = rng.uniform(-50, 50, (80, 2)), rng.uniform(-50, 50, (60, 2))
-    reach, further = rng.lognormal(1, 1.5, 80), rng.uniform(0, 2, 60)
-    found = near_pairs(a, b, reach, further)
-    np.testing.assert_array_equal(found, by_distances(a, b, reach, further))
-    assert len(found[0]) > 20
+def test_pairs_are_those_of_all_distances_in_order(subtests):
+    for seed in range(5):
+        with subtests.test(seed=seed):
+            rng = np.random.default_rng(seed)
+            a, b = rng.uniform(-50, 50, (80, 2)), rng.uniform(-50, 50, (60, 2))
+            reach, further = rng.lognormal(1, 1.5, 80), rng.uniform(0, 2, 60)
+            found = near_pairs(a, b, reach, further)
+            np.testing.assert_array_equal(found, by_distances(a, b, reach, further))
+            assert len(found[0]) > 20
 
 
 @pytest.mark.usefixtures("most_compared")
@@ -38,10 +39,11 @@ def test_unknown_reaches_find_nothing_and_infinite_ones_everything():
 
 
 @pytest.mark.usefixtures("most_compared")
-@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 3), (3, 0)])
-def test_nothing_is_near_nothing(n, m):
-    i, j = near_pairs(np.zeros((n, 2)), np.zeros((m, 2)), np.ones(n))
-    assert len(i) == len(j) == 0
+def test_nothing_is_near_nothing(subtests):
+    for n, m in [(0, 0), (0, 3), (3, 0)]:
+        with subtests.test(n=n, m=m):
+            i, j = near_pairs(np.zeros((n, 2)), np.zeros((m, 2)), np.ones(n))
+            assert len(i) == len(j) == 0
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-3, 1.0, 1e5]))

@@ -168,14 +168,15 @@ def test_an_increment_is_shared_out_over_the_epochs_it_covers() -> None:
     assert np.sqrt(np.diag(ends[1][1])) == pytest.approx(np.sqrt(np.diag(ends[0][1])), rel=0.25)
 
 
-@pytest.mark.parametrize(("gps", "heeds"), [(Gps(), False), (Gps(gate=1), True), (Gps(gate=1, outlier_scale=2), False)])
-def test_a_fix_far_off_is_gated_or_given_up(gps: Gps, heeds: bool) -> None:
-    smoother = IncrementalSmoother([Odometry(StartSettings((0.0, 0.0, 0.0))), gps])
-    for k in range(8):
-        off = 60.0 if k == 7 else 0.0
-        still = OdometryIncrement(np.eye(3), DT, 0.01 * np.eye(3))
-        smoother.step(DT * k, frame=frame(k, EgoMeasurements(still if k else None, GpsFix([off, 0.0]))))
-    assert (abs(smoother.state(now(smoother, EGO_POSE)).x()) > 1.0) == heeds  # type: ignore[attr-defined]
+def test_a_fix_far_off_is_gated_or_given_up(subtests: pytest.Subtests) -> None:
+    for gps, heeds in [(Gps(), False), (Gps(gate=1), True), (Gps(gate=1, outlier_scale=2), False)]:
+        with subtests.test(gps=gps, heeds=heeds):
+            smoother = IncrementalSmoother([Odometry(StartSettings((0.0, 0.0, 0.0))), gps])
+            for k in range(8):
+                off = 60.0 if k == 7 else 0.0
+                still = OdometryIncrement(np.eye(3), DT, 0.01 * np.eye(3))
+                smoother.step(DT * k, frame=frame(k, EgoMeasurements(still if k else None, GpsFix([off, 0.0]))))
+            assert (abs(smoother.state(now(smoother, EGO_POSE)).x()) > 1.0) == heeds  # type: ignore[attr-defined]
 
 
 def test_the_antenna_says_where_the_vehicle_points() -> None:

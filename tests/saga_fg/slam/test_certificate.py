@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -133,19 +134,19 @@ def test_positions_are_eliminated_at_their_best(dim: int) -> None:
         assert cost.at(other) > least
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("seed", range(3))
-def test_the_minimum_is_proven_and_no_other_poses_are_below_the_bound(dim: int, seed: int) -> None:
-    graph, true = loop(dim, seed)
-    minimum = chordal_minimum(graph, chordal_poses(graph))
-    cost = ChordalCost.of(graph)
-    assert minimum.certified
-    assert minimum.bound <= minimum.cost <= cost.at(true)
-    assert minimum.cost == pytest.approx(cost.at(minimum.world_T_pose), rel=1e-9)
-    np.testing.assert_allclose(minimum.world_T_pose[0], graph.world_T_pose[0], atol=1e-9)
-    rng, k = np.random.default_rng(seed), 3 * (dim - 1)
-    for scale in (0.01, 0.1, 1.0):
-        assert cost.at(true @ moved(dim, scale * rng.normal(size=(len(true), k)))) > minimum.bound
+def test_the_minimum_is_proven_and_no_other_poses_are_below_the_bound(subtests: pytest.Subtests) -> None:
+    for dim, seed in product([2, 3], range(3)):
+        with subtests.test(dim=dim, seed=seed):
+            graph, true = loop(dim, seed)
+            minimum = chordal_minimum(graph, chordal_poses(graph))
+            cost = ChordalCost.of(graph)
+            assert minimum.certified
+            assert minimum.bound <= minimum.cost <= cost.at(true)
+            assert minimum.cost == pytest.approx(cost.at(minimum.world_T_pose), rel=1e-9)
+            np.testing.assert_allclose(minimum.world_T_pose[0], graph.world_T_pose[0], atol=1e-9)
+            rng, k = np.random.default_rng(seed), 3 * (dim - 1)
+            for scale in (0.01, 0.1, 1.0):
+                assert cost.at(true @ moved(dim, scale * rng.normal(size=(len(true), k)))) > minimum.bound
 
 
 @pytest.mark.parametrize("dim", [2, 3])

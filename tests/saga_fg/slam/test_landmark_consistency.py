@@ -79,12 +79,17 @@ def drives() -> list[tuple[dict[str, tuple[float, int]], float]]:
     return [drive(seed) for seed in range(DRIVES)]
 
 
-@pytest.mark.parametrize("kind", ["pole", "plane", "road line"])
-def test_squared_errors_lie_in_the_band(kind: str, drives: list[tuple[dict[str, tuple[float, int]], float]]) -> None:
-    squared = sum(found[kind][0] for found, _ in drives)
-    dim = sum(found[kind][1] for found, _ in drives)
-    low, high = chi2.ppf([0.0005, 0.9995], dim)
-    assert low < squared < high, f"{squared / dim:.2f} a dimension, expected {low / dim:.2f} to {high / dim:.2f}"
+def test_squared_errors_lie_in_the_band(
+    drives: list[tuple[dict[str, tuple[float, int]], float]], subtests: pytest.Subtests
+) -> None:
+    for kind in ["pole", "plane", "road line"]:
+        with subtests.test(kind=kind):
+            squared = sum(found[kind][0] for found, _ in drives)
+            dim = sum(found[kind][1] for found, _ in drives)
+            low, high = chi2.ppf([0.0005, 0.9995], dim)
+            assert low < squared < high, (
+                f"{squared / dim:.2f} a dimension, expected {low / dim:.2f} to {high / dim:.2f}"
+            )
 
 
 def test_so_does_the_pose(drives: list[tuple[dict[str, tuple[float, int]], float]]) -> None:

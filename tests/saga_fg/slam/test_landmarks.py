@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import gtsam
 import numpy as np
 import pytest
@@ -137,18 +139,18 @@ def test_what_was_seen_side_by_side_is_never_one() -> None:
     assert duplicates(local, 0.999, {(1, 3)}) == {4: 2}
 
 
-@pytest.mark.parametrize("way", [0.0, np.pi / 2, np.pi, -np.pi + 1e-3], ids=lambda way: f"{way:.3f} rad")
-@pytest.mark.parametrize("side", [4.0, 0.0])
-def test_an_edge_is_one_whichever_way_its_normal_points(way: float, side: float) -> None:
+def test_an_edge_is_one_whichever_way_its_normal_points(subtests: pytest.Subtests) -> None:
     """A curb in any direction, seen again a little turned: theta beyond pi, or (theta + pi, -rho)."""
-    kind, R = LineLandmark(), 0.01 * np.eye(2)
-    local = LocalMap(np.eye(4), 1e-6 * np.eye(6))
-    for number, (turn, shift) in enumerate([(0.002, 0.02), (-0.002, -0.02)], start=1):
-        along = np.array([np.cos(way + turn), np.sin(way + turn), 0.0])
-        foot = (side + shift) * np.array([-along[1], along[0], 0.0])
-        local.augment(number, Observation(kind, np.concatenate([foot - 5 * along, foot + 5 * along]), R))
-    local.augment(3, Observation(kind, np.array([-5.0, -9.0, 0.0, 5.0, 11.0, 0.0]), R))
-    assert duplicates(local, 0.999, set()) == {2: 1}
+    for way, side in product([0.0, np.pi / 2, np.pi, -np.pi + 1e-3], [4.0, 0.0]):
+        with subtests.test(way=way, side=side):
+            kind, R = LineLandmark(), 0.01 * np.eye(2)
+            local = LocalMap(np.eye(4), 1e-6 * np.eye(6))
+            for number, (turn, shift) in enumerate([(0.002, 0.02), (-0.002, -0.02)], start=1):
+                along = np.array([np.cos(way + turn), np.sin(way + turn), 0.0])
+                foot = (side + shift) * np.array([-along[1], along[0], 0.0])
+                local.augment(number, Observation(kind, np.concatenate([foot - 5 * along, foot + 5 * along]), R))
+            local.augment(3, Observation(kind, np.array([-5.0, -9.0, 0.0, 5.0, 11.0, 0.0]), R))
+            assert duplicates(local, 0.999, set()) == {2: 1}
 
 
 def street(seed: int) -> tuple[LandmarkMap, FloatArray, FloatArray, list[gtsam.OrientedPlane3]]:

@@ -50,12 +50,13 @@ def test_true_loops_stay_however_far_odometry_is_off(count: int, noise: float, t
         assert selected(count, seed, noise, turn).kept.all()
 
 
-@pytest.mark.parametrize("count", [1, 2, 4])
-def test_a_false_loop_beside_true_ones_is_left_out(count: int) -> None:
-    for seed in range(3):
-        found = selected(count, seed, false=(0.0, 0.0, 0.0, 20.0, 0.0, 0.0))  # its rotation is right
-        np.testing.assert_array_equal(found.kept, [True] * count + [False])
-        assert found.inflation.max() < 3.0
+def test_a_false_loop_beside_true_ones_is_left_out(subtests: pytest.Subtests) -> None:
+    for count in [1, 2, 4]:
+        with subtests.test(count=count):
+            for seed in range(3):
+                found = selected(count, seed, false=(0.0, 0.0, 0.0, 20.0, 0.0, 0.0))  # its rotation is right
+                np.testing.assert_array_equal(found.kept, [True] * count + [False])
+                assert found.inflation.max() < 3.0
 
 
 @pytest.mark.parametrize("count", [2, 4])

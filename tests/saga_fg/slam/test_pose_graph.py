@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import gtsam
 import numpy as np
@@ -14,25 +15,25 @@ from saga_fg.slam.pose_graph import chordal_poses, factor_graph, nearest_rotatio
 from tests.saga_fg.loops import loop, moved
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("seed", range(3))
-def test_the_chordal_start_is_exact_without_noise(dim: int, seed: int) -> None:
-    graph, true = loop(dim, seed)
-    exact = replace(graph, first_T_second=np.linalg.inv(true[graph.first]) @ true[graph.second])
-    np.testing.assert_allclose(chordal_poses(exact), true, atol=1e-9)
+def test_the_chordal_start_is_exact_without_noise(subtests: pytest.Subtests) -> None:
+    for dim, seed in product([2, 3], range(3)):
+        with subtests.test(dim=dim, seed=seed):
+            graph, true = loop(dim, seed)
+            exact = replace(graph, first_T_second=np.linalg.inv(true[graph.first]) @ true[graph.second])
+            np.testing.assert_allclose(chordal_poses(exact), true, atol=1e-9)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_worthless_guess_leads_to_the_optimum_near_the_truth(dim: int, seed: int) -> None:
-    graph, true = loop(dim, seed)
-    optimised = optimise_poses(graph)
-    factors = factor_graph(graph)
-    near = gtsam.LevenbergMarquardtOptimizer(factors, pose_values(true)).optimize()
-    assert optimised.error == pytest.approx(factors.error(near), rel=1e-5)
-    assert factors.error(pose_values(optimised.world_T_pose)) == pytest.approx(optimised.error, rel=1e-9)
-    assert optimised.error < factors.error(pose_values(true))
-    np.testing.assert_allclose(optimised.world_T_pose[0], true[0], atol=1e-6)
+def test_a_worthless_guess_leads_to_the_optimum_near_the_truth(subtests: pytest.Subtests) -> None:
+    for dim, seed in product([2, 3], range(3)):
+        with subtests.test(dim=dim, seed=seed):
+            graph, true = loop(dim, seed)
+            optimised = optimise_poses(graph)
+            factors = factor_graph(graph)
+            near = gtsam.LevenbergMarquardtOptimizer(factors, pose_values(true)).optimize()
+            assert optimised.error == pytest.approx(factors.error(near), rel=1e-5)
+            assert factors.error(pose_values(optimised.world_T_pose)) == pytest.approx(optimised.error, rel=1e-9)
+            assert optimised.error < factors.error(pose_values(true))
+            np.testing.assert_allclose(optimised.world_T_pose[0], true[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

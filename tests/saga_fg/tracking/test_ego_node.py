@@ -50,20 +50,23 @@ def drive(sigma: float, planar: bool, count: int = 12) -> list[tuple[Frame, Fram
     return frames
 
 
-@pytest.mark.parametrize("planar", [True, False])
 @pytest.mark.parametrize(("estimator", "max_step"), [("isam2", np.inf), ("isam2", 0.04), ("fixed-lag", np.inf)])
-def test_with_a_perfectly_known_pose_the_tracks_are_todays(planar: bool, estimator: str, max_step: float) -> None:
-    start = StartSettings(None, 1e-7, 1e-8, 1e-8, planar)
-    today = Tracker(TrackerSettings(max_step=max_step))
-    settings = TrackerSettings(estimator=estimator, lag=0.3, ego=APART, max_step=max_step)
-    joint = Tracker(settings, providers=[Odometry(start)])
-    for known, told in drive(1e-8, planar):
-        a, b = today.step(known), joint.step(told)
-        assert a.id.tolist() == b.id.tolist()
-        for name in ("position", "velocity"):
-            assert getattr(b.boxes, name)[:, :2] == pytest.approx(getattr(a.boxes, name)[:, :2], abs=1e-9)
-        assert b.position_covariance == pytest.approx(a.position_covariance, abs=1e-9)
-        assert b.velocity_covariance == pytest.approx(a.velocity_covariance, abs=1e-9)
+def test_with_a_perfectly_known_pose_the_tracks_are_todays(
+    estimator: str, max_step: float, subtests: pytest.Subtests
+) -> None:
+    for planar in [True, False]:
+        with subtests.test(planar=planar):
+            start = StartSettings(None, 1e-7, 1e-8, 1e-8, planar)
+            today = Tracker(TrackerSettings(max_step=max_step))
+            settings = TrackerSettings(estimator=estimator, lag=0.3, ego=APART, max_step=max_step)
+            joint = Tracker(settings, providers=[Odometry(start)])
+            for known, told in drive(1e-8, planar):
+                a, b = today.step(known), joint.step(told)
+                assert a.id.tolist() == b.id.tolist()
+                for name in ("position", "velocity"):
+                    assert getattr(b.boxes, name)[:, :2] == pytest.approx(getattr(a.boxes, name)[:, :2], abs=1e-9)
+                assert b.position_covariance == pytest.approx(a.position_covariance, abs=1e-9)
+                assert b.velocity_covariance == pytest.approx(a.velocity_covariance, abs=1e-9)
 
 
 DT, Q, R = 0.2, 0.5, 0.04

@@ -60,19 +60,16 @@ def test_a_neighbour_in_the_same_place_gives_the_mean_and_variance_of_the_mixtur
     assert variance == pytest.approx((25 + 5 * (144 + 0.1 + SPREAD**2)) / 6 - mean**2)
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
+def test_who_tells_nothing_of_the_speed_leaves_it_unknown(subtests):
+    for other in [
         passages([(0, 0)], [np.pi], [12.0]),
         passages([(0, 12)], [0.0], [12.0]),
         passages([(0, 0)], [np.nan], [12.0]),
         passages([(0, 0)], [0.0], [12.0], variance=100.0),
         passages([(0, 0)], [0.0], [12.0], label="pedestrian"),
-    ],
-    ids=["oncoming", "other lane", "no heading", "speed unknown", "other class"],
-)
-def test_who_tells_nothing_of_the_speed_leaves_it_unknown(other):
-    assert speed_at(remembering(other)) == (pytest.approx(0.0, abs=1e-4), pytest.approx(25.0, abs=1e-3))
+    ]:
+        with subtests.test(other=other):
+            assert speed_at(remembering(other)) == (pytest.approx(0.0, abs=1e-4), pytest.approx(25.0, abs=1e-3))
 
 
 def test_a_speed_prior_needs_a_memory():

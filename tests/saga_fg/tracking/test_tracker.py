@@ -78,19 +78,18 @@ def test_a_measured_velocity_is_taken_in():
     assert ignoring.boxes.velocity[0].tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize(
-    "unknown", [{"velocity": (NAN, NAN)}, {"velocity": (10.0, NAN)}, {}, {"size": (NAN,) * 3}, {"yaw": NAN}]
-)
-def test_what_was_not_measured_does_no_harm(unknown):
-    truth = straight((0, 0), (10, 0))
-    history = run(Tracker(), seen(np.random.default_rng(0), truth, TENTHS, **unknown))
-    assert history[-1].id.tolist() == [1]
-    assert history[-1].boxes.position[0, :2] == pytest.approx(truth(TENTHS[-1])[0], abs=0.4)
-    assert np.isfinite(history[-1].boxes.velocity).all()
-    if "yaw" in unknown:
-        assert np.isnan(history[-1].boxes.yaw).all()
-    if "size" in unknown:
-        assert np.isnan(history[-1].boxes.size).all()
+def test_what_was_not_measured_does_no_harm(subtests):
+    for unknown in [{"velocity": (NAN, NAN)}, {"velocity": (10.0, NAN)}, {}, {"size": (NAN,) * 3}, {"yaw": NAN}]:
+        with subtests.test(unknown=unknown):
+            truth = straight((0, 0), (10, 0))
+            history = run(Tracker(), seen(np.random.default_rng(0), truth, TENTHS, **unknown))
+            assert history[-1].id.tolist() == [1]
+            assert history[-1].boxes.position[0, :2] == pytest.approx(truth(TENTHS[-1])[0], abs=0.4)
+            assert np.isfinite(history[-1].boxes.velocity).all()
+            if "yaw" in unknown:
+                assert np.isnan(history[-1].boxes.yaw).all()
+            if "size" in unknown:
+                assert np.isnan(history[-1].boxes.size).all()
 
 
 def test_an_unmeasured_velocity_is_unknown_along_the_heading_and_small_across():

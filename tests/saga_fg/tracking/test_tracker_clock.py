@@ -33,31 +33,33 @@ def verdicts(tracker, frames):
 
 
 @ALL
-@pytest.mark.parametrize("jump", [1e8, 1.7e9, 9.9e10, -1e8, 20.0])
-def test_one_broken_timestamp_changes_nothing(make, jump):
-    good, glitched = make(), make()
-    times = np.arange(10) / 10
-    run(good, at(100.0, times))
-    run(glitched, at(100.0, times))
-    assert verdicts(glitched, [frame(101.0 + jump, CARS(1.0))]) == ["unconfirmed"]
-    later = at(100.0, 1.0 + times)
-    for a, b in zip(run(good, later), run(glitched, later), strict=True):
-        assert b.id.tolist() == a.id.tolist()
-        assert b.boxes.position == pytest.approx(a.boxes.position, abs=1e-9)
+def test_one_broken_timestamp_changes_nothing(make, subtests):
+    for jump in [1e8, 1.7e9, 9.9e10, -1e8, 20.0]:
+        with subtests.test(jump=jump):
+            good, glitched = make(), make()
+            times = np.arange(10) / 10
+            run(good, at(100.0, times))
+            run(glitched, at(100.0, times))
+            assert verdicts(glitched, [frame(101.0 + jump, CARS(1.0))]) == ["unconfirmed"]
+            later = at(100.0, 1.0 + times)
+            for a, b in zip(run(good, later), run(glitched, later), strict=True):
+                assert b.id.tolist() == a.id.tolist()
+                assert b.boxes.position == pytest.approx(a.boxes.position, abs=1e-9)
 
 
 @ALL
-@pytest.mark.parametrize("start", [1.7e9, 1e8, 3000.0, -5e8])
-def test_a_clock_that_was_set_is_followed(make, start):
+def test_a_clock_that_was_set_is_followed(make, subtests):
     """The clock jumps from seconds since boot to the epoch, and back."""
-    tracker = make()
-    run(tracker, at(10.0, np.arange(10) / 10))
-    told = verdicts(tracker, at(start, np.arange(5) / 10))
-    assert told == ["unconfirmed", "set_ahead" if start > 0 else "set_back", *["accepted"] * 3]
-    tracks = tracker.step(frame(start + 0.5, CARS(0.5)))
-    assert tracks.timestamp == start + 0.5
-    assert tracks.id.tolist() == [3, 4], "those from before are not taken for these"
-    assert tracks.boxes.position[:, :2] == pytest.approx(CARS(0.5), abs=0.5)
+    for start in [1.7e9, 1e8, 3000.0, -5e8]:
+        with subtests.test(start=start):
+            tracker = make()
+            run(tracker, at(10.0, np.arange(10) / 10))
+            told = verdicts(tracker, at(start, np.arange(5) / 10))
+            assert told == ["unconfirmed", "set_ahead" if start > 0 else "set_back", *["accepted"] * 3]
+            tracks = tracker.step(frame(start + 0.5, CARS(0.5)))
+            assert tracks.timestamp == start + 0.5
+            assert tracks.id.tolist() == [3, 4], "those from before are not taken for these"
+            assert tracks.boxes.position[:, :2] == pytest.approx(CARS(0.5), abs=0.5)
 
 
 @ALL
@@ -79,14 +81,15 @@ def test_late_frames_in_a_burst_do_not_set_the_clock():
     assert columns(tracker.tracks(2.9)) == before
 
 
-@pytest.mark.parametrize("apart", [-5.0, -1000.0, 1000.0])
-def test_a_sensor_whose_clock_is_wrong_does_not_set_that_of_the_others(apart):
-    tracker = Tracker(TrackerSettings())
-    for t in np.arange(20) / 10:
-        assert verdicts(tracker, [frame(t, CARS(t))]) == ["accepted"]
-        two = [frame(apart + t + s, CARS(t), sensor="radar") for s in (0.0, 0.05)]
-        assert set(verdicts(tracker, two)) <= {"late", "unconfirmed"}
-    assert tracker.tracks(1.9).id.tolist() == [1, 2]
+def test_a_sensor_whose_clock_is_wrong_does_not_set_that_of_the_others(subtests):
+    for apart in [-5.0, -1000.0, 1000.0]:
+        with subtests.test(apart=apart):
+            tracker = Tracker(TrackerSettings())
+            for t in np.arange(20) / 10:
+                assert verdicts(tracker, [frame(t, CARS(t))]) == ["accepted"]
+                two = [frame(apart + t + s, CARS(t), sensor="radar") for s in (0.0, 0.05)]
+                assert set(verdicts(tracker, two)) <= {"late", "unconfirmed"}
+            assert tracker.tracks(1.9).id.tolist() == [1, 2]
 
 
 def test_a_frame_sent_twice_confirms_nothing():
@@ -112,12 +115,13 @@ def test_a_stream_that_becomes_slow_loses_one(make):
 
 
 @ALL
-@pytest.mark.parametrize("wrong", [5.0, 1e6, -1e6])
-def test_after_a_single_frame_the_second_is_believed(make, wrong):
-    tracker = make()
-    tracker.step(frame(wrong, CARS(0.0)))
-    told = verdicts(tracker, at(0.0, np.arange(4) / 10))
-    assert told[2:] == (["set_back", "accepted"] if wrong == 5.0 else ["accepted"] * 2)
+def test_after_a_single_frame_the_second_is_believed(make, subtests):
+    for wrong in [5.0, 1e6, -1e6]:
+        with subtests.test(wrong=wrong):
+            tracker = make()
+            tracker.step(frame(wrong, CARS(0.0)))
+            told = verdicts(tracker, at(0.0, np.arange(4) / 10))
+            assert told[2:] == (["set_back", "accepted"] if wrong == 5.0 else ["accepted"] * 2)
 
 
 @ALL

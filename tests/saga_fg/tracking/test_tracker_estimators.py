@@ -52,13 +52,14 @@ def agree(first, second, tolerance):
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS[1:])
-@pytest.mark.parametrize("edges", [(), TrackerSettings().edges], ids=["independent", "graph"])
-def test_every_estimator_gives_the_same_tracks(estimator, edges):
+def test_every_estimator_gives_the_same_tracks(estimator, subtests):
     """New tracks, a deletion, two sensors, two motion models, frames as late as the filters take."""
-    in_order, _ = traffic(0)
-    reference, other = tracker(edges=edges), tracker(estimator, edges=edges)
-    for f in in_order:
-        agree(reference.step(f), other.step(f), 1e-8)
+    for edges in [(), TrackerSettings().edges]:
+        with subtests.test(edges=edges):
+            in_order, _ = traffic(0)
+            reference, other = tracker(edges=edges), tracker(estimator, edges=edges)
+            for f in in_order:
+                agree(reference.step(f), other.step(f), 1e-8)
 
 
 @pytest.mark.parametrize("delay", [0.07, 0.9])
@@ -101,18 +102,21 @@ def test_an_estimator_that_is_none_is_refused():
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS[1:])
-@pytest.mark.parametrize("edges", [(), TrackerSettings().edges], ids=["independent", "graph"])
-def test_every_estimator_takes_the_same_turns(estimator, edges):
+def test_every_estimator_takes_the_same_turns(estimator, subtests):
     """Two that turn, one behind the other, of which one is not detected at last."""
-    rng, rate, speed = np.random.default_rng(5), 0.3, 8.0
-    classes = {label: replace(of_class, motion=Curvilinear(turn_time=1.5)) for label, of_class in CLASSES.items()}
-    settings = TrackerSettings(classes, edges=edges)
-    reference, other = (Tracker(replace(settings, estimator=name), SENSORS) for name in ("kalman", estimator))
-    for t in np.arange(0, 4, 0.1):
-        angle = rate * t - np.array([0.0, 0.4])
-        place = speed / rate * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
-        z, there = place + 0.1 * rng.normal(size=(2, 2)), slice(2 if t < 3 else 1)
-        seen_now = frame(t, z[there], label=LABEL[there], yaw=angle[there])
-        agree(reference.step(seen_now), other.step(seen_now), 1e-8)
-    assert any(reference.graph.modes), "turns were recorded"
-    assert np.isclose(np.hypot(*reference.tracks(4.5).boxes.velocity[0]), speed, atol=1.0)
+    for edges in [(), TrackerSettings().edges]:
+        with subtests.test(edges=edges):
+            rng, rate, speed = np.random.default_rng(5), 0.3, 8.0
+            classes = {
+                label: replace(of_class, motion=Curvilinear(turn_time=1.5)) for label, of_class in CLASSES.items()
+            }
+            settings = TrackerSettings(classes, edges=edges)
+            reference, other = (Tracker(replace(settings, estimator=name), SENSORS) for name in ("kalman", estimator))
+            for t in np.arange(0, 4, 0.1):
+                angle = rate * t - np.array([0.0, 0.4])
+                place = speed / rate * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
+                z, there = place + 0.1 * rng.normal(size=(2, 2)), slice(2 if t < 3 else 1)
+                seen_now = frame(t, z[there], label=LABEL[there], yaw=angle[there])
+                agree(reference.step(seen_now), other.step(seen_now), 1e-8)
+            assert any(reference.graph.modes), "turns were recorded"
+            assert np.isclose(np.hypot(*reference.tracks(4.5).boxes.velocity[0]), speed, atol=1.0)

@@ -153,19 +153,16 @@ def test_providers_from_the_configuration() -> None:
         same(by_name.step(f), by_hand.step(f), 1e-12)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
+def test_names_that_lead_to_no_provider(subtests: pytest.Subtests) -> None:
+    for name, message in [
         ("wall", "expected MODULE:NAME, got 'wall'"),
         ("no_such_module:Wall", "no_such_module:Wall: expected a module that can be imported"),
         ("math:Wall", "math:Wall: the module has no Wall"),
         ("math:sqrt", "math:sqrt: expected a class to be made without arguments"),
         ("collections:Counter", "collections:Counter: expected a factor provider, which has a method factors"),
-    ],
-)
-def test_names_that_lead_to_no_provider(name: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        Tracker(TrackerSettings(estimator="isam2", providers=(name,)))
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            Tracker(TrackerSettings(estimator="isam2", providers=(name,)))
 
 
 @pytest.mark.parametrize(("name", "size"), [("isam2", 6), ("fixed-lag", 16)])

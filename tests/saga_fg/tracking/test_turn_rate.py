@@ -49,15 +49,18 @@ def test_noise_is_no_turn():
     assert max(rates) < 0.15
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.05, 0.4])
-def test_mean_and_variance_are_those_of_the_mixture_of_turning_and_straight(rate):
-    turn = estimated(np.full(20, rate))
-    w, P, x = turn.rate.item(), turn.P[0, 1, 1], np.linspace(-2, 2, 40001)
-    normal = lambda d, s: np.exp(-0.5 * (d / s) ** 2) / s  # noqa: E731
-    density = (SHARE * normal(x, TURNING) + (1 - SHARE) * normal(x, STRAIGHT)) * normal(w - x, np.sqrt(P))
-    mean = (x * density).sum() / density.sum()
-    variance = ((x - mean) ** 2 * density).sum() / density.sum()
-    assert [value.item() for value in turn.known(np.array([0]), SHARE)] == pytest.approx([mean, variance], rel=1e-4)
+def test_mean_and_variance_are_those_of_the_mixture_of_turning_and_straight(subtests):
+    for rate in [0.0, 0.05, 0.4]:
+        with subtests.test(rate=rate):
+            turn = estimated(np.full(20, rate))
+            w, P, x = turn.rate.item(), turn.P[0, 1, 1], np.linspace(-2, 2, 40001)
+            normal = lambda d, s: np.exp(-0.5 * (d / s) ** 2) / s  # noqa: E731
+            density = (SHARE * normal(x, TURNING) + (1 - SHARE) * normal(x, STRAIGHT)) * normal(w - x, np.sqrt(P))
+            mean = (x * density).sum() / density.sum()
+            variance = ((x - mean) ** 2 * density).sum() / density.sum()
+            assert [value.item() for value in turn.known(np.array([0]), SHARE)] == pytest.approx(
+                [mean, variance], rel=1e-4
+            )
 
 
 def test_a_wild_heading_counts_little():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from itertools import product
 
 import numpy as np
 import pytest
@@ -55,28 +56,27 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
-@pytest.mark.parametrize("radar", [5.0, 15.0, 20.0])
-@pytest.mark.parametrize("wrong", ["radar", "lidar"])
-def test_one_wrong_clock_of_three_leaves_the_others_alone(wrong, radar, fault):
-    used, verdicts = shares({**RATES, "radar": radar}, wrong, fault)
-    assert min(used.values()) >= 0.99
-    assert not {"set_ahead", "set_back"} & set(verdicts), "the tracks of the others would be deleted"
+def test_one_wrong_clock_of_three_leaves_the_others_alone(subtests):
+    for (name, fault), radar, wrong in product(FAULTS.items(), [5.0, 15.0, 20.0], ["radar", "lidar"]):
+        with subtests.test(name, radar=radar, wrong=wrong):
+            used, verdicts = shares({**RATES, "radar": radar}, wrong, fault)
+            assert min(used.values()) >= 0.99
+            assert not {"set_ahead", "set_back"} & set(verdicts), "the tracks of the others would be deleted"
 
 
-@pytest.mark.parametrize("offset", [1.0, -1.0, 8.0, 3600.0, -3600.0])
-@pytest.mark.parametrize("wrong", ["radar", "lidar"])
-def test_a_correct_majority_sets_the_clock_back(wrong, offset):
+def test_a_correct_majority_sets_the_clock_back(subtests):
     """The clock is wrong from its first frame, which may be the first of all."""
-    used, _ = shares({**RATES, "radar": 15.0}, wrong, lambda t, k: t + offset, start=0.0)
-    assert min(used.values()) == 1.0
+    for offset, wrong in product([1.0, -1.0, 8.0, 3600.0, -3600.0], ["radar", "lidar"]):
+        with subtests.test(offset=offset, wrong=wrong):
+            used, _ = shares({**RATES, "radar": 15.0}, wrong, lambda t, k, by=offset: t + by, start=0.0)
+            assert min(used.values()) == 1.0
 
 
-@pytest.mark.parametrize("offset", [1.0, 8.0, -8.0, 3600.0])
-@pytest.mark.parametrize("rate", [5.0, 20.0])
-def test_of_two_the_one_that_kept_its_step_goes_on(rate, offset):
-    used, _ = shares({"lidar": 10.0, "radar": rate}, "radar", lambda t, k: t + offset)
-    assert used["lidar"] >= 0.99
+def test_of_two_the_one_that_kept_its_step_goes_on(subtests):
+    for offset, rate in product([1.0, 8.0, -8.0, 3600.0], [5.0, 20.0]):
+        with subtests.test(offset=offset, rate=rate):
+            used, _ = shares({"lidar": 10.0, "radar": rate}, "radar", lambda t, k, by=offset: t + by)
+            assert used["lidar"] >= 0.99
 
 
 @pytest.mark.parametrize("jump", [3600.0, -3600.0])
@@ -173,18 +173,17 @@ def tracked(wrong, offset, end=6.0, tracker=None, begin=0.0, sensors=("lidar", "
     return tracker, used
 
 
-@pytest.mark.parametrize(
-    ("wrong", "offset"), [("radar", 0.05), ("radar", -0.3), ("lidar", 0.5), ("lidar", -2.0), ("radar", 3600.0)]
-)
-def test_a_steady_offset_is_found_and_corrected(wrong, offset):
-    tracker, used = tracked(wrong, offset)
-    clocks = tracker.sensor_times
-    assert clocks[wrong].offset == pytest.approx(offset, abs=0.01)
-    assert abs(clocks[wrong].offset - offset) <= 3 * clocks[wrong].deviation <= 0.02
-    assert clocks[wrong].corrected == pytest.approx(offset, abs=0.015)
-    assert [each.corrected for name, each in clocks.items() if name != wrong] == [0.0, 0.0]
-    assert all(ok for time, name, ok in used if name == wrong and time > 4.0), "it is used again"
-    assert len(tracker.tracks(6.0)) == 10, "one track for each object"
+def test_a_steady_offset_is_found_and_corrected(subtests):
+    for wrong, offset in [("radar", 0.05), ("radar", -0.3), ("lidar", 0.5), ("lidar", -2.0), ("radar", 3600.0)]:
+        with subtests.test(wrong=wrong, offset=offset):
+            tracker, used = tracked(wrong, offset)
+            clocks = tracker.sensor_times
+            assert clocks[wrong].offset == pytest.approx(offset, abs=0.01)
+            assert abs(clocks[wrong].offset - offset) <= 3 * clocks[wrong].deviation <= 0.02
+            assert clocks[wrong].corrected == pytest.approx(offset, abs=0.015)
+            assert [each.corrected for name, each in clocks.items() if name != wrong] == [0.0, 0.0]
+            assert all(ok for time, name, ok in used if name == wrong and time > 4.0), "it is used again"
+            assert len(tracker.tracks(6.0)) == 10, "one track for each object"
 
 
 def test_of_two_sensors_the_one_heard_first_is_right():

@@ -110,9 +110,8 @@ def test_a_value_is_named_by_its_column_and_row(subtests: pytest.Subtests) -> No
                 saga_fg.track(rows)
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
+def test_what_is_probably_wrong_is_warned_of(subtests: pytest.Subtests) -> None:
+    for columns, message in [
         ({"label": "car", "score": 87.0}, r"score: expected 0 to 1, got 87 to 87; divide percent by 100"),
         ({"label": "car", "score": -2.5}, r'Sensor\(score="logit"\)'),
         ({"label": "car", "yaw": 90.0}, r"yaw: expected rad, got up to 90, which looks like degrees"),
@@ -120,11 +119,9 @@ def test_a_value_is_named_by_its_column_and_row(subtests: pytest.Subtests) -> No
             {"label": "REGULAR_VEHICLE"},
             r"label: no edges: the rules act on .*car.*, the detections are of REGULAR_VEHICLE",
         ),
-    ],
-)
-def test_what_is_probably_wrong_is_warned_of(columns: dict[str, object], message: str) -> None:
-    with pytest.warns(UserWarning, match=message):
-        saga_fg.track(table(**columns))
+    ]:
+        with subtests.test(message), pytest.warns(UserWarning, match=message):
+            saga_fg.track(table(**columns))
 
 
 def test_usual_tables_are_not_warned_of() -> None:

@@ -175,20 +175,18 @@ def test_sensors_anywhere_on_the_vehicle_and_poses_of_another_sensor() -> None:
     assert np.abs(bias.vector()[3:]).max() < 0.005
 
 
-@pytest.mark.parametrize(
-    ("sensor", "true"),
-    [
+def test_a_sensor_in_another_place_is_named(subtests: pytest.Subtests) -> None:
+    for sensor, true in [
         ("gps", SensorSettings(replace(SETTINGS.gps, antenna=(4.0, -4.0, 1.0)), IMU, SETTINGS.wheels)),
         ("imu", SensorSettings(SETTINGS.gps, replace(IMU, mounted=(0, 0, 0, 0.3, 0, 0)), SETTINGS.wheels)),
         ("imu", SensorSettings(SETTINGS.gps, replace(IMU, mounted=(0, 0, 0, 0, 0, 0.6)), SETTINGS.wheels)),
-    ],
-)
-def test_a_sensor_in_another_place_is_named(sensor: str, true: SensorSettings) -> None:
-    found = run(("gps", "imu", "wheels"), true=true, batch=True).misfits(("gps", "imu", "wheels"), SETTINGS)
-    assert next(iter(found)) == sensor  # the one that fits least comes first
-    assert found[sensor].startswith(f"{sensor}: ")
-    assert "check " in found[sensor]
-    assert run(("gps", "imu", "wheels"), batch=True).misfits(("gps", "imu", "wheels"), SETTINGS) == {}
+    ]:
+        with subtests.test(sensor=sensor, true=true):
+            found = run(("gps", "imu", "wheels"), true=true, batch=True).misfits(("gps", "imu", "wheels"), SETTINGS)
+            assert next(iter(found)) == sensor  # the one that fits least comes first
+            assert found[sensor].startswith(f"{sensor}: ")
+            assert "check " in found[sensor]
+            assert run(("gps", "imu", "wheels"), batch=True).misfits(("gps", "imu", "wheels"), SETTINGS) == {}
 
 
 def test_places_are_estimated_if_asked() -> None:
