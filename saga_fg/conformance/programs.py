@@ -10,7 +10,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, Edges, NodeType, RandomWalk, SceneGraph
-from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update, rts_smooth
+from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update
 from saga_fg.model.discretisation import Transition, discretise
 from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity, applies
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -150,52 +150,30 @@ def run(program: Iterable[Operation], estimator: E) -> tuple[E, list[float]]:
 
 
 class TextbookEstimator:
-    """`saga_fg.estimators.reference` behind the estimator protocol: dense, plain, and it remembers every moment.
-
-    A moment lasts from one prediction to the next. Nodes marginalised in it stay in its record, so that the smoother
-    can tell where they were last.
-    """
+    """The filter of `saga_fg.estimators.reference` behind the methods of an estimator: dense and plain."""
 
     def __init__(self) -> None:
         self.x = Gaussian(np.empty(0), np.empty((0, 0)))
-        self.keys: list[int | tuple[int, str]] = []  # of the moment's joint state; (id, "gone") of nodes that have left
-        self.dims: list[int] = []
-        self.filtered: list[Gaussian] = []
-        self.predicted: list[Gaussian] = []
-        self.F: list[FloatArray] = []
-        self.layouts: list[tuple[list[int | tuple[int, str]], list[int]]] = []
+        self.nodes: IntArray = np.empty(0, dtype=np.int64)
+        self.dims: IntArray = np.empty(0, dtype=np.int64)
 
-    @property
-    def nodes(self) -> IntArray:
-        return np.array([key for key in self.keys if not isinstance(key, tuple)], dtype=np.int64)
-
-    def places(self, keys: Iterable[int]) -> IntArray:
+    def places(self, nodes: ArrayLike) -> IntArray:
+        """Places of the states of some nodes in the joint state, stacked."""
         offsets = np.concatenate([[0], np.cumsum(self.dims)]).astype(int)
-        rows = [self.keys.index(key) for key in keys]
-        return np.concatenate([np.arange(offsets[r], offsets[r + 1]) for r in rows] or [np.empty(0, dtype=int)])
+        rows = [self.nodes.tolist().index(node) for node in np.asarray(nodes).tolist()]
+        return np.concatenate([np.empty(0, dtype=int), *(np.arange(offsets[r], offsets[r + 1]) for r in rows)])
 
     def add(self, nodes: Sequence[int] | IntArray, means: FloatArray, covariances: FloatArray) -> None:
-        x = self.x
-        P = scipy.linalg.block_diag(x.covariance, *covariances)
-        self.x = Gaussian(np.concatenate([x.mean, np.ravel(means)]), P[P.shape[0] - len(P) :, : len(P)])
-        self.keys += [int(node) for node in nodes]
-        self.dims += [means.shape[1]] * len(nodes)
-        if self.predicted:  # new nodes belong to the prior of their moment, uncorrelated with the others
-            old = self.predicted[-1]
-            self.predicted[-1] = Gaussian(
-                np.concatenate([old.mean, np.ravel(means)]), scipy.linalg.block_diag(old.covariance, *covariances)
-            )
-            self.F[-1] = np.vstack([self.F[-1], np.zeros((means.size, self.F[-1].shape[1]))])
+        P = scipy.linalg.block_diag(self.x.covariance, *covariances)
+        self.x = Gaussian(np.concatenate([self.x.mean, np.ravel(means)]), P[P.shape[0] - len(P) :, : len(P)])
+        self.nodes = np.concatenate([self.nodes, np.asarray(nodes, dtype=np.int64)])
+        self.dims = np.concatenate([self.dims, np.full(len(nodes), means.shape[1])])
 
     def predict(self, transition: Transition) -> None:
-        self.filtered.append(self.x)
-        self.layouts.append((list(self.keys), list(self.dims)))
         F = np.zeros((len(transition.b), len(self.x.mean)))
-        F[:, self.places(transition.nodes.tolist())] = transition.F_matrix.toarray()
+        F[:, self.places(transition.nodes)] = transition.F_matrix.toarray()
         self.x = kalman_predict(self.x, F, transition.b, transition.Q_matrix.toarray())
-        self.keys, self.dims = transition.nodes.tolist(), transition.graph.dims.tolist()
-        self.predicted.append(self.x)
-        self.F.append(F)
+        self.nodes, self.dims = transition.nodes, transition.graph.dims
 
     def update(self, measurements: Measurements) -> float:
         m, k, _ = measurements.H.shape
@@ -207,15 +185,16 @@ class TextbookEstimator:
         return log_likelihood
 
     def marginalise(self, nodes: Sequence[int] | IntArray) -> None:
-        for node in nodes:
-            row = self.keys.index(int(node))
-            self.keys[row] = (int(node), "gone")
+        kept = ~np.isin(self.nodes, nodes)
+        at = self.places(self.nodes[kept])
+        self.x = Gaussian(self.x.mean[at], self.x.covariance[np.ix_(at, at)])
+        self.nodes, self.dims = self.nodes[kept], self.dims[kept]
 
     def joint_mean(self, nodes: ArrayLike) -> FloatArray:
-        return self.x.mean[self.places(np.asarray(nodes).tolist())]
+        return self.x.mean[self.places(nodes)]
 
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
-        places = self.places(np.asarray(nodes).tolist())
+        places = self.places(nodes)
         return self.x.covariance[np.ix_(places, places)]
 
     def mean(self, nodes: Sequence[int] | IntArray) -> FloatArray:
@@ -223,18 +202,6 @@ class TextbookEstimator:
 
     def covariance(self, nodes: Sequence[int] | IntArray) -> FloatArray:
         return np.stack([self.joint_covariance([node]) for node in nodes])
-
-    def smoothed(self) -> list[dict[int, Gaussian]]:
-        """Rauch-Tung-Striebel: of every moment, the nodes that were still there at its end: {id: Gaussian}."""
-        filtered, layouts = [*self.filtered, self.x], [*self.layouts, (self.keys, self.dims)]
-        result = []
-        for x, (keys, dims) in zip(rts_smooth(filtered, self.predicted, self.F), layouts, strict=True):
-            offsets = np.concatenate([[0], np.cumsum(dims)]).astype(int)
-            spans = {key: slice(offsets[k], offsets[k + 1]) for k, key in enumerate(keys)}
-            result.append(
-                {k: Gaussian(x.mean[s], x.covariance[s, s]) for k, s in spans.items() if not isinstance(k, tuple)}
-            )
-        return result
 
 
 def random_covariance(rng: Random, dim: int, deviation: float) -> FloatArray:

@@ -16,10 +16,8 @@ weighted there,
 
     || A delta - b ||      delta: increments of variables
 
-with n the variables that are new and o those that were there. By QR the factors on new ones say
-
-    n = T o + c + R^-1 e,    e ~ N(0, 1)        what the new ones are, given the others
-    || A' o - b' ||                             and what is left, a measurement of these
+and go with the prior of the components that they tie, || L^-1 delta ||, P = L L^T, into one triangle by QR, || R x - d
+||: their posterior is N(R^-1 d, R^-1 R^-T). New variables have no prior but these factors.
 
 Variables beside the nodes (landmarks, the vehicle's pose) are blocks of the joint Gaussian under their keys: increments
 from the base, where each was first put (error state). Those of an epoch leave with the next one at which providers are
@@ -34,27 +32,25 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike
 
 from factors import SingularSystemError
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.estimator import Estimator
-from saga_fg.estimators.filtering import ComponentBounds, Dynamics, corrected, identity, lost_in_rounding, predict
+from saga_fg.estimators.filtering import ComponentBounds, Dynamics, corrected, lost_in_rounding, predict
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, replace_by_prior
 from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import prior_graph
-from saga_fg.estimators.partition import Partition, StateLayout, checked_prior
+from saga_fg.estimators.partition import StateLayout, checked_prior
 from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphError, GraphVariable, LinearisationPoint, NewVariable, insert_state, node_kind
-from saga_fg.model.discretisation import Blocks, Transition
+from saga_fg.model.discretisation import Transition
 from saga_fg.numerics.arrays import FloatArray, IntArray, shallow_copy
 from saga_fg.types.frame import Frame
 
-_TOGETHER = -(1 << 62)  # id of the new variables while they are one node
 _NO_ROWS = np.empty(0, dtype=np.int64)
 _UNDETERMINED = 1e-12  # share of its column that is left of a variable which the factors do not determine
 
@@ -133,14 +129,15 @@ def asked(
         ask(provider, graph, view)
     new = {key: one for key, one in graph.variables.items() if key not in bare.variables}
     factors = _linear(graph, ids, new)
+    if alone := tuple(key for key in new if not graph.touching(key)):
+        raise solver_error(graph.variables, graph.groups, SingularSystemError("", alone))
     if new:
         base = graph.base
         bare.add_variables("", [_again(one, one.type.read(base, key)) for key, one in new.items()])
-        x, factors = _with_new_variables(graph, x, ids, new, factors)
         ids |= {key: key for key in new}
-    increment, others = np.zeros(len(x.mean)), x.layout.places(AuxiliaryVariables(bare).rows(x.layout))
-    increment[others] = x.mean[others]
-    x = _corrected(x, [(x.layout.rows([ids[key] for key in keys]), A) for keys, A in factors], increment)
+        for key, one in new.items():  # in the place of what the factors will say of it
+            x = x.extended(x.layout.extended([key], one.dim), np.zeros((1, one.dim)), np.eye(one.dim)[None])
+    x = _given(x, graph, ids, new, factors)
     leaving = [key for key, one in bare.variables.items() if last and one.epoch not in (None, bare.epoch)]
     bare.marginalise(leaving)
     x = x.without(x.layout.rows([key for key in leaving if key in ids]))
@@ -148,37 +145,47 @@ def asked(
     return x, AuxiliaryVariables(bare, auxiliary.labels)
 
 
-def _corrected(
-    x: BlockGaussian, factors: Sequence[tuple[IntArray, FloatArray]], increment: FloatArray
+def _given(
+    x: BlockGaussian, graph: SceneFactorGraph, ids: Mapping[int, int], new: Collection[int], factors: Sequence[Linear]
 ) -> BlockGaussian:
-    """The posterior given factors [A | b] on the nodes at some rows, whose components become one; noise of variance 1.
-
-    increment (D,): where the factors on increments count from, 0 for those on states
-    """
-    for rows, _ in factors:
-        x = x.over(x.partition.joined(rows[:1].repeat(len(rows)), rows))
-    partition, mean, blocks = x.partition, x.mean.copy(), [P.copy() for P in x.blocks]
-    label = np.array([partition.label[rows[0]] for rows, _ in factors])
+    """The posterior given factors, which tie components together, and are all that is known of `new` variables."""
+    rows = [x.layout.rows([ids[key] for key in keys]) for keys, _ in factors]
+    first = np.concatenate([_NO_ROWS, *(its[:1].repeat(len(its)) for its in rows)])
+    x = x.over(x.partition.joined(first, np.concatenate([_NO_ROWS, *rows])))
+    layout, partition, mean, blocks = x.layout, x.partition, x.mean.copy(), [P.copy() for P in x.blocks]
+    known, others = ~np.isin(layout.nodes, list(new)), layout.places(AuxiliaryVariables(graph).rows(layout))
+    increment = np.zeros(len(mean))  # of nodes, whose factors are linearised where they are; of others from the base
+    increment[others] = mean[others]
+    label = np.array([partition.label[its[0]] for its in rows], dtype=np.int64)
     for number in np.unique(label).tolist():
-        mine = [factors[k] for k in np.flatnonzero(label == number).tolist()]
-        group, row = partition.group[mine[0][0][0]], partition.row[mine[0][0][0]]
-        places, P = partition.groups[group][row], blocks[group][row]
-        H, innovation = [], []
-        for rows, A in mine:
-            at = x.layout.places(rows)
-            H.append(np.zeros((len(A), len(places))))
-            H[-1][:, np.searchsorted(places, at)] = A[:, :-1]
-            innovation.append(A[:, -1] - A[:, :-1] @ increment[at])
-        J = np.concatenate(H)
-        S = J @ P @ J.T + np.eye(len(J))
+        mine = np.flatnonzero(partition.label == number)
+        places, old = layout.places(mine), layout.places(mine[known[mine]])
         try:
-            K = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), J @ P).T
-        except (np.linalg.LinAlgError, ValueError):
-            raise lost_in_rounding(S.max()) from None
-        kept = np.eye(len(P)) - K @ J
-        mean[places] += K @ np.concatenate(innovation)
-        blocks[group][row] = kept @ P @ kept.T + K @ K.T
+            W = np.linalg.inv(np.linalg.cholesky(x.joint(mine[known[mine]]))) if len(old) else np.empty((0, 0))
+        except np.linalg.LinAlgError:
+            raise lost_in_rounding(x.variances().max()) from None
+        A = [_among(places, old, np.column_stack([W, W @ increment[old]]))]
+        A += [_among(places, layout.places(rows[k]), factors[k][1]) for k in np.flatnonzero(label == number).tolist()]
+        stacked, D = np.concatenate(A), len(places)
+        upper = np.zeros((D, D + 1))
+        triangle = np.linalg.qr(stacked, mode="r")[:D]
+        upper[: len(triangle)] = triangle
+        lost = np.abs(np.diagonal(upper)) <= _UNDETERMINED * np.linalg.norm(stacked[:, :-1], axis=0)
+        if lost.any():
+            nodes = layout.nodes[np.searchsorted(layout.offsets, places[lost], side="right") - 1]
+            undetermined = tuple(key for key, node in ids.items() if node in nodes)
+            raise solver_error(graph.variables, graph.groups, SingularSystemError("", undetermined))
+        root = np.linalg.inv(upper[:, :-1])
+        mean[places] += root @ upper[:, -1] - increment[places]
+        blocks[partition.group[mine[0]]][partition.row[mine[0]]] = root @ root.T
     return BlockGaussian(partition, mean, tuple(blocks))
+
+
+def _among(places: IntArray, own: IntArray, A: FloatArray) -> FloatArray:
+    """[A | b] on the states at `own` places as one on those at `places`, ascending."""
+    result = np.zeros((len(A), len(places) + 1))
+    result[:, np.searchsorted(places, own)], result[:, -1] = A[:, :-1], A[:, -1]
+    return result
 
 
 def _move(graph: SceneFactorGraph, x: BlockGaussian, ids: Mapping[int, int]) -> None:
@@ -212,65 +219,6 @@ def _linear(graph: SceneFactorGraph, ids: Mapping[int, int], new: Collection[int
                 )
         result += [(list(one.keys()), np.array(one.augmentedJacobian())) for one in graph.linear(number, point)]
     return result
-
-
-def _with_new_variables(
-    graph: SceneFactorGraph,
-    x: BlockGaussian,
-    ids: Mapping[int, int],
-    new: Mapping[int, GraphVariable],
-    factors: Sequence[Linear],
-) -> tuple[BlockGaussian, list[Linear]]:
-    """Add new variables to the joint state, by the factors on them; returns also the factors left on the others."""
-    mine = [factor for factor in factors if not new.keys().isdisjoint(factor[0])]
-    left = [factor for factor in factors if new.keys().isdisjoint(factor[0])]
-    others = list(dict.fromkeys(key for keys, _ in mine for key in keys if key not in new))
-    A, span = _stacked(mine, {key: graph.variable(key).dim for key in (*new, *others)})
-    size, width = sum(one.dim for one in new.values()), A.shape[1] - 1
-    triangle = np.zeros((width, width + 1))
-    upper = np.linalg.qr(A, mode="r")[:width]
-    triangle[: len(upper)] = upper
-    R, rest = triangle[:size, :size], triangle[size:, size:]
-    lost = np.abs(np.diagonal(R)) <= _UNDETERMINED * np.linalg.norm(A[:, :size], axis=0)
-    if lost.any():
-        raise solver_error(
-            graph.variables, graph.groups, SingularSystemError("", tuple(key for key in new if lost[span[key]].any()))
-        )
-    if others:
-        left.append((others, rest))
-    solved = np.linalg.solve(R, np.column_stack([triangle[:size, size:], np.eye(size)]))
-    T, c, root = np.split(solved, [width - size, width - size + 1], axis=1)
-    layout, rows = x.layout.extended([_TOGETHER], size), np.arange(len(x.layout))
-    last = rows[-1:] + 1 if len(rows) else np.zeros(1, dtype=np.int64)
-    F, mean = [], c[:, 0].copy()
-    for key in others:
-        row, block = x.layout.rows([ids[key]]), -T[:, span[key].start - size : span[key].stop - size]
-        F.append(Blocks(last, row, block[None]))
-        if ids[key] == key:
-            mean += block @ x.mean[x.layout.places(row)]
-    dynamics = Dynamics(
-        layout, (*identity(layout, rows), *F), np.zeros(layout.size), (Blocks(last, last, (root @ root.T)[None]),)
-    )
-    x = predict(x.extended(layout, np.zeros((1, size)), np.eye(size)[None]), dynamics)
-    whole, label = x.layout.without(last), x.partition.label
-    for key, one in new.items():
-        whole = whole.extended([key], one.dim)
-    partition = Partition(whole, np.concatenate([label[:-1], np.full(len(new), label[-1])]))
-    return BlockGaussian(partition, np.concatenate([x.mean[:-size], mean]), x.blocks), left
-
-
-def _stacked(factors: Sequence[Linear], dims: Mapping[int, int]) -> tuple[FloatArray, dict[int, slice]]:
-    """[A | b] of factors together, over variables in the order of `dims`; the columns of each."""
-    span, width = dict[int, slice](), 0
-    for key, dim in dims.items():
-        span[key] = slice(width, width + dim)
-        width += dim
-    rows = [np.zeros((len(A), width + 1)) for _, A in factors]
-    for into, (keys, A) in zip(rows, factors, strict=True):
-        for key, block in zip(keys, np.split(A, np.cumsum([dims[key] for key in keys]), axis=1), strict=False):
-            into[:, span[key]] = block
-        into[:, -1] = A[:, -1]
-    return np.concatenate([np.empty((0, width + 1)), *rows]), span
 
 
 def _covariance(x: BlockGaussian, ids: Mapping[int, int], point: LinearisationPoint, key: int) -> FloatArray:

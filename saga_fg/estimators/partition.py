@@ -15,12 +15,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import ArrayLike
-from scipy.sparse.csgraph import connected_components
 
 from saga_fg.errors import InputError, UnknownNodeError
-from saga_fg.kernels.components import component_tables, regrouped_blocks
+from saga_fg.kernels.components import component_tables, regrouped_blocks, united_labels
 from saga_fg.numerics.arrays import (
     BoolArray,
     FloatArray,
@@ -133,7 +131,6 @@ def checked_prior(nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike) ->
 
 _FEW = 4  # components of a size that are not worth a batched operation of their own
 _PACK = 64  # states that such components together may have
-_PAIRS = 200  # from which on a graph of pairs is worth building
 
 
 class BlockPlaces(NamedTuple):
@@ -211,28 +208,12 @@ class Partition:
         """Join the components of node rows target[k] and source[k]; itself where they are one already."""
         a, b = self.label[target], self.label[source]
         across = a != b
-        if not across.any():
-            return self
-        return Partition(self.layout, _united(self.count, a[across], b[across])[self.label])
+        return self.joined_up_to(a[across], b[across], len(self.label)) if across.any() else self
 
     def joined_up_to(self, a: IntArray, b: IntArray, most: int) -> Partition:
         """Join the components of labels a[k] and b[k], pair by pair, to at most `most` nodes each."""
-        if len(a) == 0:
-            return self
-        if len(self.label) <= most:
-            return Partition(self.layout, _united(self.count, a, b)[self.label])
-        root, size = list(range(self.count)), np.bincount(self.label).tolist()
-        for one, other in zip(a.tolist(), b.tolist(), strict=True):
-            while root[one] != one:
-                root[one] = one = root[root[one]]
-            while root[other] != other:
-                root[other] = other = root[root[other]]
-            if one != other and size[one] + size[other] <= most:
-                first, second = min(one, other), max(one, other)
-                root[second], size[first] = first, size[one] + size[other]
-        for k, parent in enumerate(root):  # a parent comes before its children
-            root[k] = root[parent]
-        return Partition(self.layout, _without_gaps(np.array(root, dtype=np.int64))[self.label])
+        nodes = np.bincount(self.label, minlength=self.count)
+        return Partition(self.layout, united_labels(self.count, nodes, a, b, most)[self.label])
 
     @cached_property
     def packed(self) -> Partition:
@@ -258,23 +239,6 @@ class Partition:
     def restricted(self, layout: StateLayout, rows: IntArray) -> Partition:
         """Partition of the nodes at `rows` alone, which are those of `layout`."""
         return Partition(layout, _without_gaps(self.label[rows]))
-
-
-def _united(count: int, a: IntArray, b: IntArray) -> IntArray:
-    """(count,) number of the set that each of `count` elements is in when a[k] and b[k] are in one, without gaps."""
-    if len(a) > _PAIRS:
-        pairs = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), (count, count))
-        return np.asarray(connected_components(pairs, directed=False)[1], dtype=np.int64)
-    root = list(range(count))
-    for one, other in zip(a.tolist(), b.tolist(), strict=True):
-        while root[one] != one:
-            one = root[one]
-        while root[other] != other:
-            other = root[other]
-        root[max(one, other)] = min(one, other)
-    for k, parent in enumerate(root):  # a parent comes before its children
-        root[k] = root[parent]
-    return _without_gaps(np.array(root, dtype=np.int64))
 
 
 def _without_gaps(label: IntArray) -> IntArray:

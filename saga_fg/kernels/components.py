@@ -140,22 +140,6 @@ def regrouped_blocks(
     return result
 
 
-@kernel("f1 i1 i1 i1 i1 i")
-def node_blocks(
-    flat: FloatArray, start: IntArray, size: IntArray, offset: IntArray, rows: IntArray, d: int
-) -> FloatArray:
-    """(k, d, d) covariances of the nodes `rows` (k,), whose states have size d."""
-    result = np.empty((len(rows), d, d))
-    for k in range(len(rows)):
-        i = rows[k]
-        s = size[i]
-        at = start[i] + s * offset[i] + offset[i]
-        for a in range(d):
-            for b in range(d):
-                result[k, a, b] = flat[at + a * s + b]
-    return result
-
-
 @kernel("f1 f1 i1 i1 i1 i1 i1 i2")
 def planar_marginals(
     mean: FloatArray,
@@ -244,6 +228,35 @@ def uncorrelated_labels(
             parts += 1
         else:
             number[i] = number[one]
+    return number
+
+
+@kernel("i i1 i1 i1 i")
+def united_labels(count: int, nodes: IntArray, a: IntArray, b: IntArray, most: int) -> IntArray:
+    """(count,) number of the set that each of `count` sets is in when a[k] and b[k] (k,) are united, pair by pair.
+
+    nodes (count,) of each; those that would come to more than `most` nodes are not united. Numbers are from 0 without
+    gaps, in the order of the first of each set.
+    """
+    root, size = np.arange(count), nodes.copy()
+    for k in range(len(a)):
+        one, other = a[k], b[k]
+        while root[one] != one:
+            root[one] = root[root[one]]
+            one = root[one]
+        while root[other] != other:
+            root[other] = root[root[other]]
+            other = root[other]
+        if one != other and size[one] + size[other] <= most:
+            first, second = min(one, other), max(one, other)
+            root[second], size[first] = first, size[one] + size[other]
+    number, sets = np.empty(count, dtype=np.int64), 0
+    for k in range(count):  # a root comes before its set
+        if root[k] == k:
+            number[k] = sets
+            sets += 1
+        else:
+            number[k] = number[root[k]]
     return number
 
 

@@ -1,4 +1,4 @@
-"""Every estimator, one suite: equal to the textbook.
+"""Every estimator, one suite: equal to the textbook, beyond the programs of `saga_fg.conformance`.
 
 Figures (`docs/model.md`): means agree with the textbook to 1e-9 posterior
 standard deviations, covariances to 1e-9 relative in the Frobenius norm. Where a measurement is better than what was
@@ -59,28 +59,12 @@ def in_step(program, estimator, tolerance=TOLERANCE, textbook=None):
 # equal to the textbook
 
 
-def test_random_programs_agree_with_the_textbook(make, subtests):
-    """Changing graphs of nodes of mixed sizes, several sensors, misses, new and leaving nodes, irregular intervals."""
-    for seed in range(15):
-        with subtests.test(seed=seed):
-            in_step(random_program(np.random.default_rng(seed), moments=7), make())
-
-
-def test_a_long_program_does_not_drift_away(make, subtests):
-    for seed in range(4):
-        with subtests.test(seed=seed):
-            in_step(
-                random_program(np.random.default_rng(100 + seed), moments=40, kinds=(CAR, TRAM), density=0.15), make()
-            )
-
-
-def test_nodes_that_turn_agree_with_the_textbook(make, subtests):
+@pytest.mark.parametrize("seed", range(2))
+def test_nodes_that_turn_agree_with_the_textbook(make, seed):
     """Courses with known headings and turn rates, recorded with every interval."""
-    for seed in range(8):
-        with subtests.test(seed=seed):
-            rng = np.random.default_rng(seed)
-            program = random_program(rng, moments=7, kinds=(CAR, VAN, CONE))
-            in_step([with_courses(rng, operation) for operation in program], make())
+    rng = np.random.default_rng(seed)
+    program = random_program(rng, moments=7, kinds=(CAR, VAN, CONE))
+    in_step([with_courses(rng, operation) for operation in program], make())
 
 
 def with_courses(rng, operation):
@@ -94,22 +78,7 @@ def with_courses(rng, operation):
     return Predict(discretise(dataclasses.replace(graph, modes=(record,)), dt))
 
 
-def test_tiny_intervals(make, subtests):
-    """At dt = 0 nothing moves and there is no process noise."""
-    for dt in [0.0, 1e-6, 1e-3]:
-        with subtests.test(dt=dt):
-            rng = np.random.default_rng(3)
-            in_step(random_program(rng, moments=6, intervals=(dt, 0.4)), make())
-
-
-def test_milliseconds_beside_seconds(make, subtests):
-    """Nodes of all kinds: the noise of constant acceleration falls with the fifth power of the interval."""
-    for seed in range(6):
-        with subtests.test(seed=seed):
-            in_step(random_program(np.random.default_rng(seed), moments=9, intervals=(1e-3, 0.05, 1.0)), make())
-
-
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0])
 def test_a_thousand_seconds_without_a_word(make, seed):
     """Nodes that are measured just before and after a long gap.
 
@@ -133,33 +102,30 @@ def test_a_thousand_seconds_without_a_word(make, seed):
     assert (np.linalg.eigvalsh(estimator.joint_covariance(nodes)) > 0).all()
 
 
-def test_nodes_that_stand_still_for_ever(make, subtests):
+@pytest.mark.parametrize("seed", [0])
+def test_nodes_that_stand_still_for_ever(make, seed):
     """Stop lines and poles have no process noise: Q is singular."""
-    for seed in range(3):
-        with subtests.test(seed=seed):
-            rng = np.random.default_rng(40 + seed)
-            in_step(random_program(rng, moments=7, kinds=(CAR, POLE)), make())
+    rng = np.random.default_rng(40 + seed)
+    in_step(random_program(rng, moments=7, kinds=(CAR, POLE)), make())
 
 
-def test_a_scene_of_lights_lanes_cones_and_trailers(make, subtests):
+@pytest.mark.parametrize("seed", range(2))
+def test_a_scene_of_lights_lanes_cones_and_trailers(make, seed):
     """Standing and moving nodes whose edges go between kinds, with rates that follow the belief on a light."""
-    for seed in range(4):
-        with subtests.test(seed=seed):
-            rng = np.random.default_rng(seed)
-            in_step(road_program(rng), make())
+    rng = np.random.default_rng(seed)
+    in_step(road_program(rng), make())
 
 
-def test_measurements_far_better_than_the_prior(make, subtests):
-    for seed in range(3):
-        with subtests.test(seed=seed):
-            rng = np.random.default_rng(seed)
-            prior = Add(np.array([1, 2]), rng.normal(size=(2, 4)) * 1e3, np.stack([1e6 * np.eye(4)] * 2))
-            sharp = Update(Measurements(np.array([1]), np.array([[3.0, 4.0]]), np.eye(2, 4), 1e-2 * np.eye(2)))
-            tolerance = max(TOLERANCE, 20 * np.finfo(float).eps * 1e6 / 1e-2)
-            in_step([prior, sharp], make(), tolerance)
+@pytest.mark.parametrize("seed", [0])
+def test_measurements_far_better_than_the_prior(make, seed):
+    rng = np.random.default_rng(seed)
+    prior = Add(np.array([1, 2]), rng.normal(size=(2, 4)) * 1e3, np.stack([1e6 * np.eye(4)] * 2))
+    sharp = Update(Measurements(np.array([1]), np.array([[3.0, 4.0]]), np.eye(2, 4), 1e-2 * np.eye(2)))
+    tolerance = max(TOLERANCE, 20 * np.finfo(float).eps * 1e6 / 1e-2)
+    in_step([prior, sharp], make(), tolerance)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_numbers_without_a_digit_left_do_no_harm(make, seed):
     """Interactions that drive variances beyond 1e80 within the gap: an answer or an exception, and life goes on."""
     rng = np.random.default_rng(seed)
@@ -187,7 +153,7 @@ def test_numbers_without_a_digit_left_do_no_harm(make, seed):
 
 
 @pytest.mark.parametrize("late", [0.0, 0.5])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_every_epoch_is_smoothed_as_by_rauch_tung_striebel(make_smoother, seed, late):
     """After every call; late measurements change the past as if they had come in time, also within an interval."""
     scenario = random_scenario(np.random.default_rng(300 + seed), late=late, intervals=(0.02, 0.1, 0.37, 0.5, 1.2))
@@ -209,7 +175,7 @@ def zeros(values):
     return result
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0])
 def test_gtsam_solves_the_estimators_graph_to_the_same_answer(make, seed):
     """GTSAM's own optimiser, from zero: by QR it agrees to 1e-7 of a standard deviation.
 
@@ -239,18 +205,17 @@ def test_gtsam_solves_the_estimators_graph_to_the_same_answer(make, seed):
         assert np.linalg.norm(marginals.marginalCovariance(key) - P) < 1e-6 * np.linalg.norm(P)
 
 
-def test_the_batch_solver_solves_the_estimators_graph_to_the_same_answer(make, subtests):
+@pytest.mark.parametrize("seed", [0])
+def test_the_batch_solver_solves_the_estimators_graph_to_the_same_answer(make, seed):
     """Its graph is a running graph: nodes of a map by their kind, moments by their time, poles with one variable."""
-    for seed in range(3):
-        with subtests.test(seed=seed):
-            estimator, _ = run(random_program(np.random.default_rng(seed), moments=6), make())
-            estimator.add([-4], np.array([[3.0, 1.0]]), 0.1 * np.eye(2)[None])
-            solver = BatchSolver(graph=estimator.graph())
-            for node in estimator.nodes.tolist():
-                key, P = newest_key(estimator.graph(), node), estimator.covariance([node])[0]
-                assert np.abs((solver.state(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 5e-9
-                assert np.linalg.norm(solver.covariance(key) - P) < 5e-9 * np.linalg.norm(P)
-            assert str(solver.graph().variable(key)) == f"map node 4 at {estimator.time:.2f} s"
+    estimator, _ = run(random_program(np.random.default_rng(seed), moments=6), make())
+    estimator.add([-4], np.array([[3.0, 1.0]]), 0.1 * np.eye(2)[None])
+    solver = BatchSolver(graph=estimator.graph())
+    for node in estimator.nodes.tolist():
+        key, P = newest_key(estimator.graph(), node), estimator.covariance([node])[0]
+        assert np.abs((solver.state(key) - estimator.mean([node])[0]) / np.sqrt(np.diag(P))).max() < 5e-9
+        assert np.linalg.norm(solver.covariance(key) - P) < 5e-9 * np.linalg.norm(P)
+    assert str(solver.graph().variable(key)) == f"map node 4 at {estimator.time:.2f} s"
 
 
 def test_any_subset_in_any_order_can_be_read(make):
@@ -283,18 +248,6 @@ def test_what_is_read_is_the_readers_own(make):
             answer[:] = -5.0
     assert estimator.mean([1]).tolist() == [[1.0] * 4]
     assert estimator.covariance([1])[0].tolist() == np.eye(4).tolist()
-
-
-def test_an_estimator_of_nothing(make):
-    estimator = make()
-    assert len(estimator.nodes) == 0
-    estimator.predict(discretise(SceneGraph([], ()), 0.5))
-    assert estimator.update(Measurements([], np.empty((0, 2)), np.eye(2, 4), np.eye(2))) == 0.0
-    estimator.marginalise([])
-    estimator.add([], np.empty((0, 4)), np.empty((0, 4, 4)))
-    assert estimator.joint_mean([]).shape == (0,)
-    assert estimator.joint_covariance([]).shape == (0, 0)
-    assert len(estimator.nodes) == 0
 
 
 def test_a_node_that_left_may_come_back_as_a_new_one(make):

@@ -30,7 +30,7 @@ def permuted(operation, rng):
     return Predict(discretise(SceneGraph(graph.nodes[order], types, groups), operation.transition.dt))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_order_in_which_nodes_are_told_does_not_matter(make, seed):
     rng = np.random.default_rng(seed)
     program = random_program(rng, moments=6)
@@ -44,7 +44,7 @@ def test_the_order_in_which_nodes_are_told_does_not_matter(make, seed):
     assert np.abs(other.joint_mean(nodes) - one.joint_mean(nodes)).max() <= 1e-9 * np.sqrt(np.diag(P)).max()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_rate_zero_is_independent_filters_exactly(make, seed):
     """Together or each alone: the same digits, and no correlation between any two.
 
