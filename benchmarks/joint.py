@@ -70,9 +70,6 @@ def joint(
     first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first simulated scene.")] = 0,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
     poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False,
-    lanes: Annotated[
-        bool, typer.Option("--lanes", help="Simulated: once more with vehicles drawn to the lanes of a map.")
-    ] = False,
     parked: Annotated[
         bool, typer.Option("--parked/--no-parked", help="Simulated: cars parked on both sides, or none.")
     ] = True,
@@ -88,23 +85,22 @@ def joint(
     \b
     Examples:
       python -m benchmarks joint --scenes 10 --poles
-      python -m benchmarks joint --scenes 10 --lanes --no-parked
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
     """
     if (dataroot is None) != (detections is None):
         raise InputError("expected both --dataroot and --detections, or neither")
-    if dataroot is not None and (poles or lanes or not parked):
-        raise InputError("--poles, --lanes and --no-parked: expected with simulated streets only")
-    if online and (poles or lanes):
-        raise InputError("--online: expected neither --poles nor --lanes")
+    if dataroot is not None and (poles or not parked):
+        raise InputError("--poles and --no-parked: expected with simulated streets only")
+    if online and poles:
+        raise InputError("--online: expected without --poles")
     if dataroot is None:
-        many = [simulate_scene(street(parked, mapped=lanes), seed) for seed in range(first, first + scenes)]
+        many = [simulate_scene(street(parked), seed) for seed in range(first, first + scenes)]
     else:
         kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","), True)
         many = [kitti.scene(name) for name in kitti.scenes]
     base = load_config("simulated" if dataroot is None else "kitti", config)
-    run = partial(online_run, lag=lag) if online else partial(batch_run, poles=poles, lanes=lanes)
+    run = partial(online_run, lag=lag) if online else partial(batch_run, poles=poles)
     yield from joint_rows(many, range(seeds), partial(run, config=base, settings=JointSettings()))
 
 
@@ -122,7 +118,7 @@ class Outcome:
         self.paths[name], self.figures[column] = np.array([error**2 * poses, poses]), error
 
 
-PATHS = (("joint", "decoupled"), ("with poles", "joint"), ("in map with lanes", "in map"))
+PATHS = (("joint", "decoupled"), ("with poles", "joint"))
 OBJECTS = (("joint", "decoupled"), ("joint", "held"))
 
 
@@ -155,10 +151,8 @@ def joint_rows(scenes: Sequence[Scene], seeds: Sequence[int], run: Callable[...,
             yield "changes of pooled errors of objects", {**about, **changes}
 
 
-def batch_run(
-    scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, poles: bool = False, lanes: bool = False
-) -> Outcome:
-    """From the whole recording; with `poles` once more with those beside the road, with `lanes` with those of a map."""
+def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, poles: bool = False) -> Outcome:
+    """From the whole recording; with `poles` once more with those beside the road."""
     run, outcome = run_joint(scene, config, settings, SENSOR, seed), Outcome()
     errors, n = run.errors(), len(run.frames)
     outcome.figures["path, m"] = errors["odometry"].path_length
@@ -170,11 +164,6 @@ def batch_run(
         see = partial(poles_at, seed=seed)
         again = run_joint(scene, config, settings, SENSOR, seed, see)
         outcome.add_path("with poles", "ATE with poles", again.errors()["joint"].ate, n)
-    if lanes:
-        drawn = run_joint(scene, config, replace(settings, lanes=True), SENSOR, seed)
-        for one, name in ((run, "in map"), (drawn, "in map with lanes")):
-            off = one.paths["joint"].positions - one.truth.positions
-            outcome.add_path(name, f"{name}, m", float(np.sqrt((off**2).sum(axis=1).mean())), n)
     driven, tracker = run.odometry.world_T_ego, path_tracker(config)
     once, new = replace(settings, passes=1), partial(path_tracker, config)
     held = estimate_jointly(run.frames, run.increments, new, once, driven[0], new_providers=lambda: [HeldPath(driven)])

@@ -7,6 +7,7 @@ a few on the beginning (`LandmarkMapper.log_evidence`); the identities in the fi
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,8 +18,12 @@ from benchmarks.agreement import pairwise_agreement
 from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.recordings.ranges import compared, map_beacons
 from benchmarks.runner import Rows, each
-from data_tools.files.atomic_files import check_writable_folder
-from pipelines.slam.results import landmark_row, landmark_rows, planar_trajectory, write_landmark_map
+from data_tools.figures import write_figures
+from data_tools.files.atomic_files import atomic_directory, check_writable_folder, write_bytes
+from data_tools.lidar import write_cloud
+from data_tools.plots import paths_from_above, png
+from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
+from pipelines.slam.results import landmark_row, landmark_rows, planar_trajectory
 from saga_fg.errors import InputError
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import FloatArray
@@ -93,6 +98,28 @@ def _park(drive: LandmarkLog, scale: float | None) -> _Found:
         "log evidence by odometry scale": {f"{one:g}": value for one, value in tried.items()},
     }
     return park.world_T_pose, landmark_rows(park.landmarks), {**counts, **named, **pairs}, {}
+
+
+def write_landmark_map(
+    output: Path,
+    trajectory: Trajectory,
+    landmarks: Sequence[Mapping[str, Any]],
+    figures: Mapping[str, object],
+    others: Mapping[str, FloatArray] | None = None,
+) -> None:
+    """Write trajectory.tum, trajectory.kitti, landmarks.json, landmarks.ply, figures.json and above.png.
+
+    landmarks: rows of landmarks.json; others: further paths (n, 2 or 3) for the picture, by name
+    """
+    places = np.array([[row["x"], row["y"], row.get("z", 0.0)] for row in landmarks]).reshape(-1, 3)
+    picture = paths_from_above({**(others or {}), "estimate": trajectory.positions}, {"landmarks": places})
+    with atomic_directory(output) as folder:
+        write_tum_poses(folder / "trajectory.tum", trajectory)
+        write_kitti_poses(folder / "trajectory.kitti", trajectory)
+        write_figures(folder / "landmarks.json", landmarks)
+        write_cloud(folder / "landmarks.ply", places)
+        write_figures(folder / "figures.json", dict(figures))
+        write_bytes(folder / "above.png", png(picture))
 
 
 def _driven(drive: LandmarkLog, scale: float, most: int | None = None) -> LandmarkMapper:

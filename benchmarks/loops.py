@@ -14,6 +14,7 @@ from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
+import gtsam
 import numpy as np
 import typer
 
@@ -21,15 +22,22 @@ from benchmarks.course import SimulatedCourse, revisits
 from benchmarks.runner import Row, Rows, clocked, each
 from data_tools.files.input_files import error_context
 from data_tools.lidar import Scan
-from data_tools.pose_graphs import read_g2o, with_false_loops
+from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, degraded_odometry, trajectory_errors
 from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
-from pipelines.slam.pose_graph_baselines import graduated
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import OdometryIncrements, OdometryNoise
-from saga_fg.slam.pose_graph import PoseGraph, consensus, optimise_poses
+from saga_fg.slam.pose_graph import (
+    PoseGraph,
+    consensus,
+    factor_graph,
+    optimise_poses,
+    pose_array,
+    pose_values,
+    trusted,
+)
 from saga_fg.slam.submaps import LoopClosure
 
 NOISE = OdometryNoise(  # like that of scan registration: headings drift, distances are right
@@ -186,3 +194,53 @@ def odometry_of(course: SimulatedCourse, seed: int, drift: float) -> FloatArray:
     again = course.distance[revisits(course.world_T_ego)[0][0]]
     poses[:, :2, 3] += drift * (course.distance / again)[:, None] * np.array([np.cos(angle), np.sin(angle)])
     return poses
+
+
+def graduated(graph: PoseGraph) -> tuple[FloatArray, BoolArray]:
+    """Poses of `gtsam.GncLMOptimizer` from the guess in the graph, and which measurements (M,) it kept."""
+    params = gtsam.GncLMParams()
+    params.setLossType(gtsam.GncLossType.TLS)
+    params.setKnownInliers([0, *(1 + np.flatnonzero(trusted(graph))).tolist()])
+    optimizer = gtsam.GncLMOptimizer(factor_graph(graph), pose_values(graph.world_T_pose), params)
+    poses = pose_array(optimizer.optimize(), graph.dim)
+    return poses, np.asarray(optimizer.getWeights())[1:] > 0.5
+
+
+_LEAST = 4  # poses, of which two are no neighbours, whichever is first
+_REACH = 10.0  # m, largest coordinate of a false measurement
+
+
+def with_false_loops(graph: PoseGraph, share: float, seed: int) -> PoseGraph:
+    """Append false loops, `share` times as many as the graph has loops, each with the information of one of these.
+
+    Both poses, the position within 10 m by axis, and the rotation are uniformly distributed. Raises `InputError`.
+    """
+    loops = np.flatnonzero(~trusted(graph))
+    if not graph.poses_alone:
+        raise InputError("expected a graph of poses alone, without landmarks and priors")
+    if not len(loops) or len(graph) < _LEAST:
+        raise InputError(f"expected {_LEAST} poses and a loop or more, got {len(graph)} and {len(loops)}")
+    if not 0 <= share < np.inf:
+        raise InputError(f"share: expected a number >= 0, got {share:g}")
+    rng = np.random.default_rng(seed)
+    count, n = round(share * len(loops)), len(graph)
+    first = rng.integers(0, n, count)
+    second = (first + rng.integers(2, n - 1, count)) % n  # neither the same nor a neighbour
+    measured = np.array([_anywhere(rng, graph.dim) for _ in range(count)]).reshape(-1, graph.dim + 1, graph.dim + 1)
+    return replace(
+        graph,
+        first=np.concatenate([graph.first, np.minimum(first, second)]),
+        second=np.concatenate([graph.second, np.maximum(first, second)]),
+        first_T_second=np.concatenate([graph.first_T_second, measured]),
+        information=np.concatenate([graph.information, graph.information[rng.choice(loops, count)]]),
+    )
+
+
+def _anywhere(rng: np.random.Generator, d: int) -> FloatArray:
+    place = rng.uniform(-_REACH, _REACH, d)
+    if d == 2:
+        return np.asarray(gtsam.Pose2(rng.uniform(-np.pi, np.pi), place).matrix())
+    w, x, y, z = rng.normal(size=4)
+    return np.asarray(
+        gtsam.Pose3(gtsam.Rot3.Quaternion(*(np.array([w, x, y, z]) / np.linalg.norm([w, x, y, z]))), place).matrix()
+    )

@@ -46,7 +46,7 @@ from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.mapping import LandmarkMapper
 from saga_fg.types.landmark import Observation
 
-OURS, OPEN3D, KISS = "saga-fg", "saga-fg, open3d icp", "kiss-icp"
+OURS, KISS = "saga-fg", "kiss-icp"
 SETTINGS = OdometrySettings()
 APART, LINES, WIDTH = 10.0, 20.0, 200.0  # m between landmarks, between lines, and of the field
 STEP, REACH = 2.0, 20.0  # m
@@ -65,9 +65,6 @@ def slam(
     kiss: Annotated[
         bool, typer.Option("--kiss/--no-kiss", help="With KISS-ICP, of the extra bench, or ours alone.")
     ] = True,
-    open3d: Annotated[
-        bool, typer.Option("--open3d", help="Our odometry with Open3D's registration in place of ours, too.")
-    ] = False,
     dense: Annotated[
         int | None,
         typer.Option("--dense", min=2, help="Instead: SLAM all in on so many simulated scans of full density."),
@@ -97,7 +94,7 @@ def slam(
         raise InputError("expected one of --dataroot, --landmarks and --dense")
     if dataroot is not None:
         recorded = KittiScans(dataroot, sequence, most=scans)
-        yield from odometry_rows(recorded, kiss, open3d)
+        yield from odometry_rows(recorded, kiss)
         yield from all_in_rows(recorded)
     elif dense is not None:
         course = SimulatedCourse(seed, 0.8 * dense, settings=ScannerSettings(rings=64, columns=firings))
@@ -106,13 +103,11 @@ def slam(
         yield from landmark_rows(landmarks or 0, seed)
 
 
-def odometry_rows(scans: ScanSequence, kiss: bool = True, open3d: bool = False) -> Iterator[Row]:
+def odometry_rows(scans: ScanSequence, kiss: bool = True) -> Iterator[Row]:
     """Each contender on the scans of each case. Raises `MissingExtraError` when `kiss` is wanted and not installed."""
     truth, ego_T_lidar = Trajectory(scans.timestamps, scans.world_T_ego), scans.ego_T_lidar
     for case, skewed in (("as recorded", False), ("de-skewed", True)):
         places: dict[str, Place] = {OURS: _ours(SETTINGS)}
-        if open3d:
-            places[OPEN3D] = _ours(replace(SETTINGS, registration=replace(SETTINGS.registration, method="open3d")))
         if kiss:
             places[KISS] = _kiss(skewed)
         poses: dict[str, list[FloatArray]] = {name: [] for name in places}

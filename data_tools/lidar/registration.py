@@ -43,10 +43,6 @@ An eigenvalue of A is the number of surfels that face a motion. Normals have err
 faces: by the roughness s_g of the surfels, rad, about sum_g w_g s_g^2 of them. A motion that fewer see than that, and
 `LEAST_SURFELS` more, is unconstrained: a few false surfels, across edges, are everywhere. Sources: Zhang, Kaess, Singh,
 On degeneracy of optimization-based state estimation problems, ICRA 2016; Tuna et al., X-ICP, T-RO 2024.
-
-Registration by Open3D's tensor ICP, in place of our Gauss-Newton loop: the same surfels, pairs by its own search.
-
-The target is the mean and normal of each flat surfel; the estimate is point to plane under a Cauchy loss.
 """
 
 from __future__ import annotations
@@ -59,11 +55,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_tools.lidar.scan import voxel_groups, voxel_keys
-from data_tools.lidar.scan_files import load_open3d
 from saga_fg.errors import SagaError
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.numerics.geometry import transform_points
-from saga_fg.settings import Settings, setting
 
 LEAST_POINTS = 6  # of a flat surfel
 FLAT = 1 / 9  # largest share of the smallest eigenvalue in the second: a third of the standard deviation
@@ -270,15 +264,6 @@ class RegistrationError(SagaError):
     """The scan does not overlap the map, or the overlap does not determine the pose."""
 
 
-@dataclass(frozen=True)
-class RegistrationSettings(Settings):
-    """Method and convergence criteria of the registration."""
-
-    method: Literal["gauss-newton", "open3d"] = setting(
-        "gauss-newton", "our own iterations, or Open3D's tensor ICP on the same surfels; loops are registered by ours"
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Registration:
     """Pose of a scan in the map.
@@ -307,7 +292,6 @@ def register(
     map_T_scan: FloatArray,
     farthest: float,
     scale: float,
-    settings: RegistrationSettings,
     undetermined: Undetermined = "refuse",
 ) -> Registration:
     """Register points (N, 3) of a scan, m, in its sensor's frame, with a map.
@@ -322,7 +306,7 @@ def register(
     """
 
     def refined(free: FloatArray) -> Registration:
-        return _refined(points, surfels, map_T_scan, farthest, scale, settings, free)
+        return _refined(points, surfels, map_T_scan, farthest, scale, free)
 
     try:
         found = refined(np.eye(6))
@@ -352,12 +336,9 @@ def _refined(
     map_T_scan: FloatArray,
     farthest: float,
     scale: float,
-    settings: RegistrationSettings,
     free: FloatArray,
 ) -> Registration:
     """The registration among the motions free (6, k)."""
-    if settings.method == "open3d" and free.shape[1] == 6 and len(points) >= LEAST_PAIRS and len(surfels.flat):
-        return _by_open3d(points, surfels, map_T_scan, farthest, scale)
     T = _rigid(map_T_scan)
     span = float(np.sqrt(np.mean(np.square(points)) * 3)) if len(points) else 1.0
     converged, step = False, 0
@@ -371,20 +352,6 @@ def _refined(
         T = _rigid(T @ gtsam.Pose3.Expmap(x).matrix())
         converged = bool(np.linalg.norm(x[3:]) < _TRANSLATION_TOLERANCE and np.linalg.norm(x[:3]) < _ROTATION_TOLERANCE)
     return _assessed(points[rows], paired, T, scale, free, step, converged)
-
-
-def _by_open3d(
-    points: FloatArray,
-    surfels: SurfelMap,
-    map_T_scan: FloatArray,
-    farthest: float,
-    scale: float,
-) -> Registration:
-
-    T, iterations, converged = icp(points, surfels, map_T_scan, farthest, scale, MAX_ITERATIONS)
-    T = _rigid(T)
-    rows, paired = surfels.nearest(transform_points(T, points), farthest)
-    return _assessed(points[rows], paired, T, scale, np.eye(6), iterations, converged)
 
 
 def _assessed(
@@ -439,32 +406,3 @@ def _rigid(T: FloatArray) -> FloatArray:
     rigid = T.copy()
     rigid[:3, :3] = U @ Vt
     return rigid
-
-
-_PRECISE = 1e-6  # relative change of fitness and residual at which it ends
-
-
-def icp(
-    points: FloatArray, surfels: SurfelMap, map_T_scan: FloatArray, farthest: float, scale: float, iterations: int
-) -> tuple[FloatArray, int, bool]:
-    """Return the pose (4, 4) of points (N, 3), the number of iterations, and whether they converged.
-
-    map_T_scan: (4, 4) to begin with; farthest: m; scale: of the loss, m. Raises `MissingExtraError` without Open3D.
-    """
-    open3d = load_open3d()
-    registration, tensor = open3d.t.pipelines.registration, open3d.core.Tensor
-    flat = surfels.flat
-    target = open3d.t.geometry.PointCloud(tensor(np.ascontiguousarray(flat.mean)))
-    target.point.normals = tensor(np.ascontiguousarray(flat.normal))
-    source = open3d.t.geometry.PointCloud(tensor(np.ascontiguousarray(points)))
-    kernel = registration.robust_kernel
-    loss = kernel.RobustKernel(kernel.RobustKernelMethod.CauchyLoss, scale, 1.0)
-    found = registration.icp(
-        source,
-        target,
-        farthest,
-        tensor(np.ascontiguousarray(map_T_scan)),
-        registration.TransformationEstimationPointToPlane(loss),
-        registration.ICPConvergenceCriteria(_PRECISE, _PRECISE, iterations),
-    )
-    return found.transformation.numpy().astype(np.float64), int(found.num_iterations), bool(found.converged)

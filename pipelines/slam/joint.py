@@ -80,9 +80,9 @@ class JointRun:
         return {name: trajectory_errors(path, self.truth) for name, path in self.paths.items() if name != "truth"}
 
 
-def street(parked: bool = True, mapped: bool = False) -> SimulatorSettings:
-    """Simulated scenes with cars parked on both sides of the road, or on none; mapped: frames bring the lanes along."""
-    return SimulatorSettings(parking_probability=1.0 if parked else 0.0, mapped=mapped)
+def street(parked: bool = True) -> SimulatorSettings:
+    """Simulated scenes with cars parked on both sides of the road, or on none."""
+    return SimulatorSettings(parking_probability=1.0 if parked else 0.0)
 
 
 def run_joint(

@@ -27,7 +27,6 @@ import numpy as np
 from data_tools.lidar import (
     Registration,
     RegistrationError,
-    RegistrationSettings,
     Scan,
     SurfelMap,
     register,
@@ -67,7 +66,6 @@ class MapPlaces:
     radius: float
     min_overlap: float
     spacing: float
-    registration: RegistrationSettings
     ambiguous: bool = False
     _index: PlaceIndex | None = field(default=None, init=False)
 
@@ -110,7 +108,7 @@ class MapPlaces:
             older = np.flatnonzero(off <= self.radius).tolist()
         for match in self._index.candidates(PlaceImage.of(query), older, COMPARED)[:_REGISTERED]:
             around, frame = self.around(match.number)
-            fine = registered(around, points, match.place_T_query, self.registration)
+            fine = registered(around, points, match.place_T_query)
             if fine is None:
                 continue
             overlap = Structure.of(around).shared(mine, fine.map_T_scan)
@@ -150,11 +148,11 @@ class MapRegistration:
         if np.linalg.norm(predicted[:3, 3] - self._centre) > _RELOADED:
             self._load(predicted[:3, 3])
         thin = points[voxel_downsample(points, self._spacing)] if len(points) else points
-        criteria, start = self._places.registration, predicted
+        start = predicted
         try:
             if rough:
-                start = register(thin, self._surfels, start, 3 * SURFEL, 1.0, criteria, "hold").map_T_scan
-            found = register(thin, self._surfels, start, 1.5 * SURFEL, 0.1, criteria, "hold")
+                start = register(thin, self._surfels, start, 3 * SURFEL, 1.0, "hold").map_T_scan
+            found = register(thin, self._surfels, start, 1.5 * SURFEL, 0.1, "hold")
         except RegistrationError:
             return None
         fits = found.converged and found.pairs >= _MIN_PAIRS * len(thin) and found.residual <= _MAX_RESIDUAL
@@ -243,13 +241,13 @@ class Localiser:
         sensor_settings: SensorSettings | None = None,
     ) -> None:
         require_type("slam_map", slam_map, SlamMap)
-        self.settings = s = settings or LocaliserSettings()
+        self.settings = settings or LocaliserSettings()
         self._odometry = LidarOdometry(self.settings.odometry)
         self._guess = None if guess is None else checked_transform("guess", guess)
         self._sensors = VehicleSensors(sensors, sensor_settings, ego_T_lidar)
         self._measured, self._of_sensors = self._sensors.since_keyframe, self._sensors.new_providers()
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
-        self._places = MapPlaces(slam_map, RADIUS, MIN_OVERLAP, SCAN_SPACING, s.odometry.registration)
+        self._places = MapPlaces(slam_map, RADIUS, MIN_OVERLAP, SCAN_SPACING)
         self._map = MapRegistration(self._places, SCAN_SPACING)
         self._path = OdometryPath()
         # of keyframes as estimated when they came: map_T_lidar, and the covariance of its tangent

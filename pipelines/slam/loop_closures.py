@@ -41,7 +41,6 @@ import numpy as np
 from data_tools.lidar import (
     Registration,
     RegistrationError,
-    RegistrationSettings,
     Submap,
     SurfelMap,
     register,
@@ -130,15 +129,14 @@ def registered(
     old: FloatArray,
     points: FloatArray,
     old_T_points: FloatArray,
-    settings: RegistrationSettings,
     undetermined: Undetermined = "refuse",
 ) -> Registration | None:
     """Register points (N, 3) with the points (M, 3) of a place, from an alignment of images; None: they do not fit."""
     surfels = SurfelMap(SURFEL, reach=np.inf)
     surfels.add(old, np.zeros(3))
     try:
-        rough = register(points, surfels, old_T_points, 3 * SURFEL, 1.0, settings, undetermined)
-        fine = register(points, surfels, rough.map_T_scan, SURFEL, 0.1, settings, undetermined)
+        rough = register(points, surfels, old_T_points, 3 * SURFEL, 1.0, undetermined)
+        fine = register(points, surfels, rough.map_T_scan, SURFEL, 0.1, undetermined)
     except RegistrationError:
         return None
     return fine if fine.converged else None
@@ -246,7 +244,7 @@ class PlaceLoops:
     def _registered(self, match: PlaceMatch, number: int) -> tuple[LoopClosure | None, float]:
         old, new = (self._submaps[n].points.astype(np.float64) for n in (match.number, number))
         points = new[voxel_downsample(new, SPACING)]
-        fine = registered(old, points, match.place_T_query, RegistrationSettings(), "follow")
+        fine = registered(old, points, match.place_T_query, "follow")
         if fine is None:
             return None, 0.0
         overlap = Structure.of(old).shared(Structure.of(new), fine.map_T_scan)

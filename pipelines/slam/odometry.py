@@ -29,7 +29,6 @@ import numpy as np
 from data_tools.lidar import (
     Registration,
     RegistrationError,
-    RegistrationSettings,
     Scan,
     SurfelMap,
     constant_velocity,
@@ -42,7 +41,7 @@ from data_tools.trajectories import rotation_angle
 from saga_fg.errors import InputError, require_type
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
-from saga_fg.settings import Positive, Settings, setting, settings_group
+from saga_fg.settings import Positive, Settings, setting
 from saga_fg.types.boxes import Boxes
 
 _FIRST_DEVIATION = 1.0  # standard deviation of the first motion, m
@@ -69,7 +68,6 @@ class OdometrySettings(Settings):
     surfel_size: Positive = setting(1.0, "voxel size of the surfels, m; usual 0.5 to 1")
     map_spacing: Positive = setting(0.25, "spacing of the points that enter the map, m")
     scan_spacing: Positive = setting(1.5, "spacing of the points of a scan that is registered, m; higher: faster")
-    registration: RegistrationSettings = settings_group(RegistrationSettings, "registration of a scan in the map")
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +233,7 @@ class LidarOdometry:
         """Points (N, 3) registered with the map; known: the velocity, so that it holds where surfaces leave it open."""
         s = self.settings
         farthest = s.surfel_size + 3 * self.deviation
-        return register(points, self._map, predicted, farthest, 0.1, s.registration, "hold" if known else "follow")
+        return register(points, self._map, predicted, farthest, 0.1, "hold" if known else "follow")
 
     def _place(self, last: OdometryStep, scan: Scan, timestamp: float) -> OdometryStep:
         s, dt = self.settings, timestamp - last.timestamp

@@ -4,8 +4,7 @@
 * iSAM2 with QR factorisation (with Cholesky it throws on badly conditioned graphs), a few poses at a time, each
   starting where a measurement from an earlier pose puts it, then updated until the error changes no more. Poses that
   come one by one cost an update each; where loops are large, as on a sphere, every one of these factorises most of the
-  graph;
-* graduated non-convexity over Levenberg-Marquardt, with truncated least squares and odometry as known inliers.
+  graph.
 """
 
 from __future__ import annotations
@@ -22,15 +21,13 @@ import numpy as np
 
 from factors import PlanarPose, ResidualFactor, SpatialPose, Vector, pose, solve
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import (
     LandmarkObservations,
     PoseGraph,
     chordal_poses,
     factor_graph,
-    pose_array,
     pose_values,
-    trusted,
 )
 from saga_fg.slam.pose_graph.optimisation import SOLVER, graph_values, landmark_factors, placed
 
@@ -149,16 +146,6 @@ def isam2(graph: PoseGraph, batch: int = 10) -> float:
         if abs(before - error) <= _UNCHANGED * before:
             break
     return float(error)
-
-
-def graduated(graph: PoseGraph) -> tuple[FloatArray, BoolArray]:
-    """Poses of `gtsam.GncLMOptimizer` from the guess in the graph, and which measurements (M,) it kept."""
-    params = gtsam.GncLMParams()
-    params.setLossType(gtsam.GncLossType.TLS)
-    params.setKnownInliers([0, *(1 + np.flatnonzero(trusted(graph))).tolist()])
-    optimizer = gtsam.GncLMOptimizer(factor_graph(graph), pose_values(graph.world_T_pose), params)
-    poses = pose_array(optimizer.optimize(), graph.dim)
-    return poses, np.asarray(optimizer.getWeights())[1:] > 0.5
 
 
 def _arrivals(graph: PoseGraph) -> Iterator[tuple[int, list[int]]]:

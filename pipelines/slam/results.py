@@ -30,7 +30,6 @@ import numpy as np
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.laser import LaserLog, OccupancyGrid
-from data_tools.lidar import write_cloud
 from data_tools.plots import occupancy_picture, paths_from_above, png
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
@@ -108,28 +107,6 @@ def planar_trajectory(time: FloatArray, world_T_pose: FloatArray) -> Trajectory:
     poses[:, :2, :2] = world_T_pose[:, :2, :2]
     poses[:, :2, 3] = world_T_pose[:, :2, 2]
     return Trajectory(time, poses)
-
-
-def write_landmark_map(
-    output: Path,
-    trajectory: Trajectory,
-    landmarks: Sequence[Mapping[str, Any]],
-    figures: Mapping[str, object],
-    others: Mapping[str, FloatArray] | None = None,
-) -> None:
-    """Write trajectory.tum, trajectory.kitti, landmarks.json, landmarks.ply, figures.json and above.png.
-
-    landmarks: rows of landmarks.json; others: further paths (n, 2 or 3) for the picture, by name
-    """
-    places = np.array([[row["x"], row["y"], row.get("z", 0.0)] for row in landmarks]).reshape(-1, 3)
-    picture = paths_from_above({**(others or {}), "estimate": trajectory.positions}, {"landmarks": places})
-    with atomic_directory(output) as folder:
-        write_tum_poses(folder / "trajectory.tum", trajectory)
-        write_kitti_poses(folder / "trajectory.kitti", trajectory)
-        write_figures(folder / "landmarks.json", landmarks)
-        write_cloud(folder / "landmarks.ply", places)
-        write_figures(folder / "figures.json", dict(figures))
-        write_bytes(folder / "above.png", png(picture))
 
 
 def write_joint(output: Path, run: JointRun) -> None:

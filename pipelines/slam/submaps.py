@@ -30,7 +30,6 @@ from data_tools.files.atomic_files import write_text
 from data_tools.files.readers import TextTable, read_lines
 from data_tools.lidar import (
     RegistrationError,
-    RegistrationSettings,
     Submap,
     SurfelMap,
     read_scan,
@@ -44,7 +43,6 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, quaternion_rotation, rotation_quaternion, transform_points
 
 _SURFEL, _SCAN = 1.0, 1.5  # m: voxels, and spacing of the points registered
-_REGISTRATION = RegistrationSettings()
 
 
 class SubmapBuilder:
@@ -79,7 +77,7 @@ class SubmapBuilder:
         if self._inner and len(points):
             thin = points[voxel_downsample(points, _SCAN)]
             with contextlib.suppress(RegistrationError):  # then it lies as odometry has it
-                found = register(thin, self._surfels, placed, 2 * _SURFEL, 0.1, _REGISTRATION, "hold")
+                found = register(thin, self._surfels, placed, 2 * _SURFEL, 0.1, "hold")
                 placed = found.map_T_scan if found.converged else placed
         self._surfels.add(transform_points(placed, points), placed[:3, 3])
         self._inner.append(placed)

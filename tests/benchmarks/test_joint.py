@@ -61,10 +61,10 @@ def test_online_objects_are_scored_where_both_report_them() -> None:
 
 def test_options_go_together(refused) -> None:
     assert "expected both --dataroot and --detections" in refused("joint --dataroot somewhere")
-    assert "--online: expected neither --poles nor --lanes" in refused("joint --online --poles")
+    assert "--online: expected without --poles" in refused("joint --online --poles")
 
 
 def test_the_command_prints_the_changes(bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "street", lambda parked, mapped: replace(SHORT, mapped=mapped))
-    compared = {row.get("compared") for row in bench("joint --scenes 2 --lanes")}
+    monkeypatch.setattr(module, "street", lambda parked: SHORT)
+    compared = {row.get("compared") for row in bench("joint --scenes 2")}
     assert {"joint against decoupled", "joint against held"} <= compared

@@ -12,13 +12,14 @@ from typer.testing import CliRunner
 
 from benchmarks.scans import CURB, SimulatedScans, drive
 from data_tools.lidar import Scan, Submap, read_scan
+from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.cli import app
 from pipelines.slam.lidar_results import accumulated_map, covered_spans, metrics, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamResult, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.odometry import OdometrySettings, RecordedOdometry
-from pipelines.slam.saved_graph import read_graph, write_graph
+from pipelines.slam.saved_graph import write_graph
 from pipelines.slam.scan_content import LINE, POLE
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
@@ -119,7 +120,7 @@ class WithFalseLoop:
 
 
 def test_loops_and_inflation_go_through_the_files(tmp_path: Path) -> None:
-    """There and back by an odometry that drifts more than it says; a false loop is not in the graph that is read."""
+    """There and back by an odometry that drifts more than it says; a false loop is not in the graph that is written."""
     there = drive(36, speed=8.0)
     poses = np.concatenate([there, there[-2::-1]])
     scans = SimulatedScans(0, world_T_lidar=poses)
@@ -133,13 +134,11 @@ def test_loops_and_inflation_go_through_the_files(tmp_path: Path) -> None:
     assert len(found.false_loops) == 1
     assert found.selection.inflation.max() > 1.5
     write_graph(tmp_path, found)
-    saved = read_graph(tmp_path)
-    assert len(saved.poses.first) == len(found.keyframes) - 1 + len(found.loops)
+    saved = read_g2o(tmp_path / "graph.g2o")
+    assert len(saved.first) == len(found.keyframes) - 1 + len(found.loops)
     assert found.loops
-    solved = saved.solved(settings.submaps)
-    np.testing.assert_allclose(solved.world_T_pose, found.world_T_lidar, atol=1e-3)
-    np.testing.assert_allclose(solved.covariances[-1], found.covariances[-1], rtol=0.02, atol=1e-9)
-    assert [mark.number for mark in solved.landmarks] == [mark.number for mark in found.landmarks]
+    stated = np.linalg.inv([P for _, P in found.drive.motions(found.drive.keyframes)])
+    assert np.linalg.det(saved.information[0]) < 0.1 * np.linalg.det(stated[0])  # odometry as the loops have it
 
 
 def test_step_by_step_is_what_the_recording_gives(scans: SimulatedScans, result: LidarSlamResult) -> None:

@@ -3,7 +3,6 @@
 from saga_fg.slam.joint.association import Observations
 from saga_fg.slam.joint.batch import estimate_jointly
 from saga_fg.slam.joint.graph import JointEstimate, ObjectStates
-from saga_fg.slam.joint.lanes import lane_key
 from saga_fg.slam.joint.online import OnlineEstimate, OnlineEstimator, OnlineStep, estimate_online
 from saga_fg.slam.joint.record import JointSettings, OdometryIncrements, OdometryNoise
 
@@ -19,5 +18,4 @@ __all__ = [
     "OnlineStep",
     "estimate_jointly",
     "estimate_online",
-    "lane_key",
 ]

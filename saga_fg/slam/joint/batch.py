@@ -25,7 +25,6 @@ from saga_fg.slam.joint.association import (
     with_all_identities,
 )
 from saga_fg.slam.joint.graph import JointEstimate, detections, read_estimate, stationary_factors
-from saga_fg.slam.joint.lanes import LaneAssociation
 from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects, detections_name
 from saga_fg.slam.joint.record import MAX_ITERATIONS, JointSettings, OdometryIncrements, record_epochs
 from saga_fg.tracking import Tracker
@@ -60,7 +59,6 @@ def estimate_jointly(
     links: list[list[int]] = []
     for _ in range(settings.passes):
         tracker = new_tracker()
-        lanes = LaneAssociation(settings.lanes, [tracker.settings.road_map, *(frame.road_map for frame in frames)])
         record = record_epochs(frames, path, odometry, tracker)
         before, links = links, [now.seen.id.tolist() for now in record]
         if links == before:
@@ -70,7 +68,7 @@ def estimate_jointly(
         start_moving = estimate is None
         providers = [seen, *new_providers()]
         epochs = VehicleAndObjects(record, path, settings)
-        estimate = _solve(epochs, frames, slow, start_moving, clutter, lanes, providers)
+        estimate = _solve(epochs, frames, slow, start_moving, clutter, providers)
         estimate = replace(estimate, observations=seen)
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
@@ -98,12 +96,11 @@ def _solve(
     slow: SlowErrors,
     start_moving: bool,
     clutter_area: float,
-    lanes: LaneAssociation,
     providers: Sequence[FactorProvider],
 ) -> JointEstimate:
     """Solve the epochs of a record several times, each from the solution before: if `start_moving` with all objects
     moving, which needs no good start; with those stationary that seem so along the path; with identities by the
-    solution; at last with vehicles assigned to lanes along the solution before.
+    solution.
     """
     graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=MAX_ITERATIONS, tolerance=TOLERANCE)
     record, settings = epochs.record, epochs.settings
@@ -119,9 +116,4 @@ def _solve(
     places = [one.position for one in estimate.objects]
     record = with_all_identities(record, estimate.world_T_ego, places, clutter_area)
     graph.add_factors(epochs.name, detections(record, settings), detections_name(record[-1]))
-    solution = graph.solve(solver)
-    for _ in range(lanes.rounds):
-        lanes.assign(record, read_estimate(record, solution, probabilities), probabilities)
-        ask_all([lanes], graph)
-        solution = graph.solve(solver)
-    return read_estimate(record, solution, probabilities)
+    return read_estimate(record, graph.solve(solver), probabilities)

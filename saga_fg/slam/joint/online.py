@@ -1,11 +1,10 @@
 """Path, landmarks and objects online: the running graph of the last seconds, with a joint prior for all before.
 
 Each frame adds an epoch to the window. The stationarity of objects follows from the window, the identity of detections
-from the objects after it, landmarks are associated by
-the joint Gaussian of the new pose and the landmarks (`saga_fg.slam.mapping.associate`), vehicles are assigned to lanes
-by the present pose (`saga_fg.slam.joint.lanes`), and iSAM2 solves the window with the new factors. Epochs older than
-`lag` leave, and landmarks last observed from them (`saga_fg.slam.joint.providers`). With a lag longer than the
-recording this is the batch estimate, but for associations made online.
+from the objects after it, landmarks are associated by the joint Gaussian of the new pose and the landmarks
+(`saga_fg.slam.mapping.associate`), and iSAM2 solves the window with the new factors. Epochs older than `lag` leave, and
+landmarks last observed from them (`saga_fg.slam.joint.providers`). With a lag longer than the recording this is the
+batch estimate, but for associations made online.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from saga_fg.slam.joint.association import (
 )
 from saga_fg.slam.joint.batch import checked_landmarks
 from saga_fg.slam.joint.graph import JointEstimate, read_estimate
-from saga_fg.slam.joint.lanes import LaneAssociation
 from saga_fg.slam.joint.providers import Window
 from saga_fg.slam.joint.record import EpochRecorder, JointSettings, OdometryIncrements, RecordedEpoch
 from saga_fg.slam.mapping import LandmarkSettings
@@ -82,7 +80,6 @@ class OnlineEstimator:
         self._window = Window(self._settings, providers)
         self._clutter_area = tracker.settings.association.clutter_area
         self._landmarks = WindowLandmarks(landmarks or LandmarkSettings())
-        self._lanes = LaneAssociation(self._settings.lanes, [tracker.settings.road_map])
         self._stationary: list[FloatArray] = []
         self._slow = SlowErrors.at_start(self._settings)
         self._solution: GraphSolution | None = None
@@ -111,20 +108,16 @@ class OnlineEstimator:
             pose = window.predicted(frame.timestamp, increment)
         number = window.record[-1].epoch + 1 if window.record else 0
         now = self._recorder.add(number, frame, pose, increment, covariance)
-        self._lanes.add_maps(frame.road_map)
         before = [] if not window.record else list(window.path)
         self._stationary = self._probabilities([*window.record, now], np.stack([*before, pose]))
         solution = window.add(now, frame, pose, self._stationary)
         more: list[FactorProvider] = []
         if observations:
             more.append(self._landmarks.observe(number, solution, observations))
-        last = self._stationary[-1:]
-        newest = read_estimate(window.record[-1:], solution, last)
+        newest = read_estimate(window.record[-1:], solution, self._stationary[-1:])
         doubtful = with_identities(now, newest.world_T_ego[-1], newest.objects[-1].position, self._clutter_area)
         if (doubtful.seen.probability < _DOUBTFUL).any():
             more.append(window.weighed(doubtful))
-        if self._lanes.assign(window.record, newest, last):
-            more.append(self._lanes)
         if more:
             self._stationary = self._probabilities(window.record, window.path)
             solution = window.extend(self._stationary, more)
@@ -157,7 +150,7 @@ class OnlineEstimator:
         settled = read_estimate(window.record[:count], solution, self._stationary[:count])
         first = window.record[count].epoch
         self._stationary = self._stationary[count:]
-        window.leave(count, [*self._landmarks.forget(first, solution), *self._lanes.forget(first)])
+        window.leave(count, self._landmarks.forget(first, solution))
         return settled
 
 

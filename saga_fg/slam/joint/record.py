@@ -152,7 +152,6 @@ class JointSettings(Settings):
         "residual from which the Cauchy loss discounts a detection, standard deviations; usual 2 to 5; "
         "higher: outliers count more",
     )
-    lanes: bool = setting(False, "attract moving vehicles to the lanes of a map")
     passes: PositiveInt = setting(
         3, "most passes of associating objects along the latest path; they end when associations repeat; higher: slower"
     )

@@ -9,7 +9,6 @@ from benchmarks.scans import StaticWorld, drive, scans, street
 from data_tools.lidar import (
     Registration,
     RegistrationError,
-    RegistrationSettings,
     SurfelMap,
     observability,
     register,
@@ -25,7 +24,7 @@ def registered(world: StaticWorld, start: np.ndarray, undetermined: Undetermined
     surfels = SurfelMap(1.0, reach=100.0)
     surfels.add(first.points[voxel_downsample(first.points, 0.25)], np.zeros(3))
     points = second.points[voxel_downsample(second.points, 1.5)]
-    return register(points, surfels, start, 3.0, 0.1, RegistrationSettings(), undetermined)
+    return register(points, surfels, start, 3.0, 0.1, undetermined)
 
 
 def test_a_street_determines_the_whole_motion() -> None:

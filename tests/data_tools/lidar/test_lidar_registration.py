@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from benchmarks.scans import StaticWorld, drive, scans, street
 from data_tools.lidar import (
     RegistrationError,
-    RegistrationSettings,
     Scan,
     SurfelMap,
     azimuth_times,
@@ -26,8 +25,6 @@ from data_tools.lidar import (
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes
-
-SETTINGS = RegistrationSettings()
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 5.0))
@@ -119,7 +116,7 @@ def test_a_scan_is_registered_to_a_centimetre_and_the_covariance_says_so() -> No
         surfels.add(first.points[voxel_downsample(first.points, 0.25)], np.zeros(3))
         truth = inverse_transform(poses[0]) @ poses[1]
         points = second.points[voxel_downsample(second.points, 1.5)]
-        found = register(points, surfels, np.eye(4), 3.0, 0.1, SETTINGS)
+        found = register(points, surfels, np.eye(4), 3.0, 0.1)
         error = gtsam.Pose3.Logmap(gtsam.Pose3(inverse_transform(truth) @ found.map_T_scan))
         assert found.converged
         assert np.linalg.norm(error[3:]) < 0.04
@@ -128,36 +125,14 @@ def test_a_scan_is_registered_to_a_centimetre_and_the_covariance_says_so() -> No
     assert 1.5 < np.mean(squares) < 24  # 6 if the map were exact; it is one noisy scan
 
 
-def test_the_registration_of_open3d_agrees_with_ours() -> None:
-    world, poses = street(3), drive(2, speed=4.0)
-    first, second = scans(world, poses, 0, skewed=False)
-    surfels = SurfelMap(1.0, reach=100.0)
-    surfels.add(first.points[voxel_downsample(first.points, 0.25)], np.zeros(3))
-    points = second.points[voxel_downsample(second.points, 1.5)]
-    ours, theirs = (
-        register(points, surfels, np.eye(4), 3.0, 0.1, RegistrationSettings(method=method))
-        for method in ("gauss-newton", "open3d")
-    )
-    between = gtsam.Pose3.Logmap(gtsam.Pose3(inverse_transform(ours.map_T_scan) @ theirs.map_T_scan))
-    assert theirs.converged
-    assert np.linalg.norm(between[3:]) < 0.02
-    assert np.linalg.norm(between[:3]) < 0.001
-    np.testing.assert_allclose(np.diag(theirs.covariance), np.diag(ours.covariance), rtol=1.0)
-    plane = np.random.default_rng(0).uniform([-20, -20, 0], [20, 20, 0.02], (20000, 3))
-    ground = SurfelMap(1.0, reach=100.0)
-    ground.add(plane, np.zeros(3))
-    with pytest.raises(RegistrationError, match="leave a direction of motion unconstrained"):
-        register(plane[::20], ground, np.eye(4), 1.0, 0.1, RegistrationSettings(method="open3d"))
-
-
 def test_what_cannot_be_registered_is_said() -> None:
     surfels = SurfelMap(1.0, reach=100.0)
     ground = np.random.default_rng(0).uniform([-20, -20, 0], [20, 20, 0.02], (20000, 3))
     surfels.add(ground, np.zeros(3))
     with pytest.raises(RegistrationError, match="leave a direction of motion unconstrained"):
-        register(ground[::20], surfels, np.eye(4), 1.0, 0.1, SETTINGS)
+        register(ground[::20], surfels, np.eye(4), 1.0, 0.1)
     with pytest.raises(RegistrationError, match="expected 12 points near the map at least, got 0"):
-        register(transform_points(yaw_transform(z=50.0), ground[::20]), surfels, np.eye(4), 1.0, 0.1, SETTINGS)
+        register(transform_points(yaw_transform(z=50.0), ground[::20]), surfels, np.eye(4), 1.0, 0.1)
 
 
 def test_wrong_poses_make_a_duller_map() -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.pose_graphs import city, read_g2o, torus, with_false_loops
+from benchmarks.loops import with_false_loops
+from data_tools.pose_graphs import city, read_g2o, torus
 from saga_fg import InputError
 from saga_fg.slam.pose_graph import (
     LandmarkObservations,

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_tools.pose_graphs import city, torus, with_false_loops
+from benchmarks.loops import with_false_loops
+from data_tools.pose_graphs import city, torus
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import PoseGraph, PosePriors, PositionPriors, consensus, graph_error, optimise_poses
