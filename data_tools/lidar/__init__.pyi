@@ -1,13 +1,13 @@
-from .clusters import ClusterSettings, Ground, ObjectSize, detect_clusters, segment_ground
 from .landmarks import (
+    Ground,
     Line,
     Plane,
     Pole,
     extract_curbs,
     extract_poles,
     extract_walls,
-    fit_ground,
     fit_plane,
+    segment_ground,
     straight_lines,
 )
 from .places import Submap, scan_to_map_residual, upright
@@ -25,10 +25,8 @@ from .scan import Scan, azimuth_times, constant_velocity, deskewed, voxel_downsa
 from .scan_files import read_scan, write_cloud
 
 __all__ = [
-    "ClusterSettings",
     "Ground",
     "Line",
-    "ObjectSize",
     "Observability",
     "Plane",
     "Pole",
@@ -41,11 +39,9 @@ __all__ = [
     "azimuth_times",
     "constant_velocity",
     "deskewed",
-    "detect_clusters",
     "extract_curbs",
     "extract_poles",
     "extract_walls",
-    "fit_ground",
     "fit_plane",
     "observability",
     "read_scan",

@@ -1,6 +1,14 @@
-"""Landmarks in a scan: planes, poles and curbs, with their covariances.
+"""Ground, and landmarks in a scan: walls, poles and curbs, with their covariances.
 
-Planes in a scan: walls, and the ground under the vehicle.
+Ground segmentation on a polar grid, ring by ring from the vehicle outwards.
+
+In each sector the ground height of a ring is the lowest decile of its points' heights, if it differs from that of the
+next inner ring by no more than the steepest road would rise; otherwise (a car, a wall, a reflection from below) the
+inner height is kept. A point is ground if it lies within a clearance of the height interpolated between rings. After
+Himmelsbach, Hundelshausen, Wuensche, Fast segmentation of 3D point clouds for ground vehicles, IV 2010, with heights
+instead of lines.
+
+Walls in a scan.
 
 A plane is n . x + d = 0 in the sensor's frame, n of length 1 pointing to the side of the sensor (d > 0). Fitted to
 points, or to means of surfels, c their centre and a <= b <= e the eigenvalues of S = sum (p - c)(p - c)^T, n is the
@@ -47,8 +55,55 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from data_tools.lidar.registration import surfels_of
-from data_tools.lidar.scan import cell_order_statistics, clusters_from_above, voxel_downsample
+from data_tools.lidar.scan import cell_order_statistics, clusters_from_above
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+
+_WEDGES = 60  # number of sectors of the polar grid
+_RING_WIDTH = 1.5  # width of a ring, m
+_MAX_SLOPE = 0.15  # steepest rise, m per m
+GROUND_MAX_RANGE = 80.0  # outer radius of the last ring, m
+MAX_RISE = 0.1  # change of height between rings allowed beyond the slope, m
+CLEARANCE = 0.2  # largest distance of a ground point from the ground height, m
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Segmentation of N points: is_ground (N,), and height (N,) of each point above the ground, m."""
+
+    is_ground: BoolArray
+    height: FloatArray
+
+
+def segment_ground(points: FloatArray) -> Ground:
+    """Find the ground in points (N, 3), m, of a sensor that stands upright (z up) above it."""
+    if not len(points):
+        return Ground(np.empty(0, dtype=np.bool_), np.empty(0))
+    distance = np.hypot(points[:, 0], points[:, 1])
+    sector = ((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * _WEDGES).astype(np.int64) % _WEDGES
+    rings = int(np.ceil(GROUND_MAX_RANGE / _RING_WIDTH))
+    ring = np.minimum((distance / _RING_WIDTH).astype(np.int64), rings - 1)
+    low = cell_order_statistics(points[:, 2], sector * rings + ring, _WEDGES * rings, 10).reshape(_WEDGES, rings)
+    ground = _ground_heights(low)
+    place = np.clip(distance / _RING_WIDTH - 0.5, 0, rings - 1)
+    inner = np.minimum(place.astype(np.int64), rings - 2)
+    share = place - inner
+    height = points[:, 2] - ((1 - share) * ground[sector, inner] + share * ground[sector, inner + 1])
+    return Ground(np.abs(height) <= CLEARANCE, height)
+
+
+def _ground_heights(low: FloatArray) -> FloatArray:
+    """Heights (sectors, rings) of the ground, from the innermost ring on."""
+    near = low[:, : max(int(10.0 / _RING_WIDTH), 1)]
+    start = float(np.nanmedian(near)) if np.isfinite(near).any() else float(np.nanmin(low))
+    height, since = np.full(len(low), start), np.ones(len(low))
+    ground = np.empty_like(low)
+    for k in range(low.shape[1]):
+        fits = np.abs(low[:, k] - height) <= MAX_RISE + _MAX_SLOPE * _RING_WIDTH * since  # False in empty cells
+        height = np.where(fits, low[:, k], height)
+        since = np.where(fits, 1.0, since + 1.0)
+        ground[:, k] = height
+    return ground
+
 
 _MIN_COSINE = 0.97  # least cosine between normals of one wall
 _MAX_THICKNESS = 0.15  # largest distance of a surfel from the plane of its wall, m
@@ -59,7 +114,6 @@ MAX_TILT = 0.15  # largest z component of the normal of a wall
 PLANE_MAX_GAP = 3.0  # largest gap within a wall, m
 PLANE_MIN_LENGTH = 3.0  # least length of a wall, m
 WALL_NOISE = 0.03  # standard deviation of surfels across their wall, m
-GROUND_NOISE = 0.02  # standard deviation of surfels of the ground, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +123,7 @@ class Plane:
     coefficients  (4,) n and d, d > 0
     covariance    (3, 3) of two tilts of n (rad^2) and of d (m^2); no correlations, the tilts alike
     centre        (3,) of the visible part, m
-    extent        (2, 3) its ends: for a wall the lowest point of one end and the highest of the other; for the ground
-                  two corners
+    extent        (2, 3) its ends: the lowest point of one end and the highest of the other
     """
 
     coefficients: FloatArray
@@ -105,19 +158,6 @@ def near_walls(positions: FloatArray, walls: Sequence[Plane], distance: float) -
         across = np.abs(positions @ wall.coefficients[:3] + wall.coefficients[3])
         near |= (across <= distance) & (u >= ends[0] - distance) & (u <= ends[1] + distance)
     return near
-
-
-def fit_ground(ground: FloatArray, reach: float = 15.0) -> Plane | None:
-    """The plane of the ground points (N, 3) within `reach` m; None for too few points."""
-    near = ground[np.hypot(ground[:, 0], ground[:, 1]) <= reach]
-    near = near[voxel_downsample(near, SURFEL_SIZE)]
-    for _ in range(3):
-        if len(near) < 3 * _MIN_SURFELS:
-            return None
-        plane = fit_plane(near, GROUND_NOISE)
-        off = np.abs(near @ plane.coefficients[:3] + plane.coefficients[3])
-        near = near[off <= max(2.5 * float(np.median(off)), 0.01)]
-    return plane
 
 
 def extract_walls(points: FloatArray) -> list[Plane]:

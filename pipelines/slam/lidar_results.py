@@ -45,7 +45,7 @@ from pipelines.slam.results import (
     write_objects,
 )
 from pipelines.slam.saved_graph import write_graph, write_landmark_table
-from pipelines.slam.scan_content import GROUND, LINE, WALL
+from pipelines.slam.scan_content import LINE, WALL
 from pipelines.slam.submaps import Origin, SlamMap, write_map
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
@@ -188,8 +188,8 @@ def _lines(result: LidarSlamResult) -> dict[str, FloatArray]:
 
 
 def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
-    """Places (P, 2) of all but planes and lines."""
-    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (LINE, GROUND, WALL)]
+    """Places (P, 2) of all but walls and lines."""
+    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (LINE, WALL)]
     return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
 
 

@@ -5,7 +5,7 @@ observations.csv   keyframe, landmark, kind, value, covariance: all observations
                    the kind has it (a wall nx ny nz d, a pole x y z), the covariance as its upper triangle
 
 The pose graph holds the first pose as a prior, odometry and loops as they were in the solution, the poses as estimated,
-and poles as points whose height is open. Walls, the ground and curbs, which its format has no records for, are in the
+and poles as points whose height is open. Walls and curbs, which its format has no records for, are in the
 table beside it. The vehicle's sensors are left out.
 """
 

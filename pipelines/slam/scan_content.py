@@ -24,7 +24,6 @@ from data_tools.lidar import (
     extract_curbs,
     extract_poles,
     extract_walls,
-    fit_ground,
     segment_ground,
     straight_lines,
 )
@@ -39,7 +38,6 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
 from saga_fg.types.landmark import Observation
 
-GROUND = PlaneLandmark(name="ground")
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()
 LINE = LineLandmark()
@@ -49,7 +47,6 @@ LINE = LineLandmark()
 class ScanLandmarkSettings:
     """Settings of the detection of landmarks in a scan."""
 
-    ground: bool = setting(False, "detect the ground as one plane, for level areas only")
     walls: int = setting(6, "largest number of walls of a scan; the largest ones are kept")
     poles: int = setting(12, "largest number of poles of a scan; the nearest ones are kept")
     lines: int = setting(2, "largest number of curb lines of a scan; those with the most points are kept")
@@ -65,10 +62,6 @@ def observe_landmarks(
     s = settings or ScanLandmarkSettings()
     ground = segment_ground(points)
     found: list[Observation] = []
-    if s.ground:
-        plane = fit_ground(points[ground.is_ground])
-        if plane is not None:
-            found.append(Observation(GROUND, plane.coefficients, plane.covariance, plane.extent))
     walls = extract_walls(points[~ground.is_ground])
     for wall in walls[: s.walls]:
         found.append(Observation(WALL, wall.coefficients, wall.covariance, wall.extent))

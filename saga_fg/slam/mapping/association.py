@@ -47,7 +47,7 @@ last, Q_t of translation and Q_R of rotation. So neither a large map nor a long 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Annotated
@@ -71,10 +71,16 @@ class LandmarkSettings(Settings):
     confirm_after: Annotated[int, Range(1, 10**9)] = setting(2, "observations that confirm a landmark")
 
 
-def associate(local: LocalMap, observations: Sequence[Observation], probability: float) -> dict[int, Innovation]:
+def associate(
+    local: LocalMap,
+    observations: Sequence[Observation],
+    probability: float,
+    near: Callable[[int, int], bool] = lambda row, landmark: True,
+) -> dict[int, Innovation]:
     """Assign the observations made from the present pose to the landmarks.
 
-    probability: of the gates. Returns the innovation of each matched observation, by its row.
+    probability: of the gates; near: whether the observation of a row may be of a landmark besides.
+    Returns the innovation of each matched observation, by its row.
     """
     landmarks = sorted(local.kinds)
     column = {landmark: j for j, landmark in enumerate(landmarks)}
@@ -91,9 +97,10 @@ def associate(local: LocalMap, observations: Sequence[Observation], probability:
         noise = np.linalg.slogdet(np.stack([observations[row].covariance for row in own]))[1]
         won = log_odds(squared, spread + np.repeat(noise, len(alike)), dim, kind.density)
         for k in np.flatnonzero((squared < gate(probability, dim)) & (won > 0)).tolist():
-            row, j = own[k // len(alike)], column[innovations.landmarks[k]]
-            candidates[row, j] = innovations[k]
-            gain[row, j] = won[k]
+            row, landmark = own[k // len(alike)], innovations.landmarks[k]
+            if near(row, landmark):
+                candidates[row, column[landmark]] = innovations[k]
+                gain[row, column[landmark]] = won[k]
     rows, columns = assign(-gain, gain > 0, 0.0)
     pairs = {int(i): candidates[int(i), int(j)] for i, j in zip(rows, columns, strict=True)}
     return _compatible(local, pairs, probability)

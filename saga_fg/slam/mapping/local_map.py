@@ -16,6 +16,7 @@ Source: R. Smith, M. Self, P. Cheeseman, "Estimating uncertain spatial relations
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -150,6 +151,13 @@ class LocalMap:
         self._columns = {POSE: slice(0, 3 if self.planar else 6)}
         for number, (kind, state) in (landmarks or {}).items():
             self._insert(number, kind, state)
+
+    def copy(self) -> LocalMap:
+        """A copy that can go on without this one."""
+        twin = copy(self)
+        twin.values, twin.P = gtsam.Values(self.values), self.P.copy()
+        twin.kinds, twin._columns = dict(self.kinds), dict(self._columns)
+        return twin
 
     @property
     def pose(self) -> Any:

@@ -163,7 +163,7 @@ class SubmapGraph:
         self._closed: CondensedSubmap | None = None  # the newest one
         self._loops: list[LoopClosure] = []  # between submaps, by their numbers
         self._landmarks = SubmapLandmarks(GATE)
-        self._numbers, self._way = 0, 0.0
+        self._numbers, self._way = 1, 0.0  # of the next landmark; m since the anchor
 
     def __len__(self) -> int:
         return len(self._times)
@@ -176,7 +176,7 @@ class SubmapGraph:
     @property
     def landmarks(self) -> int:
         """Number of landmarks so far."""
-        return self._numbers
+        return self._numbers - 1
 
     @property
     def size(self) -> int:
@@ -201,10 +201,14 @@ class SubmapGraph:
         way = self._way + (0.0 if motion is None else float(np.linalg.norm(measured[0][:3, 3])))
         begins = k == 0 or way >= self.settings.length or k - self._anchors[-1] >= MAX_KEYFRAMES
         start = measured[0] if k == 0 else self.pose(k - 1) @ measured[0]
-        landmarks, numbers = self._associated(begins, motion, start, observations)
+        landmarks = SubmapLandmarks(GATE) if begins else self._landmarks.copy()
+        if motion is not None and not begins:
+            landmarks.move(*motion)
+        numbers = landmarks.observe(observations, self._numbers)
         now = list(zip(numbers, observations, strict=True))
         motion_provider = MeasuredMotion(*measured, start)
-        seen = LandmarkObservations({k: now}, {n: landmarks.state(n) for n in set(numbers)}, self.settings.robust)
+        starts = {n: one.kind.initialise(start, one.value) for n, one in now if n >= self._numbers}
+        seen = LandmarkObservations({k: now}, starts, self.settings.robust)
         self._smoother.step(time, [motion_provider, seen, *self._providers], frame)
         self._landmarks, self._way = landmarks, way
         self._numbers = max(self._numbers, *(n + 1 for n in numbers), 0)
@@ -214,7 +218,6 @@ class SubmapGraph:
         self._seen.append(now)
         if begins:
             self._begin_submap(k)
-        landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
         return begins and k > 0
 
     def close_loops(self, loops: Sequence[LoopClosure]) -> None:
@@ -314,19 +317,6 @@ class SubmapGraph:
         prior = pose_prior_factor(self._closed.successor, state.matrix(), self._by_anchors.covariance(number))
         given = Additions(named={self._closed.name: [prior, *self._closed.others]})
         self._smoother.extend([Given(given, self._closed.name)], settings=_AFTER_LOOPS)
-        self._landmarks.read(lambda number: self._smoother.state(landmark_key(number)))
-
-    def _associated(
-        self,
-        begins: bool,
-        motion: Motion | None,
-        start: FloatArray,
-        observations: Sequence[Observation],
-    ) -> tuple[SubmapLandmarks, list[int]]:
-        landmarks = SubmapLandmarks(GATE) if begins else self._landmarks.copy()
-        if motion is not None and not begins:
-            landmarks.move(*motion)
-        return landmarks, landmarks.observe(start, observations, self._numbers)
 
     def _begin_submap(self, k: int) -> None:
         """Close the running submap, if any, and make the keyframe k an anchor."""

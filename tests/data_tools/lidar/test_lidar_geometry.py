@@ -10,16 +10,13 @@ from hypothesis import strategies as st
 from benchmarks.scans import CURB, SENSOR_HEIGHT, ScannerSettings, StaticWorld, simulate_scan, street
 from data_tools.lidar import (
     Scan,
-    detect_clusters,
     extract_curbs,
     extract_poles,
     extract_walls,
-    fit_ground,
     fit_plane,
     segment_ground,
     straight_lines,
 )
-from data_tools.lidar.clusters import l_shape_heading
 from data_tools.lidar.landmarks import BIAS
 from data_tools.lidar.scan import clusters_from_above
 from saga_fg.numerics.geometry import transform_points, yaw_transform
@@ -60,20 +57,6 @@ def test_ground_follows_a_slope() -> None:
     ground = segment_ground(points)
     assert np.mean(ground.is_ground[np.abs(points[:, 0]) < 40]) > 0.98
     assert not len(segment_ground(np.empty((0, 3))).height)
-
-
-def test_the_ground_plane_is_known_within_its_covariance() -> None:
-    squares = []
-    for seed in range(5):
-        points = seen(street(seed), seed).points
-        plane = fit_ground(points[segment_ground(points).is_ground])
-        assert plane is not None
-        n, d = plane.coefficients[:3], plane.coefficients[3]
-        off = np.array([n[0], n[1], d - SENSOR_HEIGHT])
-        squares.append(float(off @ np.linalg.solve(plane.covariance, off)))
-        assert abs(d - SENSOR_HEIGHT) < 0.02
-    assert np.mean(squares) < 3 * 2  # of three degrees of freedom, on the safe side
-    assert fit_ground(np.zeros((3, 3))) is None
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -138,31 +121,6 @@ def test_curbs_are_the_edges_of_the_road() -> None:
     assert np.mean(off < 0.4) > 0.9
     flat = seen(StaticWorld(Boxes.empty(), NO_POLES)).points
     assert len(extract_curbs(flat, segment_ground(flat).height)) == 0
-
-
-def test_parked_cars_are_found_as_boxes(subtests: pytest.Subtests) -> None:
-    for seed in range(3):
-        with subtests.test(seed=seed):
-            world = street(seed)
-            pose = yaw_transform(4.0, 0.0, SENSOR_HEIGHT, 0.1)
-            found = detect_clusters(seen(world, seed, pose).points)
-            cars = world.boxes.select((world.boxes.label == "car") & (np.abs(world.boxes.position[:, 0] - 4.0) < 20))
-            places = transform_points(pose, found.boxes.position)[found.boxes.label == "car"]
-            distance = np.linalg.norm(cars.position[:, None, :2] - places[None, :, :2], axis=2)
-            assert np.mean(distance.min(axis=1) < 1.0) >= 0.8
-            assert ((found.score > 0) & (found.score <= 1)).all()
-            assert not len(detect_clusters(np.empty((0, 3))))
-
-
-@given(st.floats(0.0, np.pi / 2 - 0.01), st.integers(0, 1000))
-def test_the_heading_of_an_l_is_that_of_its_sides(yaw: float, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    long, short = rng.uniform(0, 4.4, 80), rng.uniform(0, 1.8, 40)
-    l_shape = np.concatenate([np.column_stack([long, np.zeros(80)]), np.column_stack([np.zeros(40), short])])
-    c, s = np.cos(yaw), np.sin(yaw)
-    turned = (l_shape + rng.normal(0, 0.01, l_shape.shape)) @ np.array([[c, s], [-s, c]])
-    difference = (l_shape_heading(turned) - yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    assert abs(difference) < np.radians(4)
 
 
 def test_parts_are_joined_across_cells_and_apart_beyond() -> None:

@@ -159,9 +159,9 @@ def test_fronts_in_one_plane_are_walls_of_their_own() -> None:
     graph = SubmapGraph(np.eye(4), FIRST)
     graph.append(0.0, None, [seen(0.0, 8.0), seen(12.0, 8.02)])
     graph.append(0.1, (yaw_transform(1.0), Q), [seen(4.0, 8.0), seen(11.0, 8.02)])  # on from the first; the second
-    assert [one.landmark for one in graph.observations()] == [0, 1, 0, 1]
+    assert [one.landmark for one in graph.observations()] == [1, 2, 1, 2]
     graph.append(0.2, (yaw_transform(1.0), Q), [seen(22.0, 8.0), Observation(WALL, [0, -1, 0, 8.0], Q[:3, :3])])
-    assert graph.observations()[-2].landmark == 2
+    assert graph.observations()[-2].landmark == 3
 
 
 def test_a_loop_moves_submaps_as_a_whole() -> None:
