@@ -32,7 +32,6 @@ from pipelines.slam.odometry import (
     Drive,
     LidarOdometry,
     Odometry,
-    OdometryPath,
     OdometrySettings,
     OdometryStep,
     RecordedOdometry,
@@ -85,7 +84,7 @@ class SlamStep:
 class LidarSlamResult:
     """Result for K scans, M of them keyframes, in S submaps, in the world of the first pose.
 
-    drive          the odometry; keyframes (M,) are rows among the scans
+    drive          the odometry; its keyframes (M,) are rows among the scans
     odometry       (K) poses of the vehicle by odometry alone; trajectory (K): by the graph; online (K): as estimated
                    when the scan came
     covariances    (M, 6, 6) of the keyframes' poses, (rotation, translation) in the sensor's frame, rad^2, m^2
@@ -210,8 +209,7 @@ class LidarSlam:
         self._detectors, self._others = tuple(detectors), bool(providers)
         self._closed = ClosedSubmaps(PlaceLoops(s.loops) if loops is None and s.loop_closures else loops)
         self._builder = SubmapBuilder(s.map_spacing, straighten=not isinstance(self._odometry, LidarOdometry))
-        self._path = OdometryPath()
-        self._keyframes, self._online = list[int](), list[FloatArray]()
+        self._path, self._online = Drive(), list[FloatArray]()
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
         self._finished, self._covariance = False, START  # of the last keyframe's pose
 
@@ -255,7 +253,7 @@ class LidarSlam:
             placed = self._odometry.step(scan, time, velocity)
         else:
             placed = checked_step(self._odometry.step(scan, time))
-        if not self._keyframes:
+        if not self._path.keyframes:
             placed = replace(placed, keyframe=True)
         self._degenerate.append(placed.degenerate)
         self._boxes.append(moving)
@@ -265,16 +263,16 @@ class LidarSlam:
         row, submap, known = len(self._path) - 1, None, len(self._closed.loops)
         if placed.keyframe:
             submap = self._add_keyframe(row, placed, detections)
-        since = self._path.moved(self._keyframes[-1])
+        since = self._path.moved(self._path.keyframes[-1])
         self._online[-1], now = moved_pose(self._graph.pose(len(self._graph) - 1), self._covariance, since)
-        number = len(self._keyframes) - 1 if placed.keyframe else None
+        number = len(self._path.keyframes) - 1 if placed.keyframe else None
         return SlamStep(self._online[-1], now, placed, number, submap, tuple(self._closed.loops[known:]))
 
     def finish(self) -> LidarSlamResult:
         """Close the last submap, and solve everything together."""
         if self._finished:
             raise InputError("finish: expected to be called once")
-        if not self._keyframes:
+        if not self._path.keyframes:
             raise InputError("expected at least one scan before the end, and a keyframe")
         if len(self._builder):
             self._closed.close(self._builder, self._graph, self._graph.poses())
@@ -283,13 +281,13 @@ class LidarSlam:
         fit = self._sensors.consistency
         fit.observe(solved.graph)
         fit.warn()
-        drive = self._path.drive(self._keyframes)
+        drive = self._path
         submaps, (true_loops, false_loops) = self._closed.submaps, self._closed.judged(solved.loops)
         anchors = solved.world_T_pose[[submap.anchor for submap in submaps]]
         times, lidar_T_ego = np.array(self._path.times), self._sensors.lidar_T_ego
         return LidarSlamResult(
             drive,
-            Trajectory(times, drive.poses @ lidar_T_ego),
+            Trajectory(times, np.array(drive.poses) @ lidar_T_ego),
             Trajectory(times, drive.carried(solved.world_T_pose) @ lidar_T_ego),
             Trajectory(times, np.array(self._online) @ lidar_T_ego),
             solved.covariances,
@@ -311,14 +309,14 @@ class LidarSlam:
         s, points = self.settings, placed.scan.points
         seen = observe_landmarks(points, s.observations, self._detectors) if s.landmarks else []
         moved = None
-        if self._keyframes:
-            moved = self._path.moved(self._keyframes[-1])
+        if self._path.keyframes:
+            moved = self._path.moved(self._path.keyframes[-1])
         elif row:  # a detector or provider raised at the scans before
             self._graph = self._new_graph(self._path.poses[row], START + self._path.moved(0)[1])
         frame = self._measured.frame(self._path.times[row], detections)
         closes = self._graph.append(self._path.times[row], moved, seen, frame)
         self._measured.clear()
-        self._keyframes.append(row)
+        self._path.keyframes.append(row)
         submap = self._closed.close(self._builder, self._graph, self._graph.poses()[:-1]) if closes else None
         pose = self._graph.pose(len(self._graph) - 1)
         driven = 0.0 if moved is None else float(np.linalg.norm(moved[0][:3, 3]))

@@ -36,7 +36,7 @@ from data_tools.lidar import (
 from data_tools.lidar.places import PlaceImage, PlaceIndex, Structure
 from factors import Robust, pose_prior_factor
 from pipelines.slam.loop_closures import COMPARED, FEWEST, SURFEL, agreeing, fits_otherwise, registered
-from pipelines.slam.odometry import LOST_TRANSLATION, LidarOdometry, OdometryPath, OdometrySettings, moved_pose
+from pipelines.slam.odometry import LOST_TRANSLATION, Drive, LidarOdometry, OdometrySettings, moved_pose
 from pipelines.slam.submaps import SlamMap
 from pipelines.slam.vehicle_sensors import VehicleSensors
 from saga_fg.errors import InputError, require_type
@@ -249,7 +249,7 @@ class Localiser:
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
         self._places = MapPlaces(slam_map, RADIUS, MIN_OVERLAP, SCAN_SPACING)
         self._map = MapRegistration(self._places, SCAN_SPACING)
-        self._path = OdometryPath()
+        self._path = Drive()
         # of keyframes as estimated when they came: map_T_lidar, and the covariance of its tangent
         self._found: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._fits = set[int]()  # keyframes registered with the map
@@ -306,7 +306,7 @@ class Localiser:
         if not self._found:
             return None
         rows = sorted(self._found)
-        return self._path.drive(rows).carried(np.array([self._found[row][0] for row in rows]))
+        return self._path.carried(np.array([self._found[row][0] for row in rows]), rows)
 
     def covariances(self) -> FloatArray | None:
         """Covariances (K, 6, 6) of the tangents of the poses of `path`, rad^2, m^2; None if no place has been found."""

@@ -53,22 +53,10 @@ from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import carried_covariance, inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
-from saga_fg.slam.pose_graph.running import shortest_paths
+from saga_fg.slam.pose_graph.running import Measured, shortest_paths
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
 
-
-class PoseLoop(Protocol):
-    """A measurement between two poses: first_T_second (3, 3) in the plane or (4, 4) in space."""
-
-    @property
-    def first(self) -> int: ...
-    @property
-    def second(self) -> int: ...
-    @property
-    def first_T_second(self) -> FloatArray: ...
-
-
-Loop = TypeVar("Loop", bound=PoseLoop)
+Loop = TypeVar("Loop", LoopClosure, Measured)  # in space, and in the plane
 
 
 def deviation(T: FloatArray) -> FloatArray:

@@ -297,41 +297,19 @@ def _components(velocity: FloatArray) -> str:
 LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: the best accuracy of a registration, rad and m
 
 
-@dataclass(frozen=True, eq=False)
 class Drive:
-    """Odometry of K scans, M of them keyframes.
-
-    poses        (K, 4, 4) of the sensor by odometry alone
-    covariances  (K, 6, 6) of the motion to each scan from the one before: (rotation, translation) in the frame of the
-                 later one, rad^2, m^2
-    keyframes    M rows among the scans
-    """
-
-    poses: FloatArray
-    covariances: FloatArray
-    keyframes: list[int]
-
-    def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the motion (4, 4) from each of these scans to the next, and its covariance (6, 6) at the end."""
-        return [motion(self.poses[a : b + 1], self.covariances[a + 1 : b + 1]) for a, b in pairwise(rows)]
-
-    def carried(self, world_T_lidar: FloatArray, rows: Sequence[int] | None = None) -> FloatArray:
-        """Return poses (K, 4, 4) of all scans, given some, by default the keyframes: each fixed to the one before,
-        or to the first."""
-        known = np.array(self.keyframes if rows is None else rows)
-        of = np.maximum(np.searchsorted(known, np.arange(len(self.poses)), side="right") - 1, 0)
-        return np.asarray(world_T_lidar[of] @ inverse_transform(self.poses[known[of]]) @ self.poses)
-
-
-class OdometryPath:
     """Odometry of a drive that goes on, scan by scan.
 
-    times (K), s; poses K times (4, 4) of the sensor; covariances K times (6, 6), as of `Drive`; ways (K), m, driven
+    times (K), s; poses K times (4, 4) of the sensor by odometry alone; ways (K), m, driven
+    covariances  K times (6, 6) of the motion to each scan from the one before: (rotation, translation) in the frame of
+                 the later one, rad^2, m^2
+    keyframes    rows among the scans
     """
 
     def __init__(self) -> None:
         self.times, self.ways = list[float](), list[float]()
         self.poses, self.covariances = list[FloatArray](), list[FloatArray]()
+        self.keyframes = list[int]()
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -374,9 +352,16 @@ class OdometryPath:
         pose: FloatArray = last.retract(share * before.localCoordinates(last)).matrix()
         return pose
 
-    def drive(self, keyframes: Sequence[int]) -> Drive:
-        """The drive so far, its keyframes by their rows."""
-        return Drive(np.array(self.poses), np.array(self.covariances), list(keyframes))
+    def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
+        """Return the motion (4, 4) from each of these scans to the next, and its covariance (6, 6) at the end."""
+        return [self.moved(a, b) for a, b in pairwise(rows)]
+
+    def carried(self, world_T_lidar: FloatArray, rows: Sequence[int] | None = None) -> FloatArray:
+        """Return poses (K, 4, 4) of all scans, given some, by default the keyframes: each fixed to the one before,
+        or to the first."""
+        known, poses = np.array(self.keyframes if rows is None else rows), np.array(self.poses)
+        of = np.maximum(np.searchsorted(known, np.arange(len(poses)), side="right") - 1, 0)
+        return np.asarray(world_T_lidar[of] @ inverse_transform(poses[known[of]]) @ poses)
 
 
 def motion(
@@ -453,7 +438,7 @@ class RecordedOdometry:
 
 
 def deskewed_in_range(
-    scan: Scan, row: int, poses: FloatArray, timestamps: FloatArray, settings: OdometrySettings
+    scan: Scan, row: int, poses: Sequence[FloatArray] | FloatArray, timestamps: FloatArray, settings: OdometrySettings
 ) -> Scan:
     """Return a scan within range and without skew, by poses (K, 4, 4) of the sensor at all scans."""
     scan, before = scan.within(settings.min_range, settings.max_range), max(row - 1, 0)

@@ -46,7 +46,7 @@ def pose_graph_of(result: LidarSlamResult) -> PoseGraph:
         np.array(measured),
         (information + information.swapaxes(1, 2)) / 2,
         _pole_landmarks(result),
-        PosePriors(np.zeros(1, dtype=np.int64), result.drive.poses[:1], np.linalg.inv(START)[None]),
+        PosePriors(np.zeros(1, dtype=np.int64), result.drive.poses[0][None], np.linalg.inv(START)[None]),
     )
 
 

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import gtsam
 import numpy as np
 import pytest
 
 from pipelines.slam.loop_closures import Agreement, deviation
-from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform, yaw_transform
 from saga_fg.slam.pose_graph.running import shortest_paths
+from saga_fg.slam.submaps import LoopClosure
 
 
-@dataclass(frozen=True, eq=False)
-class Loop:
-    first: int
-    second: int
-    first_T_second: FloatArray
+def loop(first: int, second: int, x: float) -> LoopClosure:
+    return LoopClosure(first, second, yaw_transform(x), np.eye(6))
 
 
 def test_deviation_is_the_same_in_the_plane_and_in_space() -> None:
@@ -32,8 +27,8 @@ def test_deviation_is_the_same_in_the_plane_and_in_space() -> None:
 def test_a_loop_is_believed_when_another_agrees(off: float, later: int, believed: int) -> None:
     """Poses 10 m apart along a line; two loops from 20 on to 0 on, the second off by `off` m, `later` poses on."""
     poses = [yaw_transform(x=10.0 * k) for k in range(40)]
-    agreement: Agreement[Loop] = Agreement(np.array([0.3, 0.05]), np.zeros(2), patience=80.0, apart=15.0)
-    loops = [Loop(0, 20, yaw_transform(5.0)), Loop(2, 20 + later, yaw_transform(5.0 + 10.0 * (later - 2) + off))]
+    agreement: Agreement[LoopClosure] = Agreement(np.array([0.3, 0.05]), np.zeros(2), patience=80.0, apart=15.0)
+    loops = [loop(0, 20, 5.0), loop(2, 20 + later, 5.0 + 10.0 * (later - 2) + off)]
     found = [
         agreement.confirmed(loop, lambda a, b: inverse_transform(poses[a]) @ poses[b], lambda k: 10.0 * k)
         for loop in loops

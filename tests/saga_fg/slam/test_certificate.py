@@ -155,20 +155,13 @@ def test_a_bad_local_minimum_is_told_and_left(dim: int) -> None:
     cost = ChordalCost.of(graph)
     stuck = descend(cost, start[:, :dim, :dim].swapaxes(1, 2))
     lowest = lowest_eigenvalue(cost, stuck.Y)
-    assert lowest.value < -1
+    assert stuck.cost + dim * len(graph) * lowest.value < 0.5 * stuck.cost
     assert lowest.direction is not None
     minimum, known = chordal_minimum(graph, start), chordal_minimum(graph, chordal_poses(graph))
     assert stuck.cost > 1000 * known.cost
     assert minimum.cost == pytest.approx(known.cost, rel=1e-6)
     assert minimum.certified
     assert known.certified
-
-
-def test_what_is_not_the_minimum_is_not_certified() -> None:
-    graph = ring(2)
-    cost = ChordalCost.of(graph)
-    stuck = descend(cost, twice_round(2)[:, :2, :2].swapaxes(1, 2))
-    assert stuck.cost + 2 * len(graph) * lowest_eigenvalue(cost, stuck.Y).value < 0.5 * stuck.cost
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -197,15 +190,6 @@ def test_frames_of_more_dimensions_are_rounded_to_rotations() -> None:
     np.testing.assert_allclose(rounded[1:] @ rounded[0].T, R[1:] @ R[0].T, atol=1e-9)
 
 
-def test_the_certified_start_is_one_of_the_starts() -> None:
-    graph, _ = loop(2, seed=1)
-    optimised = optimise_poses(graph, certify=True)
-    assert optimised.chordal is not None
-    assert optimised.chordal.certified
-    assert optimised.errors["chordal minimum"] == pytest.approx(optimised.error, rel=1e-6)
-    assert optimise_poses(graph).chordal is None
-
-
 def test_a_graph_in_pieces_cannot_be_certified() -> None:
     graph = ring(2)
     apart = PoseGraph(
@@ -226,6 +210,7 @@ def test_other_starts_are_tried_beside_proven_poses_only_where_they_are_better()
     assert far.chordal is not None
     assert far.chordal.certified
     assert set(far.errors) == {"chordal minimum"}
+    assert optimise_poses(graph).chordal is None
     there = optimise_poses(graph.at(far.world_T_pose), certify=True)
     assert there.error <= far.error * (1 + 1e-9)
 

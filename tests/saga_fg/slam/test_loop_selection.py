@@ -43,11 +43,10 @@ def selected(
     return select_loops(motions, range(0, STEPS, EVERY), loops)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-@pytest.mark.parametrize(("noise", "turn"), [(1.0, 1e-3), (1.0, 5e-3), (3.0, 0.0), (5.0, 0.0)])
-def test_true_loops_stay_however_far_odometry_is_off(count: int, noise: float, turn: float) -> None:
-    for seed in range(4):
-        assert selected(count, seed, noise, turn).kept.all()
+@pytest.mark.parametrize(("noise", "turn"), [(1.0, 1e-3), (1.0, 5e-3), (5.0, 0.0)])
+def test_true_loops_stay_however_far_odometry_is_off(noise: float, turn: float) -> None:
+    for seed, count in enumerate((1, 2, 3, 3)):
+        assert selected(count, seed, noise, turn).kept.all(), count
 
 
 def test_a_false_loop_beside_true_ones_is_left_out(subtests: pytest.Subtests) -> None:
@@ -59,11 +58,11 @@ def test_a_false_loop_beside_true_ones_is_left_out(subtests: pytest.Subtests) ->
                 assert found.inflation.max() < 3.0
 
 
-@pytest.mark.parametrize("count", [2, 4])
-def test_a_false_loop_is_left_out_where_odometry_is_worse_than_it_says(count: int) -> None:
-    found = selected(count, noise=3.0, false=(0.0, 0.0, 0.1, 20.0, 10.0, 0.0))
-    np.testing.assert_array_equal(found.kept, [True] * count + [False])
-    assert 1.5 < found.inflation.max() < 6.0
+def test_a_false_loop_is_left_out_where_odometry_is_worse_than_it_says() -> None:
+    for count in (2, 4):
+        found = selected(count, noise=3.0, false=(0.0, 0.0, 0.1, 20.0, 10.0, 0.0))
+        np.testing.assert_array_equal(found.kept, [True] * count + [False])
+        assert 1.5 < found.inflation.max() < 6.0
 
 
 def many(loops: int, anchors: int, false: int) -> tuple[LoopSelection, float]:

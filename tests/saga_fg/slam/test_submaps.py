@@ -142,9 +142,8 @@ def test_a_graph_stays_small_and_landmarks_keep_their_numbers() -> None:
     assert np.median(off) < 0.3
 
 
-@pytest.mark.parametrize("where", [0.0, 5000.0])
-def test_far_from_the_start_association_is_the_same(where: float) -> None:
-    near, far = Drive(square(60)), Drive(yaw_transform(where, -where) @ square(60))
+def test_far_from_the_start_association_is_the_same() -> None:
+    near, far = Drive(square(60)), Drive(yaw_transform(5000.0, -5000.0) @ square(60))
     graphs = [started(near), started(far)]
     for drive, graph in zip((near, far), graphs, strict=True):
         drive.into(graph, range(60))
