@@ -41,11 +41,11 @@ from pipelines.slam.submaps import SlamMap
 from pipelines.slam.vehicle_sensors import VehicleSensors
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators import IncrementalSmoother
-from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView
+from saga_fg.graph import EGO_POSE, Additions, FactorProvider
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
-from saga_fg.slam.mapping import MeasuredMotion
+from saga_fg.slam.mapping import Given, MeasuredMotion, pose_key
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings
 from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 
@@ -169,20 +169,6 @@ class MapRegistration:
         self._surfels, self._centre = SurfelMap(SURFEL, np.inf), centre
         self._surfels.add(transform_points(frame, points), centre)
         self._structure, self._structure_frame = Structure.of(points), frame
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredPose:
-    """Provider of the pose of this epoch as measured in the map: (4, 4) and its covariance (6, 6), with a loss."""
-
-    map_T_lidar: FloatArray
-    covariance: FloatArray
-    robust: Robust
-    name: str = "map"
-
-    def factors(self, view: GraphView) -> Additions:
-        key = view.key(EGO_POSE, 0)
-        return Additions(factors=[pose_prior_factor(key, self.map_T_lidar, self.covariance, self.robust)])
 
 
 _LOG = logging.getLogger(__name__)
@@ -442,7 +428,9 @@ class Localiser:
         if found is not None:
             lost = found.observed.lost / found.observed.scale
             covariance = found.covariance + _ACCURACY + LOST_TRANSLATION**2 * lost.T @ lost
-            given.append(MeasuredPose(found.map_T_scan, covariance, Robust("cauchy", ROBUST_SCALE)))
+            key = pose_key(self._smoother.graph().epoch + 1)
+            seen = pose_prior_factor(key, found.map_T_scan, covariance, Robust("cauchy", ROBUST_SCALE))
+            given.append(Given(Additions(factors=[seen]), "map"))
             self._fitted = self.way
             self._fits.add(row)
         self._smoother.step(time, [*given, *self._of_sensors], self._measured.frame(time, None))

@@ -38,11 +38,10 @@ from saga_fg.slam.joint.graph import (
     stationary_factors,
 )
 from saga_fg.slam.joint.record import MAX_ITERATIONS, JointSettings, RecordedEpoch
-from saga_fg.slam.mapping import pose_key
+from saga_fg.slam.mapping import Given, pose_key
 from saga_fg.types.frame import Frame
 
 _SAME = 1e-3  # probability
-_VEHICLE_AND_OBJECTS = "vehicle and objects"
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +56,7 @@ class VehicleAndObjects:
     path: Sequence[FloatArray] | FloatArray
     settings: JointSettings
     known: int = 0
-    name: str = _VEHICLE_AND_OBJECTS
+    name: str = "vehicle and objects"
 
     def factors(self, view: GraphView) -> Additions:
         row = view.epoch - self.record[0].epoch
@@ -91,18 +90,6 @@ class VehicleAndObjects:
 def detections_name(now: RecordedEpoch) -> Hashable:
     """Name of the detections up to an epoch among the factors of `VehicleAndObjects`."""
     return ("detections", now.epoch)
-
-
-@dataclass(frozen=True, eq=False)
-class Detections:
-    """Replace the detections of an epoch that `VehicleAndObjects` has added alone."""
-
-    now: RecordedEpoch
-    settings: JointSettings
-    name: str = _VEHICLE_AND_OBJECTS
-
-    def factors(self, view: GraphView) -> Additions:
-        return Additions(named={detections_name(self.now): detections([self.now], self.settings)})
 
 
 class StationaryPairs:
@@ -189,10 +176,11 @@ class Window:
         self._smoother.extend([*providers, self._stationary.with_probabilities(self.record, stationary)])
         return self._smoother.solution()
 
-    def weighed(self, now: RecordedEpoch) -> Detections:
+    def weighed(self, now: RecordedEpoch) -> Given:
         """The detections of the newest epoch with other probabilities, as a provider for `extend`."""
         self.record[-1] = now
-        return Detections(now, self._settings)
+        named = {detections_name(now): detections([now], self._settings)}
+        return Given(Additions(named=named), VehicleAndObjects.name)
 
     def older_than(self, time: float) -> int:
         """Number of epochs that may leave so that one at `time` or before still stays, if there is one."""

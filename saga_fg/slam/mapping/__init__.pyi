@@ -2,6 +2,7 @@ from .association import LandmarkSettings, NearbyLandmarks, associate, duplicate
 from .local_map import Innovation, LocalMap
 from .mapper import (
     AssociatedObservation,
+    Given,
     LandmarkMap,
     LandmarkMapper,
     LandmarkObservations,
@@ -13,6 +14,7 @@ from .mapper import (
 
 __all__ = [
     "AssociatedObservation",
+    "Given",
     "Innovation",
     "LandmarkMap",
     "LandmarkMapper",

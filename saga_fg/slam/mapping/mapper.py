@@ -61,6 +61,17 @@ def landmark_key(number: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
+class Given:
+    """Provider of what is known already."""
+
+    added: Additions
+    name: str
+
+    def factors(self, view: GraphView) -> Additions:
+        return self.added
+
+
+@dataclass(frozen=True, eq=False)
 class MeasuredMotion:
     """Add the next pose by its measured motion since the one before, a_T_b; the first one by a prior, world_T_pose.
 

@@ -1,5 +1,4 @@
-from .condensing import SolvedDrive, measurement_graph, solve_drive
-from .graph import SubmapGraph, SubmapSettings
+from .graph import SolvedDrive, SubmapGraph, SubmapSettings
 from .loops import LoopClosure, Loops, LoopSelection, loop_factors, select_loops
 
 __all__ = [
@@ -10,7 +9,5 @@ __all__ = [
     "SubmapGraph",
     "SubmapSettings",
     "loop_factors",
-    "measurement_graph",
     "select_loops",
-    "solve_drive",
 ]

@@ -1,6 +1,4 @@
-"""Submaps condensed to one factor each, and the whole drive with nothing condensed.
-
-A closed submap as one factor between its anchor and the next one.
+"""A closed submap as one factor between its anchor and the next one.
 
 The variables of the submap are eliminated; the marginal that they leave on the two anchors A and B is a Gaussian on
 increments. In the coordinates
@@ -20,25 +18,18 @@ go on (velocity, bias) keep their own marginal: their correlation with the motio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from factors import ResidualFactor, SolverSettings, SpatialPose, Variable, between_factor, pose_prior_factor
-from saga_fg.estimators.batch import BatchSolver
-from saga_fg.estimators.graph_window import GraphSolution
-from saga_fg.graph import FactorProvider, SceneFactorGraph, ask_all
+from factors import ResidualFactor, SpatialPose, Variable, between_factor, pose_prior_factor
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.factor_groups import PriorGroup
 from saga_fg.graph.variables import LinearisationPoint
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.mapping import LandmarkObservations, MeasuredMotion, pose_key
-from saga_fg.slam.submaps.loops import Loops, LoopSelection, Motion
-from saga_fg.types.landmark import Landmark
 
 _NOTHING = 1e-3  # root of the information that counts as none: a deviation of 1000 m or rad
 
@@ -191,55 +182,3 @@ class _Held:
     def residual(self, *now: Any) -> FloatArray:
         y = [kind.local(at, x) for kind, at, x in zip(self.types, self.states, now, strict=True)]
         return np.asarray(self.W @ np.concatenate(y) - self.c)
-
-
-_SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedDrive:
-    """Everything solved together: N poses (N, 4, 4), and the landmarks seen often enough.
-
-    solution: of the whole graph, with all variables; graph: that, at its solution; loops: which of those that came are
-    in it, and with what deviations of odometry
-    """
-
-    world_T_pose: FloatArray
-    landmarks: list[Landmark]
-    solution: GraphSolution
-    graph: SceneFactorGraph
-    loops: LoopSelection
-
-    @cached_property
-    def covariances(self) -> FloatArray:
-        """Covariances (N, 6, 6) of the poses, (rotation, translation) in the frame of each."""
-        return np.array([self.solution.marginal(pose_key(k)) for k in range(len(self.world_T_pose))])
-
-
-def measurement_graph(
-    times: Sequence[float],
-    motions: Sequence[Motion],
-    world_T_pose: FloatArray,
-    landmarks: LandmarkObservations,
-    loops: Loops,
-    others: Callable[[int], Iterable[FactorProvider]] = lambda epoch: (),
-) -> SceneFactorGraph:
-    """The graph of all measurements of N keyframes, with poses (N, 4, 4) to begin with.
-
-    motions: the prior of the first pose, then from each to the next; others: providers asked at an epoch
-    """
-    graph = SceneFactorGraph()
-    for k, (time, motion, pose) in enumerate(zip(times, motions, world_T_pose, strict=True)):
-        graph.advance(time)
-        ask_all([MeasuredMotion(*motion, pose), landmarks, loops, *others(k)], graph)
-    return graph
-
-
-def solve_drive(
-    graph: SceneFactorGraph, landmarks: LandmarkObservations, confirm_after: int, loops: LoopSelection
-) -> SolvedDrive:
-    """Solve a graph of `measurement_graph`; landmarks are taken as certain after so many observations."""
-    solver = BatchSolver(graph=graph, settings=_SOLVER)
-    solution, solved = solver.solve(), solver.graph()
-    poses = [solution.values.atPose3(pose_key(k)).matrix() for k in range(graph.epoch + 1)]
-    return SolvedDrive(np.array(poses), landmarks.landmarks(solution, confirm_after), solution, solved, loops)

@@ -22,35 +22,34 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
 
-from factors import Robust, pose, pose_prior_factor
+from factors import Robust, SolverSettings, pose, pose_prior_factor
 from saga_fg.errors import InputError
+from saga_fg.estimators.batch import BatchSolver
+from saga_fg.estimators.graph_window import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView, NewVariable, SceneFactorGraph
+from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView, NewVariable, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Positive, Range, Settings, setting
-from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations, MeasuredMotion, landmark_key, pose_key
+from saga_fg.slam.mapping import (
+    AssociatedObservation,
+    Given,
+    LandmarkObservations,
+    MeasuredMotion,
+    landmark_key,
+    pose_key,
+)
 from saga_fg.slam.submaps.association import SubmapLandmarks
-from saga_fg.slam.submaps.condensing import CondensedSubmap, SolvedDrive, measurement_graph, solve_drive
+from saga_fg.slam.submaps.condensing import CondensedSubmap
 from saga_fg.slam.submaps.loops import LoopClosure, Loops, LoopSelection, Motion, loop_factors, select_loops
 from saga_fg.types.frame import Frame
-from saga_fg.types.landmark import Observation
-
-
-@dataclass(frozen=True, eq=False)
-class Given:
-    """Provider of what is known already."""
-
-    added: Additions
-    name: str
-
-    def factors(self, view: GraphView) -> Additions:
-        return self.added
+from saga_fg.types.landmark import Landmark, Observation
 
 
 @dataclass(eq=False)
@@ -127,8 +126,29 @@ class SubmapSettings(Settings):
         return Robust("cauchy", self.robust_scale)
 
 
+_SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
 _AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
 MAX_KEYFRAMES = 80  # keyframes after which the next submap begins, on a shorter way
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedDrive:
+    """Everything solved together: N poses (N, 4, 4), and the landmarks seen often enough.
+
+    solution: of the whole graph, with all variables; graph: that, at its solution; loops: which of those that came are
+    in it, and with what deviations of odometry
+    """
+
+    world_T_pose: FloatArray
+    landmarks: list[Landmark]
+    solution: GraphSolution
+    graph: SceneFactorGraph
+    loops: LoopSelection
+
+    @cached_property
+    def covariances(self) -> FloatArray:
+        """Covariances (N, 6, 6) of the poses, (rotation, translation) in the frame of each."""
+        return np.array([self.solution.marginal(pose_key(k)) for k in range(len(self.world_T_pose))])
 
 
 class SubmapGraph:
@@ -172,11 +192,6 @@ class SubmapGraph:
     def anchors(self) -> Sequence[int]:
         """Numbers of the keyframes that are anchors, that of the running submap last."""
         return self._anchors
-
-    @property
-    def landmarks(self) -> int:
-        """Number of landmarks so far."""
-        return self._numbers - 1
 
     @property
     def size(self) -> int:
@@ -261,38 +276,29 @@ class SubmapGraph:
         """All observations with their keyframes and landmarks."""
         return [AssociatedObservation(k, one, n) for k, now in enumerate(self._seen) for n, one in now]
 
-    def select_loops(self) -> LoopSelection:
-        """Judge all loops that came, in this order."""
-        return select_loops(self._motions[1:], self._anchors, self._loops)
-
-    def measurements(self, loops: LoopSelection | None = None) -> SceneFactorGraph:
-        """The graph of all measurements, nothing condensed, at the present estimate; landmarks are those confirmed.
-
-        loops: by default as `select_loops` has it
-        """
-        return self._measurements(self.select_loops() if loops is None else loops)[0]
-
     def finish(self) -> SolvedDrive:
-        """Solve all measurements together."""
+        """Choose the loops that agree, and solve all measurements together."""
         if not len(self):
             raise InputError("expected at least one keyframe before the end")
-        loops = self.select_loops()
-        graph, landmarks = self._measurements(loops)
-        return solve_drive(graph, landmarks, self.settings.confirm_after, loops)
+        loops = select_loops(self._motions[1:], self._anchors, self._loops)
+        graph, landmarks = self.measurements(loops)
+        solver = BatchSolver(graph=graph, settings=_SOLVER)
+        solution, solved = solver.solve(), solver.graph()
+        poses = [solution.values.atPose3(pose_key(k)).matrix() for k in range(len(self))]
+        marks = landmarks.landmarks(solution, self.settings.confirm_after)
+        return SolvedDrive(np.array(poses), marks, solution, solved, loops)
 
-    def _measurements(self, chosen: LoopSelection) -> tuple[SceneFactorGraph, LandmarkObservations]:
-        poses, (first, *motions) = self.poses(), self._motions
-        inflated = [first, *((moved, chosen.inflated(covariance)) for moved, covariance in motions)]
+    def measurements(self, chosen: LoopSelection) -> tuple[SceneFactorGraph, LandmarkObservations]:
+        """The graph of all measurements with the loops chosen, nothing condensed, at the present estimate; and the
+        observations of landmarks in it, those confirmed."""
+        graph, poses = SceneFactorGraph(), self.poses()
         landmarks = LandmarkObservations(self._confirmed(), self._starts(poses), self.settings.robust)
         loops = Loops([loop for loop, kept in zip(self._loops, chosen.kept, strict=True) if kept], self._anchors)
-        graph = measurement_graph(
-            self._times,
-            inflated,
-            poses,
-            landmarks,
-            loops,
-            lambda k: (again for provider in self._providers for again in provider.again(k)),
-        )
+        for k, (time, (moved, covariance)) in enumerate(zip(self._times, self._motions, strict=True)):
+            graph.advance(time)
+            motion = MeasuredMotion(moved, chosen.inflated(covariance) if k else covariance, poses[k])
+            others = (again for provider in self._providers for again in provider.again(k))
+            ask_all([motion, landmarks, loops, *others], graph)
         return graph, landmarks
 
     def _new_smoother(self) -> IncrementalSmoother:
