@@ -31,7 +31,6 @@ from pipelines.slam.scan_content import frames_at
 from pipelines.slam.submaps import world_T_submap
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import (
     JointEstimate,
@@ -138,11 +137,7 @@ def degraded_drive(
 
 def keyframes(frames: Sequence[Frame], period: float) -> list[Frame]:
     """Return the first frame, and each that comes more than `period` s after the last one chosen."""
-    chosen: list[Frame] = []
-    for frame in frames:
-        if not chosen or frame.timestamp > chosen[-1].timestamp + period:
-            chosen.append(frame)
-    return chosen
+    return [frames[row] for row in _moments((), [frame.timestamp for frame in frames], period)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,12 +170,9 @@ def with_objects(
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
-    rows = _moments(result.drive.keyframes, scans.timestamps, KEYFRAME_PERIOD)
+    rows = _moments(result.drive.keyframes, scans.timestamps.tolist(), KEYFRAME_PERIOD)
     lidar_T_ego = inverse_transform(scans.ego_T_lidar)
-
-    def new_tracker() -> Tracker:
-        return Tracker(replace(config.tracker, estimator="kalman"), config.sensors)
-
+    new_tracker = partial(path_tracker, config)
     seen = frames_at(frames, scans.timestamps[rows], lidar_T_ego, new_tracker())
     seen = _with_sensors(seen, log)
     motions = result.motions(rows)
@@ -230,11 +222,11 @@ def _with_sensors(frames: Sequence[Frame], log: SensorLog | None) -> list[Frame]
     return found
 
 
-def _moments(keyframes: Sequence[int], timestamps: FloatArray, period: float) -> list[int]:
+def _moments(keyframes: Sequence[int], timestamps: Sequence[float], period: float) -> list[int]:
     """Rows of the scans that are moments of the graph: all keyframes, and those more than `period` s after the last."""
     chosen: list[int] = []
     waiting = set(keyframes)
-    for row, time in enumerate(timestamps.tolist()):
+    for row, time in enumerate(timestamps):
         if row in waiting or not chosen or time > timestamps[chosen[-1]] + period:
             chosen.append(row)
     return chosen

@@ -226,14 +226,6 @@ def test_scans_in_other_units_are_refused(scans: SimulatedScans) -> None:
         odometry.step(scans[0], 0.6)
 
 
-def test_what_is_no_scan_or_time_is_said(scans: SimulatedScans) -> None:
-    slam = LidarSlam(settings=PLAIN)
-    with pytest.raises(InputError, match="scan: expected Scan, got ndarray"):
-        slam.step(scans[0].points, 0.0)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="time: expected a finite number of seconds, got None"):
-        slam.step(scans[0], None)  # type: ignore[arg-type]
-
-
 def test_a_turn_on_the_spot_makes_keyframes_of_recorded_poses_too() -> None:
     scans = SimulatedScans(0, world_T_lidar=np.array([yaw_transform(0, 0, 1.7, 0.02 * k) for k in range(7)]))
     recorded = RecordedOdometry(scans, 1e-3, 0.03, OdometrySettings())

@@ -138,14 +138,11 @@ def test_a_gap_in_the_log_is_driven_by_the_wheels() -> None:
     [
         (LaserKind(readings=181, reach=8.0), 0.02, 0.03),
         (LaserKind(readings=541, field=1.5 * np.pi, reach=30.0, noise=0.015), 0.02, 0.02),
-        (LaserKind(readings=361, reach=80.0), 0.02, 0.02),
-        (LaserKind(noise=0.03), 0.02, 0.02),
         (LaserKind(missing=0.4), 0.02, 0.03),
         (LaserKind(step=0.5, wheels=1.05), 0.02, 0.03),
-        (LaserKind(wheels=0.93), 0.02, 0.02),
         (LaserKind(people=3), 0.1, 0.1),
     ],
-    ids=["short range", "wide and dense", "long range", "noisy", "glass", "fast", "wheels", "people"],
+    ids=["short range", "wide and dense", "glass", "fast, wheels", "people"],
 )
 def test_other_lasers_and_robots(kind: LaserKind, near: float, far: float) -> None:
     """Mean errors, m, of relative poses some scans apart, and between the first and the second pass."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -51,10 +50,8 @@ def localised(known: SlamMap, poses: np.ndarray, guess: np.ndarray | None = None
     return localiser, np.linalg.norm((inverse_transform(poses) @ path)[:, :3, 3], axis=1), registered
 
 
-@pytest.mark.parametrize("back", [False, True])
-def test_a_second_drive_is_recognised_and_followed(known: SlamMap, back: bool) -> None:
-    poses = drive(45.0, 1.5, 34, back) if back else drive(5.0, 0.5, 34)
-    _, errors, registered = localised(known, poses)
+def test_a_second_drive_the_other_way_is_recognised_and_followed(known: SlamMap) -> None:
+    _, errors, registered = localised(known, drive(45.0, 1.5, 34, back=True))
     assert errors.max() < 0.3
     assert np.median(errors) < 0.1
     assert registered > 10
@@ -279,16 +276,6 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     assert (tmp_path / "second" / "trajectory.tum").is_file()
     with pytest.raises(InputError, match="expected one that shows a place of this drive"):
         localise(SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 4)), slam_map)
-
-
-@pytest.mark.skipif(shutil.which("evo_ape") is None, reason="evo has an environment of its own: put it on the path")
-def test_evo_finds_the_same_error(tmp_path: Path) -> None:
-    scans = SimulatedScans(3, world_T_lidar=drive(0.0, -1.5, 12))
-    figures = write_lidar_slam(tmp_path / "run", lidar_slam(scans, settings=PLAIN), scans)
-    command = ["evo_ape", "tum", "reference.tum", "trajectory.tum", "--align_origin"]
-    said = subprocess.run(command, cwd=tmp_path / "run", capture_output=True, text=True, check=True).stdout
-    rmse = next(float(line.split()[1]) for line in said.splitlines() if line.split()[:1] == ["rmse"])
-    assert rmse == pytest.approx(figures["trajectory"]["ate"], abs=1e-6)
 
 
 def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:

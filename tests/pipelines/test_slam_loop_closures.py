@@ -8,8 +8,7 @@ import pytest
 from benchmarks.course import SimulatedCourse
 from benchmarks.scans import SMALL, StaticWorld, simulate_scan
 from data_tools.lidar import Submap, voxel_downsample
-from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
-from saga_fg.errors import InputError
+from pipelines.slam.loop_closures import PlaceLoops
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -87,8 +86,3 @@ def test_a_submap_without_points_has_no_loops(drive: tuple[list[Submap], FloatAr
     assert search.add(submaps[0], true[:1]) == []
     bare = Submap(1, (1, 2), 1, np.eye(4), np.empty((0, 3), dtype=np.float32), (30.0, 60.0))
     assert search.add(bare, true[:2]) == []
-
-
-def test_settings_out_of_range_are_refused() -> None:
-    with pytest.raises(InputError, match="overlap: expected a number from 0 to 1"):
-        LoopSettings(min_overlap=2.0)

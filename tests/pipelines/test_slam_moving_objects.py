@@ -13,7 +13,7 @@ from pipelines.slam.lidar_results import metrics
 from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
 from pipelines.slam.odometry import KeyframeClouds
 from pipelines.slam.scan_content import MovingObjects
-from saga_fg import Boxes, Detections, Frame, InputError
+from saga_fg import Boxes, Detections, Frame
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 
 START, SPEED = np.array([5.0, 1.5, 0.75]), 7.0  # m, m/s, of a car that drives ahead
@@ -66,12 +66,6 @@ def test_the_trail_of_a_moving_car_is_not_in_the_map() -> None:
     assert len(near) >= 3
     kept, there = (points_on(one, near, SIZE + 0.4) for one in (after, before))
     assert kept > 0.9 * there > 100
-
-
-def test_a_scan_needs_its_frame() -> None:
-    scans, frames, _ = drive_behind_a_car(4)
-    with pytest.raises(InputError, match=r"expected one of detections at 0\.300 s, the time of a scan"):
-        lidar_slam(scans, frames=frames[:-1], tracker=path_tracker(load_config("kitti")))
 
 
 @pytest.mark.parametrize(("turned", "said"), [(0.0, 0), (2.0, 1)])

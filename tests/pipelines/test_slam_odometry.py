@@ -27,10 +27,9 @@ def trajectory(poses: FloatArray) -> Trajectory:
     return Trajectory(PERIOD * np.arange(len(poses)), poses)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_drive_is_followed_to_centimetres(seed: int) -> None:
+def test_a_drive_is_followed_to_centimetres() -> None:
     poses = drive(30)
-    steps = run(scans(street(seed), poses, seed))
+    steps = run(scans(street(0), poses))
     estimate = poses[0] @ np.array([step.map_T_lidar for step in steps])
     errors = trajectory_errors(trajectory(estimate), trajectory(poses))
     assert errors.relative_translation < 0.03
