@@ -25,11 +25,10 @@ dimensions are enough, because objects on the ground are separate from above.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, Self, get_args
+from typing import Protocol, Self
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -98,19 +97,13 @@ class ScanSequence(Protocol):
     def __getitem__(self, row: int) -> Scan: ...
 
 
-Turning = Literal["clockwise", "counter-clockwise"]
-
-
-def azimuth_times(points: FloatArray, period: float, turning: Turning = "clockwise") -> FloatArray:
+def azimuth_times(points: FloatArray, period: float) -> FloatArray:
     """Times (N,), s, from -period / 2 to period / 2, of points (N, 3) of a head that turns once a `period` (s).
 
-    At the timestamp the head looks ahead (along x); the scan begins and ends behind. `turning` is as seen from above.
-    KITTI's Velodyne turns clockwise.
+    At the timestamp the head looks ahead (along x); the scan begins and ends behind. It turns clockwise as seen from
+    above, as KITTI's Velodyne does.
     """
-    if turning not in get_args(Turning):
-        raise InputError(f"turning: expected one of {', '.join(get_args(Turning))}, got {turning!r}")
-    sign = -1.0 if turning == "clockwise" else 1.0
-    return np.asarray(sign * np.arctan2(points[:, 1], points[:, 0]) * (period / (2 * np.pi)))
+    return np.asarray(-np.arctan2(points[:, 1], points[:, 0]) * (period / (2 * np.pi)))
 
 
 def deskewed(scan: Scan, velocity: FloatArray) -> Scan:
@@ -140,34 +133,26 @@ def constant_velocity(before_T_now: FloatArray, duration: float) -> FloatArray:
 
 
 MARGIN = 0.3  # m, by which boxes are enlarged on all sides: errors of detectors, and motion during a scan
-LIKELY = 0.5  # probability from which an object counts as moving
 
 
-def on_moving_objects(
-    points: ArrayLike, boxes: Boxes, moving: ArrayLike, margin: float = MARGIN, likely: float = LIKELY
-) -> BoolArray:
-    """Mask (N,) of the points (N, 3) inside boxes of probably moving objects, all in one frame.
+def inside_boxes(points: FloatArray, boxes: Boxes, margin: float = MARGIN) -> BoolArray:
+    """Mask (N,) of the points (N, 3) inside boxes enlarged by `margin`, m, all in one frame.
 
-    moving: (n,) probability that each object moves; margin: m; likely: probability from which it counts. Boxes without
-    a size or heading are left out. Raises `InputError` for arrays that don't fit the boxes and a negative margin.
+    Boxes without a size or heading are left out.
     """
-    places = checked("points", points, (None, 3))
-    probability = checked("moving", moving, (len(boxes),))
-    if not margin >= 0:
-        raise InputError(f"margin: expected metres >= 0, got {margin!r}")
     known = np.isfinite(boxes.size).all(axis=1) & np.isfinite(boxes.yaw)
-    result = np.zeros(len(places), dtype=bool)
-    for row in np.flatnonzero(known & (probability >= likely)).tolist():
+    result = np.zeros(len(points), dtype=bool)
+    for row in np.flatnonzero(known).tolist():
         half = boxes.size[row] / 2 + margin
-        near = np.flatnonzero(_within(places - boxes.position[row], np.full(3, np.linalg.norm(half))))
-        local = (places[near] - boxes.position[row]) @ yaw_transform(yaw=float(boxes.yaw[row]))[:3, :3]
+        near = np.flatnonzero(_within(points - boxes.position[row], np.full(3, np.linalg.norm(half))))
+        local = (points[near] - boxes.position[row]) @ yaw_transform(yaw=float(boxes.yaw[row]))[:3, :3]
         result[near[_within(local, half)]] = True
     return result
 
 
 def without_objects(scan: Scan, boxes: Boxes) -> Scan:
     """The scan without points inside boxes, all in one frame."""
-    return scan.select(~on_moving_objects(scan.points, boxes, np.ones(len(boxes)))) if len(boxes) else scan
+    return scan.select(~inside_boxes(scan.points, boxes)) if len(boxes) else scan
 
 
 def _within(offset: FloatArray, half: FloatArray) -> BoolArray:

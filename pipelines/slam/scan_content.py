@@ -27,7 +27,7 @@ from data_tools.lidar import (
     segment_ground,
     straight_lines,
 )
-from data_tools.lidar.scan import on_moving_objects
+from data_tools.lidar.scan import inside_boxes
 from saga_fg.errors import InputError
 from saga_fg.model.landmarks import LandmarkDetector, LineLandmark, PlaneLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
@@ -99,7 +99,7 @@ class MovingObjects:
         near = detections.boxes.select((distance > _NEAR[0]) & (distance < _NEAR[1]))
         raised = replace(near, position=near.position + _GROUND / 2, size=near.size - 2 * np.abs(_GROUND))
         for row in range(len(near)):
-            self._filled.append(bool(on_moving_objects(scan.points, raised.select([row]), [1.0], 0.0).any()))
+            self._filled.append(bool(inside_boxes(scan.points, raised.select([row]), 0.0).any()))
         if len(self._filled) >= _JUDGED and np.mean(self._filled) < _FILLED:
             _LOG.warning(
                 "detections: expected boxes in the frame of the vehicle, at the times of the scans; of the first %d "

@@ -93,33 +93,24 @@ def detections_name(now: RecordedEpoch) -> Hashable:
 
 
 class StationaryPairs:
-    """Add factors of stationary objects for every two epochs, replaced where the probabilities have changed."""
+    """Factors of stationary objects for every two epochs, given anew where the probabilities have changed."""
 
     name = "stationary objects"
 
     def __init__(self) -> None:
         self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
-        self._record: Record = ()
-        self._now: Sequence[FloatArray] = ()
 
-    def with_probabilities(self, record: Record, stationary: Sequence[FloatArray]) -> StationaryPairs:
-        """With the probabilities (n,) of the objects of each epoch of the window."""
-        self._record, self._now = list(record), stationary
-        return self
-
-    def factors(self, view: GraphView) -> Additions:
+    def changed(self, record: Record, stationary: Sequence[FloatArray]) -> Given:
+        """Those of a window, with the probabilities (n,) of the objects of each epoch, as a provider."""
         named: dict[Hashable, Factors] = {}
         given: dict[int, tuple[FloatArray, FloatArray]] = {}
-        for pair, rows in zip(pairwise(self._now), pairwise(self._record), strict=True):
-            k = rows[1].epoch
-            before = self._given.get(k)
-            if before is not None and all(np.allclose(a, b, atol=_SAME) for a, b in zip(before, pair, strict=True)):
-                given[k] = before
-                continue
-            given[k] = pair
-            named[k] = stationary_factors(rows, pair)
+        for pair, rows in zip(pairwise(stationary), pairwise(record), strict=True):
+            k, before = rows[1].epoch, self._given.get(rows[1].epoch)
+            if before is None or not all(np.allclose(a, b, atol=_SAME) for a, b in zip(before, pair, strict=True)):
+                named[k], before = stationary_factors(rows, pair), pair
+            given[k] = before
         self._given = given
-        return Additions(named=named)
+        return Given(Additions(named=named), self.name)
 
 
 _THRESHOLD = 0.1  # standard deviations that a variable moves before its factors are linearised anew
@@ -162,7 +153,7 @@ class Window:
         """
         record = [*self.record, now]
         new = VehicleAndObjects(record[-2:], [pose], self._settings, known=len(record[-2:]) - 1)
-        given = self._stationary.with_probabilities(record, stationary)
+        given = self._stationary.changed(record, stationary)
         try:
             self._smoother.step(now.time, [new, given, *self._smoother.providers], frame)
         except GraphError:
@@ -173,7 +164,7 @@ class Window:
 
     def extend(self, stationary: Sequence[FloatArray], providers: Sequence[FactorProvider]) -> GraphSolution:
         """Add factors of providers at the newest epoch, replace those of stationary objects, and solve."""
-        self._smoother.extend([*providers, self._stationary.with_probabilities(self.record, stationary)])
+        self._smoother.extend([*providers, self._stationary.changed(self.record, stationary)])
         return self._smoother.solution()
 
     def weighed(self, now: RecordedEpoch) -> Given:
