@@ -43,9 +43,7 @@ from saga_fg.slam.joint import (
     estimate_online,
 )
 from saga_fg.slam.joint.record import KEYFRAME_PERIOD
-from saga_fg.slam.mapping import LandmarkSettings
 from saga_fg.slam.sensors import SensorBuffer, SensorSettings, sensor_providers
-from saga_fg.slam.submaps.graph import GATE
 from saga_fg.tracking import Tracker
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
@@ -203,8 +201,7 @@ def with_objects(
         observed: list[list[Observation]] = [[] for _ in rows]
         for one in result.observations:
             observed[at[one.pose]].append(one.observation)
-        marks, others = LandmarkSettings(GATE, s.submaps.confirm_after), [*of_sensors, *new_providers()]
-        estimator = OnlineEstimator(new_tracker(), lag, s.objects, marks, start, others)
+        estimator = OnlineEstimator(new_tracker(), lag, s.objects, start, [*of_sensors, *new_providers()])
         online = estimate_online(seen, odometry, estimator, observed)
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
         slam = replace(slam, online=Trajectory(scans.timestamps, placed))

@@ -51,7 +51,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from saga_fg.estimators.graph_window import GraphSolution
@@ -60,7 +59,6 @@ from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, motion_covariances
 from saga_fg.slam.mapping import (
     LandmarkObservations,
-    LandmarkSettings,
     LocalMap,
     NearbyLandmarks,
     associate,
@@ -69,7 +67,7 @@ from saga_fg.slam.mapping import (
     pose_key,
 )
 from saga_fg.types.by_class import class_numbers
-from saga_fg.types.landmark import Landmark, LandmarkType, Observation
+from saga_fg.types.landmark import LandmarkType, Observation
 
 _SPREAD = 0.2  # m, standard deviation of the estimated positions of objects
 _LEAST = 0.01  # so that no object is without information
@@ -135,15 +133,16 @@ def nearest_landmarks(observations: Observations, path: FloatArray, reach: float
     return LandmarkObservations(seen, start)
 
 
-class WindowLandmarks:
-    """Landmarks of an online estimator: those observed in the window, and those that left it, in their last state."""
+_GATE = 0.999  # gate probability of landmarks online
 
-    def __init__(self, settings: LandmarkSettings) -> None:
-        self._settings = settings
+
+class WindowLandmarks:
+    """Landmarks of an online estimator, those observed in the window."""
+
+    def __init__(self) -> None:
         self._last_seen: dict[int, int] = {}
         self._kinds: dict[int, LandmarkType] = {}
-        self._count: dict[int, int] = {}
-        self._gone: dict[int, Landmark] = {}
+        self._numbers = 0
         self._near = NearbyLandmarks(by_odometry=False)
 
     def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> LandmarkObservations:
@@ -152,45 +151,30 @@ class WindowLandmarks:
         pose, covariance = solution.values.atPose3(pose_key(k)).matrix(), solution.marginal(pose_key(k))
         numbers = self._near.near(pose[:2, 3], covariance).tolist()
         P = solution.covariance([pose_key(k), *map(landmark_key, numbers)])
-        states = {n: (self._kinds[n], self._state(n, solution.values)) for n in numbers}
-        pairs = associate(LocalMap(pose, P, states), observations, self._settings.gate)
+        states = {n: self._kinds[n].variable.read(solution.values, landmark_key(n)) for n in numbers}
+        local = LocalMap(pose, P, {n: (self._kinds[n], state) for n, state in states.items()})
+        pairs = associate(local, observations, _GATE)
         start: dict[int, object] = {}
         seen: list[tuple[int, Observation]] = []
         for row, observation in enumerate(observations):
             if row in pairs:
                 number = pairs[row].landmark
             else:
-                number = len(self._count) + 1
+                self._numbers = number = self._numbers + 1
                 self._kinds[number] = observation.kind
                 start[number] = observation.kind.initialise(pose, observation.value)
-            self._count[number] = self._count.get(number, 0) + 1
             self._last_seen[number] = k
             self._near.see(number, places[row], pose, covariance)
             seen.append((number, observation))
         return LandmarkObservations({k: seen}, start)
 
-    def forget(self, first: int, solution: GraphSolution) -> list[int]:
+    def forget(self, first: int) -> list[int]:
         """Let landmarks leave that were last observed before the epoch `first`; returns their keys."""
-        gone = [number for number in self._kinds if self._last_seen[number] < first]
+        gone = [number for number, last in self._last_seen.items() if last < first]
         for number in gone:
-            self._gone[number] = self._landmark(number, solution)
-            del self._kinds[number]
+            del self._kinds[number], self._last_seen[number]
         self._near.forget(gone)
         return [landmark_key(number) for number in gone]
-
-    def all(self, solution: GraphSolution | None) -> list[Landmark]:
-        """All so far: those in the window, and others in their last state."""
-        current = [] if solution is None else [self._landmark(number, solution) for number in self._kinds]
-        return sorted([*self._gone.values(), *current], key=lambda mark: mark.number)
-
-    def _landmark(self, number: int, solution: GraphSolution) -> Landmark:
-        covariance = solution.covariance([landmark_key(number)])
-        count = self._count[number]
-        state = self._state(number, solution.values)
-        return Landmark(number, self._kinds[number], state, covariance, count, count >= self._settings.confirm_after)
-
-    def _state(self, number: int, values: gtsam.Values) -> object:
-        return self._kinds[number].variable.read(values, landmark_key(number))
 
 
 _CREEPING = 0.3  # speed of creeping traffic, as a share of the usual one

@@ -31,10 +31,9 @@ from saga_fg.slam.joint.batch import checked_landmarks
 from saga_fg.slam.joint.graph import JointEstimate, read_estimate
 from saga_fg.slam.joint.providers import Window
 from saga_fg.slam.joint.record import EpochRecorder, JointSettings, OdometryIncrements, RecordedEpoch
-from saga_fg.slam.mapping import LandmarkSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
-from saga_fg.types.landmark import Landmark, Observation
+from saga_fg.types.landmark import Observation
 
 _DOUBTFUL = 0.9  # probability of an assignment below which its detection is weighed anew
 
@@ -56,7 +55,7 @@ class OnlineEstimator:
 
     tracker    a new one, which associates detections
     lag        s; the window begins at the last epoch that is at least so old
-    settings   of the graph; landmarks: of the association and confirmation of landmarks
+    settings   of the graph
     start      first pose (4, 4), by default the identity
     providers  of factors of your own, asked with each frame after its vehicle and objects are added
 
@@ -68,7 +67,6 @@ class OnlineEstimator:
         tracker: Tracker,
         lag: float,
         settings: JointSettings | None = None,
-        landmarks: LandmarkSettings | None = None,
         start: FloatArray | None = None,
         providers: Sequence[FactorProvider] = (),
     ) -> None:
@@ -79,7 +77,7 @@ class OnlineEstimator:
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._window = Window(self._settings, providers)
         self._clutter_area = tracker.settings.association.clutter_area
-        self._landmarks = WindowLandmarks(landmarks or LandmarkSettings())
+        self._landmarks = WindowLandmarks()
         self._stationary: list[FloatArray] = []
         self._slow = SlowErrors.at_start(self._settings)
         self._solution: GraphSolution | None = None
@@ -133,10 +131,6 @@ class OnlineEstimator:
             raise InputError("expected a frame before the estimate is asked for")
         return read_estimate(self._window.record, self._solution, self._stationary)
 
-    def landmarks(self) -> list[Landmark]:
-        """All landmarks so far: those in the window, and others in their last state."""
-        return self._landmarks.all(self._solution)
-
     def _probabilities(self, record: Sequence[RecordedEpoch], path: FloatArray) -> list[FloatArray]:
         """For each epoch the probabilities that its objects are stationary, along a path (n, 4, 4)."""
         return stationary_probabilities(record, path, self._slow, self._settings, online=True)
@@ -150,7 +144,7 @@ class OnlineEstimator:
         settled = read_estimate(window.record[:count], solution, self._stationary[:count])
         first = window.record[count].epoch
         self._stationary = self._stationary[count:]
-        window.leave(count, self._landmarks.forget(first, solution))
+        window.leave(count, self._landmarks.forget(first))
         return settled
 
 
@@ -161,14 +155,12 @@ class OnlineEstimate:
     newest       estimated when the frame came, covariances (n, 6, 6) in its own frame: rotation vector (rad),
                  translation (m)
     settled      estimated when the epoch left the window, or at the end
-    landmarks    all that were observed
     """
 
     timestamps: FloatArray
     newest: FloatArray
     covariances: FloatArray
     settled: FloatArray
-    landmarks: list[Landmark]
 
 
 def estimate_online(
@@ -197,5 +189,4 @@ def estimate_online(
         np.stack(newest),
         np.stack(covariances),
         np.concatenate(settled),
-        estimator.landmarks(),
     )
