@@ -29,8 +29,7 @@ from typing import Protocol, Self
 
 import gtsam
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.ndimage import label
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
@@ -161,7 +160,6 @@ def _within(offset: FloatArray, half: FloatArray) -> BoolArray:
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
-_NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))  # half of the eight: the links are undirected
 
 
 def voxel_keys(points: FloatArray, size: float) -> IntArray:
@@ -213,20 +211,12 @@ def clusters_from_above(points: FloatArray, cell: float) -> list[IntArray]:
     if not len(points):
         return []
     index = np.floor(points[:, :2] / cell).astype(np.int64)
-    index -= index.min(axis=0) - 1
-    width = int(index[:, 1].max()) + 2
-    keys, row = np.unique(index[:, 0] * width + index[:, 1], return_inverse=True)
-    first, second = [], []
-    for dx, dy in _NEIGHBOURS:
-        beside = np.searchsorted(keys, keys + dx * width + dy)
-        beside = np.minimum(beside, len(keys) - 1)
-        linked = np.flatnonzero(keys[beside] == keys + dx * width + dy)
-        first.append(linked)
-        second.append(beside[linked])
-    i, j = np.concatenate(first), np.concatenate(second)
-    _, part = connected_components(csr_array((np.ones(len(i)), (i, j)), shape=(len(keys), len(keys))), directed=False)
-    order = np.argsort(part[row], kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(part[row][order])) + 1)
+    index -= index.min(axis=0)
+    occupied = np.zeros(index.max(axis=0) + 1, dtype=bool)
+    occupied[index[:, 0], index[:, 1]] = True
+    part = label(occupied, np.ones((3, 3)))[0][index[:, 0], index[:, 1]]
+    order = np.argsort(part, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(part[order])) + 1)
 
 
 def cell_order_statistics(values: FloatArray, cell: IntArray, cells: int, divisor: int) -> FloatArray:

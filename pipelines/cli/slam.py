@@ -24,7 +24,7 @@ from pipelines.cli.slam_kitti import kitti
 from pipelines.slam.configuration import load_laser_settings, load_slam_config
 from pipelines.slam.joint import run_joint, street
 from pipelines.slam.laser_slam import laser_slam
-from pipelines.slam.pose_graph_baselines import FromStart, from_same_starts, isam2
+from pipelines.slam.pose_graph_baselines import FromStart, from_same_starts
 from pipelines.slam.results import write_joint, write_laser_slam, write_pose_graph
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import IntArray
@@ -42,12 +42,8 @@ def g2o(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
     compare: Annotated[
         bool,
-        typer.Option("--compare", help="Run GTSAM's Levenberg-Marquardt and iSAM2 (QR) too, with times."),
+        typer.Option("--compare", help="Run GTSAM's Levenberg-Marquardt too, with times."),
     ] = False,
-    isam2_batch: Annotated[
-        int | None,
-        typer.Option("--isam2-batch", min=1, help="With --compare: poses that iSAM2 is given at once.  [default: 10]"),
-    ] = None,
     certify: Annotated[
         bool,
         typer.Option("--certify", help="Find the global minimum of the chordal cost too, start from it, and prove it."),
@@ -85,14 +81,12 @@ def g2o(
     if robust not in (None, "consensus") and certify:
         raise InputError("--certify: expected without a robust loss, the proof is for squared errors")
     if robust not in (None, "consensus") and compare:
-        raise InputError("--compare: expected without a robust loss, GTSAM's optimisers are run without one")
+        raise InputError("--compare: expected without a robust loss, GTSAM's optimiser is run without one")
     scale = 3.0 if robust_scale is None else robust_scale
     if not 0 < scale < math.inf:
         raise InputError(f"--robust-scale {scale:g}: expected a number > 0")
     if robust in (None, "consensus") and robust_scale is not None:
         raise InputError("--robust-scale: expected with --robust and the name of a loss only")
-    if not compare and isam2_batch is not None:
-        raise InputError("--isam2-batch: expected with --compare only")
     check_writable_folder(output)
     rejected: list[str] = []
     compared: list[FromStart] = []
@@ -111,12 +105,10 @@ def g2o(
         blocks = optimised.covariances(rows)
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
     if compare:
-        with working("GTSAM's optimisers"):
+        with working("GTSAM's optimiser"):
             compared = from_same_starts(graph)
             for row in compared:
                 errors[f"GTSAM Levenberg-Marquardt from the {row.start}"] = row.gtsam_error
-            if graph.poses_alone:
-                errors["GTSAM iSAM2 (QR)"] = isam2(graph, isam2_batch or 10)
     write_pose_graph(output, graph, optimised, rows, blocks, errors, rejected)
     poses, count = counted(len(graph), "pose"), len(graph.first)
     count += sum(len(one.pose) for one in (graph.priors, graph.places) if one is not None)
