@@ -133,9 +133,6 @@ def nearest_landmarks(observations: Observations, path: FloatArray, reach: float
     return LandmarkObservations(seen, start)
 
 
-_GATE = 0.999  # gate probability of landmarks online
-
-
 class WindowLandmarks:
     """Landmarks of an online estimator, those observed in the window."""
 
@@ -153,7 +150,7 @@ class WindowLandmarks:
         P = solution.covariance([pose_key(k), *map(landmark_key, numbers)])
         states = {n: self._kinds[n].variable.read(solution.values, landmark_key(n)) for n in numbers}
         local = LocalMap(pose, P, {n: (self._kinds[n], state) for n, state in states.items()})
-        pairs = associate(local, observations, _GATE)
+        pairs = associate(local, observations)
         start: dict[int, object] = {}
         seen: list[tuple[int, Observation]] = []
         for row, observation in enumerate(observations):

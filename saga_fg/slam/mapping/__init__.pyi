@@ -1,4 +1,4 @@
-from .association import LandmarkSettings, NearbyLandmarks, associate, duplicates, log_odds, place_of
+from .association import NearbyLandmarks, associate, duplicates, log_odds, place_of
 from .local_map import Innovation, LocalMap
 from .mapper import (
     AssociatedObservation,
@@ -19,7 +19,6 @@ __all__ = [
     "LandmarkMap",
     "LandmarkMapper",
     "LandmarkObservations",
-    "LandmarkSettings",
     "LocalMap",
     "MapperSettings",
     "MeasuredMotion",

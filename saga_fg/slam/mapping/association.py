@@ -48,38 +48,26 @@ last, Q_t of translation and Q_R of rotation. So neither a large map nor a long 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence, Set
-from dataclasses import dataclass
 from itertools import combinations
-from typing import Annotated
 
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import assign, gate
-from saga_fg.settings import Range, Settings, setting
 from saga_fg.slam.mapping.local_map import Innovation, LocalMap, initial_state
 from saga_fg.types.landmark import Observation
 
-
-@dataclass(frozen=True)
-class LandmarkSettings(Settings):
-    """Association and confirmation of landmarks."""
-
-    gate: Annotated[float, Range(0.5, 1 - 1e-09)] = setting(
-        0.999, "gate probability of association; higher: fewer duplicates, more wrong matches"
-    )
-    confirm_after: Annotated[int, Range(1, 10**9)] = setting(2, "observations that confirm a landmark")
+_GATE = 0.999  # gate probability of association; higher: fewer duplicates, more wrong matches
 
 
 def associate(
     local: LocalMap,
     observations: Sequence[Observation],
-    probability: float,
     near: Callable[[int, int], bool] = lambda row, landmark: True,
 ) -> dict[int, Innovation]:
     """Assign the observations made from the present pose to the landmarks.
 
-    probability: of the gates; near: whether the observation of a row may be of a landmark besides.
+    near: whether the observation of a row may be of a landmark besides.
     Returns the innovation of each matched observation, by its row.
     """
     landmarks = sorted(local.kinds)
@@ -96,14 +84,14 @@ def associate(
         dim = kind.variable.dim
         noise = np.linalg.slogdet(np.stack([observations[row].covariance for row in own]))[1]
         won = log_odds(squared, spread + np.repeat(noise, len(alike)), dim, kind.density)
-        for k in np.flatnonzero((squared < gate(probability, dim)) & (won > 0)).tolist():
+        for k in np.flatnonzero((squared < gate(_GATE, dim)) & (won > 0)).tolist():
             row, landmark = own[k // len(alike)], innovations.landmarks[k]
             if near(row, landmark):
                 candidates[row, column[landmark]] = innovations[k]
                 gain[row, column[landmark]] = won[k]
     rows, columns = assign(-gain, gain > 0, 0.0)
     pairs = {int(i): candidates[int(i), int(j)] for i, j in zip(rows, columns, strict=True)}
-    return _compatible(local, pairs, probability)
+    return _compatible(local, pairs)
 
 
 def log_odds(squared: FloatArray, log_det: FloatArray, dim: int, density: float) -> FloatArray:
@@ -111,14 +99,14 @@ def log_odds(squared: FloatArray, log_det: FloatArray, dim: int, density: float)
     return np.asarray(-2 * np.log(density) - squared - log_det - dim * np.log(2 * np.pi))
 
 
-def _compatible(local: LocalMap, pairs: dict[int, Innovation], probability: float) -> dict[int, Innovation]:
+def _compatible(local: LocalMap, pairs: dict[int, Innovation]) -> dict[int, Innovation]:
     """The pairs without those that contradict the others."""
     while len(pairs) > 1:
         rows = list(pairs)
         innovations = list(pairs.values())
         S = local.innovation_covariance(innovations)
         r = np.concatenate([i.r for i in innovations])
-        if _squared(r, S) < gate(probability, len(r)):
+        if _squared(r, S) < gate(_GATE, len(r)):
             break
         owner = np.repeat(np.arange(len(rows)), [len(i.r) for i in innovations])
         left = [_without(r, S, owner, row) for row in range(len(rows))]

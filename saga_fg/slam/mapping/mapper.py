@@ -44,8 +44,8 @@ from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable, key_of
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
-from saga_fg.settings import Range, Settings, setting, settings_group
-from saga_fg.slam.mapping.association import LandmarkSettings, NearbyLandmarks, associate, duplicates, place_of
+from saga_fg.settings import Range, Settings, setting
+from saga_fg.slam.mapping.association import NearbyLandmarks, associate, duplicates, place_of
 from saga_fg.slam.mapping.local_map import POSE, LocalMap
 from saga_fg.types.landmark import Landmark, LandmarkType, Observation
 
@@ -162,9 +162,9 @@ _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
 
 @dataclass(frozen=True)
 class MapperSettings(Settings):
-    """Association, confirmation and smoothing of landmarks."""
+    """Confirmation and smoothing of landmarks."""
 
-    landmarks: LandmarkSettings = settings_group(LandmarkSettings, "association and confirmation of landmarks")
+    confirm_after: Annotated[int, Range(1, 10**9)] = setting(2, "observations that confirm a landmark")
     smooth_every: Annotated[int, Range(1, 10**9)] = setting(
         100, "largest number of observations between two smoothings; higher: faster, later corrections"
     )
@@ -261,7 +261,7 @@ class LandmarkMapper:
                 self._check(observation)
             places = [place_of(observation) for observation in observations]
             self._come_near()
-            pairs = associate(self.local, observations, self.settings.landmarks.gate)
+            pairs = associate(self.local, observations)
             for row, observation in enumerate(observations):
                 if row not in pairs:
                     self.local.check(observation)
@@ -331,7 +331,7 @@ class LandmarkMapper:
             AssociatedObservation(row, observation, number) for row, now in seen.items() for number, observation in now
         ]
         poses = np.stack([_pose(solver, row) for row in range(self._poses)])
-        confirm = self.settings.landmarks.confirm_after
+        confirm = self.settings.confirm_after
         return LandmarkMap(
             poses,
             LandmarkObservations(seen, {}).landmarks(solver.solve(), confirm),

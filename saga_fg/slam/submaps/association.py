@@ -20,16 +20,15 @@ _ANCHOR = 1e-12 * np.eye(6)  # covariance of the anchor in its own frame
 
 
 class SubmapLandmarks:
-    """The landmarks of one submap, seen from its anchor on; probability: of the gates."""
+    """The landmarks of one submap, seen from its anchor on."""
 
-    def __init__(self, probability: float) -> None:
-        self._probability = probability
+    def __init__(self) -> None:
         self._local = LocalMap(np.eye(4), _ANCHOR)
         self._ends: dict[int, FloatArray] = {}  # (2, 2) of walls and lines, from above
 
     def copy(self) -> SubmapLandmarks:
         """A copy that further observations can be associated with."""
-        twin = SubmapLandmarks(self._probability)
+        twin = SubmapLandmarks()
         twin._local, twin._ends = self._local.copy(), dict(self._ends)
         return twin
 
@@ -44,7 +43,7 @@ class SubmapLandmarks:
         def near(row: int, landmark: int) -> bool:
             return _gap(self._ends.get(landmark), ends[row]) <= _GAP
 
-        pairs = associate(self._local, observations, self._probability, near)
+        pairs = associate(self._local, observations, near)
         if pairs:
             self._local.update(list(pairs.values()))
         taken = []

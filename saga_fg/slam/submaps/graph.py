@@ -97,9 +97,6 @@ def _list(factors: Any) -> Sequence[Any]:
     return factors if isinstance(factors, Sequence) else [factors]
 
 
-GATE = 0.999  # gate probability of association
-
-
 @dataclass(frozen=True)
 class SubmapSettings(Settings):
     """Size of submaps, association and confirmation of landmarks."""
@@ -182,7 +179,7 @@ class SubmapGraph:
         self._by_anchors = self._new_smoother()  # one epoch for each anchor, once a submap was closed
         self._closed: CondensedSubmap | None = None  # the newest one
         self._loops: list[LoopClosure] = []  # between submaps, by their numbers
-        self._landmarks = SubmapLandmarks(GATE)
+        self._landmarks = SubmapLandmarks()
         self._numbers, self._way = 1, 0.0  # of the next landmark; m since the anchor
 
     def __len__(self) -> int:
@@ -216,7 +213,7 @@ class SubmapGraph:
         way = self._way + (0.0 if motion is None else float(np.linalg.norm(measured[0][:3, 3])))
         begins = k == 0 or way >= self.settings.length or k - self._anchors[-1] >= MAX_KEYFRAMES
         start = measured[0] if k == 0 else self.pose(k - 1) @ measured[0]
-        landmarks = SubmapLandmarks(GATE) if begins else self._landmarks.copy()
+        landmarks = SubmapLandmarks() if begins else self._landmarks.copy()
         if motion is not None and not begins:
             landmarks.move(*motion)
         numbers = landmarks.observe(observations, self._numbers)

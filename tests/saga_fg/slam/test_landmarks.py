@@ -15,7 +15,6 @@ from saga_fg.numerics.assignment import gate
 from saga_fg.slam.mapping import (
     LandmarkMap,
     LandmarkMapper,
-    LandmarkSettings,
     LocalMap,
     MapperSettings,
     associate,
@@ -94,28 +93,28 @@ def seen(*places: tuple[float, float]) -> list[Observation]:
 
 def test_each_landmark_is_matched_once_and_by_the_likeliest() -> None:
     local = poles_at(np.array([[10.0, 2.0], [10.0, -2.0]]), drift=0.1)
-    pairs = associate(local, seen((10.05, -1.9), (10.4, -2.3), (10.0, 2.1)), 0.999)
+    pairs = associate(local, seen((10.05, -1.9), (10.4, -2.3), (10.0, 2.1)))
     assert {row: pair.landmark for row, pair in pairs.items()} == {0: 2, 2: 1}
 
 
 def test_landmarks_of_another_type_are_no_candidates() -> None:
     local = poles_at(np.array([[10.0, 2.0]]), drift=0.1)
     point = Observation(PointLandmark(dim=3), np.array([10.0, 2.0, 0.5]), 0.01 * np.eye(3))
-    assert associate(local, [point], 0.999) == {}
+    assert associate(local, [point]) == {}
 
 
 def test_pairs_that_contradict_each_other_are_not_taken_together() -> None:
     """Both move by more than a common shift can explain: one to the left, one to the right."""
     local = poles_at(np.array([[10.0, 4.0], [10.0, -4.0]]), drift=0.5)
-    for probability, expected in ((0.999, 1), (1 - 1e-9, 2)):
-        assert len(associate(local, seen((10.0, 4.6), (10.0, -4.6)), probability)) == expected
-    assert len(associate(local, seen((10.0, 4.4), (10.0, -3.6)), 0.999)) == 2
+    assert [len(associate(local, seen(one))) for one in ((10.0, 4.6), (10.0, -4.6))] == [1, 1]
+    assert len(associate(local, seen((10.0, 4.6), (10.0, -4.6)))) == 1
+    assert len(associate(local, seen((10.0, 4.4), (10.0, -3.6)))) == 2
 
 
 def test_where_the_pose_is_badly_known_a_lone_landmark_is_not_matched() -> None:
     places = np.array([[10.0, 2.0]])
-    assert len(associate(poles_at(places, 0.3), seen((10.3, 2.0)), 0.999)) == 1
-    assert len(associate(poles_at(places, 8.0), seen((10.3, 2.0)), 0.999)) == 0
+    assert len(associate(poles_at(places, 0.3), seen((10.3, 2.0)))) == 1
+    assert len(associate(poles_at(places, 8.0), seen((10.3, 2.0)))) == 0
 
 
 def revisited(shift: tuple[float, float], drift: float, count: int) -> LocalMap:
@@ -160,9 +159,7 @@ def street(seed: int) -> tuple[LandmarkMap, FloatArray, FloatArray, list[gtsam.O
     planes = [gtsam.OrientedPlane3(wall / np.linalg.norm(wall[:3])) for wall in walls]
     true = [gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.array([9.0, 0.0, 1.5]))]
     turn = 2 * np.pi / 30
-    mapper = LandmarkMapper(
-        true[0].matrix(), 1e-6 * np.eye(6), MapperSettings(LandmarkSettings(confirm_after=5), smooth_every=200)
-    )
+    mapper = LandmarkMapper(true[0].matrix(), 1e-6 * np.eye(6), MapperSettings(confirm_after=5, smooth_every=200))
     for _ in range(60):
         observations = []
         for x, y in poles:
@@ -218,7 +215,6 @@ def test_what_cannot_be_is_refused(subtests: pytest.Subtests) -> None:
         (lambda: LineLandmark().initialise(np.eye(4), np.tile([3.0, 2.0, 0.0], 2)), "two ends that are apart"),
         (lambda: PointLandmark(dim=4), "dim: expected 2 or 3"),
         (lambda: PoleLandmark(density=0.0), "density"),
-        (lambda: LandmarkSettings(gate=0.2), "gate"),
         (lambda: MapperSettings(smooth_every=0), "smooth_every"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
