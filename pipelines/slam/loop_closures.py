@@ -56,7 +56,7 @@ from saga_fg.settings import Fraction, Positive, Settings, setting
 from saga_fg.slam.pose_graph.running import Measured, shortest_paths
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
 
-Loop = TypeVar("Loop", LoopClosure, Measured)  # in space, and in the plane
+Loop = TypeVar("Loop", bound=LoopClosure | Measured)  # in space, or in the plane
 
 
 def deviation(T: FloatArray) -> FloatArray:
@@ -89,7 +89,7 @@ class Agreement(Generic[Loop]):
         between: pose of the second in the frame of the first, by odometry; way: driven until a pose, m
         """
         now = way(loop.second)
-        agreed = []
+        agreed = list[Loop]()
         self._waiting = [k for k in self._waiting if way(k.second) > now - self.patience]
         for other in self._waiting:
             far = abs(way(loop.first) - way(other.first)) + abs(now - way(other.second))
