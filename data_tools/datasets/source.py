@@ -303,6 +303,14 @@ class AreaMap:
         return cls([area for area in cut if area[1]], near)
 
 
+def map_points(points: Sequence[Sequence[float]]) -> FloatArray:
+    """Points (N, 2) of a map. Raises `ValueError` for points that are not finite."""
+    array = np.array(points, dtype=np.float64).reshape(-1, 2)
+    if not np.isfinite(array).all():
+        raise ValueError("points that are not finite")
+    return array
+
+
 def clipped(ring: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Return the part of a ring (N, 2) inside a rectangle, as a ring, empty for none (Sutherland and Hodgman, 1974)."""
     for axis in (0, 1):

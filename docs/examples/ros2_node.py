@@ -10,8 +10,7 @@ from rclpy.time import Time
 from rosidl_runtime_py import set_message_fields
 from tf2_ros import Buffer, TransformException, TransformListener
 
-from data_tools.datasets.mcap import autoware
-from data_tools.datasets.mcap.objects import message_objects, transform_matrix
+from data_tools.datasets.mcap.objects import autoware_message, autoware_rows, message_objects, transform_matrix
 from pipelines.config import load_config
 from saga_fg import Frame, InputError
 
@@ -29,7 +28,7 @@ class TrackerNode(Node):
 
     def on_detections(self, message: DetectedObjects) -> None:
         try:
-            found = message_objects(autoware.rows(message), classes={})
+            found = message_objects(autoware_rows(message), classes={})
             at = self.buffer.lookup_transform("map", found.frame, Time.from_msg(message.header.stamp))
             world_T_sensor = transform_matrix(at.transform)
             tracks = self.tracker.step(Frame(found.stamp / 1e9, "lidar", found.detections, world_T_sensor, "ego"))
@@ -37,7 +36,7 @@ class TrackerNode(Node):
             self.get_logger().warning(str(error))
             return
         result = TrackedObjects()
-        set_message_fields(result, autoware.result(tracks, found.stamp, "map", names={}))
+        set_message_fields(result, autoware_message(tracks, found.stamp, "map", names={}))
         self.publisher.publish(result)
 
 

@@ -109,14 +109,14 @@ def test_broken_maps_are_refused(root: Path) -> None:
     broken = expansion()
     broken["lane_divider"][0]["line_token"] = "none"
     path.write_text(json.dumps(broken))
-    with pytest.raises(InputError, match=r"boston-seaport\.json: lane_divider: unknown token 'none'"):
+    with pytest.raises(InputError, match=r"boston-seaport\.json: lane_divider: expected .*none"):
         source_of(root).maps(scene_of(root))
     del broken["node"][0]["x"]
     path.write_text(json.dumps(broken))
-    with pytest.raises(InputError, match=r"node: record 0: expected x"):
+    with pytest.raises(InputError, match=r"node: expected .*x"):
         source_of(root).maps(scene_of(root))
     path.write_text("[]")
-    with pytest.raises(InputError, match=r"expected a map with the layer node"):
+    with pytest.raises(InputError, match=r"node: expected a map expansion"):
         source_of(root).maps(scene_of(root))
 
 

@@ -44,7 +44,7 @@ import numpy as np
 from data_tools.datasets.annotated import DetectedScenes
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.detection_files import DetectionFile
-from data_tools.datasets.source import AreaMap, Kind
+from data_tools.datasets.source import AreaMap, Kind, map_points
 from data_tools.files.input_files import error_context, read_bytes, unknown_name
 from data_tools.files.readers import WHOLE, all_of, parsed_json, read_arrow_arrays
 from saga_fg.errors import InputError
@@ -211,10 +211,7 @@ def _borders(raw: Any) -> Iterator[FloatArray]:
 
 
 def _points(points: Any) -> FloatArray:
-    array = np.array([(point["x"], point["y"]) for point in points], dtype=np.float64).reshape(-1, 2)
-    if not np.isfinite(array).all():
-        raise ValueError("points that are not finite")
-    return array
+    return map_points([(point["x"], point["y"]) for point in points])
 
 
 SENSOR = "lidar"

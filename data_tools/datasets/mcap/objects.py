@@ -1,20 +1,31 @@
-"""Objects of a message, whatever its type, as checked rows and back.
+"""Objects of messages: raw rows of three families of types, checked field by field, and tracks as messages of each.
 
-Objects of a message, whatever its type: raw rows, checked field by field, and as detections.
+`autoware_perception_msgs/DetectedObjects` and `TrackedObjects`. Poses are in the frame of the header, velocities over
+ground along the axes of the object, as Autoware has them. The score is the existence probability, the class the most
+probable one. Results are `TrackedObjects`; their ids are those of the tracks, in the last eight bytes. Source:
+https://github.com/autowarefoundation/autoware_msgs; Autoware documentation, "Object recognition".
 
-A type of message is a module with the functions of `MessageType`.
+`vision_msgs/Detection3DArray`: boxes with hypotheses of classes, of which the one of highest score counts. Results are
+of the same type; `id` is that of the track. There is no place for a velocity. Source:
+https://github.com/ros-perception/vision_msgs, version 4 (Humble and later).
+
+Foxglove's `SceneUpdate`: an entity is an object if it has a cube, a cylinder or a sphere, of which the first counts.
+Class and score are taken from the metadata (the first of `class`, `label`, `category`, `type`; of `score`,
+`confidence`, `probability`), the class else from the first text, the velocity from `vx` and `vy`. Every message shows
+all objects of its time. Results are `foxglove.SceneUpdate` in protobuf, with the same metadata and `id`. Source:
+https://docs.foxglove.dev/docs/sdk/schemas/scene-update.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, StrArray
+from saga_fg.numerics.arrays import FloatArray, StrArray, upper_triangle
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_norms, quaternion_rotation, yaw_of, yaw_quaternion
 from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED, Boxes
 from saga_fg.types.frame import Detections
@@ -22,52 +33,57 @@ from saga_fg.types.track import Tracks
 
 NAN = float("nan")
 NO_COVARIANCE = (NAN,) * 36
+Message = dict[str, Any]
+
+
+class ObjectRow(NamedTuple):
+    """An object as its message has it: m, m/s, the scalar of a quaternion first.
+
+    covariance           36 numbers of the pose, row by row, the first two rows and columns x and y; NaN: not given
+    velocity_covariance  likewise of the velocity
+    heading              whether the rotation is known
+    """
+
+    id: str
+    label: str
+    score: float
+    position: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+    size: tuple[float, float, float]
+    velocity: tuple[float, float, float] = (NAN, NAN, NAN)
+    covariance: Any = NO_COVARIANCE
+    velocity_covariance: Any = NO_COVARIANCE
+    heading: bool = True
 
 
 @dataclass
 class ObjectRows:
-    """Columns of the objects of one message, as they are there.
+    """The objects of one message, as they are there.
 
-    stamp                ns; 0: not given
-    frame                name of the coordinate frame
-    velocity             (vx, vy, vz), m/s; in_body: whether along the axes of the box
-    covariance           36 numbers of the pose, row by row, the first two rows and columns x and y; NaN: not given
-    velocity_covariance  likewise of the velocity
-    heading              whether the rotation is known
+    stamp    ns; 0: not given
+    frame    name of the coordinate frame
+    fields   the place in the message of each field of `ObjectRow`, with {} for the number of the object
+    in_body  whether velocities are along the axes of the boxes
     """
 
     stamp: int
     frame: str
     fields: Mapping[str, str]
     in_body: bool = False
-    id: list[str] = field(default_factory=list)
-    label: list[str] = field(default_factory=list)
-    score: list[float] = field(default_factory=list)
-    position: list[tuple[float, float, float]] = field(default_factory=list)
-    rotation: list[tuple[float, float, float, float]] = field(default_factory=list)
-    heading: list[bool] = field(default_factory=list)
-    size: list[tuple[float, float, float]] = field(default_factory=list)
-    velocity: list[tuple[float, float, float]] = field(default_factory=list)
-    covariance: list[Any] = field(default_factory=list)
-    velocity_covariance: list[Any] = field(default_factory=list)
+    objects: list[ObjectRow] = field(default_factory=list)
 
 
-class MessageType(Protocol):
-    """A type of message with objects: how it is read, and how tracks are written in its like.
+class ObjectType(NamedTuple):
+    """A type of message with objects.
 
-    RESULT   type of the results; in ROS 2's encoding if it has a definition, in protobuf else
+    result   type of results: in ROS 2's encoding if it has a definition, in protobuf else
+    rows     the objects of a message; raises `AttributeError` where a field is missing
+    message  a message of tracks, with its time, ns, the name of its frame, and the names of classes in the recording
     """
 
-    TYPES: tuple[str, ...]
-    RESULT: str
-
-    @staticmethod
-    def rows(message: Any) -> ObjectRows:
-        """The objects of a message; raises `AttributeError` where a field is missing."""
-
-    @staticmethod
-    def result(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Any:
-        """A message of tracks; names: of classes, in the terms of the recording."""
+    result: str
+    rows: Callable[[Any], ObjectRows]
+    message: Callable[[Tracks, int, str, Mapping[str, str]], Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +102,13 @@ def message_objects(rows: ObjectRows, classes: Mapping[str, str]) -> MessageObje
 
     Sizes of 0, rotations of norm 0 and covariances of 0 are unknown. Raises `InputError` naming the field.
     """
-    n = len(rows.label)
-    position = _numbers(rows, "position", rows.position, 3, MAX_POSITION)
-    size = _numbers(rows, "size", rows.size, 3, MAX_SIZE, unknown=True)
+    position = _numbers(rows, "position", 3, MAX_POSITION)
+    size = _numbers(rows, "size", 3, MAX_SIZE, unknown=True)
     if (size < 0).any():
         row = int(np.argmax((size < 0).any(axis=1)))
-        raise InputError(f"{rows.fields['size'].format(row)}: expected sizes >= 0 in m, got {rows.size[row]}")
-    score = _numbers(rows, "score", rows.score, 0, np.inf)
-    rotation = _numbers(rows, "rotation", rows.rotation, 4, np.inf)
+        raise InputError(f"{rows.fields['size'].format(row)}: expected sizes >= 0 in m, got {rows.objects[row].size}")
+    score = _numbers(rows, "score", 0, np.inf)
+    rotation = _numbers(rows, "rotation", 4, np.inf)
     norm = quaternion_norms(rotation)
     turned = norm > 0
     bad = turned & (np.abs(norm - 1) > 1e-2)
@@ -102,26 +117,24 @@ def message_objects(rows: ObjectRows, classes: Mapping[str, str]) -> MessageObje
         raise InputError(f"{rows.fields['rotation'].format(row)}: expected a unit quaternion, got norm {norm[row]:.4g}")
     unit = np.where(turned[:, None], rotation, [1.0, 0, 0, 0]) / np.where(turned, norm, 1.0)[:, None]
     R = quaternion_rotation(unit)
-    velocity = _numbers(rows, "velocity", rows.velocity, 3, MAX_SPEED, unknown=True)
-    covariance = _covariances(rows, "covariance", rows.covariance)
-    spread = _covariances(rows, "velocity_covariance", rows.velocity_covariance)
-    if rows.in_body and n:
+    velocity = _numbers(rows, "velocity", 3, MAX_SPEED, unknown=True)
+    covariance, spread = _covariances(rows, "covariance"), _covariances(rows, "velocity_covariance")
+    if rows.in_body and rows.objects:
         velocity = np.einsum("nij,nj->ni", R, velocity)
         spread = R[:, :2, :2] @ spread @ np.swapaxes(R[:, :2, :2], 1, 2)
-    yaw = np.where(turned & np.array(rows.heading, dtype=bool), yaw_of(R), np.nan)
-    label = [classes.get(name, name or "object") for name in rows.label]
+    yaw = np.where(turned & np.array([each.heading for each in rows.objects], dtype=bool), yaw_of(R), np.nan)
+    label = [classes.get(each.label, each.label or "object") for each in rows.objects]
     kept = np.flatnonzero([name != "" for name in label])
     label = [name or "object" for name in label]
     boxes = Boxes.of(label, position, np.where(size > 0, size, np.nan), yaw, velocity[:, :2])
     detections = Detections(boxes, score, position_covariance=covariance)
-    id_ = np.array(rows.id, dtype=np.str_)
+    id_ = np.array([each.id for each in rows.objects], dtype=np.str_)
     return MessageObjects(rows.stamp, rows.frame, detections.select(kept), id_[kept], spread[kept])
 
 
-def _numbers(
-    rows: ObjectRows, name: str, values: list[Any], width: int, limit: float, unknown: bool = False
-) -> FloatArray:
+def _numbers(rows: ObjectRows, name: str, width: int, limit: float, unknown: bool = False) -> FloatArray:
     """A column (N, width), or (N,) for width 0, of numbers within a limit; NaN only where it may be unknown."""
+    values = [getattr(each, name) for each in rows.objects]
     array = np.array(values, dtype=np.float64).reshape((len(values), width) if width else len(values))
     bad = ~(np.abs(array) <= limit) if np.isfinite(limit) else ~np.isfinite(array)
     if unknown:
@@ -132,8 +145,9 @@ def _numbers(
     return array
 
 
-def _covariances(rows: ObjectRows, name: str, values: list[Any]) -> FloatArray:
+def _covariances(rows: ObjectRows, name: str) -> FloatArray:
     """The horizontal part (N, 2, 2) of 6 x 6 covariances, NaN where zero. Raises `InputError` for an invalid one."""
+    values = [getattr(each, name) for each in rows.objects]
     P = np.array([(v[0], v[1], v[6], v[7]) for v in values], dtype=np.float64).reshape(-1, 2, 2)
     P = np.where((P == 0).all(axis=(1, 2), keepdims=True), np.nan, P)
     P = (P + np.swapaxes(P, 1, 2)) / 2
@@ -187,22 +201,19 @@ def wxyz(quaternion: Any) -> tuple[float, float, float, float]:
     return (quaternion.w, quaternion.x, quaternion.y, quaternion.z)
 
 
-Fields = dict[str, Any]
-
-
-def header(stamp: int, frame: str) -> Fields:
+def header(stamp: int, frame: str) -> Message:
     """A std_msgs/Header; stamp in ns."""
     seconds, nanoseconds = divmod(stamp, 10**9)
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
 
 
-def vector(values: FloatArray) -> Fields:
+def vector(values: FloatArray) -> Message:
     """A vector or point (3,); unknown entries are 0."""
     x, y, z = np.nan_to_num(values).tolist()
     return {"x": x, "y": y, "z": z}
 
 
-def pose(position: FloatArray, yaw: float) -> Fields:
+def pose(position: FloatArray, yaw: float) -> Message:
     """A geometry_msgs/Pose; an unknown yaw is 0."""
     w, x, y, z = yaw_quaternion(float(np.nan_to_num(yaw))).tolist()
     return {"position": vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}}
@@ -213,3 +224,253 @@ def covariance(P: FloatArray) -> list[float]:
     whole = np.zeros((6, 6))
     whole[:2, :2] = np.nan_to_num(P)
     return whole.ravel().tolist()
+
+
+AUTOWARE_CLASSES = (
+    *("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian", "animal", "hazard"),
+    *("over_drivable", "under_drivable"),
+)  # by the number of ObjectClassification
+_UNAVAILABLE, _AVAILABLE = 0, 2  # orientation
+_CYLINDER, _POLYGON = 1, 2  # shape
+_POSE, _TWIST = "objects[{}].kinematics.pose_with_covariance.", "objects[{}].kinematics.twist_with_covariance."
+_AUTOWARE_FIELDS = {
+    "position": _POSE + "pose.position",
+    "rotation": _POSE + "pose.orientation",
+    "covariance": _POSE + "covariance",
+    "size": "objects[{}].shape.dimensions",
+    "score": "objects[{}].existence_probability",
+    "velocity": _TWIST + "twist.linear",
+    "velocity_covariance": _TWIST + "covariance",
+}
+
+
+def autoware_rows(message: Any) -> ObjectRows:
+    """The objects of `DetectedObjects`, which say what is known of their motion, or of `TrackedObjects`."""
+    stamp, frame = nanoseconds(message.header.stamp), frame_name(message.header.frame_id)
+    found = ObjectRows(stamp, frame, _AUTOWARE_FIELDS, in_body=True)
+    for each in message.objects:
+        motion = each.kinematics
+        pose, twist = motion.pose_with_covariance, motion.twist_with_covariance
+        surest = max(each.classification, key=lambda c: c.probability, default=None)
+        number = surest.label if surest is not None else 0
+        found.objects.append(
+            ObjectRow(
+                str(int.from_bytes(bytes(each.object_id.uuid)[-8:])) if hasattr(each, "object_id") else "",
+                AUTOWARE_CLASSES[number] if number < len(AUTOWARE_CLASSES) else str(number),
+                each.existence_probability,
+                xyz(pose.pose.position),
+                wxyz(pose.pose.orientation),
+                _autoware_size(each.shape),
+                xyz(twist.twist.linear) if getattr(motion, "has_twist", True) else (NAN, NAN, NAN),
+                pose.covariance if getattr(motion, "has_position_covariance", True) else NO_COVARIANCE,
+                twist.covariance if getattr(motion, "has_twist_covariance", True) else NO_COVARIANCE,
+                motion.orientation_availability != _UNAVAILABLE,
+            )
+        )
+    return found
+
+
+def autoware_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Message:
+    """`TrackedObjects` of tracks; a class that Autoware does not have is unknown."""
+    boxes, yaw = tracks.boxes, np.nan_to_num(tracks.boxes.yaw)
+    c, s = np.cos(yaw), np.sin(yaw)
+    frame_T_body = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    flat = np.einsum("nji,nj->ni", frame_T_body, boxes.velocity)
+    velocity = np.column_stack([flat, np.zeros(len(flat))])
+    spread = np.swapaxes(frame_T_body, 1, 2) @ tracks.velocity_covariance @ frame_T_body
+    nothing = vector(np.zeros(3))
+    objects = [
+        {
+            "object_id": {"uuid": list(int(id_).to_bytes(16))},
+            "existence_probability": float(np.clip(score, 0, 1)),
+            "classification": [{"label": _class_number(names.get(label, label)), "probability": 1.0}],
+            "kinematics": {
+                "pose_with_covariance": {
+                    "pose": pose(boxes.position[k], boxes.yaw[k]),
+                    "covariance": covariance(tracks.position_covariance[k]),
+                },
+                "twist_with_covariance": {
+                    "twist": {"linear": vector(velocity[k]), "angular": nothing},
+                    "covariance": covariance(spread[k]),
+                },
+                "acceleration_with_covariance": {
+                    "accel": {"linear": nothing, "angular": nothing},
+                    "covariance": [0.0] * 36,
+                },
+                "orientation_availability": _AVAILABLE if np.isfinite(boxes.yaw[k]) else _UNAVAILABLE,
+                "is_stationary": False,
+            },
+            "shape": {"type": 0, "footprint": {"points": []}, "dimensions": vector(boxes.size[k])},
+        }
+        for k, (id_, label, score) in enumerate(_named(tracks))
+    ]
+    return {"header": header(stamp, frame), "objects": objects}
+
+
+def _named(tracks: Tracks) -> Any:
+    """Id, class and score of each track."""
+    return zip(tracks.id.tolist(), tracks.boxes.label.tolist(), tracks.score.tolist(), strict=True)
+
+
+def _autoware_size(shape: Any) -> tuple[float, float, float]:
+    """Length, width and height; of a polygon those of its footprint, if it has no dimensions."""
+    x, y, z = xyz(shape.dimensions)
+    if shape.type == _CYLINDER:
+        return x, x, z
+    points = shape.footprint.points
+    if shape.type == _POLYGON and points and not (x > 0 and y > 0):
+        across = [[getattr(point, axis) for point in points] for axis in "xy"]
+        x, y = (max(values) - min(values) for values in across)
+    return x, y, z
+
+
+def _class_number(name: str) -> int:
+    if name in AUTOWARE_CLASSES:
+        return AUTOWARE_CLASSES.index(name)
+    return int(name) if name.isdecimal() and int(name) < 256 else 0
+
+
+_VISION_FIELDS = {
+    "position": "detections[{}].bbox.center.position",
+    "rotation": "detections[{}].bbox.center.orientation",
+    "covariance": "detections[{}].results[].pose.covariance",
+    "size": "detections[{}].bbox.size",
+    "score": "detections[{}].results[].hypothesis.score",
+}
+
+
+def _vision_rows(message: Any) -> ObjectRows:
+    found = ObjectRows(nanoseconds(message.header.stamp), frame_name(message.header.frame_id), _VISION_FIELDS)
+    for each in message.detections:
+        surest = max(each.results, key=lambda result: result.hypothesis.score, default=None)
+        label, score = ("", 1.0) if surest is None else (surest.hypothesis.class_id, surest.hypothesis.score)
+        place = each.bbox.center
+        row = ObjectRow(each.id, label, score, xyz(place.position), wxyz(place.orientation), xyz(each.bbox.size))
+        found.objects.append(row if surest is None else row._replace(covariance=surest.pose.covariance))
+    return found
+
+
+def _vision_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Message:
+    boxes, head = tracks.boxes, header(stamp, frame)
+    places = [pose(position, yaw) for position, yaw in zip(boxes.position, boxes.yaw.tolist(), strict=True)]
+    detections = [
+        {
+            "header": head,
+            "results": [
+                {
+                    "hypothesis": {"class_id": names.get(label, label), "score": score},
+                    "pose": {"pose": places[k], "covariance": covariance(tracks.position_covariance[k])},
+                }
+            ],
+            "bbox": {"center": places[k], "size": vector(boxes.size[k])},
+            "id": str(id_),
+        }
+        for k, (id_, label, score) in enumerate(_named(tracks))
+    ]
+    return {"header": head, "detections": detections}
+
+
+_SCENE_FIELDS = {
+    "position": "object {}: pose.position",
+    "rotation": "object {}: pose.orientation",
+    "covariance": "object {}: metadata: cov_xx, cov_xy, cov_yy",
+    "size": "object {}: size",
+    "score": "object {}: metadata: score",
+    "velocity": "object {}: metadata: vx, vy",
+    "velocity_covariance": "object {}: metadata: cov_vxvx, cov_vxvy, cov_vyvy",
+}
+_CLASS, _SCORE = ("class", "label", "category", "type"), ("score", "confidence", "probability")
+_POSITION, _VELOCITY = ("cov_xx", "cov_xy", "cov_yy"), ("cov_vxvx", "cov_vxvy", "cov_vyvy")
+_COLOUR = {"r": 0.1, "g": 0.45, "b": 0.9, "a": 0.5}
+_TEXT_GAP = 0.4  # m above the box
+
+
+def _scene_rows(message: Any) -> ObjectRows:
+    """Raises `InputError` for entities in several frames."""
+    solids = [(each, _solid(each)) for each in message.entities]
+    objects = [(each, solid) for each, solid in solids if solid is not None]
+    stamps = [nanoseconds(each.timestamp) for each in (*(each for each, _ in objects), *message.deletions)]
+    frames = list(dict.fromkeys(frame_name(each.frame_id) for each, _ in objects))
+    if len(frames) > 1:
+        raise InputError(f"entities: expected all in one frame, got {', '.join(frames)}")
+    found = ObjectRows(max(stamps, default=0), frames[0] if frames else "", _SCENE_FIELDS)
+    for k, (each, solid) in enumerate(objects):
+        facts = {fact.key.lower(): fact.value for fact in each.metadata}
+        text = each.texts[0].text if len(each.texts) else ""
+        found.objects.append(
+            ObjectRow(
+                facts.get("id", each.id),
+                next((facts[name] for name in _CLASS if name in facts), text),
+                _number(facts, k, next((name for name in _SCORE if name in facts), ""), 1.0),
+                xyz(solid.pose.position),
+                wxyz(solid.pose.orientation),
+                xyz(solid.size),
+                (_number(facts, k, "vx"), _number(facts, k, "vy"), 0.0),
+                _entries(*(_number(facts, k, name) for name in _POSITION)),
+                _entries(*(_number(facts, k, name) for name in _VELOCITY)),
+            )
+        )
+    return found
+
+
+def _scene_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Any:
+    """A cube, a text and metadata for each track."""
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    seconds, nanos = divmod(stamp, 10**9)
+    time, boxes = {"timestamp": {"seconds": seconds, "nanos": nanos}}, tracks.boxes
+    spreads = [upper_triangle(P) for P in (tracks.position_covariance, tracks.velocity_covariance)]
+    columns = np.column_stack([tracks.score, boxes.velocity, *spreads]).tolist()
+    entities: list[Any] = []
+    for k, (id_, label, _) in enumerate(_named(tracks)):
+        keys = ("score", "vx", "vy", *_POSITION, *_VELOCITY)
+        known = {key: f"{value:.6g}" for key, value in zip(keys, columns[k], strict=True) if value == value}
+        facts = {"id": str(id_), "class": names.get(label, label), **known}
+        if not tracks.settled[k]:
+            facts["settled"] = "0"
+        size = np.where(np.isfinite(boxes.size[k]), boxes.size[k], 0.5)
+        above = boxes.position[k] + [0, 0, size[2] / 2 + _TEXT_GAP]
+        text = {"pose": pose(above, 0.0), "billboard": True, "font_size": 12.0, "scale_invariant": True}
+        entities.append(
+            {
+                **time,
+                "frame_id": frame,
+                "id": f"track {id_}",
+                "metadata": [{"key": key, "value": value} for key, value in facts.items()],
+                "cubes": [{"pose": pose(boxes.position[k], boxes.yaw[k]), "size": vector(size), "color": _COLOUR}],
+                "texts": [{**text, "color": {**_COLOUR, "a": 1.0}, "text": f"{facts['class']} {id_}"}],
+            }
+        )
+    deletions: list[Any] = [{**time, "type": 1}]
+    return SceneUpdate(deletions=deletions, entities=entities)
+
+
+def _solid(entity: Any) -> Any:
+    """The first cube, cylinder or sphere of an entity; None for lines, arrows and others."""
+    return next((solids[0] for solids in (entity.cubes, entity.cylinders, entity.spheres) if len(solids)), None)
+
+
+def _number(facts: Mapping[str, str], row: int, name: str, default: float = NAN) -> float:
+    if name not in facts:
+        return default
+    try:
+        return float(facts[name])
+    except ValueError:
+        raise InputError(f"object {row}: metadata: {name}: expected a number, got {facts[name][:40]!r}") from None
+
+
+def _entries(xx: float, xy: float, yy: float) -> tuple[float, ...]:
+    """The 36 entries of a covariance by those of its horizontal part."""
+    return (xx, xy, *NO_COVARIANCE[2:6], xy, yy, *NO_COVARIANCE[8:])
+
+
+_AUTOWARE = ObjectType("autoware_perception_msgs/TrackedObjects", autoware_rows, autoware_message)
+_VISION = ObjectType("vision_msgs/Detection3DArray", _vision_rows, _vision_message)
+_SCENE = ObjectType("foxglove.SceneUpdate", _scene_rows, _scene_message)
+OBJECT_TYPES = {
+    "autoware_perception_msgs/DetectedObjects": _AUTOWARE,
+    "autoware_perception_msgs/TrackedObjects": _AUTOWARE,
+    "vision_msgs/Detection3DArray": _VISION,
+    "foxglove.SceneUpdate": _SCENE,
+    "foxglove_msgs/SceneUpdate": _SCENE,
+}

@@ -18,9 +18,14 @@ import numpy as np
 
 from data_tools.datasets.detection_files import TrackRows
 from data_tools.datasets.detection_files.column_names import pairs
-from data_tools.datasets.mcap.dataset import McapRecording, RecordedScene, RecordingOptions
-from data_tools.datasets.mcap.messages import DEFAULT_EGO, OBJECT_TYPES, recorded_messages
-from data_tools.datasets.mcap.objects import MessageObjects, message_objects
+from data_tools.datasets.mcap.dataset import (
+    DEFAULT_EGO,
+    McapRecording,
+    RecordedScene,
+    RecordingOptions,
+    recorded_messages,
+)
+from data_tools.datasets.mcap.objects import OBJECT_TYPES, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import Recording, definition
 from data_tools.datasets.parts import OpenedPart, Parts, file_digest
 from data_tools.datasets.results import SceneResult, read_table_results, scene_result
@@ -44,12 +49,12 @@ def write_track_messages(path: Path, dataset: McapRecording, scenes: Iterable[tu
     for theirs, ours in dataset.options.classes.items():
         names.setdefault(ours, theirs)
     with atomic_file(path) as file:
-        write, finish = _writer(file, dataset.form.RESULT)
+        write, finish = _writer(file, dataset.form.result)
         for scene, moments in scenes:
             assert isinstance(scene, RecordedScene)
             for token, tracks in zip(scene.tokens, moments, strict=True):
                 stamp = int(token)
-                message = dataset.form.result(tracks, stamp, scene.world, names)
+                message = dataset.form.message(tracks, stamp, scene.world, names)
                 write(message, stamp)
         finish()
 

@@ -2,8 +2,6 @@ from .dataset import NuScenes, NuScenesScans, nuscenes_scans
 from .evaluation import ScoredScene, read_scored_scenes
 from .results import (
     ResultMeta,
-    TrackedBoxes,
-    TrackingResults,
     merge_tracking_results,
     read_tracking_results,
     write_tracking_results,
@@ -19,8 +17,6 @@ __all__ = [
     "NuScenesScans",
     "ResultMeta",
     "ScoredScene",
-    "TrackedBoxes",
-    "TrackingResults",
     "merge_tracking_results",
     "nuscenes_scans",
     "read_scored_scenes",

@@ -1,7 +1,5 @@
 """The nuScenes dataset: tables, detections, scans, images and maps in; `Scene`s out.
 
-The nuScenes dataset: official tables and detection results in, `Scene`s out.
-
 World coordinates are the global frame of the recording's map (z up), the vehicle's frame is the tables' ego frame
 (origin below the rear axle, x ahead, y left). The frames carry detections in world coordinates, one frame a sample and
 sensor, at the sample's time.
@@ -26,14 +24,20 @@ import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
 from data_tools.datasets.nuscenes.results import ResultFile, ResultMeta, read_result_file
-from data_tools.datasets.nuscenes.scenes import LIDAR, SceneRecord, read_annotations, read_scenes, rigid_transform
+from data_tools.datasets.nuscenes.scenes import (
+    LIDAR,
+    SceneRecord,
+    keyframes,
+    read_annotations,
+    read_scenes,
+    rigid_transform,
+)
 from data_tools.datasets.nuscenes.tables import read_table, split_scenes, table_folder
-from data_tools.datasets.source import AreaMap, Images, Kind
+from data_tools.datasets.source import AreaMap, Images, Kind, map_points
 from data_tools.files.input_files import error_context, read_bytes, unknown_name
 from data_tools.files.readers import parsed_json
 from data_tools.lidar import Scan, read_scan
@@ -76,7 +80,7 @@ class NuScenes:
         self._results: dict[str, ResultFile] = {}
         for sensor, path in self._paths.items():
             self._results[sensor] = read_result_file(path, "detection", tables.all_samples, wanted)
-            missing = len(wanted - self._results[sensor].boxes.rows.keys())
+            missing = len(wanted - self._results[sensor].rows.keys())
             if missing:
                 log.warning(
                     "%s: lists %d of %d samples, the others get no frame", path, len(wanted) - missing, len(wanted)
@@ -120,7 +124,7 @@ class NuScenes:
     def _frames(self, token: str, time: float, world_T_ego: FloatArray) -> list[Frame]:
         frames = []
         for sensor, result in self._results.items():
-            rows = result.boxes.rows.get(token)
+            rows = result.rows.get(token)
             if rows is not None:
                 seen = Detections(result.boxes.boxes.select(rows), result.boxes.score[rows])
                 frames.append(Frame(time, sensor, seen, world_T_ego, token=token))
@@ -129,7 +133,7 @@ class NuScenes:
     def _check_seen(self, name: str) -> None:
         tokens = self.records[name].tokens
         for sensor, result in self._results.items():
-            if not any(token in result.boxes.rows for token in tokens):
+            if not any(token in result.rows for token in tokens):
                 raise InputError(
                     f"{self._paths[sensor]}: expected detections of scene {name}, the file lists none of its samples"
                 )
@@ -163,24 +167,14 @@ def nuscenes_scans(dataset: NuScenes, dataroot: str | Path) -> dict[str, NuScene
 
     Raises `InputError` for broken tables, and for names of files outside the dataroot.
     """
-    lidars = {
-        token for token, channel in read_table(dataset.folder, "sensor", ("token", "channel")) if channel == LIDAR
-    }
     wanted = {token for record in dataset.records.values() for token in record.tokens}
-    fields = ("sample_token", "calibrated_sensor_token", "is_key_frame", "filename")
-    mounted = {
-        token: (translation, rotation)
-        for token, sensor, translation, rotation in read_table(
-            dataset.folder, "calibrated_sensor", ("token", "sensor_token", "translation", "rotation")
-        )
-        if sensor in lidars
-    }
     taken: dict[str, tuple[Path, str]] = {}
-    for sample, sensor, key, name in read_table(dataset.folder, "sample_data", fields):
-        if key and sensor in mounted and sample in wanted:
-            file = file_below(Path(dataroot), dataset.folder, sample, name)
-            if file.is_file():
-                taken[sample] = (file, sensor)
+    for sample, _, sensor, name in keyframes(dataset.folder, (LIDAR,), wanted, "filename"):
+        file = file_below(Path(dataroot), dataset.folder, sample, name)
+        if file.is_file():
+            taken[sample] = (file, sensor)
+    mounts = read_table(dataset.folder, "calibrated_sensor", ("token", "translation", "rotation"))
+    place_of = {token: place for token, *place in mounts}
     scans = {}
     for scene, record in dataset.records.items():
         rows = [k for k, token in enumerate(record.tokens) if token in taken]
@@ -188,7 +182,7 @@ def nuscenes_scans(dataset: NuScenes, dataroot: str | Path) -> dict[str, NuScene
             continue
         sensor = taken[record.tokens[rows[0]]][1]
         with error_context(f"{dataset.folder / 'calibrated_sensor.json'}: record {sensor}"):
-            ego_T_lidar = rigid_transform(*mounted[sensor])
+            ego_T_lidar = rigid_transform(*place_of[sensor])
         files = [taken[record.tokens[k]][0] for k in rows]
         scans[scene] = NuScenesScans(files, record.timestamps[rows], record.world_T_ego[np.array(rows)], ego_T_lidar)
     return scans
@@ -213,22 +207,13 @@ def nuscenes_images(dataroot: Path, folder: Path, scenes: Mapping[str, Scene]) -
     """
     if not any((dataroot / "samples" / camera).is_dir() for camera in FRONT_FIRST):
         return {}
-    channels = dict(read_table(folder, "sensor", ("token", "channel")))
-    cameras = {
-        token: channels[sensor]
-        for token, sensor in read_table(folder, "calibrated_sensor", ("token", "sensor_token"))
-        if channels.get(sensor) in FRONT_FIRST
-    }
     wanted = {token: (name, k) for name, scene in scenes.items() for k, token in enumerate(scene.tokens)}
     found: dict[str, dict[str, list[Path | None]]] = {}
-    fields = ("sample_token", "calibrated_sensor_token", "is_key_frame", "filename")
-    for sample, mounted, key, name in read_table(folder, "sample_data", fields):
-        if key and mounted in cameras and sample in wanted:
-            file = file_below(dataroot, folder, sample, name)
-            if file.is_file():
-                scene, k = wanted[sample]
-                of_scene = found.setdefault(scene, {})
-                of_scene.setdefault(cameras[mounted], [None] * len(scenes[scene]))[k] = file
+    for sample, camera, _, name in keyframes(folder, FRONT_FIRST, wanted, "filename"):
+        file = file_below(dataroot, folder, sample, name)
+        if file.is_file():
+            scene, k = wanted[sample]
+            found.setdefault(scene, {}).setdefault(camera, [None] * len(scenes[scene]))[k] = file
     return {name: {camera: each[camera] for camera in FRONT_FIRST if camera in each} for name, each in found.items()}
 
 
@@ -257,57 +242,33 @@ def nuscenes_maps(dataroot: Path, folder: Path, scenes: Mapping[str, Scene]) -> 
         path = dataroot / "maps" / "expansion" / f"{place}.json"
         if place in LOCATIONS and path.is_file():
             if path not in opened:
-                opened = {path: _Layers(path)}  # one at a time: a map has tens of megabytes
-            found[name] = AreaMap.around(scene, opened[path].areas(), opened[path].lines())
+                opened = {path: _read_layers(path)}  # one at a time: a map has tens of megabytes
+            found[name] = AreaMap.around(scene, *opened[path])
     return found
 
 
-class _Layers:
-    """The layers of a file. Raises `InputError` where it is broken."""
+_Layers = tuple[list[tuple[Kind, list[FloatArray]]], list[FloatArray]]  # areas and lines, as in `AreaMap`
 
-    def __init__(self, path: Path) -> None:
-        self._path, self._raw = path, parsed_json(read_bytes(path), str(path))
-        self._nodes = {row["token"]: (row["x"], row["y"]) for row in self._rows("node", ("token", "x", "y"))}
-        self._lines = {row["token"]: row["node_tokens"] for row in self._rows("line", ("token", "node_tokens"))}
-        self._polygons = {
-            row["token"]: row for row in self._rows("polygon", ("token", "exterior_node_tokens", "holes"))
+
+def _read_layers(path: Path) -> _Layers:
+    raw, layer = parsed_json(read_bytes(path), str(path)), "node"
+    try:
+        nodes = {row["token"]: (row["x"], row["y"]) for row in raw[layer]}
+        layer = "polygon"
+        rings = {
+            row["token"]: [row["exterior_node_tokens"], *(hole["node_tokens"] for hole in row["holes"])]
+            for row in raw[layer]
         }
-
-    def areas(self) -> Iterator[tuple[Kind, Sequence[FloatArray]]]:
+        areas: list[tuple[Kind, list[FloatArray]]] = []
         for layer, kind in AREAS:
-            for row in self._rows(layer, ()):
+            for row in raw[layer]:
                 for token in row.get("polygon_tokens", [row.get("polygon_token")]):
-                    polygon = self._known(self._polygons, layer, token)
-                    holes = [self._points(layer, hole["node_tokens"]) for hole in polygon["holes"]]
-                    yield kind, [self._points(layer, polygon["exterior_node_tokens"]), *holes]
-
-    def lines(self) -> Iterator[FloatArray]:
+                    areas.append((kind, [map_points([nodes[node] for node in ring]) for ring in rings[token]]))
+        layer = "line"
+        nodes_of = {row["token"]: row["node_tokens"] for row in raw[layer]}
+        lines = []
         for layer in LINES:
-            for row in self._rows(layer, ("line_token",)):
-                yield self._points(layer, self._known(self._lines, layer, row["line_token"]))
-
-    def _rows(self, layer: str, fields: tuple[str, ...]) -> list[dict[str, Any]]:
-        rows = self._raw.get(layer) if isinstance(self._raw, dict) else None
-        if not isinstance(rows, list):
-            raise InputError(f"{self._path}: expected a map with the layer {layer}")
-        for number, row in enumerate(rows):
-            missing = None if isinstance(row, dict) else "an object"
-            missing = missing or next((field for field in fields if field not in row), None)
-            if missing:
-                raise InputError(f"{self._path}: {layer}: record {number}: expected {missing}")
-        return rows
-
-    def _known(self, table: Mapping[str, Any], layer: str, token: Any) -> Any:
-        if not isinstance(token, str) or token not in table:
-            raise InputError(f"{self._path}: {layer}: unknown token {token!r}")
-        return table[token]
-
-    def _points(self, layer: str, tokens: Sequence[str]) -> FloatArray:
-        points = [self._known(self._nodes, layer, token) for token in tokens]
-        try:
-            array = np.array(points, dtype=np.float64).reshape(-1, 2)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{self._path}: node: expected numbers: {error}") from error
-        if not np.isfinite(array).all():
-            raise InputError(f"{self._path}: node: expected finite numbers")
-        return array
+            lines += [map_points([nodes[node] for node in nodes_of[row["line_token"]]]) for row in raw[layer]]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: {layer}: expected a map expansion of nuScenes: {error!r}") from error
+    return areas, lines

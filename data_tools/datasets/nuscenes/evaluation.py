@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.nuscenes.dataset import NuScenes
-from data_tools.datasets.nuscenes.results import MAX_BOXES, TrackingResults, read_tracking_results
-from data_tools.datasets.nuscenes.scenes import SceneRecord, read_bicycle_racks
+from data_tools.datasets.nuscenes.results import MAX_BOXES, ResultBoxes, read_tracking_results
+from data_tools.datasets.nuscenes.scenes import SceneRecord, read_annotations
 from data_tools.datasets.results import SceneResult
 from data_tools.evaluation import (
     Evaluation,
@@ -62,36 +62,37 @@ def read_scored_scenes(
     than 500 boxes in one: the official evaluation takes neither.
     """
     dataset = NuScenes(dataroot, version, detections or {}, scenes, ground_truth=True)
-    found = read_tracking_results(result)
-    racks = read_bicycle_racks(dataset.folder, dataset.records)
-    read = {name: dataset.scene(name) for name in dataset.scenes}
-    scored = {
-        name: _scored(str(result), dataset.records[name], scene.ground_truth or (), racks[name], found)
-        for name, scene in read.items()
-    }
-    return {name: ScoredScene(read[name], tracking.found, tracking) for name, tracking in scored.items()}
+    found = read_tracking_results(result).samples
+    racks = read_annotations(dataset.folder, dataset.records, {"static_object.bicycle_rack": "bicycle_rack"})
+    scored = {}
+    for name in dataset.scenes:
+        scene = dataset.scene(name)
+        truth = scene.ground_truth or ()
+        tracking = _scored(str(result), dataset.records[name], truth, [each.boxes for each in racks[name]], found)
+        scored[name] = ScoredScene(scene, tracking.found, tracking)
+    return scored
 
 
 def _scored(
-    path: str, record: SceneRecord, truth: Sequence[Annotations], racks: Sequence[Boxes], found: TrackingResults
+    path: str,
+    record: SceneRecord,
+    truth: Sequence[Annotations],
+    racks: Sequence[Boxes],
+    found: Mapping[str, ResultBoxes],
 ) -> NuScenesTrackingScene:
     for token in record.tokens:
-        if token not in found.samples:
+        if token not in found:
             raise InputError(f"{path}: expected every sample of scene {record.name}, {token} is missing")
-        if len(found.samples[token]) > MAX_BOXES:
+        if len(found[token]) > MAX_BOXES:
             raise InputError(f"{path}: sample {token}: expected at most {MAX_BOXES} boxes")
-    samples = [found.samples[token] for token in record.tokens]
+    samples = [found[token] for token in record.tokens]
+    tracks = ResultBoxes.concatenate(samples)
+    frame = np.repeat(np.arange(len(samples)), [len(sample) for sample in samples])
     return NuScenesTrackingScene(
         timestamps=record.timestamps,
         ego_position=record.world_T_ego[:, :2, 3],
         truth=SceneBoxes.of_annotations(truth, hidden=False),
-        found=SceneBoxes(
-            np.repeat(np.arange(len(samples)), [len(sample) for sample in samples]),
-            np.concatenate([sample.id for sample in samples]),
-            Boxes.concatenate([sample.boxes for sample in samples]),
-            np.concatenate([sample.score for sample in samples]),
-            np.concatenate([sample.position_covariance for sample in samples]),
-        ),
+        found=SceneBoxes(frame, tracks.id, tracks.boxes, tracks.score, tracks.position_covariance),
         racks=racks,
     )
 

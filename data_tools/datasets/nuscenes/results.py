@@ -41,7 +41,7 @@ from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.readers import JsonStream, open_json
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, from_upper_triangle, upper_triangle
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, StrArray, from_upper_triangle, upper_triangle
 from saga_fg.numerics.geometry import quaternion_norms, quaternion_yaw, yaw_quaternion
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
@@ -54,17 +54,30 @@ _NO_COVARIANCE = (np.nan, np.nan, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
-class ResultBoxes:
-    """All boxes of a file: `boxes` and `score` (N,), tracks' `id` (N,) ("" for detections), rows of each sample.
+class ResultBoxes(Columns):
+    """N boxes: tracks' `id` (N,) ("" for detections), `boxes` and `score` (N,).
 
     position_covariance (N, 2, 2), m^2: NaN where the file has none.
     """
 
+    id: StrArray
     boxes: Boxes
     score: FloatArray
-    id: StrArray
     position_covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ResultFile:
+    """A result file: its `meta`, its boxes, and which of them are those of each sample, by token."""
+
+    meta: ResultMeta
+    boxes: ResultBoxes
     rows: dict[str, slice]
+
+    @property
+    def samples(self) -> dict[str, ResultBoxes]:
+        """The boxes of every sample by token."""
+        return {token: self.boxes.select(rows) for token, rows in self.rows.items()}
 
 
 class ResultColumns:
@@ -107,8 +120,11 @@ class ResultColumns:
         self._labels += labels
         self._ids += ids
 
-    def finish(self) -> ResultBoxes:
-        """Check the values and convert. Raises `InputError` naming sample, box and field."""
+    def finish(self) -> tuple[ResultBoxes, dict[str, slice]]:
+        """Check the values; return the boxes and the rows of each sample.
+
+        Raises `InputError` naming sample, box and field.
+        """
         columns = {name: np.concatenate([np.empty((0, n)), *self._numbers[name]]) for name, n in _NUMBERS.items()}
         norm = quaternion_norms(columns["rotation"])
         for name, good, expected in (
@@ -142,7 +158,8 @@ class ResultColumns:
             velocity=columns["velocity"],
         )
         covariance = from_upper_triangle(columns["position_covariance"])
-        return ResultBoxes(boxes, columns["score"][:, 0], np.array(self._ids, dtype=np.str_), covariance, self._rows)
+        ids = np.array(self._ids, dtype=np.str_)
+        return ResultBoxes(ids, boxes, columns["score"][:, 0], covariance), self._rows
 
     def _require(self, good: BoolArray, name: str, column: FloatArray, expected: str) -> None:
         if not good.all():
@@ -213,12 +230,6 @@ class ResultMeta:
         return cls(**{f.name: any(getattr(meta, f.name) for meta in metas) for f in fields(cls)})
 
 
-@dataclass(frozen=True, eq=False)
-class ResultFile:
-    meta: ResultMeta
-    boxes: ResultBoxes
-
-
 def read_result_file(
     path: str | Path, task: Task, known: Container[str] | None = None, wanted: Container[str] | None = None
 ) -> ResultFile:
@@ -237,7 +248,7 @@ def read_result_file(
             raise InputError(f"{path}: sample {token}: expected samples of the tables, they hold no such sample")
         elif wanted is None or token in wanted:
             columns.add(token, value)
-    return ResultFile(meta, columns.finish())
+    return ResultFile(meta, *columns.finish())
 
 
 def result_entries(path: Path) -> Iterator[tuple[str | None, Any]]:
@@ -357,40 +368,11 @@ def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> 
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class TrackedBoxes:
-    """The boxes of one sample of a tracking result: `id` (N,) names of the tracks, `boxes`, `score` (N,).
-
-    position_covariance (N, 2, 2), m^2: NaN where the file has none.
-    """
-
-    id: StrArray
-    boxes: Boxes
-    score: FloatArray
-    position_covariance: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.boxes)
-
-
-@dataclass(frozen=True, eq=False)
-class TrackingResults:
-    """A tracking result file: its `meta`, and the boxes of every sample by token."""
-
-    meta: ResultMeta
-    samples: dict[str, TrackedBoxes]
-
-
-def read_tracking_results(path: str | Path) -> TrackingResults:
+def read_tracking_results(path: str | Path) -> ResultFile:
     """Read a tracking result file. Raises `InputError` naming sample, box and field of what is not as it should be."""
     result = read_result_file(path, "tracking")
-    columns = result.boxes
-    samples = {}
-    for token, rows in columns.rows.items():
-        ids = columns.id[rows]
+    for token, rows in result.rows.items():
+        ids = result.boxes.id[rows]
         if len(np.unique(ids)) != len(ids):
             raise InputError(f"{path}: sample {token}: tracking_id: expected each track at most once")
-        samples[token] = TrackedBoxes(
-            ids, columns.boxes.select(rows), columns.score[rows], columns.position_covariance[rows]
-        )
-    return TrackingResults(result.meta, samples)
+    return result

@@ -1,6 +1,6 @@
-"""The moments of a nuScenes scene: times, poses, annotated boxes, bicycle racks.
+"""The moments of a nuScenes scene and their annotated boxes.
 
-The moments of a nuScenes scene: its samples in order, their times, and the poses of the vehicle.
+The moments: its samples in order, their times, and the poses of the vehicle.
 
 A scene is a chain of samples (keyframes at 2 Hz), from `first_sample_token` along `next`. The pose of the vehicle at a
 sample is the `ego_pose` of its LIDAR_TOP keyframe, as in the official evaluation.
@@ -16,10 +16,10 @@ An object counts as visible if some LiDAR or radar point lies in its box; the of
 from __future__ import annotations
 
 from array import array
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Container, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.nuscenes.tables import CATEGORY_TO_TRACKING_CLASS, read_table
 from data_tools.files.input_files import error_context, unknown_name
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import checked_quaternions, checked_transform, quaternion_rotation, quaternion_yaw
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations
@@ -117,18 +117,7 @@ def _times(folder: Path, chain: tuple[str, ...], samples: dict[str, tuple[Any, s
 
 def _poses(folder: Path, wanted: Collection[str]) -> dict[str, FloatArray]:
     """world_T_ego (4, 4) of each sample at its LIDAR_TOP keyframe."""
-    lidars = {token for token, channel in read_table(folder, "sensor", ("token", "channel")) if channel == LIDAR}
-    mounted = {
-        token
-        for token, sensor in read_table(folder, "calibrated_sensor", ("token", "sensor_token"))
-        if sensor in lidars
-    }
-    fields = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "is_key_frame")
-    pose_of = {
-        sample: pose
-        for sample, pose, sensor, key in read_table(folder, "sample_data", fields)
-        if key and sensor in mounted and sample in wanted
-    }
+    pose_of = {sample: pose for sample, _, _, pose in keyframes(folder, (LIDAR,), wanted, "ego_pose_token")}
     missing = next((token for token in wanted if token not in pose_of), None)
     if missing is not None:
         raise InputError(f"{folder / 'sample_data.json'}: sample {missing}: expected a {LIDAR} keyframe, there is none")
@@ -142,6 +131,19 @@ def _poses(folder: Path, wanted: Collection[str]) -> dict[str, FloatArray]:
         if pose not in poses:
             raise InputError(f"{folder / 'ego_pose.json'}: expected pose {pose!r} of sample {sample}, there is none")
     return {sample: poses[pose] for sample, pose in pose_of.items()}
+
+
+def keyframes(
+    folder: Path, channels: Collection[str], wanted: Container[str], field: str
+) -> Iterator[tuple[str, str, str, Any]]:
+    """The `sample_data` of keyframes: sample (of `wanted`), channel, calibrated sensor, and a field of the record."""
+    named = {token: name for token, name in read_table(folder, "sensor", ("token", "channel")) if name in channels}
+    mounts = read_table(folder, "calibrated_sensor", ("token", "sensor_token"))
+    mounted = {token: named[sensor] for token, sensor in mounts if sensor in named}
+    fields = ("sample_token", "calibrated_sensor_token", "is_key_frame", field)
+    for sample, sensor, key, value in read_table(folder, "sample_data", fields):
+        if key and sensor in mounted and sample in wanted:
+            yield sample, mounted[sensor], sensor, value
 
 
 def _pose(folder: Path, token: str, translation: Any, rotation: Any) -> FloatArray:
@@ -168,28 +170,33 @@ MAX_GAP = 1.5  # s between an annotation and its neighbour, for a velocity
 _FIELDS = ("sample_token", "instance_token", "translation", "size", "rotation", "num_lidar_pts", "num_radar_pts")
 
 
-def read_annotations(folder: Path, scenes: Mapping[str, SceneRecord]) -> dict[str, list[Annotations]]:
-    """The annotations of each scene, one entry a sample. Raises `InputError` for missing tables and broken records."""
-    classes = _instance_classes(folder)
+def read_annotations(
+    folder: Path, scenes: Mapping[str, SceneRecord], class_of: Mapping[str, str] = CATEGORY_TO_TRACKING_CLASS
+) -> dict[str, list[Annotations]]:
+    """The annotations of each scene, one entry a sample, of the categories that have a class.
+
+    Raises `InputError` for missing tables and broken records.
+    """
+    classes = _instance_classes(folder, class_of)
     moments = {t: (name, k) for name, scene in scenes.items() for k, t in enumerate(scene.tokens)}
-    rows = {name: _Rows() for name in scenes}
+    rows = {name: _Rows([], array("d")) for name in scenes}
     path = folder / "sample_annotation.json"
     for sample, instance, translation, size, rotation, lidar, radar in read_table(folder, "sample_annotation", _FIELDS):
         if sample not in moments:
             continue
         if instance not in classes:
             raise InputError(f"{path}: sample {sample}: instance_token: expected an instance, {instance!r} is none")
-        label = classes[instance]
-        if label is not None:
-            name, k = moments[sample]
-            try:
-                numbers = (*translation, *size, *rotation)
-                if (len(translation), len(size), len(rotation)) != (3, 3, 4):
-                    raise TypeError("lengths")
-                rows[name].add(k, instance, label, numbers, lidar + radar)
-            except (TypeError, OverflowError) as error:
-                where = f"{path}: sample {sample}, instance {instance}"
-                raise InputError(f"{where}: expected 3, 3 and 4 numbers as translation, size, rotation") from error
+        if (label := classes[instance]) is None:
+            continue
+        name, k = moments[sample]
+        try:
+            if (len(translation), len(size), len(rotation)) != (3, 3, 4):
+                raise TypeError("lengths")
+            rows[name].numbers.extend((*translation, *size, *rotation))
+            rows[name].names.append((k, instance, label, int(lidar + radar)))
+        except (TypeError, OverflowError) as error:
+            where = f"{path}: sample {sample}, instance {instance}"
+            raise InputError(f"{where}: expected 3, 3 and 4 numbers as translation, size, rotation") from error
     result = {}
     for name, scene in scenes.items():
         with error_context(f"{path}: scene {name}"):
@@ -197,42 +204,30 @@ def read_annotations(folder: Path, scenes: Mapping[str, SceneRecord]) -> dict[st
     return result
 
 
-def _instance_classes(folder: Path) -> dict[str, str | None]:
-    """The tracking class of every instance, None for the categories that are not tracked."""
+def _instance_classes(folder: Path, class_of: Mapping[str, str]) -> dict[str, str | None]:
+    """The class of every instance, None for the categories that have none."""
     names = dict(read_table(folder, "category", ("token", "name")))
     classes: dict[str, str | None] = {}
     for token, category in read_table(folder, "instance", ("token", "category_token")):
         if category not in names:
             raise InputError(f"{folder / 'instance.json'}: record {token}: expected a category, {category!r} is none")
-        classes[token] = CATEGORY_TO_TRACKING_CLASS.get(names[category])
+        classes[token] = class_of.get(names[category])
     return classes
 
 
-@dataclass
-class _Rows:
-    """Annotations of one scene, packed: sample index, instance, class, ten numbers, number of points."""
+class _Rows(NamedTuple):
+    """Annotations of one scene: index of the sample, instance, class, number of points; and ten numbers of each."""
 
-    sample: array[int] = field(default_factory=lambda: array("q"))
-    instance: list[str] = field(default_factory=list)
-    label: list[str] = field(default_factory=list)
-    numbers: array[float] = field(default_factory=lambda: array("d"))
-    points: array[int] = field(default_factory=lambda: array("q"))
-
-    def add(self, sample: int, instance: str, label: str, numbers: tuple[float, ...], points: int) -> None:
-        self.sample.append(sample)
-        self.instance.append(instance)
-        self.label.append(label)
-        self.numbers.extend(numbers)
-        self.points.append(points)
+    names: list[tuple[int, str, str, int]]
+    numbers: array[float]
 
     def annotations(self, scene: SceneRecord) -> list[Annotations]:
-        sample = np.array(self.sample, dtype=np.int64)
-        instance = np.array(self.instance, dtype=np.str_)
-        label = np.array(self.label, dtype=np.str_)
+        index, instances, labels, points = zip(*self.names, strict=True) if self.names else ((), (), (), ())
+        sample, instance = np.array(index, dtype=np.int64), np.array(instances, dtype=np.str_)
+        visible = np.array(points, dtype=np.int64) > 0
         numbers = np.array(self.numbers).reshape(-1, 10)
-        visible = np.array(self.points, dtype=np.int64) > 0
         boxes = Boxes(
-            label=label,
+            label=np.array(labels, dtype=np.str_),
             position=numbers[:, :3],
             size=numbers[:, [4, 3, 5]],
             yaw=quaternion_yaw(checked_quaternions("rotation", numbers[:, 6:])),
@@ -246,41 +241,3 @@ class _Rows:
             with error_context(f"sample {token}"):
                 result.append(Annotations(instance[chosen], boxes.select(chosen), visible[chosen]))
         return result
-
-
-CATEGORY = "static_object.bicycle_rack"
-
-
-def read_bicycle_racks(folder: Path, scenes: Mapping[str, SceneRecord]) -> dict[str, list[Boxes]]:
-    """The racks of each scene, one entry a sample. Raises `InputError` for missing tables and broken records."""
-    category = {token for token, name in read_table(folder, "category", ("token", "name")) if name == CATEGORY}
-    racks = {token for token, kind in read_table(folder, "instance", ("token", "category_token")) if kind in category}
-    found: dict[str, list[tuple[list[float], list[float], list[float]]]] = {
-        token: [] for scene in scenes.values() for token in scene.tokens
-    }
-    if racks:
-        fields = ("sample_token", "instance_token", "translation", "size", "rotation")
-        for sample, instance, *box in read_table(folder, "sample_annotation", fields):
-            if instance in racks and sample in found:
-                found[sample].append((box[0], box[1], box[2]))
-    path = folder / "sample_annotation.json"
-    result: dict[str, list[Boxes]] = {}
-    for name, scene in scenes.items():
-        result[name] = []
-        for token in scene.tokens:
-            with error_context(f"{path}: sample {token}, {CATEGORY}"):
-                result[name].append(_boxes(found[token]))
-    return result
-
-
-def _boxes(rows: list[tuple[list[float], list[float], list[float]]]) -> Boxes:
-    if not rows:
-        return Boxes.empty()
-    position, size, rotation = zip(*rows, strict=True)
-    width_length_height = checked("size", size, (None, 3))
-    return Boxes.of(
-        ["bicycle_rack"] * len(rows),
-        position,
-        width_length_height[:, [1, 0, 2]],
-        quaternion_yaw(checked_quaternions("rotation", rotation)),
-    )

@@ -73,5 +73,5 @@ def test_a_broken_rack_is_named(tmp_path: Path) -> None:
     content["sample_annotation"][-1]["size"] = [2.0, -4.0, 1.5]
     root = write_tables(tmp_path, content)
     result = write(tmp_path / "r.json", {"a0": [], "a1": [], "a2": []})
-    with pytest.raises(InputError, match=r"sample_annotation\.json: sample a1, static_object\.bicycle_rack: size"):
+    with pytest.raises(InputError, match=r"sample_annotation\.json: scene scene-0103: size"):
         read_scored_scenes(result, root, VERSION, ["scene-0103"])
