@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.datasets.source import DatasetSource
 from data_tools.evaluation import placed_detections
@@ -119,7 +119,7 @@ def evaluate_labels(
     The scenes are those in the table. Raises `InputError` for a table that is missing, broken or empty, and for
     scenes and moments that the dataset does not have.
     """
-    rows = read_label_table(table)
+    rows = read_tracks(table)
     if len(rows.source) == 0:
         raise InputError(f"{table}: expected labels, there are none")
     scenes: list[str] = []
@@ -127,13 +127,13 @@ def evaluate_labels(
     labelled: list[LabelledScene] = []
     parts: dict[str, list[SceneBoxes]] = {name: [] for name in SYSTEMS}
     seen: list[tuple[IntArray, Boxes, FloatArray]] = []
-    for name in np.unique(rows.tracks.scene).tolist():
+    for name in np.unique(rows.scene).tolist():
         scene = dataset.scene(name)
         online = track_scene(scene, config.tracking.new_tracker(method), progress)
         systems = {
             "detections": _detections(scene, config),
             "online": SceneBoxes.of_tracks(online.tracks),
-            "labels": scene_result(scene, rows.tracks, table).found,
+            "labels": scene_result(scene, rows, table).found,
         }
         first = len(np.concatenate([np.empty(0), *timestamps]))
         for system, found in systems.items():

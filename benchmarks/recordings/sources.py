@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Literal, Self
+from typing import Literal
 
 from benchmarks.recordings.ngsim import MAPS, WINDOWS, ngsim_windows
 from benchmarks.recordings.openacc import FILE, openacc_platoons
@@ -58,9 +58,6 @@ class TrafficSource(DatasetSource):
 
     def ground_truth(self) -> AbstractContextManager[Dataset]:
         return self._opened(true_scene)
-
-    def restricted(self, scenes: Collection[str]) -> Self:
-        return replace(self, scenes=",".join(scenes))
 
     @contextmanager
     def _opened(self, make: Callable[[RecordedTraffic], Scene]) -> Iterator[Dataset]:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Self
 
 import numpy as np
 
 from data_tools.datasets.detection_files import DetectionFile, read_detections
 from data_tools.datasets.source import ChosenScenes, DatasetSource, option
-from data_tools.files.input_files import is_url, local_copy
+from data_tools.files.input_files import local_copy
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Detections, Frame
@@ -46,12 +44,6 @@ class AnnotatedSource(DatasetSource):
             else:
                 with local_copy(self.detections) as path:
                     yield DetectedScenes(dataset, read_detections(path))
-
-    def restricted(self, scenes: Collection[str]) -> Self:
-        return replace(self, scenes=",".join(scenes))
-
-    def input_files(self) -> tuple[Path, ...]:
-        return () if self.detections is None or is_url(self.detections) else (Path(self.detections),)
 
 
 class DetectedScenes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,10 +14,19 @@ from data_tools.datasets.detection_files import TableImport, TruthFile
 from data_tools.datasets.detection_files.column_names import pairs
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.formats import column_names
-from data_tools.datasets.parts import OpenedPart, Parts, file_digest
 from data_tools.datasets.results import SceneResult, read_judged_results, read_table_results
-from data_tools.datasets.source import TRACKING, ChosenScenes, DatasetSource, Verb, names, option
-from data_tools.files.input_files import expanded, is_url, local_copy, name_of
+from data_tools.datasets.source import (
+    TRACKING,
+    ChosenScenes,
+    DatasetSource,
+    OpenedPart,
+    Parts,
+    Verb,
+    file_digest,
+    names,
+    option,
+)
+from data_tools.files.input_files import expanded, local_copy, name_of
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 
@@ -112,10 +121,6 @@ class DetectionFileSource(DatasetSource):
     def title(self) -> str:
         return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"
 
-    @property
-    def tracks_suffix(self) -> str:
-        return f".{self.table}"
-
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[Dataset]:
         if truth and self.truth is not None:
@@ -129,10 +134,6 @@ class DetectionFileSource(DatasetSource):
     def restricted(self, scenes: Collection[str]) -> Self:
         return replace(self, scenes=None)
 
-    def input_files(self) -> tuple[Path, ...]:
-        places = (*(self.detections or ()), *([self.truth] if self.truth is not None else []))
-        return tuple(Path(place) for place in places if not is_url(place))
-
     @contextmanager
     def parts(self) -> Iterator[Parts]:
         if self.scenes is not None:
@@ -140,11 +141,8 @@ class DetectionFileSource(DatasetSource):
         parts = [DetectionFilePart(url, self.how, self._hosts) for url in expanded(self.detections or (), self._hosts)]
         yield Parts([part.name for part in parts], parts)
 
-    def stream(self) -> AbstractContextManager[Iterator[Scene]]:
-        return self._stream()
-
     @contextmanager
-    def _stream(self) -> Iterator[Iterator[Scene]]:
+    def stream(self) -> Iterator[Iterator[Scene]]:
         chosen = None if self.scenes is None else names("--scenes", self.scenes)
         with local_copy(self._table(), self._hosts) as path:
             yield read_scenes_in_parts(path, scenes=chosen, how=self.how)

@@ -27,31 +27,32 @@ A package offers a `DatasetSource` through the entry point group `saga_fg.datase
 
 from __future__ import annotations
 
+import hashlib
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import MISSING, dataclass, field
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 
-from data_tools.files.input_files import unknown_name
+from data_tools.files.atomic_files import write_zip
+from data_tools.files.input_files import open_bytes, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.dataset import Scene
+from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
-    from data_tools.datasets.parts import Parts
     from data_tools.datasets.results import SceneResult
     from data_tools.evaluation import Evaluation
     from data_tools.lidar.scan import ScanSequence
     from data_tools.plausibility import Mend
     from saga_fg.smoothing import Labels
-    from saga_fg.types.dataset import Dataset
     from saga_fg.types.track import Tracks
 
 Verb = Literal[
@@ -61,7 +62,7 @@ Verb = Literal[
 TRACKING: tuple[Verb, ...] = ("track", "smooth", "evaluate labels", "benchmark", "learn noise")
 """Verbs that need detections."""
 
-TrackedScenes = Iterable[tuple["Scene", Sequence["Tracks"]]]
+TrackedScenes = Iterable[tuple[Scene, Sequence["Tracks"]]]
 """Scenes with one `Tracks` for each of their timestamps."""
 
 Images = Mapping[str, Sequence[Path | None]]
@@ -70,8 +71,93 @@ Images = Mapping[str, Sequence[Path | None]]
 Innovations = Mapping[str, "FloatArray"]
 """Squared distances of tracks and the detections they took, in sigmas, by class."""
 
-LabelledScenes = Iterable[tuple["Scene", Sequence["Labels"]]]
+LabelledScenes = Iterable[tuple[Scene, Sequence["Labels"]]]
 """Scenes with one `Labels` for each of their timestamps."""
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedPart:
+    """A part at hand: the SHA-256 of each of its inputs by name, and how to read it as a dataset."""
+
+    digests: Mapping[str, str]
+    read: Callable[[], Dataset]
+
+
+class Part(Protocol):
+    """One scene, or a file of several, that is sent to a worker by pickling."""
+
+    @property
+    def name(self) -> str:
+        """Unique within a run; results and the manifest are named for it."""
+        ...
+
+    def opened(self) -> AbstractContextManager[OpenedPart]:
+        """Make the part available for the length of a block; raises `InputError` where it is not."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The parts of a dataset, by name, and the dataset they come from if it is open."""
+
+    names: Sequence[str]
+    parts: Iterable[Part]
+    dataset: Dataset | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class HeldScene:
+    """A scene in memory; a dataset of itself. Its inputs are its moments and the frames of each sensor."""
+
+    held: Scene
+
+    @property
+    def name(self) -> str:
+        return self.held.name
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The one name."""
+        return (self.held.name,)
+
+    def scene(self, name: str) -> Scene:
+        """The scene; raises `InputError` for another name."""
+        if name != self.held.name:
+            raise InputError(f"scene {name!r}: expected {self.held.name}")
+        return self.held
+
+    @contextmanager
+    def opened(self) -> Iterator[OpenedPart]:
+        """Open with the digests of everything in the scene but its ground truth."""
+        yield OpenedPart(scene_digests(self.held), lambda: self)
+
+
+def scene_digests(scene: Scene) -> dict[str, str]:
+    """SHA-256 of a scene's moments and of the frames of each sensor: of all that its results can depend on."""
+    moments = hashlib.sha256(repr((scene.name, scene.tokens)).encode())
+    for array in (scene.timestamps, scene.world_T_ego):
+        moments.update(np.ascontiguousarray(array).tobytes())
+    maps = {id(frame.road_map): frame.road_map for frame in scene.frames}  # most bring the same
+    moments.update(repr(list(maps.values())).encode())
+    digests = {"moments": moments.hexdigest()}
+    for sensor in scene.sensors:
+        frames = hashlib.sha256()
+        for frame in scene.frames:
+            if frame.sensor != sensor:
+                continue
+            boxes = frame.detections.boxes
+            frames.update(repr((frame.timestamp, frame.coordinates, frame.token, boxes.label.tolist())).encode())
+            pose = np.empty(0) if frame.world_T_ego is None else frame.world_T_ego
+            for array in (pose, boxes.position, boxes.size, boxes.yaw, boxes.velocity, frame.detections.score):
+                frames.update(np.ascontiguousarray(array).tobytes())
+        digests[sensor] = frames.hexdigest()
+    return digests
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    with open_bytes(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def option(
@@ -146,6 +232,7 @@ class DatasetSource(ABC):
     tracks          what `track` writes, for the help; tracks_example: such a name
     merged          result of all parts in parallel, "" for none: of tracks, of labels
     all_tracks      what holds the tracks of all parts of a parallel run, for `benchmark`; "" for none
+    submission      pattern of the files that the official server takes, "" for none
     summarised      whether figures have a narrow summary
     """
 
@@ -154,10 +241,11 @@ class DatasetSource(ABC):
     has_truth: ClassVar[bool] = True
     truth_option: ClassVar[str] = ""
     example: ClassVar[str] = ""
-    tracks: ClassVar[str] = "Table of tracks to write: .csv, .ndjson or .jsonl."
+    tracks: ClassVar[str] = "Table of tracks to write: .csv, .ndjson, .jsonl or .parquet (extra [parquet])."
     tracks_example: ClassVar[str] = "tracks.csv"
     merged: ClassVar[tuple[str, str]] = ("", "")
     all_tracks: ClassVar[str] = ""
+    submission: ClassVar[str] = ""
     summarised: ClassVar[bool] = False
 
     @property
@@ -167,8 +255,8 @@ class DatasetSource(ABC):
 
     @property
     def tracks_suffix(self) -> str:
-        """Suffix of the result of one part, in parallel runs."""
-        return ".csv"
+        """Suffix of the result of one part, in parallel runs: that of the option `table`, or of the usual result."""
+        return f".{self.table}" if hasattr(self, "table") else Path(self.tracks_example).suffix or ".csv"
 
     @abstractmethod
     def open(self, truth: bool = False) -> AbstractContextManager[Dataset]:
@@ -179,12 +267,16 @@ class DatasetSource(ABC):
         return self.open(truth=True)
 
     def restricted(self, scenes: Collection[str]) -> Self:
-        """Recordings of these scenes alone; a dataset may open more than these."""
-        return self
+        """Recordings of these scenes alone, if `scenes` is an option; a dataset may open more than these."""
+        named = any(each.name == "scenes" for each in fields(self))
+        return replace(self, scenes=",".join(scenes)) if named else self
 
     def input_files(self) -> tuple[Path, ...]:
-        """Files that the options name, which no result may overwrite."""
-        return ()
+        """Files that the options name, as FILE or NAME=FILE, which no result may overwrite."""
+        values = [getattr(self, each.name) for each in fields(self)]
+        texts = [text for value in values for text in (value if isinstance(value, list) else [value])]
+        places = [place for text in texts if isinstance(text, str) for place in (text, text.partition("=")[2])]
+        return tuple(Path(place) for place in places if os.path.isfile(place))  # noqa: PTH113 (stands any text)
 
     def option_for(self, mend: Mend) -> str:
         """The options of the command that mend a suspicion about the recordings; "" where it has none."""
@@ -201,8 +293,6 @@ class DatasetSource(ABC):
     @contextmanager
     def parts(self) -> Iterator[Parts]:
         """The recordings one by one, for workers; by default scenes that are read here and sent."""
-        from data_tools.datasets.parts import HeldScene, Parts
-
         with self.open() as dataset:
             yield Parts(dataset.scenes, (HeldScene(dataset.scene(name)) for name in dataset.scenes), dataset)
 
@@ -246,7 +336,8 @@ class DatasetSource(ABC):
 
     def write_submission(self, output: Path) -> Path | None:
         """Write what the official server takes, beside the tracks of all parts; returns its place, None for none."""
-        return None
+        files = sorted(output.glob(self.submission)) if self.submission else ()
+        return write_zip(output / "submission.zip", files) if files else None
 
     def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         """Join the labels of all parts of a parallel run to the file `merged`."""

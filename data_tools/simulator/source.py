@@ -19,8 +19,7 @@ from typing import Any, Self
 import numpy as np
 
 from data_tools.datasets.detection_files import write_rows
-from data_tools.datasets.parts import HeldScene, OpenedPart, Parts
-from data_tools.datasets.source import DatasetSource, option
+from data_tools.datasets.source import DatasetSource, HeldScene, OpenedPart, Parts, option
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.world import SimulatedTraffic
 from saga_fg.numerics.geometry import yaw_of

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import DatasetSource, Innovations
 from data_tools.evaluation import LEGEND
@@ -123,7 +123,7 @@ def _evaluate_labels(
     agree with the detections.
     """
     table = _table(result)
-    scenes = np.unique(read_label_table(table).tracks.scene).tolist()
+    scenes = np.unique(read_tracks(table).scene).tolist()
     settings = load_smooth_config(source.family, config)
     chosen = source.restricted(scenes) if scenes else source
     with chosen.open(source.has_truth and not without_truth) as dataset, progress_bar(len(scenes)) as progress:

@@ -32,7 +32,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal, Protocol
 from urllib.parse import quote
 
-from data_tools.datasets.parts import Part
+from data_tools.datasets.source import Part
 from data_tools.files.readers import parsed_json
 from pipelines.scale_out.folder import OutputFolder, is_inside
 from pipelines.tracking import one_thread

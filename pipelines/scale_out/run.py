@@ -17,8 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
-from data_tools.datasets.parts import Part
-from data_tools.datasets.source import DatasetSource
+from data_tools.datasets.source import DatasetSource, Part
 from data_tools.files.atomic_files import remove_leftovers
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
@@ -182,7 +181,7 @@ class SmoothTask:
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         """Write the labels; counts objects, and boxes by where they come from."""
-        from data_tools.datasets.label_table import write_label_table
+        from data_tools.datasets.detection_files import write_label_table
 
         runs = tuple(smooth_dataset(dataset, self.settings, self.method))
         labels = [(run.scene, run.labels) for run in runs]

@@ -19,7 +19,7 @@ from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from data_tools.datasets.label_table import write_label_table
+from data_tools.datasets.detection_files import write_label_table
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory
 from pipelines.config import Method

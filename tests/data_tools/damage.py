@@ -24,7 +24,6 @@ from data_tools.datasets.detection_files import TruthFile, read_detections, read
 from data_tools.datasets.eth_ucy import EthUcy
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.results import read_scored_sequences
-from data_tools.datasets.label_table import read_label_table
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o
@@ -139,7 +138,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "tracks": one("tracks.csv", TRACKS, read_tracks),
         "tracks of others": one("others.csv", OTHERS, lambda path: _scenes_of(TruthFile(path))),
         **_arrow(folder),
-        "labels": one("labels.csv", LABELS, read_label_table),
+        "labels": one("labels.csv", LABELS, read_tracks),
         "pose graph, plane": one("plane.g2o", G2O_2D, read_g2o),
         "pose graph, space": one("space.g2o", G2O_3D, read_g2o),
         "poses, KITTI": one("poses.txt", POSES, read_kitti_poses),

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from data_tools.datasets.detection_file_source import DetectionFileSource
-from data_tools.datasets.parts import HeldScene, Part
+from data_tools.datasets.source import HeldScene, Part
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.source import SimulatedScene, SimulatedSource
 from pipelines.scale_out import Job, LocalPool, Manifest, RunSummary, SceneTask, perform, pools, run_scenes

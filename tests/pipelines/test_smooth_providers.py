@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
-from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts, read_tracks
 from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
 
@@ -69,8 +68,7 @@ def test_a_wall_of_the_configuration_moves_the_labels(walkers: Path) -> None:
         run = CliRunner().invoke(app, [*arguments, str(walkers.parent / f"labels{len(more)}"), *more])
         assert run.exit_code == 0, run.output
     plain, walled = (
-        read_label_table(walkers.parent / folder / "labels.csv").tracks.boxes.position
-        for folder in ("labels0", "labels2")
+        read_tracks(walkers.parent / folder / "labels.csv").boxes.position for folder in ("labels0", "labels2")
     )
     assert len(plain) == len(walled) == 72
     assert np.allclose(plain[0], walled[0], atol=1e-3)

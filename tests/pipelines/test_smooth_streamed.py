@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
-from data_tools.datasets.label_table import read_label_table
+from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts, read_tracks
 from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
 from pipelines.smoothing.labelling import Identities, ObjectSummary
@@ -90,8 +89,8 @@ def test_the_command_streams_several_recordings(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["smooth", "file", str(path), "--output", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"labels.csv", "summary.json"}
-    labels = read_label_table(tmp_path / "out" / "labels.csv")
-    first, second = (labels.tracks.boxes.position[labels.tracks.scene == name] for name in ("a", "b"))
+    labels = read_tracks(tmp_path / "out" / "labels.csv")
+    first, second = (labels.boxes.position[labels.scene == name] for name in ("a", "b"))
     np.testing.assert_array_equal(first, second)
 
 

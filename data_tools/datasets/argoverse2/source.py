@@ -137,9 +137,7 @@ def read_feather_tracks(path: Path, scenes: Mapping[str, Scene]) -> TrackRows:
     if all(name in rows for name in _VELOCITY):
         velocity = np.stack([rows[name] for name in _VELOCITY], axis=1).astype(np.float64)
         boxes = replace(boxes, velocity=velocity)
-    unknown = np.full((len(log), 2, 2), np.nan)
-    id_ = rows["track_id"].astype(np.str_)
-    return TrackRows(log, time, id_, boxes, score, unknown, unknown, np.full(len(log), np.nan))
+    return TrackRows.of(log, time, rows["track_id"].astype(np.str_), boxes, score)
 
 
 def track_categories(scene: Scene, moments: Sequence[Tracks]) -> dict[int, str]:
@@ -242,10 +240,6 @@ class ArgoverseSource(AnnotatedSource):
         None,
         metavar="FILE",
     )
-
-    @property
-    def tracks_suffix(self) -> str:
-        return ".feather"
 
     @contextmanager
     def annotated(self) -> Iterator[ArgoverseLogs]:

@@ -57,6 +57,7 @@ and settled (0 where the solver found no minimum of a nonlinear graph, else 1).
 from data_tools.datasets.detection_files.column_names import TableImport
 from data_tools.datasets.detection_files.dataset import DetectionFile, read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.tracks import (
+    LABEL_COLUMNS,
     PREDICTION_COLUMNS,
     TRACK_COLUMNS,
     PredictionRows,
@@ -66,12 +67,13 @@ from data_tools.datasets.detection_files.tracks import (
     predictions_path,
     read_predictions,
     read_tracks,
-    track_rows,
+    write_label_table,
     write_rows,
     write_tracks,
 )
 
 __all__ = [
+    "LABEL_COLUMNS",
     "PREDICTION_COLUMNS",
     "TRACK_COLUMNS",
     "DetectionFile",
@@ -85,7 +87,7 @@ __all__ = [
     "read_predictions",
     "read_scenes_in_parts",
     "read_tracks",
-    "track_rows",
+    "write_label_table",
     "write_rows",
     "write_tracks",
 ]

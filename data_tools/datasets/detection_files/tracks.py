@@ -1,4 +1,10 @@
-"""Tables of tracks, predicted tracks and true objects, written and read back.
+"""Tables of tracks, labels, predicted tracks and true objects, written and read back: a row per box.
+
+Tables of labels have the columns of tracks and
+
+    yaw_variance   of the heading, rad^2
+    source         observed, filled or extended
+    quality        high, medium or low
 
 Tables of true objects: a row per object and moment, with the columns of tracks and `visible`, 0 where hidden.
 
@@ -22,9 +28,10 @@ import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -35,12 +42,11 @@ from data_tools.datasets.detection_files.dataset import box_columns
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context, open_bytes, unknown_name
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import (
     BoolArray,
     Columns,
     FloatArray,
-    IntArray,
     StrArray,
     from_upper_triangle,
     upper_triangle,
@@ -50,31 +56,78 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.track import PredictedTracks, Tracks
 
+if TYPE_CHECKING:
+    from saga_fg.smoothing import Labels
+
 TRACK_COLUMNS = (
     *("scene", "timestamp", "id", "label", "x", "y", "z", "length", "width", "height", "yaw", "vx", "vy", "score"),
     *("cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy", "coasting"),
 )
 SETTLED = "settled"  # 1 or 0, the last column of results
+LABEL_COLUMNS = (*TRACK_COLUMNS, "yaw_variance", "source", "quality")
+TEXTS = ("scene", "sensor", "label", "source", "quality")
+WHOLE = ("id", SETTLED)
+ROWS_AT_A_TIME = 65536  # of a Parquet file
 
 
 def write_tracks(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> None:
-    """Write the tracks of some scenes, each with one `Tracks` for each of its timestamps, to .csv, .ndjson or .jsonl.
+    """Write the tracks of some scenes, each with one `Tracks` for each of its timestamps, as `write_rows` does.
 
-    `scenes` may be a generator: the file appears when all is done. What is unknown is left empty (CSV) or out (JSON);
-    numbers are written in full. Raises `InputError` for another suffix, a path that is not writable, and tracks that
-    do not fit the scene.
+    `scenes` may be a generator: the file appears when all is done; numbers are written in full. Raises `InputError` for
+    another suffix, a path that is not writable, and tracks that do not fit the scene.
     """
-    write_rows(path, (*TRACK_COLUMNS, SETTLED), _result_rows(str(path), scenes))
+    rows = (
+        _rows(str(path), scene, moments, [int(settled) for tracks in moments for settled in tracks.settled])
+        for scene, moments in scenes
+    )
+    write_rows(path, (*TRACK_COLUMNS, SETTLED), chain.from_iterable(rows))
+
+
+def write_label_table(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Labels]]]) -> None:
+    """Write the labels of some scenes, each with one `Labels` for each of its timestamps; else as `write_tracks`."""
+    rows = (
+        _rows(
+            str(path),
+            scene,
+            [labels.tracks for labels in frames],
+            *(
+                [value for labels in frames for value in getattr(labels, name).tolist()]
+                for name in ("yaw_variance", "source", "quality")
+            ),
+        )
+        for scene, frames in scenes
+    )
+    write_rows(path, LABEL_COLUMNS, chain.from_iterable(rows))
+
+
+def _rows(path: str, scene: Scene, moments: Sequence[Tracks], *further: list[Any]) -> Iterator[list[Any]]:
+    """The rows of `TRACK_COLUMNS` and `further` columns of a scene, None for what is unknown; `path` is for errors."""
+    if len(moments) != len(scene):
+        raise InputError(f"{path}: scene {scene.name}: expected tracks for {len(scene)} moments, got {len(moments)}")
+    if not len(scene):
+        return
+    tracks, times = Tracks.concatenate(moments), np.repeat(scene.timestamps, [len(each) for each in moments])
+    boxes = tracks.boxes
+    spreads = [upper_triangle(P) for P in (tracks.position_covariance, tracks.velocity_covariance)]
+    places = (boxes.position, boxes.size, boxes.yaw, boxes.velocity)
+    numbers = np.column_stack([*places, tracks.score, *spreads, tracks.coasting]).tolist()
+    names = times.tolist(), tracks.id.tolist(), boxes.label.tolist()
+    for time, id_, label, row, *more in zip(*names, numbers, *further, strict=True):
+        yield [scene.name, time, id_, label, *(None if value != value else value for value in (*row, *more))]
 
 
 def write_rows(path: str | Path, columns: tuple[str, ...], rows: Iterable[list[Any]]) -> None:
-    """Write a table to .csv, .ndjson or .jsonl; None is left empty (CSV) or out (JSON).
+    """Write a table to .csv, .ndjson, .jsonl or .parquet; None is left empty (CSV), out (JSON) or null (Parquet).
 
-    Raises `InputError` for another suffix and a path that is not writable.
+    Raises `InputError` for another suffix and a path that is not writable, `MissingExtraError` for Parquet without its
+    extra.
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in (".csv", ".ndjson", ".jsonl"):
-        raise InputError(f"{path}: expected a file name that ends in .csv, .ndjson, .jsonl")
+    if suffix not in (".csv", ".ndjson", ".jsonl", ".parquet"):
+        raise InputError(f"{path}: expected a file name that ends in .csv, .ndjson, .jsonl, .parquet")
+    if suffix == ".parquet":
+        _write_parquet(path, columns, iter(rows))
+        return
     with atomic_file(path) as binary:
         file = io.TextIOWrapper(binary, encoding="utf-8", newline="", write_through=True)
         if suffix == ".csv":
@@ -88,6 +141,20 @@ def write_rows(path: str | Path, columns: tuple[str, ...], rows: Iterable[list[A
         file.detach()
 
 
+def _write_parquet(path: str | Path, columns: tuple[str, ...], rows: Iterator[list[Any]]) -> None:
+    """Write rows as they come: `TEXTS` as text, `WHOLE` as whole numbers, all other columns as numbers."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as error:
+        raise MissingExtraError(f"{path}: Parquet needs pyarrow: pip install 'saga-fg[parquet]'") from error
+    kinds = dict.fromkeys(TEXTS, pa.string()) | dict.fromkeys(WHOLE, pa.int64())
+    schema = pa.schema([(name, kinds.get(name, pa.float64())) for name in columns])
+    with atomic_file(path) as file, pq.ParquetWriter(file, schema) as writer:
+        while block := list(islice(rows, ROWS_AT_A_TIME)):
+            writer.write_table(pa.table(dict(zip(columns, zip(*block, strict=True), strict=True)), schema=schema))
+
+
 def merge_tables(path: Path, parts: Iterable[Path]) -> None:
     """Write the rows of several CSV tables with the same columns into one. Raises `InputError` where that fails."""
     with atomic_file(path) as file:
@@ -98,42 +165,18 @@ def merge_tables(path: Path, parts: Iterable[Path]) -> None:
                 shutil.copyfileobj(table, file)
 
 
-def track_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterator[list[Any]]:
-    """The rows of `TRACK_COLUMNS`, None for what is unknown; `path` is named where tracks do not fit their scene."""
-    for scene, moments in scenes:
-        with error_context(f"{path}: scene {scene.name}"):
-            if len(moments) != len(scene):
-                raise InputError(f"expected tracks for {len(scene)} moments, got {len(moments)}")
-        for timestamp, tracks in zip(scene.timestamps.tolist(), moments, strict=True):
-            boxes = tracks.boxes
-            before = np.column_stack([boxes.position, boxes.size, boxes.yaw, boxes.velocity, tracks.score])
-            covariances = (tracks.position_covariance, tracks.velocity_covariance)
-            after = np.column_stack([*(upper_triangle(P) for P in covariances), tracks.coasting])
-            for id_, label, *numbers in zip(
-                tracks.id.tolist(), boxes.label.tolist(), *np.hstack([before, after]).T.tolist(), strict=True
-            ):
-                yield [scene.name, timestamp, id_, label, *(None if x != x else x for x in numbers)]
-
-
-def _result_rows(path: str, scenes: Iterable[tuple[Scene, Sequence[Tracks]]]) -> Iterator[list[Any]]:
-    """The rows of `track_rows` with the last column of results."""
-    for scene, moments in scenes:
-        settled = np.concatenate([np.empty(0, dtype=bool), *(tracks.settled for tracks in moments)])
-        rows = track_rows(path, [(scene, moments)])
-        yield from ([*row, value] for row, value in zip(rows, settled.astype(int).tolist(), strict=True))
-
-
 REQUIRED = ("timestamp", "id", "x", "y")
 OWN = frozenset({"timestamp", "id", "x", "y", "cov_xx", "coasting"})  # columns of a table that saga-fg wrote
 NUMBERS = tuple(name for name in TRACK_COLUMNS if name not in ("scene", "id", "label"))
 
 
 @dataclass(frozen=True, eq=False)
-class TrackRows:
-    """N rows of a table of tracks, in the order of the file; NaN in covariances and coasting for what is left out.
+class TrackRows(Columns):
+    """N rows of a table of tracks or labels, in the order of the file; NaN for what is left out of numbers.
 
     scene (N,), timestamp (N,) in s, id (N,), boxes in world coordinates, score (N,), position_covariance (N, 2, 2) in
-    m^2, velocity_covariance (N, 2, 2) in (m/s)^2, coasting (N,) in s; named: whether the table names its scenes
+    m^2, velocity_covariance (N, 2, 2) in (m/s)^2, coasting (N,) in s; of labels: yaw_variance (N,) in rad^2,
+    source (N,), quality (N,), "observed" and "low" where left out; named: whether the table names its scenes
     """
 
     scene: StrArray
@@ -144,28 +187,43 @@ class TrackRows:
     position_covariance: FloatArray
     velocity_covariance: FloatArray
     coasting: FloatArray
+    yaw_variance: FloatArray
+    source: StrArray
+    quality: StrArray
     named: bool = True
 
-    def select(self, rows: IntArray) -> TrackRows:
-        """Some of the rows."""
-        return replace(
-            self,
-            **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in ("boxes", "named")},
-            boxes=self.boxes.select(rows),
-        )
+    @classmethod
+    def of(
+        cls,
+        scene: StrArray,
+        timestamp: FloatArray,
+        id_: StrArray,
+        boxes: Boxes,
+        score: FloatArray,
+        position_covariance: FloatArray | None = None,
+        velocity_covariance: FloatArray | None = None,
+    ) -> Self:
+        """Rows of tracks of which no more is known."""
+        n = len(scene)
+        unknown, whole = np.full((n, 2, 2), np.nan), np.full(n, np.nan)
+        spreads = [unknown if P is None else P for P in (position_covariance, velocity_covariance)]
+        names = np.full(n, "observed"), np.full(n, "low")
+        return cls(scene, timestamp, id_, boxes, score, *spreads, whole, whole, *names)
 
 
 def read_tracks(path: str | Path, how: TableImport | None = None, lenient: bool = False) -> TrackRows:
-    """Read a table of tracks in any of the formats of detections. Raises `InputError` naming file, row and column.
+    """Read a table of tracks or labels in any of the formats of detections.
+
+    Raises `InputError` naming file, row and column.
 
     how      what it takes to understand it, without effect on a table that saga-fg wrote
     lenient  columns that `how` names need not be there
     """
-    layout = Layout((*TRACK_COLUMNS, SETTLED, *QUATERNION), REQUIRED, lenient)
-    return track_rows_of(read_raw_table(Path(path), layout, how, own=OWN))
+    layout = Layout((*LABEL_COLUMNS, SETTLED, *QUATERNION), REQUIRED, lenient)
+    return _track_rows(read_raw_table(Path(path), layout, how, own=OWN))
 
 
-def track_rows_of(raw: RawTable) -> TrackRows:
+def _track_rows(raw: RawTable) -> TrackRows:
     """The tracks in a table that may have further columns; without those of classes that are to be left out."""
     raw.check_numbers(NUMBERS)
     _, left_out = raw.labels()
@@ -185,6 +243,9 @@ def track_rows_of(raw: RawTable) -> TrackRows:
         _covariance(raw, ("cov_xx", "cov_xy", "cov_yy"))[kept],
         _covariance(raw, ("cov_vxvx", "cov_vxvy", "cov_vyvy"))[kept],
         raw.numbers("coasting")[kept],
+        raw.numbers("yaw_variance")[kept],
+        raw.texts("source", "observed")[kept],
+        raw.texts("quality", "low")[kept],
         "scene" in raw.columns,
     )
 
@@ -209,7 +270,7 @@ class TruthFile:
         """Read and check everything. Raises `InputError` naming file, row and column."""
         raw = read_raw_table(Path(path), LAYOUT, how)
         self.path = raw.path
-        self.rows = track_rows_of(raw)
+        self.rows = _track_rows(raw)
         if not len(self.rows.id):
             raise InputError(f"{path}: expected at least one row, the table is empty")
         kept = np.flatnonzero(~raw.labels()[1])
@@ -308,15 +369,9 @@ class PredictionRows(Columns):
     @classmethod
     def of(cls, moments: Sequence[PredictedTracks]) -> Self:
         """The rows of what was predicted at several moments."""
-        each = [cls._of_moment(predicted) for predicted in moments]
         none = np.empty(0)
         empty = cls(none, none, np.empty(0, dtype=np.str_), np.empty((0, 2)), np.empty((0, 2, 2)))
-        return cls(
-            *(
-                np.concatenate([getattr(rows, name) for rows in (empty, *each)])
-                for name in ("timestamp", "horizon", "id", "position", "covariance")
-            )
-        )
+        return cls.concatenate([empty, *(cls._of_moment(predicted) for predicted in moments)])
 
     @classmethod
     def _of_moment(cls, predicted: PredictedTracks) -> Self:
@@ -340,11 +395,11 @@ def prediction_writer(path: Path) -> Iterator[Callable[[str, Sequence[PredictedT
         file = io.TextIOWrapper(binary, encoding="utf-8", newline="", write_through=True)
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(PREDICTION_COLUMNS)
-        yield lambda scene, moments: writer.writerows(row for each in moments for row in _rows(scene, each))
+        yield lambda scene, moments: writer.writerows(row for each in moments for row in _prediction_rows(scene, each))
         file.detach()
 
 
-def _rows(scene: str, predicted: PredictedTracks) -> Iterator[list[Any]]:
+def _prediction_rows(scene: str, predicted: PredictedTracks) -> Iterator[list[Any]]:
     names = list(zip(predicted.id.tolist(), predicted.label.tolist(), strict=True))
     for k, horizon in enumerate(predicted.horizons.tolist()):
         covariances = (predicted.position_covariance[k], predicted.velocity_covariance[k])

@@ -78,11 +78,11 @@ def write_kitti_results(
     directory: str | Path,
     dataset: KittiTracking,
     scenes: Iterable[tuple[Scene, Sequence[Tracks]]],
-    image_size: tuple[int, int] = IMAGE_SIZE,
+    table: str = TRACK_TABLE,
 ) -> None:
     """Write the tracks of some sequences, each with one `Tracks` for each of its timestamps, to directory/NNNN.txt.
 
-    All of them together go to directory/tracks.csv as well, in full.
+    All of them together go to directory/`table` as well, in full.
 
     `scenes` may be a generator: the files appear when all is done. Raises `InputError` for a directory that is not
     writable, tracks that do not fit the scene, a size or heading that is unknown, a class KITTI does not have.
@@ -92,11 +92,11 @@ def write_kitti_results(
         def written() -> Iterator[tuple[Scene, Sequence[Tracks]]]:
             for scene, moments in scenes:
                 with error_context(f"{directory}: sequence {scene.name}"):
-                    text = kitti_result_text(scene, moments, dataset.calibration(scene.name), image_size)
+                    text = kitti_result_text(scene, moments, dataset.calibration(scene.name))
                 (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
                 yield scene, moments
 
-        write_tracks(folder / TRACK_TABLE, written())
+        write_tracks(folder / table, written())
 
 
 def write_kitti_labels(

@@ -18,7 +18,6 @@ from data_tools.datasets.kitti.results import (
     write_kitti_labels,
     write_kitti_results,
 )
-from data_tools.datasets.parts import OpenedPart, Parts, file_digest
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
     TRACKING,
@@ -26,12 +25,14 @@ from data_tools.datasets.source import (
     Images,
     Innovations,
     LabelledScenes,
+    OpenedPart,
+    Parts,
     TrackedScenes,
+    file_digest,
     names,
     option,
     tracks_of,
 )
-from data_tools.files.atomic_files import write_zip
 from data_tools.files.input_files import is_url
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
@@ -51,6 +52,7 @@ class KittiSource(DatasetSource):
     tracks = "Folder to write: NNNN.txt in the benchmark's format, tracks.csv with velocities and covariances."
     tracks_example = "results"
     all_tracks = "tracks"
+    submission = "tracks/[0-9]*.txt"
     merged = (f"tracks/{TRACK_TABLE}", f"results/{TRACK_TABLE}")
     dataroot: str = option("Folder that holds training/, or oxts/, calib/ and, for scores, label_02/; or its URL.")
     detections: str | None = option(
@@ -103,23 +105,19 @@ class KittiSource(DatasetSource):
         write_kitti_results(output, dataset, scenes)
 
     def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes) -> None:
-        assert isinstance(dataset, KittiTracking)
-        write_kitti_labels(folder / "label_02", dataset, scenes)
-        self.write_tracks(folder / "results", dataset, tracks_of(scenes))
+        self.write_label_part(folder, Path(TRACK_TABLE).stem, dataset, scenes)
 
     def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
-        self.write_tracks(folder / "tracks", dataset, scenes)
-        (folder / "tracks" / TRACK_TABLE).rename(folder / "tracks" / f"{stem}.csv")
+        assert isinstance(dataset, KittiTracking)
+        write_kitti_results(folder / "tracks", dataset, scenes, f"{stem}.csv")
 
     def write_label_part(self, folder: Path, stem: str, dataset: Dataset, scenes: LabelledScenes) -> None:
-        self.write_labels(folder, dataset, scenes)
-        (folder / "results" / TRACK_TABLE).rename(folder / "results" / f"{stem}.csv")
+        assert isinstance(dataset, KittiTracking)
+        write_kitti_labels(folder / "label_02", dataset, scenes)
+        write_kitti_results(folder / "results", dataset, tracks_of(scenes), f"{stem}.csv")
 
     def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         merge_tables(output / self.merged[0], [output / "tracks" / f"{stem}.csv" for stem in stems])
-
-    def write_submission(self, output: Path) -> Path:
-        return write_zip(output / "submission.zip", sorted((output / self.all_tracks).glob("[0-9]*.txt")))
 
     def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         merge_tables(output / self.merged[1], [output / "results" / f"{stem}.csv" for stem in stems])

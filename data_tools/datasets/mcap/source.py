@@ -7,7 +7,7 @@ The topic is `/saga_fg/tracks`, the frame the one that was tracked in, the times
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -27,9 +27,8 @@ from data_tools.datasets.mcap.dataset import (
 )
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import Recording, definition
-from data_tools.datasets.parts import OpenedPart, Parts, file_digest
 from data_tools.datasets.results import SceneResult, read_table_results, scene_result
-from data_tools.datasets.source import TRACKING, DatasetSource, TrackedScenes, option
+from data_tools.datasets.source import TRACKING, DatasetSource, OpenedPart, Parts, TrackedScenes, file_digest, option
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context
 from saga_fg.errors import InputError
@@ -99,17 +98,15 @@ def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, 
                 )
             parts.append(found)
     n = [len(each.id) for each in parts]
-    boxes = Boxes.concatenate([each.detections.boxes for each in parts])
     none = np.empty((0, 2, 2))
-    return TrackRows(
+    return TrackRows.of(
         np.full(sum(n), scene.name),
         np.repeat([each.stamp / 1e9 for each in parts], n),
         np.concatenate([np.empty(0, dtype="<U1"), *(each.id for each in parts)]),
-        boxes,
+        Boxes.concatenate([each.detections.boxes for each in parts]),
         np.concatenate([np.empty(0), *(each.detections.score for each in parts)]),
         np.concatenate([none, *(each.detections.position_covariance for each in parts)]),
         np.concatenate([none, *(each.velocity_covariance for each in parts)]),
-        np.full(sum(n), np.nan),
     )
 
 
@@ -125,7 +122,7 @@ class McapSource(DatasetSource):
     name = "mcap"
     has_truth = False
     example = "drive.mcap --topic /perception/objects"
-    tracks = "File to write: .mcap for messages of the type that the detections have; a table: .csv, .ndjson, .jsonl."
+    tracks = "File to write: .mcap for messages of the type that the detections have; a table: .csv, .ndjson, .parquet."
     tracks_example = "tracks.mcap"
     recording: list[str] | None = option(
         "MCAP file or bag folder. In parallel: several of them.",
@@ -147,19 +144,9 @@ class McapSource(DatasetSource):
     )
     table: Literal["mcap", "csv", "ndjson"] = option("Format of the results, in parallel.", "mcap", verbs=("track",))
 
-    @property
-    def tracks_suffix(self) -> str:
-        return f".{self.table}"
-
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[McapRecording]:
         yield McapRecording(self._one(), self._options())
-
-    def restricted(self, scenes: Collection[str]) -> Self:
-        return self
-
-    def input_files(self) -> tuple[Path, ...]:
-        return tuple(Path(path) for path in self.recording or ())
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:

@@ -13,21 +13,23 @@ from data_tools.datasets.nuscenes.dataset import NuScenes, NuScenesScans, nuscen
 from data_tools.datasets.nuscenes.results import ResultMeta, merge_tracking_results, write_tracking_results
 from data_tools.datasets.nuscenes.tables import split_scenes
 from data_tools.datasets.nuscenes.writer import merge_label_parts, write_label_part, write_nuscenes_labels
-from data_tools.datasets.parts import HeldScene, OpenedPart, Parts, scene_digests
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
     TRACKING,
     AreaMap,
     DatasetSource,
+    HeldScene,
     Images,
     Innovations,
     LabelledScenes,
+    OpenedPart,
+    Parts,
     TrackedScenes,
     names,
     option,
+    scene_digests,
     tracks_of,
 )
-from data_tools.files.atomic_files import write_zip
 from data_tools.files.input_files import is_url, local_copy, local_tree
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
@@ -46,7 +48,7 @@ class NuScenesSource(DatasetSource):
     tracks = "Official tracking-result JSON to write."
     tracks_example = "tracks.json"
     merged = ("tracks.json", "tracking.json")
-    all_tracks = "tracks.json"
+    all_tracks = submission = "tracks.json"
     dataroot: str = option("Folder that holds the folder of tables, or its URL.")
     detections: list[str] | None = option(
         "Detection-result JSON of a sensor, or its URL; repeatable.", None, metavar="NAME=FILE", required=TRACKING
@@ -55,10 +57,6 @@ class NuScenesSource(DatasetSource):
     split: str | None = option("An official split, or one of splits.json beside the tables.", None)
     scenes: str | None = option("Scene names with commas between them.", None)
 
-    @property
-    def tracks_suffix(self) -> str:
-        return ".json"
-
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[NuScenes]:
         with self._local() as (root, files):
@@ -66,9 +64,6 @@ class NuScenesSource(DatasetSource):
 
     def restricted(self, scenes: Collection[str]) -> Self:
         return replace(self, split=None, scenes=",".join(scenes))
-
-    def input_files(self) -> tuple[Path, ...]:
-        return tuple(Path(place) for place in sensor_locations(self.detections or ()).values() if not is_url(place))
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:
@@ -110,9 +105,6 @@ class NuScenesSource(DatasetSource):
         assert isinstance(dataset, NuScenes)
         parts = (output / "tracks" / f"{stem}.json" for stem in stems)
         merge_tracking_results(output / self.merged[0], parts, dataset.meta)
-
-    def write_submission(self, output: Path) -> Path:
-        return write_zip(output / "submission.zip", [output / self.all_tracks])
 
     def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
         assert isinstance(dataset, NuScenes)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.label_table import LABEL_COLUMNS, read_label_table, write_label_table
+from data_tools.datasets.detection_files import LABEL_COLUMNS, read_tracks, write_label_table
 from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
 from data_tools.datasets.nuscenes.writer import write_nuscenes_labels
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
@@ -47,13 +47,13 @@ LABELS = [labels_at(0.0, [1, 2]), labels_at(0.5, [1], "filled"), labels_at(1.0, 
 def test_a_table_of_labels_comes_back_as_it_was(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"labels{suffix}"
     write_label_table(path, [(scene_of([0.0, 0.5, 1.0]), LABELS)])
-    rows = read_label_table(path)
-    assert rows.tracks.id.tolist() == ["1", "2", "1", "1", "3"]
-    assert rows.tracks.timestamp.tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
+    rows = read_tracks(path)
+    assert rows.id.tolist() == ["1", "2", "1", "1", "3"]
+    assert rows.timestamp.tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
     assert rows.source.tolist() == ["observed", "observed", "filled", "extended", "extended"]
     assert set(rows.quality.tolist()) == {"medium"}
     assert np.isnan(rows.yaw_variance).all()
-    assert np.array_equal(rows.tracks.position_covariance[0], LABELS[0].tracks.position_covariance[0])
+    assert np.array_equal(rows.position_covariance[0], LABELS[0].tracks.position_covariance[0])
 
 
 def test_parquet_holds_the_same_columns(tmp_path: Path) -> None:

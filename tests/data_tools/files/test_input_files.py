@@ -15,7 +15,6 @@ import pytest
 from benchmarks.recordings.landmarks import read_landmark_log
 from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
-from data_tools.datasets.label_table import read_label_table
 from data_tools.datasets.nuscenes import read_tracking_results
 from data_tools.files.input_files import expanded, open_bytes, read_text, unknown_name
 from data_tools.files.readers import open_json, parsed_json
@@ -29,7 +28,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "a.ndjson": read_detections,
     "a.npz": read_detections,
     "tracks.csv": read_tracks,
-    "labels.ndjson": read_label_table,
+    "labels.ndjson": read_tracks,
     "results.json": read_tracking_results,
     "0000.txt": read_kitti_labels,
     "a.g2o": read_g2o,
