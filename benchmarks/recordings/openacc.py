@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
 from data_tools.files.input_files import error_context, unknown_name
-from data_tools.files.readers import NUMBERS, WHOLE, all_of, read_arrow_arrays
+from data_tools.files.readers import NUMBERS, WHOLE, arrow_arrays
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
@@ -48,7 +48,7 @@ def openacc_platoons(root: Path) -> Recordings:
     Raises `InputError` for a folder or a file that is not as above, `MissingExtraError` without pyarrow.
     """
     path = root / FILE
-    found = read_arrow_arrays(path, all_of(path, _COLUMNS), _KINDS, _COLUMNS[:4])
+    found = arrow_arrays(path, _COLUMNS, _KINDS, gaps=_COLUMNS[4:])
     columns = {name: column.astype(_TYPES[_KINDS.get(name, NUMBERS)]) for name, column in found.items()}
     if not len(columns["t"]):
         raise InputError(f"{path}: expected rows, there are none")

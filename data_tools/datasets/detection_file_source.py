@@ -14,7 +14,7 @@ from data_tools.datasets.detection_files import TableImport, TruthFile
 from data_tools.datasets.detection_files.column_names import pairs
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.formats import column_names
-from data_tools.datasets.results import SceneResult, read_judged_results, read_table_results
+from data_tools.datasets.results import SceneResult, read_table_results
 from data_tools.datasets.source import (
     TRACKING,
     ChosenScenes,
@@ -150,7 +150,7 @@ class DetectionFileSource(DatasetSource):
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
         if self.truth is not None:
             with self._true_scenes() as truth:
-                return read_judged_results(result, truth, self.how, self.scenes is not None)
+                return read_table_results(result, truth, self.scenes is not None, self.how, judged=True)
         if self.detections is None:
             return read_table_results(result, None, how=self.how)
         with self.open() as dataset:

@@ -38,58 +38,43 @@ class SceneResult:
 
 
 def read_table_results(
-    path: Path, dataset: Dataset | None, every_scene: bool = False, how: TableImport | None = None
+    path: Path,
+    dataset: Dataset | None,
+    every_scene: bool = False,
+    how: TableImport | None = None,
+    judged: bool = False,
 ) -> dict[str, SceneResult]:
     """A table of tracks in those scenes of a dataset that it has; rows of other scenes are left out.
 
     every_scene  include scenes without a row, in which nothing was found; an empty table always has all scenes
     how          what it takes to understand the table, if saga-fg did not write it
+    judged       these are anybody's tracks beside the ground truth of the dataset: rows at other times are left out,
+                 and the only scene of the one is that of the other
 
     Without a dataset, the scenes are those of the table: their moments are the times of its rows, and the vehicle
     stands amid all tracks. Logs a warning where scenes are left out. Raises `InputError` for a broken table, for one
-    that has none of the scenes, and for times that are no moments of their scene.
+    that has none of the scenes, for times that are no moments of their scene, and for judged tracks where hardly a
+    moment has some near its time.
     """
     rows = read_tracks(path, how, lenient=True)
     there = tuple(dict.fromkeys(rows.scene.tolist()))
     if dataset is None:
         return {name: scene_result(_scene(rows, name), rows, path) for name in there}
-    if dataset.scenes != there and len(there) == len(dataset.scenes) == 1 and not rows.named:
+    if len(there) == len(dataset.scenes) == 1 and (judged or not rows.named):
         rows, there = replace(rows, scene=np.full(len(rows.scene), dataset.scenes[0])), tuple(dataset.scenes)
     if there and not set(there) & set(dataset.scenes):
-        raise InputError(f"{path}: {unknown_name('scene', there[0], dataset.scenes)}")
+        whose = " (scenes of the ground truth)" if judged else ""
+        raise InputError(f"{path}: {unknown_name('scene', there[0], dataset.scenes)}{whose}")
     chosen = [name for name in dataset.scenes if every_scene or not there or name in there]
     if len(chosen) < len(dataset.scenes):
-        log.warning(
-            "%s: has tracks in %d of the %d scenes of the dataset, the others are left out",
-            path,
-            len(chosen),
-            len(dataset.scenes),
-        )
-    return {name: scene_result(dataset.scene(name), rows, path) for name in chosen}
-
-
-def read_judged_results(
-    path: Path, truth: Dataset, how: TableImport | None = None, every_scene: bool = False
-) -> dict[str, SceneResult]:
-    """A table of anybody's tracks at the moments of a dataset with ground truth; rows at other times are left out.
-
-    The only scene of the one is that of the other. Raises `InputError` for a broken table, and where hardly a moment
-    has tracks near its time.
-    """
-    rows = read_tracks(path, how, lenient=True)
-    there = tuple(dict.fromkeys(rows.scene.tolist()))
-    if len(there) == len(truth.scenes) == 1:
-        rows, there = replace(rows, scene=np.full(len(rows.scene), truth.scenes[0])), tuple(truth.scenes)
-    if there and not set(there) & set(truth.scenes):
-        raise InputError(f"{path}: {unknown_name('scene', there[0], truth.scenes)} (scenes of the ground truth)")
-    chosen = [name for name in truth.scenes if every_scene or not there or name in there]
-    if len(chosen) < len(truth.scenes):
-        log.warning("%s: has tracks in %d of the %d scenes with ground truth", path, len(chosen), len(truth.scenes))
+        whose = "scenes with ground truth" if judged else "scenes of the dataset, the others are left out"
+        log.warning("%s: has tracks in %d of the %d %s", path, len(chosen), len(dataset.scenes), whose)
     results = {}
     for name in chosen:
-        scene = truth.scene(name)
-        results[name] = scene_result(scene, _at_moments(rows, scene, path), path)
-    _warn_of_classes(results, path, how or TableImport())
+        scene = dataset.scene(name)
+        results[name] = scene_result(scene, _at_moments(rows, scene, path) if judged else rows, path)
+    if judged:
+        _warn_of_classes(results, path, how or TableImport())
     return results
 
 

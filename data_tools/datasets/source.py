@@ -268,8 +268,8 @@ class DatasetSource(ABC):
 
     def restricted(self, scenes: Collection[str]) -> Self:
         """Recordings of these scenes alone, if `scenes` is an option; a dataset may open more than these."""
-        named = any(each.name == "scenes" for each in fields(self))
-        return replace(self, scenes=",".join(scenes)) if named else self
+        chosen: dict[str, Any] = {each.name: ",".join(scenes) for each in fields(self) if each.name == "scenes"}
+        return replace(self, **chosen)
 
     def input_files(self) -> tuple[Path, ...]:
         """Files that the options name, as FILE or NAME=FILE, which no result may overwrite."""

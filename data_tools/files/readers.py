@@ -10,7 +10,7 @@ words NaN and Infinity in result files (ijson, equally fast, refuses them).
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
@@ -187,33 +187,27 @@ class JsonStream:
 
     def array(self) -> Iterator[Any]:
         """The entries of the array that starts here."""
-        self.take("[")
-        if self.peek() == "]":
-            self.take("]")
-            return
-        while True:
+        for _ in self._entries("[", "]"):
             yield self.value()
-            if self.peek() != ",":
-                break
-            self.take(",")
-        self.take("]")
 
     def members(self) -> Iterator[str]:
         """The keys of the object that starts here; the caller steps over each value before asking for the next key."""
-        self.take("{")
-        if self.peek() == "}":
-            self.take("}")
-            return
-        while True:
+        for _ in self._entries("{", "}"):
             if self.peek() != '"':
                 raise self._fault("expected a key in double quotes")
             key = str(self.value())
             self.take(":")
             yield key
-            if self.peek() != ",":
-                break
-            self.take(",")
-        self.take("}")
+
+    def _entries(self, opening: str, closing: str) -> Iterator[None]:
+        """Stop at the beginning of each entry between two brackets; the caller steps over it."""
+        self.take(opening)
+        if self.peek() != closing:
+            yield
+            while self.peek() == ",":
+                self.take(",")
+                yield
+        self.take(closing)
 
     def end(self) -> None:
         """Check that the text ends here."""
@@ -315,34 +309,53 @@ def _as_doubles(array: NDArray[Any]) -> NDArray[Any]:
 
 SUFFIXES = (".parquet", ".feather", ".arrow")
 NUMBERS, WHOLE = "iuf", "iu"  # kinds of NumPy's types
-Choose = Callable[[list[str]], Sequence[str]]
 
 
-def read_arrow_columns(path: Path, choose: Choose) -> dict[str, Any]:
+def arrow_names(path: Path) -> list[str]:
     """The columns of a Parquet file (.parquet), or a Feather or Arrow file (other suffixes).
-
-    A column of numbers that are all there is an array (N,); any other a list of N values, dates and times as text of
-    ISO 8601, None where there is no value.
-
-    choose  the columns to read from the names of all; it may raise `InputError`, as `all_of` does
 
     Raises `InputError` for a file that is not readable or has two columns of one name, `MissingExtraError` without
     pyarrow.
     """
-    return {name: column for name, column, _ in _read(path, choose, False)}
+    if find_spec("pyarrow") is None:
+        raise MissingExtraError(f"{path}: {_kind(path)} needs pyarrow: pip install 'saga-fg[parquet]'")
+    (names,) = isolated(f"expected a readable {_kind(path)} file", _names, path)
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: expected every column once, got {', '.join(name[:40] for name in names)[:500]}")
+    return list(names)
 
 
-def read_arrow_arrays(path: Path, choose: Choose, kinds: Mapping[str, str], filled: Sequence[str]) -> dict[str, Any]:
-    """The columns of such a file as arrays (N,), NaN or None where there is no value.
+def arrow_columns(path: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Some columns of such a file.
 
-    kinds   kinds of NumPy's types that a column may have, `NUMBERS` for those not named
-    filled  columns that have a value in every row
-
-    Raises as `read_arrow_columns` does, and `InputError` naming the file and the column.
+    A column of numbers that are all there is an array (N,); any other a list of N values, dates and times as text of
+    ISO 8601, None where there is no value. Raises `InputError` for a file that is not readable.
     """
-    columns = {}
-    for name, column, missing in _read(path, choose, True):
-        if missing and name in filled:
+    return {name: column for name, column, _ in _read(path, names, False)}
+
+
+def arrow_arrays(
+    path: Path,
+    columns: Sequence[str],
+    kinds: Mapping[str, str],
+    gaps: Collection[str] = (),
+    optional: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Some columns of such a file as arrays (N,), NaN or None where there is no value.
+
+    kinds     kinds of NumPy's types that a column may have, `NUMBERS` for those not named
+    gaps      those of the columns that need not have a value in every row
+    optional  further columns, which may be missing and may have gaps
+
+    Raises as `arrow_names` does, and `InputError` naming the file and the column.
+    """
+    there = arrow_names(path)
+    for name in columns:
+        if name not in there:
+            raise InputError(f"{path}: {name}: expected this column, the file has {', '.join(there)[:200]}")
+    found = {}
+    for name, column, missing in _read(path, [*columns, *(name for name in optional if name in there)], True):
+        if missing and name not in (*gaps, *optional):
             raise InputError(f"{path}: {name}: expected a value in every row")
         allowed = kinds.get(name, NUMBERS)
         if column.dtype.kind not in allowed:
@@ -352,32 +365,17 @@ def read_arrow_arrays(path: Path, choose: Choose, kinds: Mapping[str, str], fill
             row = next((k for k, value in enumerate(column) if not isinstance(value, str | None)), None)
             if row is not None:
                 raise InputError(f"{path}: {name}: row {row + 1}: expected text, got {str(column[row])[:40]!r}")
-        columns[name] = column
-    return columns
+        found[name] = column
+    return found
 
 
-def all_of(path: Path, columns: Sequence[str]) -> Choose:
-    """Choose these columns; raises `InputError` naming the first that is not there."""
-
-    def choose(there: list[str]) -> Sequence[str]:
-        for name in columns:
-            if name not in there:
-                raise InputError(f"{path}: {name}: expected this column, the file has {', '.join(there)[:200]}")
-        return columns
-
-    return choose
+def _kind(path: Path) -> str:
+    return "Parquet" if path.suffix.lower() == ".parquet" else "Feather"
 
 
-def _read(path: Path, choose: Choose, arrays: bool) -> Iterator[tuple[str, Any, int]]:
-    """Names, values and numbers of missing values of the chosen columns."""
-    kind = "Parquet" if path.suffix.lower() == ".parquet" else "Feather"
-    if find_spec("pyarrow") is None:
-        raise MissingExtraError(f"{path}: {kind} needs pyarrow: pip install 'saga-fg[parquet]'")
-    problem = f"expected a readable {kind} file"
-    (names,) = isolated(problem, _names, path)
-    if len(set(names)) != len(names):
-        raise InputError(f"{path}: expected every column once, got {', '.join(name[:40] for name in names)[:500]}")
-    return isolated(problem, _columns, path, list(choose(names)), arrays)
+def _read(path: Path, names: Sequence[str], arrays: bool) -> Iterator[tuple[str, Any, int]]:
+    """Names, values and numbers of missing values of the columns."""
+    return isolated(f"expected a readable {_kind(path)} file", _columns, path, list(names), arrays)
 
 
 def _names(path: Path) -> Iterator[list[str]]:

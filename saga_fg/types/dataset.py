@@ -9,7 +9,7 @@ works on `Scene`s alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
@@ -161,15 +161,3 @@ class LabelledObjects:
             return np.full(self.position.shape[1:], np.nan)
         share = (time - self.time[after - 1]) / (self.time[after] - self.time[after - 1])
         return np.asarray((1 - share) * self.position[after - 1] + share * self.position[after])
-
-    def about_their_mean(self) -> Self:
-        """With positions about their mean, to the metre."""
-        known = np.isfinite(self.position[..., 0])
-        origin = np.round(self.position[known].mean(axis=0)) if known.any() else np.zeros(2)
-        return replace(self, position=self.position - origin)
-
-    def until(self, time: float) -> Self:
-        """The moments up to a time after the first, s."""
-        kept = self.time <= self.time[0] + time
-        columns = {name: getattr(self, name)[kept] for name in ("time", "position", "heading", "velocity")}
-        return replace(self, **columns)

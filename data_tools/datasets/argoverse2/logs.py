@@ -46,7 +46,7 @@ from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.detection_files import DetectionFile
 from data_tools.datasets.source import AreaMap, Kind, map_points
 from data_tools.files.input_files import error_context, read_bytes, unknown_name
-from data_tools.files.readers import WHOLE, all_of, parsed_json, read_arrow_arrays
+from data_tools.files.readers import WHOLE, arrow_arrays, parsed_json
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, checked
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
@@ -120,7 +120,7 @@ class ArgoverseLogs:
         if name not in self._scenes:
             raise InputError(f"{self._root}: {unknown_name('log', name, self._scenes)}")
         path = self._root / name / "annotations.feather"
-        rows = columns_of(path, _ANNOTATIONS)
+        rows = arrow_arrays(path, _ANNOTATIONS, KINDS)
         stamp: IntArray = rows["timestamp_ns"]
         stamps, moment = np.unique(stamp, return_inverse=True)
         poses = self.poses(name, stamps)
@@ -144,7 +144,7 @@ class ArgoverseLogs:
     def poses(self, name: str, stamps: IntArray) -> FloatArray:
         """city_T_ego (K, 4, 4) at some times, ns. Raises `InputError` for one without a pose."""
         path = self._root / name / "city_SE3_egovehicle.feather"
-        rows = columns_of(path, ("timestamp_ns", *POSE))
+        rows = arrow_arrays(path, ("timestamp_ns", *POSE), KINDS)
         order = np.argsort(rows["timestamp_ns"])
         known = rows["timestamp_ns"][order]
         at = np.minimum(np.searchsorted(known, stamps), max(len(known) - 1, 0))
@@ -169,15 +169,6 @@ def transforms(rows: dict[str, Any]) -> FloatArray:
     T[:, :3, :3] = quaternion_rotation(checked_quaternions("qw qx qy qz", quaternion))
     T[:, :3, 3] = checked("tx_m ty_m tz_m", translation, (len(T), 3))
     return T
-
-
-def columns_of(path: Path, names: tuple[str, ...], may_lack: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The named columns of a Feather file as arrays, and those of `may_lack` that it has."""
-
-    def choose(there: list[str]) -> list[str]:
-        return [*all_of(path, names)(there), *(name for name in may_lack if name in there)]
-
-    return read_arrow_arrays(path, choose, KINDS, names)
 
 
 BORDERS = ("left_lane_boundary", "right_lane_boundary")
@@ -249,7 +240,7 @@ class DetectedLogs:
 
     def __init__(self, logs: ArgoverseLogs, path: str | Path) -> None:
         self._logs, self._path = logs, Path(path)
-        self._rows = columns_of(self._path, COLUMNS)
+        self._rows = arrow_arrays(self._path, COLUMNS, KINDS)
         self._log: StrArray = self._rows["log_id"].astype(np.str_)
         names = tuple(dict.fromkeys(self._log.tolist()))
         self.scenes = tuple(name for name in logs.scenes if name in set(names))

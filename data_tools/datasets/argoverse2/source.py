@@ -30,6 +30,7 @@ from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.argoverse2.logs import (
     CLASSES,
     FILES,
+    KINDS,
     POSE,
     SIZE,
     AnnotatedLogs,
@@ -38,7 +39,6 @@ from data_tools.datasets.argoverse2.logs import (
     DetectedLogs,
     argoverse_maps,
     class_names,
-    columns_of,
     is_feather,
     transforms,
 )
@@ -47,6 +47,7 @@ from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.datasets.source import AreaMap, ChosenScenes, TrackedScenes, option
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context, is_url, local_copy, local_tree
+from data_tools.files.readers import arrow_arrays
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import (
@@ -112,7 +113,7 @@ def merge_feather_tracks(path: Path, parts: Iterable[Path]) -> None:
 
 def read_feather_tracks(path: Path, scenes: Mapping[str, Scene]) -> TrackRows:
     """Tracks of some logs, in world coordinates. Raises `InputError` for a missing column and an unknown time."""
-    rows = columns_of(path, COLUMNS, may_lack=_VELOCITY)
+    rows = arrow_arrays(path, COLUMNS, KINDS, optional=_VELOCITY)
     log: StrArray = rows["log_id"].astype(np.str_)
     kept = np.flatnonzero(np.isin(log, list(scenes)))
     rows, log = {name: values[kept] for name, values in rows.items()}, log[kept]
@@ -274,9 +275,7 @@ class ArgoverseSource(AnnotatedSource):
             )
         if result.suffix != ".feather":
             return super().read_results(result)
-        from data_tools.datasets.argoverse2.logs import columns_of
-
-        there = dict.fromkeys(columns_of(result, ("log_id",))["log_id"].tolist())
+        there = dict.fromkeys(arrow_arrays(result, ("log_id",), KINDS)["log_id"].tolist())
         with self.open(truth=True) as dataset:
             names = [name for name in dataset.scenes if self.scenes is not None or not there or name in there]
             if not names:

@@ -17,7 +17,7 @@ import numpy as np
 from data_tools.datasets.detection_files.column_names import Clock, Columns, TableImport, meaning, understood
 from data_tools.datasets.detection_files.columns import COLUMNS, POSE, REQUIRED, RawTable, Values, clock_of
 from data_tools.files.input_files import open_bytes, open_text
-from data_tools.files.readers import SUFFIXES, load_archive, parsed_json, read_arrow_columns
+from data_tools.files.readers import SUFFIXES, arrow_columns, arrow_names, load_archive, parsed_json
 from saga_fg.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -115,8 +115,7 @@ def _tables(reading: _Reading) -> Iterator[RawTable]:
         ".csv": _read_csv,
         ".ndjson": _read_ndjson,
         ".jsonl": _read_ndjson,
-        ".npz": _read_npz,
-        **dict.fromkeys(SUFFIXES, _read_arrow),
+        **dict.fromkeys((".npz", *SUFFIXES), _read_columns),
     }
     path = reading.path
     if path.suffix.lower() not in readers:
@@ -262,32 +261,23 @@ def _line(lines: list[int], row: int) -> str:
     return f"line {lines[row]}"
 
 
-def _read_npz(reading: _Reading) -> Iterator[RawTable]:
+def _read_columns(reading: _Reading) -> Iterator[RawTable]:
+    """The one part of a file that is no text."""
     path = reading.path
-    names, _ = load_archive(path, ())
+    archive = path.suffix.lower() == ".npz"
+    names = load_archive(path, ())[0] if archive else arrow_names(path)
     found = reading.understood(names)
-    _, arrays = load_archive(path, found.names.values())
-    columns: dict[str, Values] = {ours: arrays[theirs] for ours, theirs in found.names.items()}
+    wanted = list(found.names.values())
+    theirs = load_archive(path, wanted)[1] if archive else arrow_columns(path, wanted)
+    columns: dict[str, Values] = {ours: theirs[name] for ours, name in found.names.items()}
     first = "timestamp" if "timestamp" in columns else next(iter(columns))
-    length = len(columns[first]) if np.ndim(columns[first]) == 1 else 0
-    for name, column in columns.items():
-        if np.shape(column) != (length,):
-            raise InputError(f"{path}: {name}: expected shape ({length},) as {first} has, got {np.shape(column)}")
+    length = 0 if archive and np.ndim(columns[first]) != 1 else len(columns[first])
+    for ours, column in columns.items():
+        if archive and np.shape(column) != (length,):
+            raise InputError(f"{path}: {ours}: expected shape ({length},) as {first} has, got {np.shape(column)}")
+        if ours in NAMED and not archive:
+            columns[ours] = _names(column)
     yield RawTable(path, columns, length, _row, False, found, reading.way(names))
-
-
-def _read_arrow(reading: _Reading) -> Iterator[RawTable]:
-    found = Columns()
-
-    def choose(names: list[str]) -> list[str]:
-        nonlocal found
-        found = reading.understood(names)
-        return list(found.names.values())
-
-    theirs = read_arrow_columns(reading.path, choose)
-    columns = {ours: _names(theirs[name]) if ours in NAMED else theirs[name] for ours, name in found.names.items()}
-    length = len(next(iter(columns.values())))
-    yield RawTable(reading.path, columns, length, _row, False, found, reading.way(list(found.names)))
 
 
 def _names(values: Values) -> Values:

@@ -206,9 +206,9 @@ class TrackRows(Columns):
         """Rows of tracks of which no more is known."""
         n = len(scene)
         unknown, whole = np.full((n, 2, 2), np.nan), np.full(n, np.nan)
-        spreads = [unknown if P is None else P for P in (position_covariance, velocity_covariance)]
-        names = np.full(n, "observed"), np.full(n, "low")
-        return cls(scene, timestamp, id_, boxes, score, *spreads, whole, whole, *names)
+        P = unknown if position_covariance is None else position_covariance
+        V = unknown if velocity_covariance is None else velocity_covariance
+        return cls(scene, timestamp, id_, boxes, score, P, V, whole, whole, np.full(n, "observed"), np.full(n, "low"))
 
 
 def read_tracks(path: str | Path, how: TableImport | None = None, lenient: bool = False) -> TrackRows:

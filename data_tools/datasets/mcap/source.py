@@ -72,19 +72,16 @@ def _writer(file: BinaryIO, type_: str) -> tuple[Callable[[Any, int], None], Cal
     return lambda message, time: ros.write_message(TOPIC, schema, message, time, time), ros.finish
 
 
-def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, str], topic: str = TOPIC) -> TrackRows:
-    """Tracks of one scene, of this or another tracker.
+def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, str]) -> TrackRows:
+    """Tracks of one scene, of this or another tracker: of our topic or, where it is missing, the only one with objects.
 
     Raises `InputError` naming file, topic, message and field; and for tracks in another frame than the scene's.
-
-    topic  the one that is read; where it is missing, the only one that holds objects
     """
     recording = Recording(path)
     fit = [each.name for each in recording.topics.values() if each.type in OBJECT_TYPES]
-    if topic not in fit:
-        if len(fit) != 1:
-            raise InputError(f"{path}: expected a topic {topic} with tracks, there are {', '.join(fit) or 'none'}")
-        topic = fit[0]
+    if TOPIC not in fit and len(fit) != 1:
+        raise InputError(f"{path}: expected a topic {TOPIC} with tracks, there are {', '.join(fit) or 'none'}")
+    topic = TOPIC if TOPIC in fit else fit[0]
     parts: list[MessageObjects] = []
     for logged in recorded_messages(recording, [topic]):
         with error_context(f"{path}: {topic}: message {logged.number}"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.detection_files import TableImport, read_detections
-from data_tools.files.readers import all_of, read_arrow_columns
+from data_tools.files.readers import arrow_columns
 from saga_fg.errors import InputError
 
 pa = pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
@@ -59,7 +59,7 @@ def test_columns_have_their_values_and_dates_are_text(tmp_path: Path) -> None:
         ("s", pa.array(["a", "b"])),
     ]
     path = write(tmp_path / "a.parquet", columns)
-    found = read_arrow_columns(path, all_of(path, ("s", "day", "x", "n")))
+    found = arrow_columns(path, ("s", "day", "x", "n"))
     np.testing.assert_array_equal(found.pop("x"), X)
     assert found == {"s": ["a", "b"], "day": ["2024-05-01", None], "n": [1, None]}
 

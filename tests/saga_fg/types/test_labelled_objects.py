@@ -28,9 +28,6 @@ def test_the_table_has_all_objects_at_all_moments():
     assert objects.position[:, 1, 0].tolist() == [0, 1, 2, 3]
     assert np.isnan(objects.position[1:3, 0]).all()
     assert np.isnan(objects.heading).all()
-    assert len(objects.until(1.0)) == 3
-    known = np.isfinite(objects.position[..., 0])
-    assert np.abs(objects.about_their_mean().position[known].mean(axis=0)).max() <= 0.5
 
 
 def test_places_between_labels_are_on_a_line_where_these_are_near():
