@@ -54,12 +54,8 @@ def test_ground_truth(root: Path) -> None:
     assert np.isnan(truth[2].boxes.velocity[1]).all()
 
 
-def test_without_detections_there_are_no_frames(root: Path) -> None:
-    assert len(KittiTracking(root).scene("0007").frames) == 0
-
-
-def test_root_may_be_the_training_folder(root: Path) -> None:
-    assert KittiTracking(root / "training").scenes == ("0007",)
+def test_without_detections_there_are_no_frames_and_the_root_may_be_the_training_folder(root: Path) -> None:
+    assert len(KittiTracking(root / "training").scene("0007").frames) == 0
 
 
 def test_class_without_a_file_is_empty_and_said(root: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -77,14 +73,7 @@ def test_unknown_sequence_suggests_the_nearest(root: Path) -> None:
         KittiTracking(root).scene("0001")
 
 
-@pytest.mark.parametrize("folder", ["calib", "label_02"])
-def test_missing_file(root: Path, folder: str) -> None:
-    (root / "training" / folder / "0007.txt").unlink()
-    with pytest.raises(InputError, match=rf"{folder}/0007\.txt: cannot be read: No such file"):
-        KittiTracking(root, ground_truth=True).scene("0007")
-
-
-def test_missing_folders(root: Path) -> None:
+def test_missing_files_and_folders(root: Path) -> None:
     with pytest.raises(InputError, match="oxts: expected GPS/IMU records"):
         KittiTracking(root / "found")
     with pytest.raises(InputError, match=r"nowhere: expected a folder .* there is no such folder"):
@@ -94,6 +83,10 @@ def test_missing_folders(root: Path) -> None:
     (root / "empty").mkdir()
     with pytest.raises(InputError, match=r"expected Pedestrian/0007\.txt or Car/0007\.txt or Cyclist/0007\.txt"):
         KittiTracking(root, root / "empty").scene("0007")
+    for folder in ("label_02", "calib"):
+        (root / "training" / folder / "0007.txt").unlink()
+        with pytest.raises(InputError, match=rf"{folder}/0007\.txt: cannot be read: No such file"):
+            KittiTracking(root, ground_truth=True).scene("0007")
 
 
 CAR = "0,2,500,150,600,250,8.5,1.5,1.6,4,2,1.75,10,-1.5,-1.5"

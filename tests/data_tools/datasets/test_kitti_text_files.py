@@ -27,20 +27,17 @@ def test_calibration_chain(tmp_path: Path) -> None:
     assert calibration.projection.shape == (3, 4)
 
 
-@pytest.mark.parametrize(
-    "renamed",
-    [
+def test_both_spellings_of_the_keys(tmp_path: Path) -> None:
+    plain = read_calibration(write(tmp_path / "a.txt", calibration_text()))
+    for renamed in (
         {"R_rect": "R_rect:", "Tr_velo_cam": "Tr_velo_cam:", "Tr_imu_velo": "Tr_imu_velo:", "P2:": "P2"},
         {"R_rect": "R0_rect:", "Tr_velo_cam": "Tr_velo_to_cam:", "Tr_imu_velo": "Tr_imu_to_velo:"},
-    ],
-)
-def test_both_spellings_of_the_keys(tmp_path: Path, renamed: dict[str, str]) -> None:
-    text = calibration_text()
-    for old, new in renamed.items():
-        text = text.replace(f"{old} ", f"{new} ")
-    other = read_calibration(write(tmp_path / "b.txt", text))
-    plain = read_calibration(write(tmp_path / "a.txt", calibration_text()))
-    np.testing.assert_array_equal(other.camera_T_imu, plain.camera_T_imu)
+    ):
+        text = calibration_text()
+        for old, new in renamed.items():
+            text = text.replace(f"{old} ", f"{new} ")
+        other = read_calibration(write(tmp_path / "b.txt", text))
+        np.testing.assert_array_equal(other.camera_T_imu, plain.camera_T_imu)
 
 
 def test_rotations_are_made_exact(tmp_path: Path) -> None:
@@ -56,7 +53,6 @@ BROKEN_CALIBRATIONS = [
     (calibration_text().replace("700 180", "700 x"), r"line 2: P2: expected 12 numbers: could not convert"),
     (calibration_text(R_rect=[2, 0, 0, 0, 2, 0, 0, 0, 2]), r"line 3: R_rect: expected a rotation"),
     (calibration_text(R_rect=[1, 0, 0, 0, 1, 0, 0, 0, -1]), r"line 3: R_rect: expected a rotation"),
-    (calibration_text(R_rect=[float("nan")] * 9), r"line 3: R_rect: expected 9 finite numbers"),
 ]
 
 
@@ -88,7 +84,6 @@ BROKEN_POSES = [
     (oxts_line() + "\n" + oxts_line().replace("49.0", "149.0"), r"line 2: latitude: expected degrees within 85 of 0"),
     (oxts_line().replace("8.0", "888.0"), r"line 1: longitude: expected degrees within 180"),
     (oxts_line().replace("100.0", "nan"), r"line 1: altitude: expected a finite number, got 'nan'"),
-    (oxts_line().replace("100.0", "high"), r"line 1: altitude: expected a finite number, got 'high'"),
     ("", "expected a record per frame, the file is empty"),
 ]
 
@@ -116,11 +111,8 @@ def test_labels(tmp_path: Path) -> None:
     assert objects.select(has_box(objects)).type.tolist() == ["Car", "Car", "Car", "Person_sitting"]
 
 
-def test_results_have_a_score(tmp_path: Path) -> None:
+def test_results_have_a_score_and_an_empty_file_holds_none(tmp_path: Path) -> None:
     assert read_kitti_labels(write(tmp_path / "r.txt", LABELS[1] + " 8.5\n\n")).score.tolist() == [8.5]
-
-
-def test_empty_file_holds_no_objects(tmp_path: Path) -> None:
     assert len(read_kitti_labels(write(tmp_path / "l.txt", ""))) == 0
 
 
@@ -132,9 +124,7 @@ BROKEN_LABELS = [
     (CAR.replace("0 4 Car", "-1 4 Car"), r"line 1: frame: expected a whole number from 0 to \d+, got -1"),
     (CAR.replace("0 4 Car", "0.5 4 Car"), r"line 1: frame: expected a whole number .*, got 0\.5"),
     (CAR.replace("0 4 Car", "0 1e300 Car"), r"line 1: id: expected a whole number .*, got 1e300"),
-    (CAR.replace("0 4 Car", "x 4 Car"), r"line 1: frame: expected a finite number, got 'x'"),
     (CAR.replace("2 1.75 10", "2 nan 10"), r"line 1: y: expected a finite number, got 'nan'"),
-    (CAR.replace("2 1.75 10", "2 1.75 inf"), r"line 1: z: expected a finite number, got 'inf'"),
     (
         CAR.replace("1.5 1.6 4", "1.5 -1.6 4"),
         r"line 1: h w l: expected a positive size in m, got \[1\.5, -1\.6, 4\.0\]",
@@ -147,11 +137,3 @@ def test_broken_labels(tmp_path: Path, subtests: pytest.Subtests) -> None:
     for text, message in BROKEN_LABELS:
         with subtests.test(message), pytest.raises(InputError, match=rf"l\.txt: {message}"):
             read_kitti_labels(write(tmp_path / "l.txt", text))
-
-
-def test_file_that_is_missing_or_no_text(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.txt: cannot be read: No such file"):
-        read_kitti_labels(tmp_path / "none.txt")
-    (tmp_path / "l.txt").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match=r"l\.txt: expected text"):
-        read_kitti_labels(tmp_path / "l.txt")

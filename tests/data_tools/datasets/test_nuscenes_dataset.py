@@ -55,14 +55,13 @@ def test_frames_hold_the_detections_of_each_sample(tmp_path: Path) -> None:
     assert scene.frames[2].coordinates == "world"
 
 
-@pytest.mark.parametrize("velocity", [None, [float("nan")] * 2, "absent"])
-def test_velocity_may_be_unknown(tmp_path: Path, velocity: Any) -> None:
+def test_velocity_may_be_unknown(tmp_path: Path) -> None:
     found = results()
-    found["a0"][0]["velocity"] = velocity
-    if velocity == "absent":
-        del found["a0"][0]["velocity"]
-    scene = dataset(tmp_path, found=found).scene("scene-0103")
-    assert np.isnan(scene.frames[0].detections.boxes.velocity).all()
+    for velocity in ({"velocity": None}, {"velocity": [float("nan")] * 2}, {}):
+        found["a0"][0].pop("velocity", None)
+        found["a0"][0] |= velocity
+        scene = dataset(tmp_path, found=found).scene("scene-0103")
+        assert np.isnan(scene.frames[0].detections.boxes.velocity).all()
 
 
 def test_two_sensors_speak_at_each_sample(tmp_path: Path) -> None:
@@ -117,15 +116,6 @@ def test_no_velocity_over_a_long_gap(tmp_path: Path) -> None:
     assert known == [[True, False], [False], [False, False]]
 
 
-def test_scenes_default_to_all_of_the_tables(tmp_path: Path) -> None:
-    assert dataset(tmp_path, scenes=None).scenes == ("scene-0103", "scene-0061")
-
-
-def test_scene_without_boxes_in_every_frame_is_fine(tmp_path: Path) -> None:
-    scene = dataset(tmp_path, found={"a0": [], "a1": [], "a2": []}).scene("scene-0103")
-    assert [len(frame) for frame in scene.frames] == [0, 0, 0]
-
-
 # Broken tables: what is changed, and the one line that says so.
 
 
@@ -147,7 +137,6 @@ BROKEN_TABLES = [
     (change("sample", 1, timestamp=START), r"sample\.json: record a1: timestamp: .* time repeats at"),
     (change("sample", 2, timestamp=START - 1), r"sample\.json: record a2: timestamp: .* time runs backwards at"),
     (change("sample", 1, timestamp="x"), r"record a1: timestamp: expected a whole number of microseconds, got 'x'"),
-    (change("sample", 1, timestamp=10**400), r"record a1: timestamp: expected a whole number"),
     (change("sample", 1, token="a0"), r"sample\.json: record a0: expected every token once, it occurs again"),
     (change("sample", 1, next="zz"), r"sample\.json: scene scene-0103: expected a sample 'zz', there is none"),
     (change("sample", 1, next="a0"), r"sample\.json: scene scene-0103: expected 3 samples, the chain goes on"),
@@ -156,17 +145,14 @@ BROKEN_TABLES = [
     (change("scene", 0, name="scene-0061"), r"scene\.json: name: expected unique scene names, got 'scene-0061'"),
     (change("scene", 0, nbr_samples="3"), r"scene\.json: scene scene-0103: nbr_samples: expected a number, got '3'"),
     (drop("scene", 0, "name"), r"scene\.json: record 0 \(scene-0103\): field 'name' is missing"),
-    (drop("sample", 1, "timestamp"), r"sample\.json: record 1 \(a1\): field 'timestamp' is missing"),
     (change("sensor", 0, channel="TOP"), r"sample_data\.json: sample a\d: expected a LIDAR_TOP keyframe"),
     (drop("ego_pose", 3), r"ego_pose\.json: expected pose 'p-a1-0' of sample a1, there is none"),
     (change("ego_pose", 3, rotation=[1, 1, 0, 0]), r"ego_pose\.json: record p-a1-0: rotation\[0\]: expected a unit"),
-    (change("ego_pose", 3, rotation=[1, 0]), r"ego_pose\.json: record p-a1-0: rotation: expected shape"),
     (change("ego_pose", 3, translation=["x"]), r"ego_pose\.json: record p-a1-0: translation: expected three numbers"),
     (change("ego_pose", 3, translation=[1, float("nan"), 0]), r"ego_pose\.json: record p-a1-0: pose\[1, 3\]: expec"),
     (change("instance", 0, category_token="zz"), r"instance\.json: record i-car: expected a category, 'zz' is none"),
     (change("sample_annotation", 0, instance_token="zz"), r"sample a1: instance_token: expected an instance, 'zz'"),
     (change("sample_annotation", 0, size=[1, 2]), r"sample a1, instance i-car: expected 3, 3 and 4 numbers"),
-    (change("sample_annotation", 0, size=[1, 2, "x"]), r"sample a1, instance i-car: expected 3, 3 and 4 numbers"),
     (change("sample_annotation", 0, size=[1, 0, 1]), r"scene scene-0103: size\[0\]: expected positive"),
     (change("sample_annotation", 0, rotation=[2, 0, 0, 0]), r"scene scene-0103: rotation\[0\]: expected a unit quat"),
     (change("sample_annotation", 0, sample_token="a0"), r"sample a0: id: expected unique object ids"),
@@ -183,42 +169,28 @@ def test_broken_table(tmp_path: Path, subtests: pytest.Subtests) -> None:
             assert "\n" not in str(caught.value)
 
 
-def test_missing_table(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_tables_that_are_missing_cut_off_or_no_tables(tmp_path: Path, subtests: pytest.Subtests) -> None:
     for table in list(tables()):
-        with subtests.test(table=table):
-            write_tables(tmp_path)
-            (tmp_path / "v1.0-mini" / f"{table}.json").unlink()
-            with pytest.raises(InputError, match=rf"v1\.0-mini/{table}\.json: missing table '{table}'"):
-                NuScenes(tmp_path, "v1.0-mini", {}, ground_truth=True)
-
-
-def test_truncated_table(tmp_path: Path, subtests: pytest.Subtests) -> None:
-    for table in ["scene", "sample", "ego_pose", "sample_data"]:
         with subtests.test(table=table):
             write_tables(tmp_path)
             path = tmp_path / "v1.0-mini" / f"{table}.json"
             path.write_text(path.read_text()[:-20])
             with pytest.raises(InputError, match=rf"{table}\.json: character \d+: "):
-                NuScenes(tmp_path, "v1.0-mini", {})
-
-
-def test_table_that_is_no_list_of_objects(tmp_path: Path) -> None:
-    write_tables(tmp_path)
+                NuScenes(tmp_path, "v1.0-mini", {}, ground_truth=True)
+            path.unlink()
+            with pytest.raises(InputError, match=rf"v1\.0-mini/{table}\.json: missing table '{table}'"):
+                NuScenes(tmp_path, "v1.0-mini", {}, ground_truth=True)
     (tmp_path / "v1.0-mini" / "scene.json").write_text("[7]")
     with pytest.raises(InputError, match=r"scene\.json: record 0: expected an object with fields name, "):
         NuScenes(tmp_path, "v1.0-mini", {})
+    with pytest.raises(InputError, match=r"v1\.0-trainval: expected the folder .*versions there: v1\.0-mini"):
+        NuScenes(tmp_path, "v1.0-trainval", {})
 
 
 def test_annotations_are_read_only_when_asked_for(tmp_path: Path) -> None:
     write_tables(tmp_path)
     (tmp_path / "v1.0-mini" / "sample_annotation.json").unlink()
     assert NuScenes(tmp_path, "v1.0-mini", {}).scene("scene-0103").ground_truth is None
-
-
-def test_wrong_version_names_those_present(tmp_path: Path) -> None:
-    write_tables(tmp_path)
-    with pytest.raises(InputError, match=r"v1\.0-trainval: expected the folder .*versions there: v1\.0-mini"):
-        NuScenes(tmp_path, "v1.0-trainval", {})
 
 
 def test_unknown_scene_suggests_the_nearest(tmp_path: Path) -> None:
@@ -232,17 +204,11 @@ def test_unknown_scene_suggests_the_nearest(tmp_path: Path) -> None:
 
 BROKEN_BOXES = [
     ({"translation": [1, float("nan"), 0]}, r"translation: expected three finite numbers in m, got \[1\.0, nan,"),
-    ({"translation": [1, float("inf"), 0]}, r"translation: expected three finite numbers in m, got \[1\.0, inf,"),
     ({"translation": [1, 2]}, r"translation: expected 3 numbers, got '\[1, 2\]'"),
-    ({"translation": "here"}, r"translation: expected 3 numbers, got 'here'"),
     ({"size": [2, -4, 1]}, r"size: expected positive width, length, height in m, got \[2\.0, -4\.0, 1\.0\]"),
-    ({"size": [2, 0, 1]}, r"size: expected positive"),
     ({"size": [2, None, 1]}, r"size: expected 3 numbers"),
-    ({"size": [2, float("nan"), 1]}, r"size: expected positive"),
     ({"rotation": [1, 1, 0, 0]}, r"rotation: expected a unit quaternion \(w, x, y, z\), got \[1\.0, 1\.0, 0"),
-    ({"rotation": [float("nan"), 0, 0, 0]}, r"rotation: expected a unit quaternion"),
     ({"velocity": [float("inf"), 0]}, r"velocity: expected finite numbers, or NaN for unknown"),
-    ({"velocity": [1]}, r"velocity: expected 2 numbers"),
     ({"detection_score": float("nan")}, r"detection_score: expected a finite number, got nan"),
     ({"detection_score": "high"}, r"detection_score: expected a number, got 'high'"),
     ({"detection_name": "cra"}, r"detection_name: unknown class 'cra'; did you mean 'car'"),
@@ -258,9 +224,6 @@ def test_broken_box_names_file_sample_box_and_field(tmp_path: Path, subtests: py
             with pytest.raises(InputError, match=rf"found\.json: sample a2: box 1: {message}") as caught:
                 dataset(tmp_path, found=found)
             assert "\n" not in str(caught.value)
-
-
-def test_box_without_a_field(tmp_path: Path, subtests: pytest.Subtests) -> None:
     for field in ["translation", "size", "rotation", "detection_name", "detection_score"]:
         with subtests.test(field=field):
             found = results()
@@ -296,12 +259,6 @@ def test_broken_result_file(tmp_path: Path, subtests: pytest.Subtests) -> None:
             path.write_text(text)
             with pytest.raises(InputError, match=rf"found\.json: {message}"):
                 NuScenes(tmp_path, "v1.0-mini", {"lidar": path})
-
-
-def test_missing_detection_file(tmp_path: Path) -> None:
-    write_tables(tmp_path)
-    with pytest.raises(InputError, match=r"none\.json: cannot be read: No such file"):
-        NuScenes(tmp_path, "v1.0-mini", {"lidar": tmp_path / "none.json"})
 
 
 def test_scene_that_a_sensor_never_saw(tmp_path: Path) -> None:

@@ -65,18 +65,18 @@ def test_usual_names_and_units_at_their_ends_are_understood(tmp_path: Path, suff
     assert np.isnan(sign.yaw)
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_classes_are_renamed_and_left_out_and_their_frames_stay(tmp_path: Path, suffix: str) -> None:
+def test_classes_are_renamed_and_left_out_and_their_frames_stay(tmp_path: Path) -> None:
     how = TableImport(classes={"REGULAR_VEHICLE": "car", "SIGN": ""})
-    frames = read_detections(table(tmp_path, ROWS, suffix), how).scene("drive").frames
-    assert [frame.detections.boxes.label.tolist() for frame in frames] == [["car"], []]
+    for suffix in (".csv", ".parquet"):
+        frames = read_detections(table(tmp_path, ROWS, suffix), how).scene("drive").frames
+        assert [frame.detections.boxes.label.tolist() for frame in frames] == [["car"], []]
 
 
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_values_may_be_separated_by_other_signs(tmp_path: Path, separator: str) -> None:
+def test_values_may_be_separated_by_other_signs(tmp_path: Path) -> None:
     path = tmp_path / "drive.csv"
-    path.write_text("time,x,y\n0,1,2\n".replace(",", separator), encoding="utf-8-sig")
-    assert read_detections(path).scene("drive").frames[0].detections[0].position == (1.0, 2.0, 0.0)
+    for separator in ",;\t":
+        path.write_text("time,x,y\n0,1,2\n".replace(",", separator), encoding="utf-8-sig")
+        assert read_detections(path).scene("drive").frames[0].detections[0].position == (1.0, 2.0, 0.0)
 
 
 def test_columns_that_are_named_win_and_may_be_left_out(tmp_path: Path) -> None:
@@ -110,21 +110,16 @@ def test_all_values_that_are_wrong_are_named_at_once_by_the_files_names(tmp_path
     assert "line 2: score (column 'conf'): expected a number, got 'high'" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("times", "seconds"),
-    [
+def test_the_clock_is_found_by_what_times_look_like(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    for times, seconds in (
         ([0, 0.1, 0.2], [0, 0.1, 0.2]),
-        ([T0 * 1000, T0 * 1000 + 100], [T0, T0 + 0.1]),
-        ([T0 * 10**6, T0 * 10**6 + 10**5], [T0, T0 + 0.1]),
-        ([T0 * 10**9, T0 * 10**9 + 10**8], [T0, T0 + 0.1]),
         ([10**11 * 5, 10**11 * 5 + 10**8], [500, 500.1]),  # ns since the start, of 500 s
         (["2023-11-14T22:13:20Z", "2023-11-14T22:13:20.100"], [T0, T0 + 0.1]),
         (["2023-11-15 00:13:20+02:00"], [T0]),
-    ],
-)
-def test_the_clock_is_found_by_the_size_of_its_numbers(tmp_path: Path, times: list[Any], seconds: list[float]) -> None:
-    path = table(tmp_path, [{"time": time, "x": 1, "y": 2} for time in times])
-    np.testing.assert_allclose(read_detections(path).scene("drive").timestamps, seconds, atol=1e-6)
+    ):
+        with subtests.test(times=times):
+            path = table(tmp_path, [{"time": time, "x": 1, "y": 2} for time in times])
+            np.testing.assert_allclose(read_detections(path).scene("drive").timestamps, seconds, atol=1e-6)
 
 
 def test_a_clock_that_is_guessed_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -146,10 +141,7 @@ def test_dates_that_are_none_are_named(tmp_path: Path) -> None:
     path = table(tmp_path, [{"time": time, "x": 1, "y": 2} for time in ("2023-11-14T22:13:20", "later")])
     with pytest.raises(InputError, match=r"line 3: timestamp \(column 'time'\): expected a date and time of ISO 8601"):
         read_detections(path)
-
-
-def test_numbers_among_dates_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "drive.ndjson"
+    path = tmp_path / "numbers.ndjson"
     path.write_text('{"time": "2023-11-14T22:13:20", "x": 1, "y": 2}\n{"time": 5, "x": 1, "y": 2}\n')
     with pytest.raises(InputError, match=r"line 2: timestamp .* expected a date and time of ISO 8601, got '5'"):
         read_detections(path)
@@ -184,13 +176,8 @@ def test_a_quaternion_that_is_none_is_named(tmp_path: Path) -> None:
     path = table(tmp_path, [{"t": 0, "x": 1, "y": 2, "qw": 1, "qx": 1, "qy": 0, "qz": 0}])
     with pytest.raises(InputError, match=r"line 2: qw qx qy qz: expected a quaternion of length 1, got 1\.41421"):
         read_detections(path)
-
-
-def test_a_part_of_a_quaternion_is_told_from_a_heading(tmp_path: Path) -> None:
     path = table(tmp_path, [{"t": 0, "x": 1, "y": 2, "rotation_z": 1}])
-    with pytest.raises(
-        InputError, match="expected qw qx qy qz with it; if it is the heading: --columns yaw=rotation_z"
-    ):
+    with pytest.raises(InputError, match="qy qz with it; if it is the heading: --columns yaw=rotation_z"):
         read_detections(path)
     turned = TableImport(columns={"yaw": "rotation_z"})
     assert read_detections(path, turned).scene("drive").frames[0].detections[0].yaw == 1

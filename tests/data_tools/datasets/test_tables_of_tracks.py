@@ -67,30 +67,25 @@ def test_tracks_as_ndjson(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".ndjson"])
-def test_tracks_can_be_read_as_detections(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"tracks{suffix}"
-    write_tracks(path, [(scene(name), [tracks(0.0), tracks(0.5)]) for name in ("a", "b")])
-    data = read_detections(path)
-    assert data.scenes == ("a", "b")
-    read = data.scene("b").frames[1].detections
-    for name in ("label", "position", "size", "yaw", "velocity"):
-        np.testing.assert_array_equal(getattr(read.boxes, name), getattr(tracks(0.5).boxes, name))
-    np.testing.assert_array_equal(read.score, tracks(0.5).score)
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".ndjson"])
-def test_tracks_are_read_as_they_were_written(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"tracks{suffix}"
-    write_tracks(path, [(scene(name), [tracks(0.0), tracks(0.5)]) for name in ("a", "b")])
-    rows = read_tracks(path)
-    assert rows.scene.tolist() == ["a"] * 4 + ["b"] * 4
-    assert rows.timestamp.tolist() == [0.0, 0.0, 0.5, 0.5] * 2
-    assert rows.id.tolist() == ["7", "9"] * 4
-    np.testing.assert_array_equal(rows.boxes.velocity[:2], tracks(0.0).boxes.velocity)
-    np.testing.assert_array_equal(rows.position_covariance[:2], tracks(0.0).position_covariance)
-    np.testing.assert_array_equal(rows.velocity_covariance[:2], tracks(0.0).velocity_covariance)
-    np.testing.assert_array_equal(rows.coasting[:2], tracks(0.0).coasting)
+def test_tracks_are_read_as_they_were_written_and_as_detections(tmp_path: Path) -> None:
+    for suffix in (".csv", ".ndjson", ".parquet"):
+        path = tmp_path / f"tracks{suffix}"
+        if suffix == ".parquet":
+            pytest.importorskip("pyarrow.parquet", reason="Parquet comes with the extra parquet")
+        write_tracks(path, [(scene(name), [tracks(0.0), tracks(0.5)]) for name in ("a", "b")])
+        rows = read_tracks(path)
+        assert rows.scene.tolist() == ["a"] * 4 + ["b"] * 4
+        assert rows.timestamp.tolist() == [0.0, 0.0, 0.5, 0.5] * 2
+        assert rows.id.tolist() == ["7", "9"] * 4
+        np.testing.assert_array_equal(rows.boxes.velocity[:2], tracks(0.0).boxes.velocity)
+        for name in ("position_covariance", "velocity_covariance", "coasting"):
+            np.testing.assert_array_equal(getattr(rows, name)[:2], getattr(tracks(0.0), name))
+        data = read_detections(path)
+        assert data.scenes == ("a", "b")
+        read = data.scene("b").frames[1].detections
+        for name in ("label", "position", "size", "yaw", "velocity"):
+            np.testing.assert_array_equal(getattr(read.boxes, name), getattr(tracks(0.5).boxes, name))
+        np.testing.assert_array_equal(read.score, tracks(0.5).score)
 
 
 def test_a_table_of_tracks_names_what_is_wrong_in_it(tmp_path: Path) -> None:

@@ -70,15 +70,15 @@ def test_a_name_of_greatest_length(tmp_path: Path) -> None:
         write_text(tmp_path / ("n" * 256), "text")
 
 
-def test_output_path_that_is_a_folder(tmp_path: Path) -> None:
+def test_paths_of_another_kind(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected the name of a file to write, this is a folder"):
         write_text(tmp_path, "x")
-
-
-def test_output_path_that_is_a_device() -> None:
     with pytest.raises(InputError, match="no regular file"):
         write_text("/dev/null", "x")
     assert Path("/dev/null").is_char_device()
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match="expected the name of a folder"), atomic_directory(tmp_path / "out"):
+        pytest.fail("the block must not run")
 
 
 def test_folder_that_is_missing_or_a_file(tmp_path: Path, subtests: pytest.Subtests) -> None:
@@ -93,19 +93,19 @@ def test_folder_that_is_missing_or_a_file(tmp_path: Path, subtests: pytest.Subte
                     pytest.fail("the block must not run")
 
 
-@pytest.mark.parametrize("output", [atomic_file, atomic_directory])
-def test_folder_without_permission(tmp_path: Path, output, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # permission bits do not bind root, who may well run the tests: refuse as the system would
     def refuse(self: Path, *args: object, **kwargs: object) -> None:
         raise PermissionError(13, "Permission denied", str(self))
 
     monkeypatch.setattr(Path, "open", refuse)
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with (
-        pytest.raises(InputError, match=r"out: not writable: Permission denied; expected a folder"),
-        output(tmp_path / "out"),
-    ):
-        pytest.fail("the block must not run")
+    for output in (atomic_file, atomic_directory):
+        with (
+            pytest.raises(InputError, match=r"out: not writable: Permission denied; expected a folder"),
+            output(tmp_path / "out"),
+        ):
+            pytest.fail("the block must not run")
 
 
 def test_full_disk_is_one_line(tmp_path: Path) -> None:
@@ -170,35 +170,27 @@ def test_interrupted_directory_leaves_nothing(tmp_path: Path, exists: bool) -> N
     assert not exists or (final / "old").read_text() == "old"
 
 
-def test_directory_path_that_is_a_file(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("")
-    with pytest.raises(InputError, match="expected the name of a folder"), atomic_directory(tmp_path / "out"):
-        pytest.fail("the block must not run")
-
-
 def test_other_os_errors_pass(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), atomic_file(tmp_path / "out"):
         (tmp_path / "elsewhere").read_text()
 
 
-def test_a_path_is_checked_before_long_work(tmp_path: Path) -> None:
+def test_paths_are_checked_before_long_work(tmp_path: Path) -> None:
     check_writable(tmp_path / "new.json")
-    assert list(tmp_path.iterdir()) == []
-    for path in (tmp_path, tmp_path / "missing" / "new.json"):
-        with pytest.raises(InputError, match=path.name):
-            check_writable(path)
-
-
-def test_so_is_a_folder(tmp_path: Path) -> None:
     check_writable_folder(tmp_path / "new")
     (tmp_path / "there").mkdir()
     check_writable_folder(tmp_path / "there")
     (tmp_path / "file").touch()
     assert names(tmp_path) == ["file", "there"]
     assert names(tmp_path / "there") == []
-    for path in (tmp_path / "missing" / "new", tmp_path / "file"):
+    for check, path in (
+        (check_writable, tmp_path),
+        (check_writable, tmp_path / "missing" / "new.json"),
+        (check_writable_folder, tmp_path / "missing" / "new"),
+        (check_writable_folder, tmp_path / "file"),
+    ):
         with pytest.raises(InputError, match=str(path)):
-            check_writable_folder(path)
+            check(path)
 
 
 def test_only_what_a_killed_write_left_is_removed(tmp_path: Path) -> None:

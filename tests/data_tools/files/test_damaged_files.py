@@ -63,7 +63,7 @@ def test_what_is_whole_is_read(valid: dict[str, Target]) -> None:
     assert read["run record"].method == "kf"
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_damage_is_read_or_named(valid: dict[str, Target], seed: int) -> None:
     for number, (name, target) in enumerate(valid.items()):
         rng = random.Random(1000 * seed + number)
