@@ -41,7 +41,7 @@ from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.readers import JsonStream, open_json
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, StrArray, from_upper_triangle, upper_triangle
+from saga_fg.numerics.arrays import Columns, FloatArray, StrArray, from_upper_triangle, upper_triangle
 from saga_fg.numerics.geometry import quaternion_norms, quaternion_yaw, yaw_quaternion
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
@@ -49,7 +49,8 @@ from saga_fg.types.track import Tracks, known_velocities
 
 Task = Literal["detection", "tracking"]
 _UNKNOWN = (np.nan, np.nan)
-_NUMBERS = {"translation": 3, "size": 3, "rotation": 4, "velocity": 2, "score": 1, "position_covariance": 3}
+_WIDTHS = {"translation": 3, "size": 3, "rotation": 4, "velocity": 2, "position_covariance": 3}
+_FIXED = ("translation", "size", "rotation")
 _NO_COVARIANCE = (np.nan, np.nan, np.nan)
 
 
@@ -80,110 +81,64 @@ class ResultFile:
         return {token: self.boxes.select(rows) for token, rows in self.rows.items()}
 
 
-class ResultColumns:
-    """Collects the boxes of one file sample by sample, then checks and converts them all at once."""
-
-    def __init__(self, path: str, task: Task) -> None:
-        self._path, self._task = path, task
-        self._numbers: dict[str, list[FloatArray]] = {name: [] for name in _NUMBERS}
-        self._labels: list[str] = []
-        self._ids: list[str] = []
-        self._rows: dict[str, slice] = {}
-
-    def add(self, token: str, boxes: Any) -> None:
-        """Take in the boxes of one sample. Raises `InputError` for a box that lacks a field or has one misshaped."""
-        where = f"{self._path}: sample {token}"
-        if not isinstance(boxes, list):
-            raise InputError(f"{where}: expected a list of boxes, got {str(boxes)[:40]!r}")
-        if token in self._rows:
-            raise InputError(f"{where}: expected each sample once, this one occurs again")
-        label, score = f"{self._task}_name", f"{self._task}_score"
-        try:
-            columns: dict[str, list[Any]] = {name: [box[name] for box in boxes] for name in _NUMBERS if name in _FIXED}
-            columns["velocity"] = [_velocity(box) for box in boxes]
-            columns["score"] = [(box[score],) for box in boxes]
-            columns["position_covariance"] = [box.get("position_covariance", _NO_COVARIANCE) for box in boxes]
-            labels = [box[label] for box in boxes]
-            ids = [box["tracking_id"] for box in boxes] if self._task == "tracking" else [""] * len(boxes)
-            strangers = [box for box in boxes if box.get("sample_token", token) != token]
-        except (KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{where}: {_missing(boxes, (*_FIXED, label, score), self._task)}") from error
-        if strangers:
-            raise InputError(f"{where}: sample_token: expected the sample's own, got {strangers[0]['sample_token']!r}")
-        for name, column in columns.items():
-            self._numbers[name].append(_table(f"{where}: ", self._task, name, column))
-        for name, names in ((label, labels), ("tracking_id", ids)):
-            for i, value in enumerate(names):
-                if not isinstance(value, str):
-                    raise InputError(f"{where}: box {i}: {name}: expected a string, got {value!r}")
-        self._rows[token] = slice(len(self._labels), len(self._labels) + len(boxes))
-        self._labels += labels
-        self._ids += ids
-
-    def finish(self) -> tuple[ResultBoxes, dict[str, slice]]:
-        """Check the values; return the boxes and the rows of each sample.
-
-        Raises `InputError` naming sample, box and field.
-        """
-        columns = {name: np.concatenate([np.empty((0, n)), *self._numbers[name]]) for name, n in _NUMBERS.items()}
-        norm = quaternion_norms(columns["rotation"])
-        for name, good, expected in (
-            ("translation", np.isfinite(columns["translation"]).all(axis=1), "three finite numbers in m"),
-            (
-                "size",
-                (np.isfinite(columns["size"]) & (columns["size"] > 0)).all(axis=1),
-                "positive width, length, height in m",
-            ),
-            ("rotation", np.abs(norm - 1) <= 1e-3, "a unit quaternion (w, x, y, z)"),
-            ("velocity", ~np.isinf(columns["velocity"]).any(axis=1), "finite numbers, or NaN for unknown"),
-            ("score", np.isfinite(columns["score"]).all(axis=1), "a finite number"),
-            (
-                "position_covariance",
-                ~np.isinf(columns["position_covariance"]).any(axis=1),
-                "finite numbers (xx, xy, yy) in m^2",
-            ),
-        ):
-            self._require(good, name, columns[name], expected)
-        labels = np.array(self._labels, dtype=np.str_)
-        known = DETECTION_CLASSES if self._task == "detection" else TRACKING_CLASSES
-        strange = ~np.isin(labels, known)
-        if strange.any():
-            row = int(np.argmax(strange))
-            raise InputError(f"{self._where(row)}: {self._task}_name: {unknown_name('class', str(labels[row]), known)}")
-        boxes = Boxes(
-            label=labels,
-            position=columns["translation"],
-            size=columns["size"][:, [1, 0, 2]],
-            yaw=quaternion_yaw(columns["rotation"] / norm[:, None]),
-            velocity=columns["velocity"],
-        )
-        covariance = from_upper_triangle(columns["position_covariance"])
-        ids = np.array(self._ids, dtype=np.str_)
-        return ResultBoxes(ids, boxes, columns["score"][:, 0], covariance), self._rows
-
-    def _require(self, good: BoolArray, name: str, column: FloatArray, expected: str) -> None:
+def _sample_boxes(where: str, task: Task, token: str, boxes: Any) -> ResultBoxes:
+    """The boxes of one sample. Raises `InputError` naming box and field of what is not as the format says."""
+    if not isinstance(boxes, list):
+        raise InputError(f"{where}: expected a list of boxes, got {str(boxes)[:40]!r}")
+    label, score = f"{task}_name", f"{task}_score"
+    try:
+        columns: dict[str, list[Any]] = {name: [box[name] for box in boxes] for name in _FIXED}
+        columns["velocity"] = [_UNKNOWN if box.get("velocity") is None else box["velocity"] for box in boxes]
+        columns[score] = [(box[score],) for box in boxes]
+        columns["position_covariance"] = [box.get("position_covariance", _NO_COVARIANCE) for box in boxes]
+        labels = [box[label] for box in boxes]
+        ids = [box["tracking_id"] for box in boxes] if task == "tracking" else [""] * len(boxes)
+        strangers = [box for box in boxes if box.get("sample_token", token) != token]
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{where}: {_missing(boxes, (*_FIXED, label, score), task)}") from error
+    if strangers:
+        raise InputError(f"{where}: sample_token: expected the sample's own, got {strangers[0]['sample_token']!r}")
+    for name, names in ((label, labels), ("tracking_id", ids)):
+        for row, value in enumerate(names):
+            if not isinstance(value, str):
+                raise InputError(f"{where}: box {row}: {name}: expected a string, got {value!r}")
+    numbers = {name: _table(where, name, column, _WIDTHS.get(name, 1)) for name, column in columns.items()}
+    norm = quaternion_norms(numbers["rotation"])
+    finite = {name: np.isfinite(column).all(axis=1) for name, column in numbers.items()}
+    for name, good, expected in (
+        ("translation", finite["translation"], "three finite numbers in m"),
+        ("size", finite["size"] & (numbers["size"] > 0).all(axis=1), "positive width, length, height in m"),
+        ("rotation", np.abs(norm - 1) <= 1e-3, "a unit quaternion (w, x, y, z)"),
+        ("velocity", ~np.isinf(numbers["velocity"]).any(axis=1), "finite numbers, or NaN for unknown"),
+        (score, finite[score], "a finite number"),
+        (
+            "position_covariance",
+            ~np.isinf(numbers["position_covariance"]).any(axis=1),
+            "finite numbers (xx, xy, yy) in m^2",
+        ),
+    ):
         if not good.all():
             row = int(np.argmin(good))
-            field = f"{self._task}_score" if name == "score" else name
-            value = column[row].tolist() if column.shape[1] > 1 else float(column[row, 0])
-            raise InputError(f"{self._where(row)}: {field}: expected {expected}, got {value}")
+            value = numbers[name][row].tolist()
+            got = value if len(value) > 1 else value[0]
+            raise InputError(f"{where}: box {row}: {name}: expected {expected}, got {got}")
+    classes = DETECTION_CLASSES if task == "detection" else TRACKING_CLASSES
+    strange = next((row for row, name in enumerate(labels) if name not in classes), None)
+    if strange is not None:
+        raise InputError(f"{where}: box {strange}: {label}: {unknown_name('class', labels[strange], classes)}")
+    read = Boxes(
+        label=np.array(labels, dtype=np.str_),
+        position=numbers["translation"],
+        size=numbers["size"][:, [1, 0, 2]],
+        yaw=quaternion_yaw(numbers["rotation"] / norm[:, None]),
+        velocity=numbers["velocity"],
+    )
+    covariance = from_upper_triangle(numbers["position_covariance"])
+    return ResultBoxes(np.array(ids, dtype=np.str_), read, numbers[score][:, 0], covariance)
 
-    def _where(self, row: int) -> str:
-        token, rows = next((t, r) for t, r in self._rows.items() if r.start <= row < r.stop)
-        return f"{self._path}: sample {token}: box {row - rows.start}"
 
-
-_FIXED = ("translation", "size", "rotation")
-
-
-def _velocity(box: dict[str, Any]) -> Any:
-    velocity = box.get("velocity")
-    return _UNKNOWN if velocity is None else velocity
-
-
-def _table(where: str, task: Task, name: str, column: Sequence[Any]) -> FloatArray:
+def _table(where: str, name: str, column: Sequence[Any], width: int) -> FloatArray:
     """Rows of numbers as an array of the field's width."""
-    width = _NUMBERS[name]
     try:
         table = np.array(column)
         if table.dtype.kind in "fiu" and table.shape == (len(column), width):
@@ -192,14 +147,13 @@ def _table(where: str, task: Task, name: str, column: Sequence[Any]) -> FloatArr
         pass
     if not column:
         return np.empty((0, width))
-    for i, row in enumerate(column):
-        numbers = isinstance(row, list | tuple) and all(type(x) in (int, float) for x in row)
-        if not numbers or len(row) != width:
-            field = f"{task}_score" if name == "score" else name
+    for row, value in enumerate(column):
+        numbers = isinstance(value, list | tuple) and all(type(x) in (int, float) for x in value)
+        if not numbers or len(value) != width:
             numerals = "a number" if width == 1 else f"{width} numbers"
-            got = row[0] if name == "score" else row
-            raise InputError(f"{where}box {i}: {field}: expected {numerals}, got {str(got)[:60]!r}")
-    raise InputError(f"{where}{name}: expected numbers of ordinary magnitude")
+            got = value[0] if width == 1 else value
+            raise InputError(f"{where}: box {row}: {name}: expected {numerals}, got {str(got)[:60]!r}")
+    raise InputError(f"{where}: {name}: expected numbers of ordinary magnitude")
 
 
 def _missing(boxes: list[Any], fields: tuple[str, ...], task: Task) -> str:
@@ -238,17 +192,22 @@ def read_result_file(
     Raises `InputError` for a file that cannot be read or is not JSON, for samples that are not among the `known` ones
     (None: any will do), and for boxes of wanted samples that are not as the format says.
     """
-    path = Path(path)
-    columns = ResultColumns(str(path), task)
-    meta = ResultMeta()
+    path, meta = Path(path), ResultMeta()
+    parts = [_sample_boxes(str(path), task, "", [])]
+    rows: dict[str, slice] = {}
+    last = 0
     for token, value in result_entries(path):
         if token is None:
             meta = _meta(path, value)
         elif known is not None and token not in known:
             raise InputError(f"{path}: sample {token}: expected samples of the tables, they hold no such sample")
         elif wanted is None or token in wanted:
-            columns.add(token, value)
-    return ResultFile(meta, *columns.finish())
+            if token in rows:
+                raise InputError(f"{path}: sample {token}: expected each sample once, this one occurs again")
+            parts.append(_sample_boxes(f"{path}: sample {token}", task, token, value))
+            rows[token] = slice(last, last + len(parts[-1]))
+            last = rows[token].stop
+    return ResultFile(meta, ResultBoxes.concatenate(parts), rows)
 
 
 def result_entries(path: Path) -> Iterator[tuple[str | None, Any]]:
