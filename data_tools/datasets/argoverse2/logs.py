@@ -126,15 +126,11 @@ class ArgoverseLogs:
         poses = self.poses(name, stamps)
         with error_context(str(path)):
             ego_T_box = transforms(rows)
-            world_T_box = poses[moment] @ ego_T_box
-            category: StrArray = rows["category"].astype(np.str_)
-            label = class_names(category)
-            ids: StrArray = rows["track_uuid"].astype(np.str_)
+            boxes = boxes_of(rows, poses[moment] @ ego_T_box)
+            category, ids = rows["category"].astype(np.str_), rows["track_uuid"].astype(np.str_)
             time = (stamps - stamps[0]) * 1e-9 if len(stamps) else np.empty(0)
-            position = world_T_box[:, :3, 3]
-            velocity = central_differences(ids, time[moment], position[:, :2], _LONGEST_GAP, _REACH)
-            size = np.stack([rows[name] for name in SIZE], axis=1).astype(np.float64)
-            boxes = Boxes(label, position, size, yaw_of(world_T_box[:, :3, :3]), velocity)
+            velocity = central_differences(ids, time[moment], boxes.position[:, :2], _LONGEST_GAP, _REACH)
+            boxes = replace(boxes, velocity=velocity)
             seen = rows["num_interior_pts"] > 0
             of_moment = [np.flatnonzero(moment == k) for k in range(len(stamps))]
             truth = [Annotations(ids[at], boxes.select(at), seen[at]) for at in of_moment]
@@ -157,9 +153,13 @@ class ArgoverseLogs:
             return transforms(rows)[order][at]
 
 
-def class_names(category: StrArray) -> StrArray:
-    """Our names of classes (N,) for categories (N,)."""
-    return np.array([CLASSES.get(each, each.lower()) for each in category.tolist()], dtype=np.str_)
+def boxes_of(rows: Mapping[str, Any], frame_T_box: FloatArray) -> Boxes:
+    """The boxes of rows at their poses (N, 4, 4), of unknown velocity. Raises `InputError` for scores that are none."""
+    if not np.isfinite(rows.get("score", np.empty(0)).astype(np.float64)).all():
+        raise InputError("score: expected finite numbers")
+    label = np.array([CLASSES.get(each, each.lower()) for each in rows["category"].tolist()], dtype=np.str_)
+    size = np.stack([rows[name] for name in SIZE], axis=1).astype(np.float64)
+    return Boxes.of(label, frame_T_box[:, :3, 3], size, yaw_of(frame_T_box[:, :3, :3]))
 
 
 def transforms(rows: dict[str, Any]) -> FloatArray:
@@ -261,14 +261,8 @@ class DetectedLogs:
             times = np.union1d(times, annotated)
         poses = self._logs.poses(name, times)
         with error_context(f"{self._path}: log {name}"):
-            score = rows["score"].astype(np.float64)
-            if not np.isfinite(score).all():
-                raise InputError("score: expected finite numbers")
-            ego_T_box = transforms(rows)
-            size = np.stack([rows[column] for column in SIZE], axis=1).astype(np.float64)
+            found = Detections(boxes_of(rows, transforms(rows)), rows["score"].astype(np.float64))
             category: StrArray = rows["category"].astype(np.str_)
-            boxes = Boxes.of(class_names(category), ego_T_box[:, :3, 3], size, yaw_of(ego_T_box[:, :3, :3]))
-            found = Detections(boxes, score)
             frames, categories = [], []
             order = np.argsort(stamp, kind="stable")
             bounds = (
@@ -285,8 +279,3 @@ class DetectedLogs:
     def _unannotated(self, name: str, times: IntArray) -> ArgoverseScene:
         seconds = (times - times[0]) * 1e-9
         return ArgoverseScene(name, seconds, self._logs.poses(name, times), tuple(map(str, times.tolist())), [])
-
-
-def is_feather(path: str) -> bool:
-    """True for the name of a file of Argoverse's detection task."""
-    return path.endswith(".feather")

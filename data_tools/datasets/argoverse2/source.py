@@ -38,8 +38,7 @@ from data_tools.datasets.argoverse2.logs import (
     ArgoverseScene,
     DetectedLogs,
     argoverse_maps,
-    class_names,
-    is_feather,
+    boxes_of,
     transforms,
 )
 from data_tools.datasets.detection_files import TrackRows, read_detections
@@ -54,7 +53,6 @@ from saga_fg.numerics.geometry import (
     inverse_transform,
     quaternion_rotation,
     rotation_quaternion,
-    yaw_of,
     yaw_quaternion,
 )
 from saga_fg.types.boxes import Boxes
@@ -128,17 +126,11 @@ def read_feather_tracks(path: Path, scenes: Mapping[str, Scene]) -> TrackRows:
             raise InputError(f"{path}: log {name}: timestamp_ns: expected times of the log, it has none at {strange}")
         time[mine], poses[mine] = scene.timestamps[at], scene.world_T_ego[at]
     with error_context(str(path)):
-        world_T_box = poses @ transforms(rows)
-        size = np.stack([rows[name] for name in SIZE], axis=1).astype(np.float64)
-        label = class_names(rows["category"].astype(np.str_))
-        boxes = Boxes.of(label, world_T_box[:, :3, 3], size, yaw_of(world_T_box[:, :3, :3]))
-        score = rows["score"].astype(np.float64)
-        if not np.isfinite(score).all():
-            raise InputError("score: expected finite numbers")
+        boxes = boxes_of(rows, poses @ transforms(rows))
     if all(name in rows for name in _VELOCITY):
         velocity = np.stack([rows[name] for name in _VELOCITY], axis=1).astype(np.float64)
         boxes = replace(boxes, velocity=velocity)
-    return TrackRows.of(log, time, rows["track_id"].astype(np.str_), boxes, score)
+    return TrackRows.of(log, time, rows["track_id"].astype(np.str_), boxes, rows["score"].astype(np.float64))
 
 
 def track_categories(scene: Scene, moments: Sequence[Tracks]) -> dict[int, str]:
@@ -254,8 +246,8 @@ class ArgoverseSource(AnnotatedSource):
                 yield self._chosen(AnnotatedLogs(logs, None))
                 return
             with local_copy(self.detections) as path:
-                feather = is_feather(str(path))
-                yield self._chosen(DetectedLogs(logs, path) if feather else AnnotatedLogs(logs, read_detections(path)))
+                official = path.suffix == ".feather"
+                yield self._chosen(DetectedLogs(logs, path) if official else AnnotatedLogs(logs, read_detections(path)))
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
         if output.suffix == ".feather":

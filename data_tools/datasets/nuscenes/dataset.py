@@ -28,15 +28,17 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from data_tools.datasets.nuscenes.results import ResultFile, ResultMeta, read_result_file
-from data_tools.datasets.nuscenes.scenes import (
+from data_tools.datasets.nuscenes.tables import (
     LIDAR,
     SceneRecord,
     keyframes,
     read_annotations,
     read_scenes,
+    read_table,
     rigid_transform,
+    split_scenes,
+    table_folder,
 )
-from data_tools.datasets.nuscenes.tables import read_table, split_scenes, table_folder
 from data_tools.datasets.source import AreaMap, Images, Kind, map_points
 from data_tools.files.input_files import error_context, read_bytes, unknown_name
 from data_tools.files.readers import parsed_json

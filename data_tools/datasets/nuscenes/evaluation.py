@@ -10,7 +10,7 @@ import numpy as np
 
 from data_tools.datasets.nuscenes.dataset import NuScenes
 from data_tools.datasets.nuscenes.results import MAX_BOXES, ResultBoxes, read_tracking_results
-from data_tools.datasets.nuscenes.scenes import SceneRecord, read_annotations
+from data_tools.datasets.nuscenes.tables import SceneRecord, read_annotations
 from data_tools.datasets.results import SceneResult
 from data_tools.evaluation import (
     Evaluation,
