@@ -16,9 +16,9 @@ from benchmarks.recordings.sources import TrafficScenes
 from benchmarks.recordings.traffic import Recordings, overlapping
 from benchmarks.runner import chosen
 from data_tools.datasets.kitti import KittiTracking, write_kitti_results
-from data_tools.datasets.kitti.results import CLASSES, kitti_label_errors, read_scored_sequences
+from data_tools.datasets.kitti.source import CLASSES, kitti_label_errors, read_scored_sequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
-from data_tools.datasets.nuscenes.evaluation import nuscenes_label_errors
+from data_tools.datasets.nuscenes.source import nuscenes_label_errors
 from data_tools.datasets.source import ChosenScenes
 from data_tools.evaluation import placed_detections
 from data_tools.metrics import (

@@ -14,7 +14,7 @@ import typer
 from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport
 from data_tools.datasets.detection_files.column_names import pairs
-from data_tools.datasets.detection_files.survey import TableSurvey, survey_table
+from data_tools.datasets.detection_files.dataset import TableSurvey, survey_table
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_file, check_writable
 from data_tools.files.input_files import error_context

@@ -23,7 +23,7 @@ from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.detection_files import TruthFile, read_detections, read_tracks
 from data_tools.datasets.eth_ucy import EthUcy
 from data_tools.datasets.kitti import KittiTracking
-from data_tools.datasets.kitti.results import read_scored_sequences
+from data_tools.datasets.kitti.source import read_scored_sequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o

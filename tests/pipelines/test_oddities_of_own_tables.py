@@ -230,7 +230,7 @@ def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(
 
 
 def test_a_look_sees_scenes_that_are_scattered_in_a_long_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("data_tools.datasets.detection_files.survey.ROWS", 3)
+    monkeypatch.setattr("data_tools.datasets.detection_files.dataset.ROWS", 3)
     table = write(tmp_path / "d.csv", [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("aabbaabb")])
     look = saga_fg("inspect", table).stdout
     assert "rows are not in order of time; add --sort" in look

@@ -55,11 +55,10 @@ and settled (0 where the solver found no minimum of a nonlinear graph, else 1).
 """
 
 from data_tools.datasets.detection_files.column_names import TableImport
+from data_tools.datasets.detection_files.columns import LABEL_COLUMNS, TRACK_COLUMNS
 from data_tools.datasets.detection_files.dataset import DetectionFile, read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.tracks import (
-    LABEL_COLUMNS,
     PREDICTION_COLUMNS,
-    TRACK_COLUMNS,
     PredictionRows,
     TrackRows,
     TruthFile,

@@ -40,6 +40,12 @@ GPS = ("gps_x", "gps_y", "gps_z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ROTATIONS = {"yaw": QUATERNION, "ego_yaw": tuple(f"ego_{name}" for name in QUATERNION)}
 COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, *ODOMETRY, *GPS, *QUATERNION, *ROTATIONS["ego_yaw"], "empty")
+TRACK_COLUMNS = (
+    *("scene", "timestamp", "id", "label", "x", "y", "z", "length", "width", "height", "yaw", "vx", "vy", "score"),
+    *("cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy", "coasting"),
+)
+SETTLED = "settled"  # 1 or 0, the last column of results
+LABEL_COLUMNS = (*TRACK_COLUMNS, "yaw_variance", "source", "quality")
 LIMITS = {
     "timestamp": LATEST,
     **dict.fromkeys(("x", "y", "z", *POSE[:3], *ODOMETRY[:2], *GPS), MAX_POSITION),

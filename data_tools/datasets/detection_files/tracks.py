@@ -37,7 +37,15 @@ import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.detection_files.column_names import TableImport
-from data_tools.datasets.detection_files.columns import POSE, QUATERNION, ROTATIONS, RawTable
+from data_tools.datasets.detection_files.columns import (
+    LABEL_COLUMNS,
+    POSE,
+    QUATERNION,
+    ROTATIONS,
+    SETTLED,
+    TRACK_COLUMNS,
+    RawTable,
+)
 from data_tools.datasets.detection_files.dataset import box_columns
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.files.atomic_files import atomic_file
@@ -59,12 +67,6 @@ from saga_fg.types.track import PredictedTracks, Tracks
 if TYPE_CHECKING:
     from saga_fg.smoothing import Labels
 
-TRACK_COLUMNS = (
-    *("scene", "timestamp", "id", "label", "x", "y", "z", "length", "width", "height", "yaw", "vx", "vy", "score"),
-    *("cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy", "coasting"),
-)
-SETTLED = "settled"  # 1 or 0, the last column of results
-LABEL_COLUMNS = (*TRACK_COLUMNS, "yaw_variance", "source", "quality")
 TEXTS = ("scene", "sensor", "label", "source", "quality")
 WHOLE = ("id", SETTLED)
 ROWS_AT_A_TIME = 65536  # of a Parquet file

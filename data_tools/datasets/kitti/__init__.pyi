@@ -1,6 +1,6 @@
 from .dataset import Calibration, KittiScans, KittiTracking, local_kitti, read_calibration, read_poses
 from .labels import image_boxes, observation_angles, read_kitti_labels
-from .results import kitti_result_text, write_kitti_results
+from .source import kitti_result_text, write_kitti_results
 
 __all__ = [
     "Calibration",

@@ -1,22 +1,53 @@
-"""KITTI tracking as a dataset of the command."""
+"""KITTI tracking as a dataset of the command; results in its text format, written, read, and scored.
+
+Tracking results and labels in KITTI's text format: a file `NNNN.txt` for each sequence, one box a line,
+
+    frame id type truncated occluded alpha x1 y1 x2 y2 h w l x y z rotation_y score
+
+World boxes go back to the rectified camera frame; the 2D box is the projection of the 3D box, clipped to the image.
+Boxes that do not show in the image are left out: the benchmark knows only what the camera sees. `truncated` and
+`occluded`, which evaluators do not read in results, are 0.
+
+The format has neither velocities nor covariances, nor what lies outside the image. All of that is in a table beside
+the sequences' files, `tracks.csv`, in world coordinates (`data_tools.datasets.detection_files`).
+
+Tracking results in KITTI's text format beside the labels: as the benchmark scores them, and in world coordinates.
+
+Velocities and covariances come from the table `tracks.csv` beside the results, if there is one; else they are unknown.
+So is a velocity of a large standard deviation there (`saga_fg.types.track.known_velocities`).
+
+A KITTI tracking result scored: figures averaged over recall, errors at labels, calibration, HOTA.
+
+HOTA is of what the benchmark judges (`data_tools.metrics.kitti_boxes`), by the overlap in the
+image as well, as published figures are.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
+
+from data_tools.datasets.detection_files import TrackRows, read_tracks, write_tracks
 from data_tools.datasets.detection_files.tracks import merge_tables
-from data_tools.datasets.kitti.dataset import KittiTracking, kitti_images, local_kitti
-from data_tools.datasets.kitti.results import (
-    TRACK_TABLE,
-    ScoredSequence,
-    result_sequences,
-    scored_sequences,
-    write_kitti_labels,
-    write_kitti_results,
+from data_tools.datasets.kitti.dataset import (
+    FRAME_PERIOD,
+    Calibration,
+    KittiScans,
+    KittiTracking,
+    kitti_images,
+    local_kitti,
+)
+from data_tools.datasets.kitti.labels import (
+    TYPES,
+    image_boxes,
+    lower_case_classes,
+    observation_angles,
+    read_kitti_labels,
 )
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
@@ -33,13 +64,296 @@ from data_tools.datasets.source import (
     option,
     tracks_of,
 )
-from data_tools.files.input_files import is_url
+from data_tools.evaluation import Evaluation, HotaRow, mean_scores, placed_detections
+from data_tools.figures import FigureTable, cell
+from data_tools.files.atomic_files import atomic_directory
+from data_tools.files.input_files import error_context, is_url, unknown_name
+from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
+from data_tools.metrics import (
+    KittiSimilarity,
+    KittiTrackingMetrics,
+    KittiTrackingSequence,
+    LabelErrors,
+    SceneBoxes,
+    WholeTracks,
+    kitti_hota_metrics,
+    kitti_tracking_metrics,
+    label_errors,
+    label_velocities,
+    whole_tracks,
+)
 from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.track import Tracks, known_velocities
 
 if TYPE_CHECKING:
-    from data_tools.datasets.kitti.dataset import KittiScans
-    from data_tools.evaluation import Evaluation
+    from saga_fg.smoothing import Labels
+
+TRACK_TABLE = "tracks.csv"
+IMAGE_SIZE = (1242, 375)  # pixels, the largest common to most sequences
+
+_TYPE_OF_LABEL = {name.lower(): name for name in TYPES if name != "DontCare"}
+
+
+def write_kitti_results(
+    directory: str | Path,
+    dataset: KittiTracking,
+    scenes: Iterable[tuple[Scene, Sequence[Tracks]]],
+    table: str = TRACK_TABLE,
+) -> None:
+    """Write the tracks of some sequences, each with one `Tracks` for each of its timestamps, to directory/NNNN.txt.
+
+    All of them together go to directory/`table` as well, in full.
+
+    `scenes` may be a generator: the files appear when all is done. Raises `InputError` for a directory that is not
+    writable, tracks that do not fit the scene, a size or heading that is unknown, a class KITTI does not have.
+    """
+    with atomic_directory(directory) as folder:
+
+        def written() -> Iterator[tuple[Scene, Sequence[Tracks]]]:
+            for scene, moments in scenes:
+                with error_context(f"{directory}: sequence {scene.name}"):
+                    text = kitti_result_text(scene, moments, dataset.calibration(scene.name))
+                (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
+                yield scene, moments
+
+        write_tracks(folder / table, written())
+
+
+def write_kitti_labels(
+    directory: str | Path, dataset: KittiTracking, scenes: Iterable[tuple[Scene, Sequence[Labels]]]
+) -> None:
+    """Write labels as text of ground truth, without scores, to directory/NNNN.txt; the files appear when all is done.
+
+    Boxes that do not show in the image are left out. Raises `InputError` for a directory that is not writable, a size
+    or heading that is unknown, a class KITTI does not have.
+    """
+    with atomic_directory(directory) as folder:
+        for scene, moments in scenes:
+            tracks = [moment.tracks for moment in moments]
+            with error_context(f"{directory}: sequence {scene.name}"):
+                text = kitti_result_text(scene, tracks, dataset.calibration(scene.name), with_score=False)
+            (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
+
+
+def kitti_result_text(
+    scene: Scene,
+    moments: Sequence[Tracks],
+    calibration: Calibration,
+    image_size: tuple[int, int] = IMAGE_SIZE,
+    with_score: bool = True,
+) -> str:
+    """The lines of one sequence; without the score they are those of a label file."""
+    if len(moments) != len(scene):
+        raise InputError(f"expected tracks for {len(scene)} frames, got {len(moments)}")
+    imu_T_camera = inverse_transform(calibration.camera_T_imu)
+    lines: list[str] = []
+    for frame, (tracks, world_T_imu) in enumerate(zip(moments, scene.world_T_ego, strict=True)):
+        lines += _lines(frame, tracks, world_T_imu @ imu_T_camera, calibration, image_size, with_score)
+    return "".join(lines)
+
+
+def _lines(
+    frame: int,
+    tracks: Tracks,
+    world_T_camera: FloatArray,
+    calibration: Calibration,
+    image_size: tuple[int, int],
+    with_score: bool,
+) -> list[str]:
+    types = [_type(frame, label) for label in tracks.boxes.label.tolist()]
+    unmeasured = ~np.isfinite(tracks.boxes.size).all(axis=1) | ~np.isfinite(tracks.boxes.yaw)
+    if unmeasured.any():
+        id_ = int(tracks.id[np.argmax(unmeasured)])
+        raise InputError(f"frame {frame}: track {id_}: expected a known size and heading, the format requires them")
+    boxes = world_boxes_to_camera(tracks.boxes, world_T_camera)
+    bbox = image_boxes(boxes, calibration.projection, image_size)
+    columns = [observation_angles(boxes), bbox, boxes.size, boxes.location, boxes.rotation_y]
+    numbers = np.column_stack([*columns, tracks.score] if with_score else columns)
+    return [
+        f"{frame} {id_} {type_} 0 0 {' '.join(f'{x:.6f}' for x in row)}\n"
+        for id_, type_, row, shows in zip(
+            tracks.id.tolist(), types, numbers.tolist(), np.isfinite(bbox[:, 0]).tolist(), strict=True
+        )
+        if shows
+    ]
+
+
+def _type(frame: int, label: str) -> str:
+    if label not in _TYPE_OF_LABEL:
+        raise InputError(f"frame {frame}: {unknown_name('class', label, tuple(_TYPE_OF_LABEL))}")
+    return _TYPE_OF_LABEL[label]
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredSequence(SceneResult):
+    """One sequence: also the lines of its label file and of the result, and the true boxes in world coordinates."""
+
+    labels: KittiObjects
+    result: KittiObjects
+    truth: SceneBoxes
+
+
+def read_scored_sequences(
+    result: str | Path,
+    dataroot: str | Path,
+    sequences: Collection[str] | None = None,
+    detections: str | Path | None = None,
+) -> dict[str, ScoredSequence]:
+    """The chosen sequences by name (None: all that folder `result` has a file for).
+
+    Raises `InputError` for missing or broken files, and for results beyond the end of a sequence.
+    """
+    chosen = result_sequences(result) if sequences is None else sequences
+    return scored_sequences(result, KittiTracking(dataroot, detections, chosen, ground_truth=True))
+
+
+def result_sequences(result: str | Path) -> tuple[str, ...]:
+    """The sequences that a folder has results for. Raises `InputError` where there are none."""
+    found = tuple(sorted(path.stem for path in Path(result).glob("[0-9]*.txt")))
+    if not found:
+        raise InputError(f"{result}: expected results NNNN.txt, there are none")
+    return found
+
+
+def scored_sequences(result: str | Path, dataset: KittiTracking) -> dict[str, ScoredSequence]:
+    """The sequences of a dataset with ground truth, each with its result; raises as `read_scored_sequences` does."""
+    folder = Path(result)
+    table = read_tracks(folder / TRACK_TABLE) if (folder / TRACK_TABLE).exists() else None
+    return {name: _scored(folder / f"{name}.txt", name, dataset, table) for name in dataset.scenes}
+
+
+def _scored(path: Path, name: str, dataset: KittiTracking, table: TrackRows | None) -> ScoredSequence:
+    if not path.is_file():
+        raise InputError(f"{path}: expected the results of sequence {name}, there is no such file")
+    scene = dataset.scene(name)
+    result = read_kitti_labels(path)
+    if len(result) and result.frame.max() >= len(scene):
+        raise InputError(f"{path}: frame {result.frame.max()}: expected frames 0 to {len(scene) - 1} only")
+    world_T_camera = scene.world_T_ego @ inverse_transform(dataset.calibration(name).camera_T_imu)
+    with error_context(str(path)):
+        found = _in_world(result, world_T_camera)
+    if table is not None:
+        found = _with_motion(found, table, name)
+    assert scene.ground_truth is not None
+    truth = SceneBoxes.of_annotations(scene.ground_truth)
+    return ScoredSequence(scene, found, dataset.labels(name), result, truth)
+
+
+def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> SceneBoxes:
+    """Objects with a 3D box; `world_T_camera` (K, 4, 4) of the frames."""
+    objects = objects.select(has_box(objects) & (objects.track_id >= 0))
+    objects = objects.select(np.argsort(objects.frame, kind="stable"))
+    boxes = camera_boxes_to_world(objects.boxes, lower_case_classes(objects.type), world_T_camera[objects.frame])
+    return SceneBoxes(objects.frame, objects.track_id.astype(np.str_), boxes, np.nan_to_num(objects.score))
+
+
+def _with_motion(found: SceneBoxes, table: TrackRows, scene: str) -> SceneBoxes:
+    """The boxes with velocities and covariances of the rows of the same frame and track."""
+    rows = np.flatnonzero(table.scene == scene)
+    frame = np.rint(table.timestamp[rows] / FRAME_PERIOD).astype(np.int64)
+    row_of = dict(zip(zip(frame.tolist(), table.id[rows].tolist(), strict=True), rows.tolist(), strict=True))
+    wanted = zip(found.frame.tolist(), found.id.tolist(), strict=True)
+    at = np.array([row_of.get(key, -1) for key in wanted], dtype=np.int64)
+    known = at >= 0
+    velocity, covariance = found.boxes.velocity.copy(), found.position_covariance.copy()
+    velocity[known] = known_velocities(table.boxes.velocity[at[known]], table.velocity_covariance[at[known]])
+    covariance[known] = table.position_covariance[at[known]]
+    return replace(found, boxes=replace(found.boxes, velocity=velocity), position_covariance=covariance)
+
+
+CLASSES = ("car", "pedestrian", "cyclist")
+IOUS = (0.25, 0.5, 0.7)
+REACH = 5  # frames to either side for a label's velocity, 0.5 s
+_COLUMNS = (
+    *("class", "3D IoU", "sAMOTA", "safe", "AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "recall", "precision"),
+    *("TP", "FP", "FN", "GT", "MT", "ML"),
+)
+SIMILARITIES: dict[str, KittiSimilarity] = {"image": "image", "2D": "bev_iou", "3D": "iou_3d"}
+ByIou = Mapping[float, KittiTrackingMetrics]
+
+
+def evaluate_kitti(
+    scored: Mapping[str, ScoredSequence],
+    classes: Sequence[str] = CLASSES,
+    ious: Sequence[float] = IOUS,
+    with_hota: bool = False,
+    innovations: Mapping[str, FloatArray] | None = None,
+    persons: bool = False,
+) -> Evaluation:
+    """Score the tracks of the sequences that were read; errors are those at the labels that their detections match.
+
+    persons      whether boxes at `Person` labels are exempt for pedestrians, see `kitti_tracking_metrics`
+    innovations  of the journal of the run, by class, to be among the figures
+
+    Raises `MissingExtraError` for HOTA without trackeval.
+    """
+    pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
+    tracking: dict[str, ByIou] = {}
+    for label in classes:
+        found = ((iou, kitti_tracking_metrics(pairs, label, iou, persons)) for iou in ious)
+        by_iou = {iou: figures for iou, figures in found if figures is not None}
+        if by_iou:
+            tracking[label] = by_iou
+    best = {label: next(iter(by_iou.values())).threshold_safe for label, by_iou in tracking.items()}
+    return Evaluation(
+        kitti_table("KITTI 3D tracking metrics, in %", tracking),
+        {"sequences": tuple(scored), "per_class": tracking},
+        LabelErrors.pool(kitti_label_errors(each, classes) for each in scored.values()),
+        WholeTracks.concatenate(
+            [
+                whole_tracks(_of_classes(each.truth, classes), _of_classes(each.found, classes))
+                for each in scored.values()
+            ]
+        ),
+        kitti_hota(pairs, best) if with_hota else (),
+        innovations or {},
+    )
+
+
+def kitti_label_errors(scored: ScoredSequence, classes: Sequence[str]) -> LabelErrors:
+    """The errors at the labels of the classes in one sequence: those that a detection matches, if there are any."""
+    truth = _of_classes(scored.truth, classes)
+    velocity = label_velocities(truth, scored.scene.timestamps, REACH)
+    return label_errors(truth, scored.found, velocity, placed_detections(scored.scene) if scored.scene.frames else None)
+
+
+def _of_classes(table: SceneBoxes, classes: Sequence[str]) -> SceneBoxes:
+    return table.select(np.isin(table.boxes.label, classes))
+
+
+def kitti_hota(sequences: Sequence[KittiTrackingSequence], thresholds: Mapping[str, float]) -> list[HotaRow]:
+    """Judge the tracks that reach the threshold of their class. Raises `MissingExtraError` without trackeval."""
+    rows = []
+    for label, threshold in thresholds.items():
+        scored = [replace(each, found=_surer_lines(each.found, label, threshold)) for each in sequences]
+        for overlap, similarity in SIMILARITIES.items():
+            rows.append(HotaRow(label, overlap, threshold, kitti_hota_metrics(scored, label, similarity)))
+    return rows
+
+
+def _surer_lines(found: KittiObjects, label: str, threshold: float) -> KittiObjects:
+    """Select the objects of a class in tracks whose mean score is at least `threshold`; no score counts as infinite."""
+    rows = np.flatnonzero(np.char.lower(found.type) == label)
+    score = np.nan_to_num(found.score[rows], nan=np.inf)
+    return found.select(rows[mean_scores(found.track_id[rows], score) >= threshold - 1e-12])
+
+
+def kitti_table(title: str, tracking: Mapping[str, ByIou]) -> FigureTable:
+    """A row for each class and overlap."""
+    rows = ((label, f"{iou:g}", f) for label, by_iou in tracking.items() for iou, f in by_iou.items())
+    return FigureTable(title, _COLUMNS, tuple((label, iou, *_cells(f)) for label, iou, f in rows))
+
+
+def _cells(f: KittiTrackingMetrics) -> tuple[str, ...]:
+    def percent(*values: float) -> tuple[str, ...]:
+        return tuple(cell(100 * value, 2) for value in values)
+
+    counts = (cell(value) for value in (f.tp, f.fp, f.fn, f.gt))
+    first = percent(f.samota, f.samota_safe, f.amota, f.amotp, f.mota, f.motp)
+    return (*first, cell(f.ids), cell(f.frag), *percent(f.recall, f.precision), *counts, *percent(f.mt, f.ml))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +403,6 @@ class KittiSource(DatasetSource):
         yield Parts(scenes, (KittiPart(self.restricted([name]), name) for name in scenes))
 
     def scans(self, scenes: Collection[str]) -> Mapping[str, KittiScans]:
-        from data_tools.datasets.kitti.dataset import KittiScans
-
         if is_url(self.dataroot):
             return {}
         root = self._folder()
@@ -134,8 +446,6 @@ class KittiSource(DatasetSource):
         hota: bool = False,
         innovations: Innovations | None = None,
     ) -> Evaluation:
-        from data_tools.datasets.kitti.results import evaluate_kitti
-
         scored = {name: each for name, each in results.items() if isinstance(each, ScoredSequence)}
         classes, exempt = names("--classes", self.classes), self.persons == "exempt"
         return evaluate_kitti(scored, classes, overlaps(self.iou), hota, innovations, exempt)

@@ -1,11 +1,11 @@
 from .dataset import NuScenes, NuScenesScans, nuscenes_scans
-from .evaluation import ScoredScene, read_scored_scenes
 from .results import (
     ResultMeta,
     merge_tracking_results,
     read_tracking_results,
     write_tracking_results,
 )
+from .source import ScoredScene, read_scored_scenes
 from .tables import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES, split_scenes
 from .writer import write_nuscenes
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import data_tools.datasets.detection_files
 from data_tools.datasets.detection_files import TableImport, read_detections
-from data_tools.datasets.detection_files.survey import survey_table
+from data_tools.datasets.detection_files.dataset import survey_table
 from saga_fg import Dataset, InputError
 from saga_fg.numerics.geometry import yaw_of
 from tests.data_tools.datasets.drive_tables import write

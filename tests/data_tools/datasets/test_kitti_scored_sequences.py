@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.kitti import KittiTracking, write_kitti_results
-from data_tools.datasets.kitti.results import read_scored_sequences
+from data_tools.datasets.kitti.source import read_scored_sequences
 from saga_fg import InputError, Tracks
 from tests.data_tools.kitti_example import write_sequence
 

@@ -7,7 +7,7 @@ import pytest
 
 from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.kitti import KittiTracking, read_kitti_labels, write_kitti_results
-from data_tools.datasets.kitti.results import TRACK_TABLE
+from data_tools.datasets.kitti.source import TRACK_TABLE
 from saga_fg import Boxes, InputError, Scene, Tracks
 from tests.data_tools.kitti_example import write_sequence
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_tools.datasets.nuscenes.evaluation import read_scored_scenes
+from data_tools.datasets.nuscenes.source import read_scored_scenes
 from data_tools.metrics import nuscenes_tracking_metrics
 from saga_fg import InputError
 from tests.data_tools.nuscenes_example import VERSION, annotation, box, tables, write_tables

@@ -19,7 +19,7 @@ import pytest
 
 from benchmarks.metrics import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
 from data_tools.datasets.nuscenes import NuScenes, ResultMeta, split_scenes, write_tracking_results
-from data_tools.datasets.nuscenes.evaluation import read_scored_scenes
+from data_tools.datasets.nuscenes.source import read_scored_scenes
 from data_tools.metrics import NuScenesClassMetrics, NuScenesTrackingMetrics, nuscenes_tracking_metrics
 from saga_fg import Annotations, Boxes, InputError, Tracks
 from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
