@@ -318,30 +318,25 @@ class DatasetSource(ABC):
 
         write_tracks(output, scenes)
 
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes) -> None:
-        """Write labels in the dataset's own format to a folder that has the table of labels."""
+    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
+        """Write labels in the dataset's own format to a folder that has the table of labels.
+
+        part  name of a part of a parallel run, whose files go to folder/*/PART.*
+        """
         return
 
     def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
         """Write the result of one part of a parallel run to folder/tracks/STEM.*."""
         self.write_tracks(folder / "tracks" / f"{stem}{self.tracks_suffix}", dataset, scenes)
 
-    def write_label_part(self, folder: Path, stem: str, dataset: Dataset, scenes: LabelledScenes) -> None:
-        """Write the labels of one part of a parallel run to folder/*/STEM.*."""
-        self.write_labels(folder, dataset, scenes)
-
-    def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
-        """Join the results of all parts of a parallel run to the file `merged`."""
+    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
+        """Join the tracks, or labels, of all parts of a parallel run to the file `merged`."""
         return
 
     def write_submission(self, output: Path) -> Path | None:
         """Write what the official server takes, beside the tracks of all parts; returns its place, None for none."""
         files = sorted(output.glob(self.submission)) if self.submission else ()
         return write_zip(output / "submission.zip", files) if files else None
-
-    def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
-        """Join the labels of all parts of a parallel run to the file `merged`."""
-        return
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
         """The result of any tracker by scene, with ground truth. Raises `InputError` for one missing or broken.

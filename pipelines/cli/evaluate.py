@@ -199,7 +199,7 @@ def _benchmark(
     settings = options.configured(source.family, config, method, estimator, lag, association)
     options.apart(output, *source.input_files())
     task = TrackTask(settings, method, source)
-    run = run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)
+    run = run_at_scale(source, task, output, workers, ray)
     exit_on_failures(run)
     with working("writing the submission"):
         submission = source.write_submission(output)

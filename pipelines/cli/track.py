@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,7 +24,6 @@ from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg.errors import InputError
 from saga_fg.smoothing import LabelCounts
 from saga_fg.tracking import SensorTime
-from saga_fg.types.dataset import Dataset
 
 FAILED_SCENES = 1  # exit code
 
@@ -60,20 +59,20 @@ def run_at_scale(
     output: Path,
     workers: int | None,
     ray: str | None,
-    merged: str,
-    merge: Callable[[Path, Sequence[str], Dataset | None], None],
+    labels: bool = False,
 ) -> RunSummary:
-    """Do the task with all parts of a dataset; print and return what became of them.
+    """Do the task, which makes tracks or labels, with all parts of a dataset; print and return what became of them.
 
-    merge  makes the file `merged` of what they left, if all have done it; "" for none
+    What the parts left becomes the file `DatasetSource.merged`, if all have done it.
     """
     if output.suffix:
         raise InputError(f"--output {output}: expected the name of a folder, since scenes are done in parallel")
 
     def finish(report: RunSummary) -> None:
         if merged and not report.failed:
-            merge(output, [file_name(name) for name in there.names], there.dataset)
+            source.merge(output, [file_name(name) for name in there.names], there.dataset, labels)
 
+    merged = source.merged[labels]
     with source.parts() as there, progress_bar(unit="scenes") as bar:
         if merged:
             (output / merged).unlink(missing_ok=True)
@@ -173,7 +172,7 @@ def _track(
     if at_scale(workers, ray):
         doubts.see_first(source)
         task = TrackTask(settings, method, source, horizons)
-        report = run_at_scale(source, task, output, workers, ray, source.merged[0], source.merge_tracks)
+        report = run_at_scale(source, task, output, workers, ray)
         doubts.add(task.classes(report.counts))
         doubts.finish()
         exit_on_failures(report)
@@ -242,7 +241,7 @@ def _smooth(
     if at_scale(workers, ray):
         doubts.see_first(source)
         task = SmoothTask(settings, method, source, f".{table}")
-        report = run_at_scale(source, task, output, workers, ray, source.merged[1], source.merge_labels)
+        report = run_at_scale(source, task, output, workers, ray, labels=True)
         exit_on_failures(report)
         return
     stream = source.stream()

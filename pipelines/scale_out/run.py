@@ -187,7 +187,7 @@ class SmoothTask:
         labels = [(run.scene, run.labels) for run in runs]
         (folder / "labels").mkdir()
         write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
-        self.source.write_label_part(folder, file_name(name), dataset, labels)
+        self.source.write_labels(folder, dataset, labels, file_name(name))
         return asdict(LabelCounts.sum(run.counts for run in runs))
 
 

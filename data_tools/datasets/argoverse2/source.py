@@ -257,7 +257,7 @@ class ArgoverseSource(AnnotatedSource):
         else:
             super().write_tracks(output, dataset, scenes)
 
-    def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
+    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
         merge_feather_tracks(output / self.merged[0], [output / "tracks" / f"{stem}.feather" for stem in stems])
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:

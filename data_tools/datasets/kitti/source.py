@@ -416,23 +416,18 @@ class KittiSource(DatasetSource):
         assert isinstance(dataset, KittiTracking)
         write_kitti_results(output, dataset, scenes)
 
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes) -> None:
-        self.write_label_part(folder, Path(TRACK_TABLE).stem, dataset, scenes)
+    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
+        assert isinstance(dataset, KittiTracking)
+        write_kitti_labels(folder / "label_02", dataset, scenes)
+        write_kitti_results(folder / "results", dataset, tracks_of(scenes), f"{part}.csv" if part else TRACK_TABLE)
 
     def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
         assert isinstance(dataset, KittiTracking)
         write_kitti_results(folder / "tracks", dataset, scenes, f"{stem}.csv")
 
-    def write_label_part(self, folder: Path, stem: str, dataset: Dataset, scenes: LabelledScenes) -> None:
-        assert isinstance(dataset, KittiTracking)
-        write_kitti_labels(folder / "label_02", dataset, scenes)
-        write_kitti_results(folder / "results", dataset, tracks_of(scenes), f"{stem}.csv")
-
-    def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
-        merge_tables(output / self.merged[0], [output / "tracks" / f"{stem}.csv" for stem in stems])
-
-    def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
-        merge_tables(output / self.merged[1], [output / "results" / f"{stem}.csv" for stem in stems])
+    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
+        merged = output / self.merged[labels]
+        merge_tables(merged, [merged.parent / f"{stem}.csv" for stem in stems])
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
         chosen = self._chosen()

@@ -232,28 +232,24 @@ class NuScenesSource(DatasetSource):
         assert isinstance(dataset, NuScenes | NuScenesPart)
         write_tracking_results(output, scenes, dataset.meta)
 
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes) -> None:
+    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
+        if part:
+            for kind in ("tracking", "objects"):
+                (folder / kind).mkdir()
+            self.write_tracks(folder / "tracking" / f"{part}.json", dataset, tracks_of(scenes))
+            write_label_part(folder / "objects" / f"{part}.ndjson", scenes)
+            return
         assert isinstance(dataset, NuScenes)
         self.write_tracks(folder / self.merged[1], dataset, tracks_of(scenes))
         write_nuscenes_labels(folder, dataset.dataroot, dataset.version, scenes)
 
-    def write_label_part(self, folder: Path, stem: str, dataset: Dataset, scenes: LabelledScenes) -> None:
-        for kind in ("tracking", "objects"):
-            (folder / kind).mkdir()
-        self.write_tracks(folder / "tracking" / f"{stem}.json", dataset, tracks_of(scenes))
-        write_label_part(folder / "objects" / f"{stem}.ndjson", scenes)
-
-    def merge_tracks(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
+    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
         assert isinstance(dataset, NuScenes)
-        parts = (output / "tracks" / f"{stem}.json" for stem in stems)
-        merge_tracking_results(output / self.merged[0], parts, dataset.meta)
-
-    def merge_labels(self, output: Path, stems: Sequence[str], dataset: Dataset | None) -> None:
-        assert isinstance(dataset, NuScenes)
-        parts = (output / "tracking" / f"{stem}.json" for stem in stems)
-        merge_tracking_results(output / self.merged[1], parts, dataset.meta)
-        objects = (output / "objects" / f"{stem}.ndjson" for stem in stems)
-        merge_label_parts(output, dataset.dataroot, dataset.version, objects)
+        parts = (output / ("tracking" if labels else "tracks") / f"{stem}.json" for stem in stems)
+        merge_tracking_results(output / self.merged[labels], parts, dataset.meta)
+        if labels:
+            objects = (output / "objects" / f"{stem}.ndjson" for stem in stems)
+            merge_label_parts(output, dataset.dataroot, dataset.version, objects)
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
         with self._local() as (root, files):
