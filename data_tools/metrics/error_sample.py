@@ -1,6 +1,6 @@
 """Errors pooled over scenes, and consistency of their covariances (NEES).
 
-Consistency of covariances: the normalised estimation error squared (NEES) and the coverage of ellipses.
+The normalised estimation error squared (NEES) and the coverage of ellipses.
 
     nees = (x_hat - x)^T P^-1 (x_hat - x)        chi-squared with dim(x) degrees of freedom if P is right
 

@@ -1,7 +1,5 @@
 """Boxes that the KITTI benchmark evaluates of a class, and those that it exempts.
 
-The boxes of one class, and those exempt from evaluation by the rules of the KITTI tracking benchmark.
-
 A class is scored together with its neighbour (car: van; pedestrian: person sitting), so that confusing the two is not
 an error. True boxes count unless they are of the neighbour class, truncated, or occluded beyond "largely"; those may be
 matched but count neither as found nor as missed. Unmatched found boxes are not false positives if they are of the

@@ -1,6 +1,4 @@
-"""Vehicles on lanes and trucks with trailers, integrated in small steps.
-
-Vehicles on lanes: car following, lane changes and reactions to lights, integrated in small steps.
+"""Vehicles on lanes and trucks with trailers: car following, lane changes and reactions to lights, in small steps.
 
 State of a vehicle: travelled distance s of its centre, m; speed v over ground, m/s; its lane; and, while it changes
 lanes, the lane it comes from and the share q of the change it has completed. Each step of length h

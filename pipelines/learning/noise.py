@@ -1,13 +1,10 @@
 """Sensors' models, process noise and clock offsets from recordings, as pieces of configuration.
 
-Sensors' models and process noise from recordings, with ground truth or without.
-
 With ground truth, detections are compared with the true objects next to them. Without, the tracker with the present
 settings assigns detections to objects; then once more with the settings learned from that.
 
-Offsets of the sensors' clocks as a piece of configuration: what `--learn-offsets` writes.
-
-The offsets of several scenes are joined by their weights, with a deviation that allows for scenes that differ:
+The offsets of several scenes (`--learn-offsets`) are joined by their weights, with a deviation that allows for scenes
+that differ:
 
     o = sum_k o_k / s_k^2 / sum_k 1 / s_k^2,   s^2 = max(1, chi^2 / (n - 1)) / sum_k 1 / s_k^2
 """

@@ -1,6 +1,4 @@
-"""A sensor's model from a sample: noise by robust maximum likelihood, score calibration, detection.
-
-A sensor's model from a sample: noise, calibration, detection probability and field of view, class by class.
+"""A sensor's model from a sample: noise, calibration, detection probability and field of view, class by class.
 
 A class with few samples takes the values of all classes together.
 
