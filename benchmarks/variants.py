@@ -56,7 +56,6 @@ COMPONENTS = (
     Variant("tracks of one detection rank as others", changes={"tracker.min_hits": 1}),
     Variant("without non-maximum suppression", changes={"tracker.classes.*.nms_distance": 0.0}),
     Variant("without suppression of weak detections", changes={"tracker.classes.*.weak_nms_distance": 0.0}),
-    Variant("matching without overlap", changes={"tracker.classes.*.giou_weight": 0.0}),
     Variant("matching without clutter", changes={"tracker.association.clutter_area": math.inf}),
     Variant("matching without existence", changes={"tracker.association.existence_weight": 0.0}),
     Variant("matching without scores", changes={"tracker.association.score_weight": 0.0}),

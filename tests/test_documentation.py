@@ -141,7 +141,7 @@ def test_settings_in_the_documentation_exist() -> None:
     """Dotted names that begin with a section of settings; `tracker.graph` may be an attribute of a tracker as well."""
     known = all_settings()
     sections = {name.split(".")[0] for name in known} - {"*"}
-    assert {"tracker.existence.report_above", "existence.report_above", "sensors.*.max_speed"} <= known
+    assert {"tracker.existence.report_above", "existence.report_above", "sensors.*.use_velocity"} <= known
     for page in PAGES:
         for span in code_spans(page):
             (name,) = re.findall(r"^[a-z_]+(?:\.(?:[a-z_]+|\*|<name>))+(?=$|: (?!unknown key))", span) or [""]

@@ -32,7 +32,6 @@ from saga_fg.learning import (
     fit_curvilinear_by_class,
     fit_sensor,
     fit_trajectory_noise,
-    learn_confusion,
     measured_trajectories,
     sample_with_tracker,
     sample_with_truth,
@@ -88,11 +87,9 @@ def _reported(dataset: Dataset, names: Sequence[str], suffix: str, progress: Pro
 
 
 def _from_truth(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
-    kept, groups = list(scenes), config.tracker.class_groups
-    pooled = sample_with_truth(kept, config.sensors, groups)
+    kept = list(scenes)
+    pooled = sample_with_truth(kept, config.sensors)
     learned = {name: fit_sensor(sample, sensor_model(config.sensors, name), GATE) for name, sample in pooled.items()}
-    for name, tables in (learn_confusion(kept, config.sensors, groups) if groups else {}).items():
-        learned[name] = replace(learned[name], confusion={**learned[name].confusion, **tables})
     config = replace(config, sensors={**config.sensors, **learned})
     motions = learned_motions(measured_trajectories(kept, config.sensors), config)
     return _with_motions(config, motions, pooled)
@@ -210,7 +207,7 @@ def _joined(parts: list[SensorTime]) -> tuple[float, float]:
     return mean, math.sqrt(max(1.0, chi2 / max(len(parts) - 1, 1)) / total)
 
 
-LEARNED = ("noise", "calibration", "detection_probability", "class_detection_probability", "field_of_view", "confusion")
+LEARNED = ("noise", "calibration", "detection_probability", "class_detection_probability", "field_of_view")
 KINDS: dict[type, str] = {ConstantVelocity: "constant_velocity", Curvilinear: "curvilinear"}
 
 
@@ -221,8 +218,6 @@ def learned_fragment(learned: LearnedNoise, origin: str) -> str:
         values = asdict(learned.config.sensors[name])
         sensors[name] = {key: _rounded(values[key]) for key in LEARNED if values[key] != {}}
     tracker: dict[str, Any] = {}
-    if any("confusion" in values for values in sensors.values()):  # it is one among the classes of these groups
-        tracker["class_groups"] = [list(group) for group in learned.config.tracker.class_groups]
     if learned.classes:
         classes = learned.config.tracker.classes
         motions = {label: class_settings(classes, ClassSettings, label).motion for label in learned.classes}

@@ -64,7 +64,7 @@ def compared_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: Flo
     return row[:k].copy(), column[:k].copy()
 
 
-@kernel("i1 i1 f2 f3 f1 i1 f2 f2 f3 i1 f2")
+@kernel("i1 i1 f2 f3 f1 i1 f2 f3 i1")
 def gated_pairs(
     row: IntArray,
     column: IntArray,
@@ -72,22 +72,19 @@ def gated_pairs(
     P: FloatArray,
     gate: FloatArray,
     group: IntArray,
-    belief: FloatArray,
     z: FloatArray,
     R: FloatArray,
     group_z: IntArray,
-    likelihood: FloatArray,
 ) -> Gated:
     """Rows of the tracks and of the measurements (k,) of pairs inside the gates, innovation (k, 2), S (k, 2, 2), d2 and
-    cost (k,), as `saga_fg.tracking.association` defines them, without overlap.
+    cost (k,), as `saga_fg.tracking.association` defines them.
 
-        S = P + R,   d2 = (z - x)^T S^-1 (z - x),   cost = d2 + log det S - 2 log(belief . likelihood)
+        S = P + R,   d2 = (z - x)^T S^-1 (z - x),   cost = d2 + log det S
 
-    A pair is inside where cost - log det S < gate. Of E pairs within reach: rows `row`, `column` (E,); of n tracks:
-    position (n, 2), P (n, 2, 2), gate (n,), group (n,), belief (n, C); of m measurements: z (m, 2), R (m, 2, 2),
-    group_z (m,), likelihood (m, C); C = 0: classes tell nothing
+    A pair of one class is inside where d2 < gate. Of E pairs within reach: rows `row`, `column` (E,); of n tracks:
+    position (n, 2), P (n, 2, 2), gate (n,), group (n,) class; of m measurements: z (m, 2), R (m, 2, 2), group_z (m,)
     """
-    k, E, classes = 0, len(row), belief.shape[1]
+    k, E = 0, len(row)
     rows, innovation, S, costs = (
         np.empty((2, E), dtype=np.int64),
         np.empty((E, 2)),
@@ -102,17 +99,10 @@ def gated_pairs(
         a, b, c = P[i, 0, 0] + R[j, 0, 0], P[i, 0, 1] + R[j, 0, 1], P[i, 1, 1] + R[j, 1, 1]
         det = a * c - b * b
         d2 = (c * x * x - 2 * b * x * y + a * y * y) / det
-        of_class = 0.0
-        if classes > 0:
-            chance = 0.0
-            for q in range(classes):
-                chance += belief[i, q] * likelihood[j, q]
-            if chance > 0:
-                of_class = -2 * math.log(chance)
-        if d2 + of_class < gate[i]:
+        if d2 < gate[i]:
             rows[0, k], rows[1, k], innovation[k, 0], innovation[k, 1] = i, j, x, y
             S[k, 0, 0], S[k, 0, 1], S[k, 1, 0], S[k, 1, 1] = a, b, b, c
-            costs[0, k], costs[1, k] = d2, d2 + np.log(det) + of_class
+            costs[0, k], costs[1, k] = d2, d2 + np.log(det)
             k += 1
     return rows[0, :k], rows[1, :k], innovation[:k], S[:k], costs[0, :k], costs[1, :k]
 
@@ -290,7 +280,7 @@ def paired_overlaps(
     other_yaw: FloatArray,
     hair: float,
 ) -> FloatArray:
-    """(n,) IoU of the footprints of n boxes and n others; NaN where a size or heading is unknown.
+    """(n,) area common to the footprints of n boxes and n others, m^2; NaN where a size or heading is unknown.
 
     hair: relative growth and shrinkage, so that common edges count once
     """
@@ -330,7 +320,5 @@ def paired_overlaps(
                 leave = min(min(max(x1, x2), max(y1, y2)), 1.0)
                 share = max(leave - enter, 0.0)
                 total += share * (x[k] * dy[k] - y[k] * dx[k]) if turn == 0 else share * 2 * gx * gy
-        area, other_area = 4 * hx * hy, 4 * gx * gy
-        common = min(max(total / 2, 0.0), min(area, other_area))
-        result[i] = common / (area + other_area - common)
+        result[i] = min(max(total / 2, 0.0), min(4 * hx * hy, 4 * gx * gy))
     return result

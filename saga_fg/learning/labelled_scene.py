@@ -1,4 +1,4 @@
-"""Labelled objects of a recording, detections matched to them, and samples and confusions from these.
+"""Labelled objects of a recording, detections matched to them, and samples from these.
 
 The labelled objects of a recording over its moments, and which detections are of which object.
 
@@ -9,18 +9,10 @@ Match the detections of a recording to the true objects: one to one, by least di
 
 True positions between two annotated times are interpolated. An object was in view where the annotations call it
 visible.
-
-Class confusion of a sensor: how often objects of each class are reported as another, from matches to the truth.
-
-    A(z | c) = ( n_cz + 1 ) / ( n_c + k )
-
-n_cz of the n_c detections of objects of class c were reported as z, among the k classes of its group: the posterior
-mean with a uniform prior.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -33,7 +25,6 @@ from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import assign
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.tracking.track_table import ClassGroups
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, LabelledObjects, Scene
 from saga_fg.types.frame import Detections, Frame
@@ -197,17 +188,13 @@ class MatchedFrame:
     truth: IntArray
 
 
-def match_to_truth(
-    scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE, groups: Sequence[Sequence[str]] = ()
-) -> Iterator[MatchedFrame]:
+def match_to_truth(scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE) -> Iterator[MatchedFrame]:
     """The frames between the first and the last annotated moment, matched class by class within `gate`, m.
 
-    Of classes in one of the `groups`, which are mistaken for each other, also across classes within half of it.
     Raises `InputError` for a scene without ground truth.
     """
     if scene.ground_truth is None:
         raise InputError(f"scene {scene.name}: expected ground truth")
-    mates = ClassGroups(groups)
     for frame in scene.frames:
         sensor = sensor_model(sensors, frame.sensor)
         time = frame.timestamp + sensor.time_offset
@@ -218,22 +205,17 @@ def match_to_truth(
         detections = sensor.in_world(frame)
         boxes, truth = detections.boxes, annotations.boxes
         distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - truth.position[None, :, :2], -1, 0))
-        reach = np.where(
-            boxes.label[:, None] == truth.label, gate, gate / 2 * mates.same_group(boxes.label, truth.label)
-        )
-        possible = distance < reach
+        possible = (distance < gate) & (boxes.label[:, None] == truth.label)
         yield MatchedFrame(
             frame, detections, sensor.origin(frame), annotations, *assign(distance, possible, unmatched=gate)
         )
 
 
-def sample_with_truth(
-    scenes: Iterable[Scene], sensors: Mapping[str, Sensor], groups: Sequence[Sequence[str]] = ()
-) -> dict[str, DetectionSample]:
+def sample_with_truth(scenes: Iterable[Scene], sensors: Mapping[str, Sensor]) -> dict[str, DetectionSample]:
     """A sample of each sensor of annotated scenes. Raises `InputError` for a scene without ground truth."""
     parts: dict[str, list[DetectionSample]] = {}
     for scene in scenes:
-        for matched in match_to_truth(scene, sensors, groups=groups):
+        for matched in match_to_truth(scene, sensors):
             sensor = sensor_model(sensors, matched.frame.sensor)
             parts.setdefault(matched.frame.sensor, []).append(_sample(matched, sensor))
     return {name: DetectionSample.pool(part) for name, part in parts.items()}
@@ -305,33 +287,3 @@ def _truth_at(scene: Scene, k: int, time: float) -> Annotations:
     position = after.boxes.position.copy()
     position[new] += share * (before.boxes.position[old] - position[new])
     return replace(after, boxes=replace(after.boxes, position=position))
-
-
-FEWEST = 20  # detections of a class, for a row of its own
-
-
-def learn_confusion(
-    scenes: Iterable[Scene], sensors: Mapping[str, Sensor], groups: Sequence[Sequence[str]]
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Sensor -> true class -> reported class -> share, for classes in `groups` with enough detections.
-
-    Raises `InputError` for a scene without ground truth.
-    """
-    seen: dict[str, Counter[tuple[str, str]]] = {}
-    for scene in scenes:
-        for matched in match_to_truth(scene, sensors, groups=groups):
-            true = matched.annotations.boxes.label[matched.truth].tolist()
-            reported = matched.detections.boxes.label[matched.detection].tolist()
-            seen.setdefault(matched.frame.sensor, Counter()).update(zip(true, reported, strict=True))
-    return {name: _tables(counts, groups) for name, counts in seen.items()}
-
-
-def _tables(counts: Counter[tuple[str, str]], groups: Sequence[Sequence[str]]) -> dict[str, dict[str, float]]:
-    tables = {}
-    for group in groups:
-        for label in group:
-            total = sum(counts[label, other] for other in group)
-            if total >= FEWEST:
-                shares = {other: (counts[label, other] + 1) / (total + len(group)) for other in group}
-                tables[label] = {other: round(share, 4) for other, share in shares.items()}
-    return tables

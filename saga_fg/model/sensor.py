@@ -16,8 +16,7 @@ The motion model does not depend on the sensor, so a new sensor is a few lines o
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Literal
@@ -89,6 +88,7 @@ class Extrinsics(Settings):
         return transform
 
 
+MAX_MEASURED_SPEED = 150.0  # m/s; no road user is faster: measured velocities and range rates above are errors
 LEAST_PROBABILITY = 1e-3  # of a detection, and of its being none
 _LARGEST_LOGIT = 50.0  # beyond, a probability is 0 or 1 to the last digit
 
@@ -152,9 +152,6 @@ class Sensor(Settings):
         lambda: {DEFAULT: NoiseModel()}, "measurement noise by class; the entry named default serves all others"
     )
     use_velocity: bool = setting(True, "use velocities and range rates, where they are measured")
-    max_speed: PositiveOrInf = setting(
-        150.0, "ignore measured velocities and range rates above this, m/s; .inf: use all"
-    )
     detection_probability: Fraction = setting(
         0.9, "probability that a visible object in the field of view is detected; higher: misses count more"
     )
@@ -165,12 +162,6 @@ class Sensor(Settings):
     calibration: Mapping[str, ScoreCalibration] = settings_group(
         lambda: {DEFAULT: ScoreCalibration()},
         "calibration of the scores by class; the entry named default serves all others",
-    )
-    class_accuracy: Fraction = setting(
-        0.9, "probability that a detection has the right class of its group (tracker.class_groups); usual 0.7 to 0.99"
-    )
-    confusion: Mapping[str, Mapping[str, float]] = settings_group(
-        dict, "by true class, counts or shares of the classes it is detected as; used in place of class_accuracy"
     )
     colour_accuracy: Fraction = setting(
         0.9, "probability that the reported colour of a traffic light is right; higher: beliefs change faster"
@@ -186,16 +177,6 @@ class Sensor(Settings):
     time_offset: Annotated[float, Range(-LATEST, LATEST)] = setting(
         0.0, "added to the sensor's timestamps to get the time of measurement, s; usual -0.1 to 0"
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.class_accuracy < 1:
-            raise InputError(f"class_accuracy: expected a probability inside 0 to 1, got {self.class_accuracy!r}")
-        for label, taken_for in self.confusion.items():
-            if not all(0 <= share < math.inf for share in taken_for.values()) or sum(taken_for.values()) == 0:
-                raise InputError(f"confusion.{label}: expected shares >= 0, some above, got {dict(taken_for)!r}")
-            if label not in taken_for:
-                raise InputError(f"confusion.{label}: expected {label} among the classes it is taken for")
 
     def logit(self, score: FloatArray) -> FloatArray:
         """The logits (N,) of the detector's own scores, before calibration; of probabilities in [0.001, 0.999]."""
@@ -219,16 +200,6 @@ class Sensor(Settings):
         occurring, index = distinct(label)
         chance = [self.class_detection_probability.get(c, self.detection_probability) for c in occurring]
         return np.array(chance, dtype=np.float64)[index]
-
-    def confusion_among(self, group: Sequence[str]) -> FloatArray:
-        """A (k, k): the chance that an object of each class of a group (rows) is taken for each (columns)."""
-        k = len(group)
-        A = np.full((k, k), (1 - self.class_accuracy) / max(k - 1, 1))
-        np.fill_diagonal(A, self.class_accuracy)
-        for row, label in enumerate(group):
-            if label in self.confusion:
-                A[row] = [max(self.confusion[label].get(other, 0.0), LEAST_PROBABILITY) for other in group]
-        return np.asarray(A / A.sum(axis=1, keepdims=True))
 
     def deviations(self, label: StrArray, *names: str) -> FloatArray:
         """(k, N) the noise parameters of these names, of the class of each label (N,)."""

@@ -197,6 +197,16 @@ def _numbered(label: StrArray) -> _Distinct:
     return tuple(label[first].tolist()), number
 
 
+def common_numbers(*labels: StrArray) -> list[IntArray]:
+    """Numbers (n,) of the classes of several arrays of labels (n,), the same in all of them."""
+    number: dict[str, int] = {}
+    found = []
+    for label in labels:
+        names, of_row = distinct(label)
+        found.append(np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)[of_row])
+    return found
+
+
 def of_classes(label: StrArray, classes: Container[str]) -> BoolArray:
     """(n,) which labels are among `classes`."""
     names, index = distinct(label)

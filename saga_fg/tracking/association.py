@@ -1,10 +1,10 @@
 r"""Associate: match the measurements of a frame to the tracks, within the classes.
 
-    cost_ij      = d_ij^2 + log det S_ij - w GIoU_ij
+    cost_ij      = d_ij^2 + log det S_ij
     unmatched_ij = a 2 log( p_D r_i / (1 - p_D r_i) ) + b 2 log( p_j / (1 - p_j) ) - 2 log( 2 pi lambda )
     lambda       = sum over j of (1 - p_j) / clutter_area
 
-A pair is matched for less than what it costs to leave both alone: with w = 0 and a = b = 1 the difference of the two is
+A pair is matched for less than what it costs to leave both alone: with a = b = 1 the difference of the two is
 -2 log of the ratio of likelihoods that the detection is the track's, or that the track was missed and the detection is
 false. r_i is the track's existence, p_D the sensor's detection probability, p_j the detection's probability; a and b
 below 1 reduce their influence. lambda is the number of false detections of the class per m^2 that the frame's own
@@ -16,8 +16,7 @@ made cheapest pair first (`greedy`), or registers the observed graph to the pred
 are then joined by those of `saga_fg.numerics.assignment` between pairs of candidates, of all classes, whose tracks
 have correlated errors.
 
-Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Rezatofighi et al.,
-Generalized Intersection over Union, CVPR 2019.
+Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from saga_fg.kernels.pairs import gated_pairs
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, distinct
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, common_numbers
 from saga_fg.numerics.assignment import (
     CrossCovariances,
     Matching,
@@ -42,11 +41,10 @@ from saga_fg.numerics.gating import near_pairs
 from saga_fg.tracking.initiation import over_confirmed, relinked
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
-from saga_fg.tracking.track_table import ClassEvidence
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.update import past_cross_covariances, past_positions
-from saga_fg.types.boxes import Boxes, paired_giou_3d
-from saga_fg.types.by_class import class_settings, class_values
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.by_class import class_values
 
 LEAST_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
 
@@ -85,11 +83,8 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
     predicted = state.boxes(position, np.full_like(position, np.nan))
     expected = table.existence * sensor.detection_chance(table.label)
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
-    groups, likelihood = state.class_groups, measurements.class_likelihood
-    evidence = ClassEvidence(groups, table.class_belief, likelihood) if len(groups) else None
-    deferred = over_confirmed(state, predicted)
-    tracks = ExpectedTracks(predicted, P, expected, cross, deferred)
-    found = match(tracks, measurements, state.settings, area, evidence)
+    tracks = ExpectedTracks(predicted, P, expected, cross, over_confirmed(state, predicted))
+    found = match(tracks, measurements, state.settings, area)
     return relinked(state, measurements, found, position, P)
 
 
@@ -111,18 +106,10 @@ class ExpectedTracks(NamedTuple):
 
 
 def match(
-    tracks: ExpectedTracks,
-    measurements: FrameMeasurements,
-    settings: TrackerSettings,
-    clutter_area: float,
-    evidence: ClassEvidence | None = None,
+    tracks: ExpectedTracks, measurements: FrameMeasurements, settings: TrackerSettings, clutter_area: float
 ) -> Matching:
-    """The assignment of a frame.
-
-    clutter_area  area over which false detections spread, m^2: that of the sensor, else of the settings
-    evidence      of classes, where detectors mistake some for each other
-    """
-    found = candidates(tracks, measurements, settings, clutter_area, evidence)
+    """The assignment of a frame; clutter_area  over which false detections spread, m^2."""
+    found = _candidates(tracks, measurements, settings, clutter_area)
     if tracks.deferred is None or not tracks.deferred.any():
         return _chosen(found, settings.association, tracks.cross)
     late = tracks.deferred[found.track]
@@ -143,53 +130,19 @@ def _chosen(found: CandidatePairs, association: AssociationSettings, cross: Cros
     return Matching(found.track[chosen], found.detection[chosen], found.d2[chosen])
 
 
-def candidates(
-    tracks: ExpectedTracks,
-    measurements: FrameMeasurements,
-    settings: TrackerSettings,
-    clutter_area: float,
-    evidence: ClassEvidence | None = None,
+def _candidates(
+    tracks: ExpectedTracks, measurements: FrameMeasurements, settings: TrackerSettings, clutter_area: float
 ) -> CandidatePairs:
-    """The pairs of one class, or group, that are inside its gate; the arguments are those of `match`."""
-    predicted, P, expected = tracks.boxes, tracks.P, tracks.chance
-    (classes, of_track), (_, of_detection) = distinct(predicted.label), distinct(measurements.boxes.label)
-    names = ("max_distance", "giou_weight")
-    reach, giou_weight = class_values(settings.classes, ClassSettings, predicted.label, *names)
-    gates = np.array([gate(class_settings(settings.classes, ClassSettings, c).gate) for c in classes])[of_track]
-    found = _gated(predicted, P, reach, gates, measurements, evidence)
-    found = found._replace(gain=found.gain - _overlap(found, predicted, measurements.boxes, giou_weight))
-    unmatched = _unmatched(found, expected, measurements.probability, of_detection, settings.association, clutter_area)
+    """The pairs of one class that are inside its gate; the arguments are those of `match`."""
+    boxes, detected = tracks.boxes, measurements.boxes
+    of_track, of_detection = common_numbers(boxes.label, detected.label)
+    reach, share = class_values(settings.classes, ClassSettings, boxes.label, "max_distance", "gate")
+    x, z = boxes.position[:, :2], detected.position[:, :2]
+    pairs, gates = near_pairs(x, z, reach), np.array([gate(each) for each in share.tolist()])
+    found = CandidatePairs(*gated_pairs(*pairs, x, tracks.P, gates, of_track, z, measurements.R, of_detection))
+    probability, association = measurements.probability, settings.association
+    unmatched = _unmatched(found, tracks.chance, probability, of_detection, association, clutter_area)
     return found._replace(gain=found.gain - unmatched)
-
-
-def _gated(
-    predicted: Boxes,
-    P: FloatArray,
-    reach: FloatArray,
-    gates: FloatArray,
-    measurements: FrameMeasurements,
-    evidence: ClassEvidence | None,
-) -> CandidatePairs:
-    """The pairs inside the `gates` (n,), without overlap."""
-    boxes = measurements.boxes
-    if evidence is None:
-        (classes, of_track), (seen, of_detection) = distinct(predicted.label), distinct(boxes.label)
-        of_detection = np.array([classes.index(c) if c in classes else -1 for c in seen], dtype=np.int64)[of_detection]
-        belief = likelihood = np.empty((1, 0))
-    else:
-        of_track, of_detection = (evidence.groups.numbers(label) for label in (predicted.label, boxes.label))
-        belief, likelihood = evidence.belief, evidence.likelihood
-    x, z = predicted.position[:, :2], boxes.position[:, :2]
-    tracks, detected = (x, P, gates, of_track, belief), (z, measurements.R, of_detection, likelihood)
-    row, column = near_pairs(x, z, reach)
-    return CandidatePairs(*gated_pairs(row, column, *tracks, *detected))
-
-
-def _overlap(found: CandidatePairs, predicted: Boxes, detected: Boxes, weight: FloatArray) -> FloatArray:
-    """(K,) gain by the overlap of the boxes; weight (n,) of each track's class."""
-    if not weight.any():
-        return np.zeros(len(found.track))
-    return weight[found.track] * paired_giou_3d(predicted.select(found.track), detected.select(found.detection))
 
 
 def _unmatched(

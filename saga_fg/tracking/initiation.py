@@ -24,7 +24,7 @@ nothing, and where the positions of a sensor are uncertain by most of the box's 
 Re-link: a detection that would initiate a track may be the return of an object that has a track already.
 
     odds_ij = r_i e^(-T_i / lifetime) ( (1 - s_i) N(z_j; m_i, P_i + R_j) + s_i N(z_j; a_i, D_i + R_j) ) / density
-    density = (number of detections of the class, or its group, that would initiate tracks) / area
+    density = (number of detections of the class that would initiate tracks) / area
 
 are the odds that detection j is track i, not detected for T_i s, against its being one of the others, anywhere in the
 area. N(m, P) is the state in the joint filter, so that neighbours that are still detected count; s is the probability
@@ -43,7 +43,7 @@ densities of a continued and of a new target.
 
 Hand over: a new track proves to be the return of an object that has a track already, and takes its identity.
 
-    odds = r e^(-T / lifetime) (moving + stationary) / density,   density = (new tracks of the class or group) / area
+    odds = r e^(-T / lifetime) (moving + stationary) / density,   density = (new tracks of the class) / area
     moving     = (1 - s) (1 - s') / (1 - p)  N(m' - m; 0, P + P') / N(0; 0, V)          over position and velocity
     stationary = s s' / p  N(a' - a; 0, D + D')                                          over position
 
@@ -73,7 +73,7 @@ from saga_fg.kernels.pairs import relinking_pairs, return_evidence, returned_pai
 from saga_fg.kernels.tracks import log_peaks
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, common_numbers
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.track_filters import BoxFilter, Kinematics, Stationarity, TurnRate, after_evidence, log_density
@@ -123,8 +123,8 @@ def _pairs(
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Rows of tracks, of places `z` (m, 2) of classes `label` (m,), and costs (k,) of pairs
     that re-linking pays for."""
-    still, number = state.table.stationarity, state.class_groups.numbers
-    group, of_place = number(state.table.label), number(label)
+    still = state.table.stationarity
+    group, of_place = common_numbers(state.table.label, label)
     log_density = np.log(np.bincount(of_place)[of_place] / area(state))
     objects = position, P, still.position, still.P, still.probability, log_survival(state)
     return relinking_pairs(tracks, group, *objects, z, R, of_place, log_density, least_log_odds(state), _ROUNDING)
@@ -202,7 +202,7 @@ def unresolved_frames(
     track = detected[column[~is_new] - len(boxes)]
     surer[~is_new] = (state.table.unresolved[track] == 0) & (state.table.existence[track] >= probability[row[~is_new]])
     row, column = row[surer], column[surer]
-    covered = _largest(_overlaps(state, boxes, others, row, column), row, len(boxes)) > OVERLAP
+    covered = _largest(_overlaps(boxes, others, row, column), row, len(boxes)) > OVERLAP
     if not covered.any():
         return np.zeros(len(boxes))
     precise = np.sqrt(np.linalg.eigvalsh(R)[:, -1]) < PRECISE * boxes.size[:, :2].min(axis=1)
@@ -224,7 +224,7 @@ def resolve_tracks(state: TrackerState, matching: Matching) -> None:
     row, column = touching_pairs(mine, theirs)
     surer = table.existence[sure[column]] >= table.existence[rows[row]]
     row, column = row[surer], column[surer]
-    overlap = _overlaps(state, mine, theirs, row, column)
+    overlap = _overlaps(mine, theirs, row, column)
     most, seen, other = _largest(overlap, row, len(rows)), detected[rows], np.zeros(len(rows), dtype=bool)
     other[row[(overlap > OVERLAP) & detected[sure[column]]]] = True
     apart = (most <= OVERLAP) | (other & (most <= MOST_OVERLAP))
@@ -241,14 +241,14 @@ def over_confirmed(state: TrackerState, predicted: Boxes) -> BoolArray:
         sure = (table.confirmed & (table.unresolved == 0)).nonzero()[0]
         mine, theirs = predicted.select(rows), predicted.select(sure)
         row, column = touching_pairs(mine, theirs)
-        result[rows] = _largest(_overlaps(state, mine, theirs, row, column), row, len(rows)) > OVERLAP
+        result[rows] = _largest(_overlaps(mine, theirs, row, column), row, len(rows)) > OVERLAP
     return result
 
 
-def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, row: IntArray, column: IntArray) -> FloatArray:
-    """(K,) bird's-eye IoU of boxes[row] with others[column] of their class or group, 0 with those of other classes."""
+def _overlaps(boxes: Boxes, others: Boxes, row: IntArray, column: IntArray) -> FloatArray:
+    """(K,) bird's-eye IoU of boxes[row] with others[column] of their class, 0 with those of other classes."""
     overlap = np.zeros(len(row))
-    alike = state.class_groups.pairs_of_group(boxes.label, others.label, row, column).nonzero()[0]
+    alike = (boxes.label[row] == others.label[column]).nonzero()[0]
     found = paired_bev_iou(boxes.select(row[alike]), others.select(column[alike]))
     overlap[alike] = np.where(np.isnan(found), 0.0, found)
     return overlap
@@ -274,7 +274,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     relative = None if measurements.relative is None else measurements.relative.select(rows)
     state.joint.add(ids, boxes.label, kinematics, delay, relative, appended=True)
     update_range_rates(state, measurements, rows, ids, boxes.label)
-    likelihood, time = measurements.class_likelihood[rows], state.time - delay
+    time = state.time - delay
     z_noise, yaw_noise = measurements.z_noise[rows], measurements.yaw_noise[rows]
     new = TrackTable(
         ids,
@@ -294,7 +294,6 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         hits=np.ones(k),
         required_hits=np.full(k, required_hits(state, measurements.sensor)),
         unresolved=unresolved,
-        class_belief=state.class_groups.updated(0 * likelihood, likelihood),
         box=BoxFilter.initiated(boxes.size, p, boxes.position[:, 2], z_noise, boxes.yaw, yaw_noise),
         stationarity=Stationarity.initiated(kinematics, stationary),
         turn=TurnRate.initiated(boxes.yaw, yaw_noise),
@@ -366,8 +365,7 @@ def hand_over(state: TrackerState, matching: Matching) -> Matching:
 
 
 def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntArray, IntArray]:
-    """Pairs of rows (k,): new tracks just detected, and old ones of their class, or its group; the number (k,) of such
-    new tracks."""
+    """Pairs of rows (k,): new tracks just detected, and old ones of their class; the number (k,) of such new tracks."""
     table, settings = state.table, state.settings
     resolved, detected = table.unresolved == 0, np.zeros(len(table), dtype=bool)
     detected[matching.track] = settings.association.relink_above < 1
@@ -377,7 +375,7 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
         return new, new, new
     old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
     now, still = state.kinematics(), table.stationarity
-    group, places = state.class_groups.numbers(table.label), (now.position, now.P, still.position, still.P)
+    (group,), places = common_numbers(table.label), (now.position, now.P, still.position, still.P)
     return returned_pairs(new, old, group, table.initiated, table.last_detected, *places, _FARTHEST)
 
 
@@ -398,7 +396,7 @@ def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[Fl
 
 def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatArray) -> None:
     """Update tracks `old` (k,) with all that is known of tracks `new` (k,); stationary (k,): then, the probability."""
-    table, joint, box, groups = state.table, state.joint, state.table.box, state.class_groups
+    table, joint, box = state.table, state.joint, state.table.box
     if state.settings.stationarity.prior > 0:
         place, P = table.stationarity.position[new], np.tile(np.eye(4), (len(new), 1, 1))
         P[:, :2, :2] = table.stationarity.P[new]
@@ -415,9 +413,6 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
     z_noise, yaw_noise = np.sqrt(box.z_variance[new]), np.sqrt(box.yaw_variance[new])
     box.update(old, box.size[new], box.size_weight[new], box.z[new], z_noise, box.yaw[new], yaw_noise)
     table.turn.update(old, table.turn.heading[new], np.sqrt(table.turn.P[new, 0, 0]))
-    if len(groups):
-        table.class_belief[old] = groups.updated(table.class_belief[old], table.class_belief[new])
-        table.label = groups.labels(table.class_belief, table.label)
     table.sensors.join(old, new)
     table.hits, table.opportunities = table.sensors.best_hits()
     for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected, table.last_in_view):

@@ -47,7 +47,7 @@ from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, senso
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.prediction import EdgeEffect, edge_effects, node_table
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
-from saga_fg.tracking.track_table import ClassGroups, TrackTable
+from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_settings
@@ -101,7 +101,7 @@ class TrackerView:
         initiated: IntArray | None = None,
     ) -> TrackerView:
         """View a state and the results of a frame so far."""
-        table, now = state.table.snapshot(), state.kinematics()
+        table, now = state.table.copied(), state.kinematics()
         table.last_detected += state.start
         table.last_in_view += state.start
         return cls(
@@ -281,7 +281,6 @@ class Journal:
 
     def __init__(self, settings: TrackerSettings, write: Callable[[Event], None]) -> None:
         self._settings, self._write = settings, write
-        self._groups = ClassGroups(settings.class_groups)
         self._before: TrackerView | None = None  # at the end of the frame before
         self._predicted: TrackerView | None = None
         self._matched: TrackerView | None = None
@@ -349,11 +348,11 @@ class Journal:
     def _candidates(
         self, row: int, position: FloatArray, measurements: FrameMeasurements, taken: dict[int, int], chosen: int | None
     ) -> list[Event]:
-        """Detections near a track, of its class or group, the nearest first."""
+        """Detections near a track, of its class, the nearest first."""
         assert self._predicted is not None
         label = str(self._predicted.table.label[row])
         settings = class_settings(self._settings.classes, ClassSettings, label)
-        rows = np.flatnonzero(self._groups.same_group(np.array([label]), measurements.boxes.label)[0])
+        rows = np.flatnonzero(measurements.boxes.label == label)
         measured = measurements.boxes.position[rows, :2]
         d2, _ = mahalanobis(position[None], self._predicted.P[row][None], measured, measurements.R[rows, :2, :2])
         apart, limit = np.hypot(*(measured - position).T), gate(settings.gate)

@@ -3,9 +3,9 @@
 The measurements of a frame: its usable detections, in the world, with the sensor's model of their noise.
 
 Duplicates are left out by non-maximum suppression. Of two detections of a class closer than `nms_distance` the
-less probable one is suppressed; within `weak_nms_distance` only where its probability is below `weak_nms_ratio` of the
+less probable one is suppressed; within `weak_nms_distance` only where its probability is below `WEAK_RATIO` of the
 other's: two people may walk half a metre apart, but a weak detection that close to a strong one is most often a
-duplicate. Boxes of different classes suppress each other only where they overlap.
+duplicate. Boxes of different classes do not suppress each other.
 
 The vehicle as a node of the scene graph: it leads and follows like any other, and is never reported.
 
@@ -20,7 +20,7 @@ errors of both depend on earlier detections, so that a detection is compared wit
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,18 +28,19 @@ from factors import relative_detection_factors
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, key_of
 from saga_fg.model.interactions import POSITION, NodeTable
-from saga_fg.model.sensor import Sensor, measurement_covariance
+from saga_fg.model.sensor import MAX_MEASURED_SPEED, Sensor, measurement_covariance
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, of_classes, unchecked
 from saga_fg.numerics.gating import near_pairs
 from saga_fg.numerics.geometry import yaw_of
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings
 from saga_fg.tracking.track_filters import MOVING, Kinematics, RelativePositions
-from saga_fg.types.boxes import Boxes, paired_bev_iou, touching_pairs
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_settings, class_values
 from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import COLOUR_LABELS
 
+WEAK_RATIO = 0.5  # of probabilities, below which a detection near another one is much weaker; 0.3 to 0.7 do alike
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 
 
@@ -62,7 +63,6 @@ class FrameMeasurements:
     covariance_scale             (m,) factor on the reported deviation of positions, see `saga_fg.tracking.reporting`
     position_bias                 (m,) part of the reported error of positions that does not average out, m
     delay                        time by which the frame is older than the state, s
-    class_likelihood             (m, C) of the classes of `saga_fg.tracking.track_table`
     relative                     positions seen from a vehicle whose pose is estimated, else None
     """
 
@@ -82,18 +82,14 @@ class FrameMeasurements:
     covariance_scale: FloatArray
     position_bias: FloatArray
     delay: float = 0.0
-    class_likelihood: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     relative: RelativePositions | None = None
 
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def with_context(
-        self, delay: float, class_likelihood: FloatArray, relative: RelativePositions | None
-    ) -> FrameMeasurements:
+    def with_context(self, delay: float, relative: RelativePositions | None) -> FrameMeasurements:
         """Add what the tracker knows of them."""
-        known = {"delay": delay, "class_likelihood": class_likelihood, "relative": relative}
-        return unchecked(FrameMeasurements, **vars(self) | known)
+        return unchecked(FrameMeasurements, **vars(self) | {"delay": delay, "relative": relative})
 
 
 def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) -> FrameMeasurements:
@@ -104,18 +100,14 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     objects = ~of_classes(label, COLOUR_LABELS)  # the colours of lights are not objects of their own
     keep = (objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0])).nonzero()[0]
     detections, probability, viewpoint = detections.select(keep), probability[keep], sensor.origin(frame)
-    names = ("nms_distance", "weak_nms_distance", "weak_nms_ratio", "cross_class_nms_iou")
-    *limits, overlap = class_values(classes, ClassSettings, detections.boxes.label, *names)
-    kept = suppress_duplicates(detections.boxes, probability, *limits)
-    if len(kept) < len(keep):
-        keep, detections, probability, overlap = keep[kept], detections.select(kept), probability[kept], overlap[kept]
-    kept = suppress_other_classes(detections.boxes, probability, overlap)
+    distances = class_values(classes, ClassSettings, detections.boxes.label, "nms_distance", "weak_nms_distance")
+    kept = suppress_duplicates(detections.boxes, probability, *distances)
     if len(kept) < len(keep):
         keep, detections, probability = keep[kept], detections.select(kept), probability[kept]
     boxes = detections.boxes
     R = measurement_covariance(sensor, detections, viewpoint, probability)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
-    limit = sensor.max_speed if sensor.use_velocity else -1.0
+    limit = MAX_MEASURED_SPEED if sensor.use_velocity else -1.0
     covariance_scale, position_bias = sensor.covariance_calibration(boxes.label, probability)
     return FrameMeasurements(
         sensor,
@@ -137,12 +129,12 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
 
 
 def suppress_duplicates(
-    boxes: Boxes, probability: FloatArray, distance: FloatArray, weak_distance: FloatArray, weak_ratio: FloatArray
+    boxes: Boxes, probability: FloatArray, distance: FloatArray, weak_distance: FloatArray
 ) -> IntArray:
     """Rows of the boxes that stay, ascending, after suppression within the classes.
 
-    boxes (n); probability (n,); of their classes nms_distance (n,), weak_nms_distance (n,), m, and weak_nms_ratio (n,).
-    Greedy from the most probable down, so that a suppressed box suppresses no other.
+    boxes (n); probability (n,); of their classes nms_distance (n,) and weak_nms_distance (n,), m. Greedy from the most
+    probable down, so that a suppressed box suppresses no other.
     """
     if len(boxes) < 2:
         return np.arange(len(boxes))
@@ -153,38 +145,14 @@ def suppress_duplicates(
         return np.arange(len(boxes))
     a, b = a[once], b[once]
     apart = np.hypot(*(position[a] - position[b]).T)
-    strong, weak = _ordered(a, b, probability)
+    swap = probability[b] > probability[a]
+    strong, weak = np.where(swap, b, a), np.where(swap, a, b)
     duplicate = apart < np.minimum(distance[a], distance[b])
-    much_weaker = probability[weak] < weak_ratio[strong] * probability[strong]
+    much_weaker = probability[weak] < WEAK_RATIO * probability[strong]
     duplicate |= (apart < np.minimum(weak_distance[a], weak_distance[b])) & much_weaker
     rival = (boxes.label[a] == boxes.label[b]) & duplicate
-    return _survivors(strong[rival], weak[rival], probability)
-
-
-def suppress_other_classes(boxes: Boxes, probability: FloatArray, overlap: FloatArray) -> IntArray:
-    """Rows of the boxes that stay, ascending, where detectors report one object as several classes.
-
-    boxes (n); probability (n,); overlap (n,): a box whose bird's-eye IoU with a more probable one of another class is
-    larger than this is suppressed; from 1 on never.
-    """
-    if len(boxes) < 2 or (overlap >= 1).all():
-        return np.arange(len(boxes))
-    a, b = touching_pairs(boxes, boxes)
-    across = (a < b) & (boxes.label[a] != boxes.label[b])
-    strong, weak = _ordered(a[across], b[across], probability)
-    rival = paired_bev_iou(boxes.select(strong), boxes.select(weak)) > overlap[weak]
-    return _survivors(strong[rival], weak[rival], probability)
-
-
-def _ordered(a: IntArray, b: IntArray, probability: FloatArray) -> tuple[IntArray, IntArray]:
-    """The more probable and the less probable row of each pair."""
-    swap = probability[b] > probability[a]
-    return np.where(swap, b, a), np.where(swap, a, b)
-
-
-def _survivors(strong: IntArray, weak: IntArray, probability: FloatArray) -> IntArray:
-    """Rows that stay where strong[k] suppresses weak[k], the most probable first."""
-    alive = np.ones(len(probability), dtype=bool)
+    strong, weak = strong[rival], weak[rival]
+    alive = np.ones(len(boxes), dtype=bool)
     for k in np.argsort(-probability[strong], kind="stable"):
         if alive[strong[k]]:
             alive[weak[k]] = False

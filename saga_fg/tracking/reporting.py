@@ -38,7 +38,7 @@ from saga_fg.kernels.components import biased_covariances
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 from saga_fg.tracking.initiation import relinkable
 from saga_fg.tracking.settings import ExistenceSettings
-from saga_fg.tracking.track_table import ClassGroups, TrackTable
+from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.track import Tracks
@@ -54,7 +54,7 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     yaw, (scale, bias) = table.box.yaw[rows], (table.covariance_scale[rows], table.position_bias[rows])
     centre = np.concatenate([now.position + state.origin, table.box.z[rows, None]], axis=1)
     P = biased_covariances(now.P, yaw, scale, bias)
-    score = reported_score(table, rows, state.class_groups, coasting > 0, settings.existence)
+    score = reported_score(table, rows, coasting > 0, settings.existence)
     if settings.tentative_score_factor < 1:
         score = np.where(table.tentative[rows], settings.tentative_score_factor * score, score)
     columns = {"label": table.label[rows], "position": centre, "size": table.box.size.take(rows, 0)}
@@ -91,15 +91,11 @@ def known_places(state: TrackerState) -> BoolArray:
     return np.asarray(state.kinematics().deviation <= most)
 
 
-def reported_score(
-    table: TrackTable, rows: IntArray, groups: ClassGroups, coasting: BoolArray, settings: ExistenceSettings
-) -> FloatArray:
+def reported_score(table: TrackTable, rows: IntArray, coasting: BoolArray, settings: ExistenceSettings) -> FloatArray:
     """(k,) score of the boxes of tracks `rows` (k,); coasting (k,): not detected now."""
     hits, opportunities = table.hits[rows], table.opportunities[rows]
     hit_ratio = (hits / (opportunities + settings.prior_opportunities)) ** settings.hit_ratio_weight
     evidence = np.maximum(table.score[rows], LASTING_SHARE * table.best_score[rows])
-    if len(groups):
-        evidence = evidence * groups.certainty(table.class_belief.take(rows, 0))
     return np.asarray(evidence * hit_ratio * np.where(coasting, table.existence[rows], 1.0))
 
 

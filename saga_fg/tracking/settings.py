@@ -34,7 +34,7 @@ from saga_fg.tracking.clock import ClockSettings
 from saga_fg.tracking.names import AssociationName
 from saga_fg.tracking.track_filters import StationaritySettings
 from saga_fg.tracking.traffic import TrafficSettings
-from saga_fg.types.by_class import DEFAULT, class_settings
+from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.road_map import RoadMap, SignalSettings
 
 
@@ -66,17 +66,6 @@ class ClassSettings(Settings):
     )
     weak_nms_distance: NonNegative = setting(
         0.0, "discard a detection this close to a much more probable one, m; usual 1 to 4, 0: never"
-    )
-    weak_nms_ratio: Fraction = setting(
-        0.5,
-        "discard the weaker of two detections within weak_nms_distance if its probability is below this "
-        "share of the other's; higher: more are discarded",
-    )
-    cross_class_nms_iou: Fraction = setting(
-        1.0, "discard a detection whose IoU, from above, with a surer one of another class is larger; 1: never"
-    )
-    giou_weight: NonNegative = setting(
-        0.0, "weight of the 3D GIoU in the association cost, squared deviations; 0: compare centres only"
     )
     gate: Fraction = setting(
         0.999, "gate probability: share of true pairs inside the chi-square gate; usual 0.99 to 0.9999; higher: wider"
@@ -207,9 +196,6 @@ class TrackerSettings(Settings):
             "edge rules of the scene graph: who interacts with whom; []: no interactions",
         )
     )
-    class_groups: tuple[tuple[str, ...], ...] = setting(
-        (), "groups of classes that detectors confuse: tracks of a group are matched across its classes; []: none"
-    )
     explained_noise: NonNegative = setting(
         0.0, "process noise is scaled by exp(-explained_noise K) at the total rate K of interactions, s; usual 0 to 2"
     )
@@ -290,19 +276,5 @@ class TrackerSettings(Settings):
         require_estimator_name(self.estimator)
         if self.ego is not None and self.ego.estimated and self.association.method == "graph":
             raise InputError("ego.estimated: expected association without pairs, got association.method graph")
-        self._require_groups_that_move_alike()
         require_rules("edges", self.edges)
         require_stable(self.edges, self.max_step)
-
-    def _require_groups_that_move_alike(self) -> None:
-        grouped = [label for group in self.class_groups for label in group]
-        if len(set(grouped)) < len(grouped) or not all(len(group) > 1 for group in self.class_groups):
-            raise InputError(f"class_groups: expected groups of two classes and more, none in two, got {grouped}")
-        for group in self.class_groups:
-            motions = {class_settings(self.classes, ClassSettings, label).motion for label in group}
-            kinds = {type(motion).__name__ for motion in motions}
-            if len(kinds) > 1 or (len(motions) > 1 and kinds == {Mixture.__name__}):
-                raise InputError(
-                    f"class_groups: expected one kind of motion in {', '.join(group)}, or one mixture, "
-                    f"got {sorted(kinds)}"
-                )

@@ -159,9 +159,7 @@ class Tracker:
         self._notify("predict", state, frame.sensor)
 
         measurements = frame_measurements(frame, sensor, self.settings.classes)
-        likelihood = state.class_groups.likelihood(measurements.boxes.label, sensor)
-        relative = state.ego.relative_positions(measurements, frame)
-        measurements = measurements.with_context(delay, likelihood, relative)
+        measurements = measurements.with_context(delay, state.ego.relative_positions(measurements, frame))
         compare_clocks(state, frame.timestamp + sensor.time_offset, measurements)
         state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
         self._notify("measure", state, frame.sensor, measurements)

@@ -31,7 +31,7 @@ from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.measurements import EgoNode
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_filters import Kinematics
-from saga_fg.tracking.track_table import ClassGroups, TrackTable
+from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.traffic import Traffic
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
@@ -89,7 +89,6 @@ class TrackerState:
         self, settings: TrackerSettings, rules: tuple[EdgeRule, ...], providers: tuple[FactorProvider, ...] = ()
     ) -> None:
         self.settings, self.rules, self.providers = settings, rules, providers
-        self.class_groups = ClassGroups(settings.class_groups)
         self.graph: SceneGraph | None = None
         self.start, self.time, self.origin = 0.0, 0.0, np.zeros(2)
         self.next_id = 1
@@ -106,7 +105,7 @@ class TrackerState:
         poses = settings.ego is not None and settings.ego.estimated
         estimator = new_estimator(settings.estimator, values, self.providers, poses)
         self.joint = JointTrackState(estimator, lambda label: motion_of(settings, label))
-        self.table = TrackTable.empty(len(self.class_groups))
+        self.table = TrackTable.empty()
         read = MAP_CLASSES if self.providers else classes_read(self.rules)
         self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.of(settings)
         self.traffic = Traffic(settings.traffic)

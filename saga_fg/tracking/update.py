@@ -1,6 +1,6 @@
 """Update: matched measurements correct the state, and existence follows from all that was seen.
 
-Update: the matched measurements correct position and velocity, box, stationarity and class of their tracks.
+Update: the matched measurements correct position and velocity, box and stationarity of their tracks.
 
 Where they are, and how fast, is remembered for the paths and speeds of others (`saga_fg.tracking.traffic`).
 
@@ -73,7 +73,6 @@ LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known 
 
 def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> None:
     """Take in the measurements that are matched to tracks."""
-    _update_class(state, measurements, matching)
     table, boxes, delay = state.table, measurements.boxes, measurements.delay
     t, d = matching.track, matching.detection
     z = np.concatenate([boxes.position[d, :2] - state.origin, boxes.velocity[d]], axis=1)
@@ -109,14 +108,6 @@ def infer_signals(state: TrackerState, matching: Matching) -> None:
         P = now.P_velocity[t]
         variance = (P[:, 0, 0] + P[:, 1, 1]) / 2
         state.map_nodes.infer(state.table.id[t], now.velocity[t], variance, state.time)
-
-
-def _update_class(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> None:
-    groups, table = state.class_groups, state.table
-    if len(groups):
-        likelihood = measurements.class_likelihood[matching.detection]
-        table.class_belief[matching.track] = groups.updated(table.class_belief[matching.track], likelihood)
-        table.label = groups.labels(table.class_belief, table.label)
 
 
 def update_range_rates(

@@ -141,9 +141,3 @@ def test_extrinsics_are_finite(subtests):
                 pytest.raises(InputError, match=f"^{key}: expected a finite number, got"),
             ):
                 Extrinsics(**{key: value})
-
-
-def test_the_accuracy_of_classes_is_a_probability_inside_0_to_1(subtests):
-    for value in [float("nan"), float("inf"), -0.1, 0.0, 1.0, 1.1]:
-        with subtests.test(value=value), pytest.raises(InputError, match=r"^class_accuracy: expected"):
-            Sensor(class_accuracy=value)

@@ -62,8 +62,6 @@ def test_classes_keep_to_themselves():
 def test_without_an_area_all_that_is_inside_the_gate_is_matched():
     assert pairs(boxes([0.0]), boxes([3.5]), probability=0.01, expected=0.01) == [(0, 0)]
     assert pairs(boxes([0.0]), boxes([9.0])) == []
-    beside = {"default": ClassSettings(max_distance=20.0, giou_weight=20.0)}
-    assert pairs(boxes([0.0]), boxes([0.0], y=3.5), classes=beside) == [(0, 0)]  # however little the boxes overlap
 
 
 def test_a_track_that_nobody_believes_in_takes_no_detection_from_afar():
@@ -93,14 +91,6 @@ def test_among_many_weak_detections_a_match_needs_to_be_nearer():
     for others, matched in ((0.9, [(0, 0)]), (0.05, [])):
         weights = {"clutter_area": 1000.0, "existence_weight": 1.0, "score_weight": 1.0}
         assert pairs(boxes([0.0]), crowd, [0.5, *np.full(50, others)], **weights) == matched
-
-
-def test_overlap_decides_between_detections_equally_far():
-    turned = boxes([0.0, 0.0], yaw=[0.0, np.pi / 2], y=[1.0, -1.0])
-    for weight in (0.0, 20.0):
-        classes = {"default": ClassSettings(max_distance=20.0, giou_weight=weight)}
-        chosen = pairs(boxes([0.0], y=-0.01), turned, classes=classes)
-        assert chosen == ([(0, 0)] if weight else [(0, 1)])
 
 
 @pytest.mark.parametrize(("method", "chosen"), [("hungarian", [(0, 0), (1, 1)]), ("greedy", [(1, 0)])])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
-from saga_fg.tracking.track_table import ClassGroups, TrackTable
+from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.update import _existence
 from tests.saga_fg.traffic_frames import frame
 
@@ -24,7 +24,7 @@ def score(probability, hits, opportunities, coasting=False, existence=0.9, setti
     counts = {"hits": np.full(n, hits * 1.0), "opportunities": np.full(n, opportunities * 1.0)}
     best = np.maximum(probability, best)
     table = replace(TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, **counts)
-    return reported_score(table, np.arange(n), ClassGroups(()), np.full(n, coasting), settings)
+    return reported_score(table, np.arange(n), np.full(n, coasting), settings)
 
 
 def after_miss(r, p_detect, elapsed, settings):

@@ -96,13 +96,6 @@ def test_switched_off():
     assert [detected_ids(tracks) for tracks in returning(crossing, settings=off)[1]] == [[2]] * 4
 
 
-def test_classes_that_are_mistaken_for_each_other_hand_over():
-    apart = returning(beside, label="truck")[1]
-    grouped = returning(beside, settings=replace(SETTINGS, class_groups=(("car", "truck"),)), label="truck")[1]
-    assert [detected_ids(tracks) for tracks in apart] == [[2]] * 4
-    assert [detected_ids(tracks) for tracks in grouped] == [[2], [2], [1], [1]]
-
-
 def test_an_unresolved_track_hands_nothing_over():
     for unresolved, kept in ((0.0, False), (6.0, True)):
         tracker, _ = returning(beside, 2)

@@ -75,14 +75,6 @@ def test_another_class_does_not_take_it():
     assert tracks.id[tracks.coasting == 0].tolist() == [2]
 
 
-def test_a_class_of_its_group_does():
-    tracker = Tracker(replace(SETTINGS, class_groups=(("car", "truck"),)))
-    run(tracker, [frame(0.1 * k, [(20.0, 5.0)]) for k in range(30)])
-    run(tracker, [frame(0.1 * k, []) for k in range(30, 60)])
-    tracks = tracker.step(frame(6.0, [(20.0, 5.0)], label="truck"))
-    assert (tracks.id.tolist(), tracks.coasting.tolist()) == ([1], [0.0])
-
-
 def test_a_probability_of_zero_is_refused():
     with pytest.raises(InputError, match="relink_above: expected a probability above 0"):
         AssociationSettings(relink_above=0.0)

@@ -6,17 +6,15 @@ from dataclasses import fields
 
 import numpy as np
 
-from saga_fg import Tracker, TrackerSettings
+from saga_fg import Tracker
 from saga_fg.numerics.arrays import Columns
 from saga_fg.tracking.track_table import TrackTable
 from tests.saga_fg.traffic_frames import frame
 
-SETTINGS = TrackerSettings(class_groups=(("car", "truck"),))
-
 
 def table(*x: float) -> TrackTable:
     """The tracks of a tracker after a frame of cars at these places."""
-    tracker = Tracker(SETTINGS)
+    tracker = Tracker()
     tracker.step(frame(0.0, [(each, 0.0) for each in x]))
     return tracker.snapshot().table
 
@@ -45,7 +43,7 @@ def test_all_columns_are_appended_and_selected_together():
 
 def test_a_snapshot_shares_no_array_that_can_be_written():
     tracks = table(0.0, 10.0)
-    kept = tracks.snapshot()
+    kept = tracks.copied()
     for name, column in arrays(kept).items():
         np.testing.assert_array_equal(column, arrays(tracks)[name])
         assert not (np.shares_memory(column, arrays(tracks)[name]) and column.flags.writeable)
@@ -54,7 +52,7 @@ def test_a_snapshot_shares_no_array_that_can_be_written():
 def test_an_empty_table_takes_tracks():
     tracks = table(0.0, 10.0)
     sensors = tracks.sensors.empty(0, tracks.sensors.sensors)
-    empty = TrackTable.empty(classes=2)
+    empty = TrackTable.empty()
     empty.sensors = sensors
     for name, column in arrays(empty.append(tracks)).items():
         np.testing.assert_array_equal(column, arrays(tracks)[name])

@@ -17,7 +17,7 @@ from saga_fg.estimators import JointKalmanFilter
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings, ClockSettings
 from saga_fg.tracking import tracker as tracker_module
-from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
+from saga_fg.types.boxes import MAX_POSITION
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 ESTIMATORS = ("kalman", "isam2", "fixed-lag")
@@ -200,9 +200,9 @@ def yaw_pose(x):
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_tracks_that_leave_all_bounds_are_deleted_by_name_and_the_others_go_on(estimator, caplog):
-    tracker = Tracker(TrackerSettings(edges=(), estimator=estimator), {"default": Sensor(max_speed=np.inf)})
+    tracker = Tracker(TrackerSettings(edges=(), estimator=estimator))
     near = [(0.0, 0.0), (MAX_POSITION - 1.0, 50.0)]
-    tracker.step(frame(0.0, near, velocity=[(0.0, 0.0), (0.9 * MAX_SPEED, 0.0)]))
+    tracker.step(frame(0.0, near, velocity=[(0.0, 0.0), (140.0, 0.0)]))
     tracks = tracker.step(frame(0.1, near[:1]))
     assert tracks.id.tolist() == [1]
     assert "deleted, since their states are out of bounds: tracks [2]" in caplog.text
@@ -275,15 +275,6 @@ def test_a_wrong_range_rate_changes_nothing(estimator, rate):
         expected, got = right.step(without), wrong.step(bad)
     assert got.boxes.velocity == pytest.approx(expected.boxes.velocity, abs=1e-9)
     assert got.boxes.velocity[0] == pytest.approx([10.0, 0.0], abs=0.5)
-
-
-def test_how_fast_things_are_can_be_set():
-    for limit, expected in ((150.0, 0.0), (400.0, 300.0)):
-        sensors = {"radar": Sensor(max_speed=limit)}
-        tracks = Tracker(TrackerSettings(edges=()), sensors).step(with_rate(0.0, np.nan, velocity=(300.0, 0.0)))
-        assert tracks.boxes.velocity[0, 0] == pytest.approx(expected)
-    with pytest.raises(InputError, match="max_speed: expected a number > 0"):
-        Sensor(max_speed=-1.0)
 
 
 # what is no frame, and copies

@@ -1,4 +1,4 @@
-"""Overlap of oriented boxes: known cases, laws, and a plain polygon clipping and hull as reference."""
+"""Overlap of oriented boxes: known cases, laws, and a plain polygon clipping as reference."""
 
 import math
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from saga_fg import Boxes
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.boxes import bev_iou, iou_3d, paired_bev_iou, paired_giou_3d, paired_iou_3d, touching_pairs
+from saga_fg.types.boxes import bev_iou, iou_3d, paired_bev_iou, paired_iou_3d, touching_pairs
 
 
 def box(x=0.0, y=0.0, z=0.0, length=4.0, width=2.0, height=1.5, yaw=0.0):
@@ -35,25 +35,6 @@ def clipped(polygon, clip):
 
 def area(polygon):
     return sum(p[0] * q[1] - p[1] * q[0] for p, q in zip(polygon, polygon[1:] + polygon[:1], strict=True)) / 2
-
-
-def turn(p, q, r):
-    """Positive where p, q, r turn left."""
-    return (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
-
-
-def hull(points):
-    """Area of the convex hull (Andrew's monotone chain)."""
-    points = sorted(set(points))
-    chains = []
-    for sequence in (points, points[::-1]):
-        chain = []
-        for p in sequence:
-            while len(chain) > 1 and turn(chain[-2], chain[-1], p) <= 0:
-                chain.pop()
-            chain.append(p)
-        chains.append(chain[:-1])
-    return area(chains[0] + chains[1])
 
 
 def corner_lists(boxes):
@@ -100,17 +81,8 @@ def test_known_volumes():
     assert iou_3d(box(), box(height=0.5)) == pytest.approx(1 / 3)
 
 
-def test_known_generalised():
-    # Two boxes of 4 x 2 with a gap of 4 between them: the hull is 12 x 2.
-    assert paired_giou_3d(box(), box(x=8.0)) == pytest.approx(-8 / 24)
-    # One above the other with a gap of the same height: the hull is three boxes high.
-    assert paired_giou_3d(box(), box(z=3.0)) == pytest.approx(-1 / 3)
-
-
 def test_what_is_unknown_overlaps_nothing():
     unknown = Boxes.of(["car"], [(0, 0, 0)])
-    assert paired_giou_3d(unknown, box()).tolist() == [-1.0]
-    assert paired_giou_3d(Boxes.empty(), Boxes.empty()).shape == (0,)
     for function in (bev_iou, iou_3d):
         assert function(unknown, box()).tolist() == [[0.0]]
         assert function(Boxes.empty(), box()).shape == (0, 1)
@@ -131,36 +103,24 @@ def test_equals_polygon_clipping(a, b):
 
 
 @given(boxes, boxes)
-def test_generalised_equals_the_hull(a, b):
-    (pa,), (pb,) = corner_lists(a), corner_lists(b)
-    common = clipped(pa, pb)
-    low, high = (np.array([x.position[0, 2] + sign * x.size[0, 2] / 2 for x in (a, b)]) for sign in (-1, 1))
-    common *= max(0.0, high.min() - low.max())
-    union = area(pa) * a.size[0, 2] + area(pb) * b.size[0, 2] - common
-    spanned = hull(pa + pb) * (high.max() - low.min())
-    assert paired_giou_3d(a, b)[0] == pytest.approx(common / union - (spanned - union) / spanned, abs=1e-8)
-
-
-@given(boxes, boxes)
 def test_symmetric_and_bounded(a, b):
-    for function, low in ((paired_bev_iou, 0.0), (paired_iou_3d, 0.0), (paired_giou_3d, -1.0)):
+    for function in (paired_bev_iou, paired_iou_3d):
         value = function(a, b)[0]
         assert value == pytest.approx(function(b, a)[0], abs=1e-9)
-        assert low <= value <= 1.0 + 1e-12
-    assert paired_giou_3d(a, b)[0] <= paired_iou_3d(a, b)[0] + 1e-9
+        assert 0.0 <= value <= 1.0 + 1e-12
 
 
 @given(boxes, boxes, st.floats(-1000, 1000), st.floats(-1000, 1000), st.floats(-5, 5), st.floats(-4, 4))
 def test_does_not_depend_on_the_frame(a, b, x, y, z, yaw):
     T = yaw_transform(x, y, z, yaw)
-    for function in (bev_iou, iou_3d, paired_giou_3d):
+    for function in (bev_iou, iou_3d):
         moved = function(a.transformed(T), b.transformed(T))
         assert moved == pytest.approx(function(a, b), abs=1e-7)
 
 
 @given(boxes)
 def test_a_box_is_identical_to_itself(a):
-    for function in (paired_bev_iou, paired_iou_3d, paired_giou_3d):
+    for function in (paired_bev_iou, paired_iou_3d):
         assert function(a, a)[0] == pytest.approx(1.0, abs=1e-9)
 
 
@@ -198,5 +158,3 @@ def test_all_pairs_are_the_pairs_one_by_one():
         assert matrix.ravel() == pytest.approx(paired(a.select(rows), b.select(columns)), abs=1e-12)
         assert (matrix > 0).sum() > 10
     assert len(touching_pairs(a, b)[0]) < 1200
-    together = paired_giou_3d(a.select(rows), b.select(columns))
-    assert together[3 * 40 + 5] == pytest.approx(paired_giou_3d(a.select([3]), b.select([5]))[0])
