@@ -52,16 +52,13 @@ COMPONENTS = (
     Variant("without neighbours", changes={"tracker.edges": _without(Neighbours)}),
     Variant("without explained noise", changes={"tracker.explained_noise": 0.0}),
     Variant("without speeds of traffic", changes={"tracker.traffic.speed_prior.weight": 0.0}),
-    Variant("without stationary objects", changes={"tracker.stationarity.prior": 0.0}),
+    Variant("without stationary objects", changes={"tracker.stationary_share": 0.0}),
     Variant("tracks of one detection rank as others", changes={"tracker.min_hits": 1}),
     Variant("without non-maximum suppression", changes={"tracker.classes.*.nms_distance": 0.0}),
     Variant("without suppression of weak detections", changes={"tracker.classes.*.weak_nms_distance": 0.0}),
     Variant("matching without clutter", changes={"tracker.association.clutter_area": math.inf}),
-    Variant("matching without existence", changes={"tracker.association.existence_weight": 0.0}),
-    Variant("matching without scores", changes={"tracker.association.score_weight": 0.0}),
     Variant("greedy matching", changes={"tracker.association.method": "greedy"}),
     Variant("graph matching", changes={"tracker.association.method": "graph"}),
-    Variant("tracks that never leave unseen", changes={"tracker.existence.lifetime": math.inf}),
     Variant("scores without hit ratio", changes={"tracker.existence.hit_ratio_weight": 0.0}),
     Variant("without tentative tracks", changes={"tracker.tentative_score_factor": 0.0}),
     Variant("without output while coasting", changes={"tracker.report_coasting": 0.0}),
@@ -136,7 +133,7 @@ def _classical(family: str | Path, name: str, stationary: bool, turn: bool) -> V
             found[label] = replace(own, motion=motion)
         return found
 
-    return Variant(name, "kf", {"tracker.stationarity.prior": 0.5 if stationary else 0.0, "tracker.classes": change})
+    return Variant(name, "kf", {"tracker.stationary_share": 0.5 if stationary else 0.0, "tracker.classes": change})
 
 
 def changed(settings: Any, name: str, value: Any) -> Any:

@@ -67,7 +67,7 @@ def setting_names(where: str, schema: Schema) -> Iterator[str]:
 
 
 def all_settings() -> set[str]:
-    """Every setting by its full name and by every ending of it that has a dot: `tracker.clock.max_jump`."""
+    """Every setting by its full name and by every ending of it that has a dot: `tracker.existence.report_above`."""
     files = {
         "smoothing": SmoothingSettings,
         "slam": SlamSettings,

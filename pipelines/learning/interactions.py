@@ -36,7 +36,7 @@ from saga_fg.errors import InputError
 from saga_fg.learning import MOST_GAPS, TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
 from saga_fg.learning.gaps import LENGTHS
 from saga_fg.learning.hidden_objects import FOLLOWED, LONGEST
-from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
+from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.sensor import Sensor
 from saga_fg.model.stability import LearnedInteractions
@@ -195,7 +195,7 @@ def coupled_classes(rules: Sequence[Rule]) -> list[tuple[str, ...]]:
 def _forms(shipped: Rules) -> dict[str, Rules]:
     return {
         "everywhere": TEMPLATE,
-        "hidden": tuple(replace(rule, information_gain=HIDDEN) for rule in TEMPLATE),
+        "hidden": tuple(replace(rule, information_gain=True) for rule in TEMPLATE),
         "refitted": tuple(rule for rule in shipped if not isinstance(rule.interaction, AccelerationLaw)),
     }
 

@@ -238,7 +238,7 @@ def _stacked_dynamics(
                 other = types[rows[0, slot]]
                 pv = node_type.index(POSITION + VELOCITY)
                 other_pv = other.index(POSITION + VELOCITY if other.has(VELOCITY) else POSITION)
-                weight = group.rate[mine[some]] * group.law.time_constant
+                weight = group.rate[mine[some]]
                 accelerations.append(
                     AccelerationTerm(group.law, at[some], slot, weight, group.given[mine[some]], pv, other_pv)
                 )

@@ -117,7 +117,7 @@ def leader_rates(
     return target[chosen[:count]], source[chosen[:count]], strength[:count].copy()
 
 
-@kernel("i1 i1 f1 f2 f2 f1 f1 f1 f f f f f f b i f")
+@kernel("i1 i1 f1 f2 f2 f1 f1 f f f f f f i f")
 def neighbour_rates(
     target: IntArray,
     source: IntArray,
@@ -125,7 +125,6 @@ def neighbour_rates(
     position: FloatArray,
     velocity: FloatArray,
     heading: FloatArray,
-    moved: FloatArray,
     variance: FloatArray,
     rate: float,
     distance_scale: float,
@@ -133,7 +132,6 @@ def neighbour_rates(
     speed_scale: float,
     max_distance: float,
     min_speed: float,
-    parked: bool,
     degree: int,
     spread: float,
 ) -> Led:
@@ -141,9 +139,8 @@ def neighbour_rates(
 
         rate exp(-((distance / distance_scale)^2 + (turn / heading_scale)^2 + (faster / speed_scale)^2) / 2) gain
 
-    faster: size of the difference of velocities; for `parked` ones squares of both speeds are added to its square.
-
-    Of n nodes: position, velocity (n, 2), heading, moved, variance of the velocity (n,); spread as above
+    faster: size of the difference of velocities. Of n nodes: position, velocity (n, 2), heading, variance of the
+    velocity (n,); spread as above
     """
     E, k = len(target), 0
     strength, order = np.empty(E), np.empty(E, dtype=np.int64)
@@ -155,13 +152,8 @@ def neighbour_rates(
         faster = math.hypot(velocity[j, 0] - velocity[i, 0], velocity[j, 1] - velocity[i, 1])
         turn = wrapped(direction[e] - heading[j])
         exponent = (apart / distance_scale) ** 2 + (turn / heading_scale) ** 2
-        if parked:
-            able = moved[i] == 0 and moved[j] == 0
-            exponent += (own**2 + other**2) / speed_scale**2
-        else:
-            able = own >= min_speed and other >= min_speed
         strength[e] = 0.0
-        if able and apart <= max_distance:
+        if own >= min_speed and other >= min_speed and apart <= max_distance:
             strength[e] = rate * math.exp(-(exponent + (faster / speed_scale) ** 2) / 2)
         strength[e] *= gain(variance[i], variance[j], spread)
     begin = 0

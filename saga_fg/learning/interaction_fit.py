@@ -60,7 +60,7 @@ MOST_GAPS = 300  # a random sample to learn from; more only take longer
 LEAST_GAIN = 1e-3  # nats a place, of an iteration; what is left below it, the differences hardly resolve
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
-_LED = replace(traffic_rules()[0], classes=ROAD_USERS, information_gain=None)
+_LED = replace(traffic_rules()[0], classes=ROAD_USERS, information_gain=False)
 TEMPLATE: tuple[Rule, ...] = (
     _LED,
     replace(_LED, interaction=CarFollowing(time_constant=math.inf), rate=0.5, leaders="stationary"),

@@ -10,7 +10,7 @@ A rule is any object with `interaction` and `pairs(nodes)`; pass your own to the
 
 Information gain of an edge: how much the velocity of its source says about that of its target.
 
-    gain_ij = s_i^2 / ( s_i^2 + s_j^2 + spread^2 ),     s^2 = variance of the velocity + ( unseen_acceleration t )^2
+    gain_ij = s_i^2 / ( s_i^2 + s_j^2 + spread^2 ),     s^2 = variance of the velocity + ( `UNSEEN_ACCELERATION` t )^2
 
 This is the gain of a Kalman filter that takes the velocity of j, off by the spread, for a measurement of that of i. A
 detected object learns more from its detections than from neighbours, who pull on a bus that brakes for its stop; a
@@ -32,7 +32,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -44,7 +44,6 @@ from saga_fg.model.interactions import (
     CarFollowing,
     Interaction,
     NodeTable,
-    SharedCourse,
     SharedVelocity,
     unit,
 )
@@ -61,31 +60,18 @@ from saga_fg.numerics.gating import near_pairs
 from saga_fg.settings import (
     NonNegative,
     NonNegativeInt,
-    Positive,
     PositiveOrInf,
     Settings,
     setting,
     settings_group,
 )
 
-CONES = ("traffic_cone", "barrier")
+CONES = ("traffic_cone", "barrier")  # classes of objects that form a line
+CLEARANCE = 1.75  # c, m, usual 1.5 to 2: half a vehicle and half a metre or more
 MIN_SPEED = 1.0  # m/s; slower vehicles are not pushed
 BESIDE = 3.0  # m behind the middle of a vehicle, up to which a cone is still beside it
 CORRIDOR = 6.0  # cones further aside are ignored, m
 REACH = 45.0  # cones further ahead are ignored, m
-
-
-@dataclass(frozen=True)
-class ConeGeometry(Settings):
-    """Range of cones that concern a vehicle, and the clearance to them."""
-
-    clearance: Positive = setting(
-        1.75, "c: distance that drivers keep between cones and the middle of their vehicle, m; usual 1.5 to 2"
-    )
-    preview: Positive = setting(
-        1.5, "time by which drivers look ahead along the line, s; usual 0.5 to 3; higher: vehicles move aside earlier"
-    )
-    classes: tuple[str, ...] = setting(CONES, "classes of objects that form a line")
 
 
 class ConesAhead(NamedTuple):
@@ -100,9 +86,9 @@ class ConesAhead(NamedTuple):
     speed: FloatArray
 
 
-def cones_ahead(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) -> ConesAhead:
+def cones_ahead(nodes: NodeTable, vehicles: IntArray) -> ConesAhead:
     """The cones ahead of `vehicles` (n,), rows of `nodes`."""
-    cones = np.flatnonzero(of_classes(nodes.label, geometry.classes))
+    cones = np.flatnonzero(of_classes(nodes.label, CONES))
     u = unit(nodes.heading[vehicles])
     offset = nodes.position[cones] - nodes.position[vehicles, None]
     ahead = np.einsum("nmi,ni->nm", offset, u)
@@ -112,18 +98,18 @@ def cones_ahead(nodes: NodeTable, vehicles: IntArray, geometry: ConeGeometry) ->
     ahead, left, known = (np.take_along_axis(x, order, axis=1) for x in (ahead, left, known))
     first = left[:, 0] if len(cones) else np.zeros(len(vehicles))
     side = np.where(first < 0, 1.0, -1.0)
-    demand = side[:, None] * left + geometry.clearance
+    demand = side[:, None] * left + CLEARANCE
     speed = np.einsum("ni,ni->n", nodes.velocity[vehicles], u)
     return ConesAhead(cones[order], ahead, demand, known, side, speed)
 
 
-def anticipated(nodes: NodeTable, classes: tuple[str, ...], geometry: ConeGeometry) -> FloatArray:
+def anticipated(nodes: NodeTable, classes: tuple[str, ...]) -> FloatArray:
     """Positions (n, 2) of all nodes, those of vehicles moved aside as far as the cones before them will push them."""
     position = nodes.position.copy()
     vehicles = np.flatnonzero(of_classes(nodes.label, classes))
-    if len(vehicles) == 0 or not of_classes(nodes.label, geometry.classes).any():
+    if len(vehicles) == 0 or not of_classes(nodes.label, CONES).any():
         return position
-    line = cones_ahead(nodes, vehicles, geometry)
+    line = cones_ahead(nodes, vehicles)
     pushed = np.where(line.known & (line.ahead > 0), line.demand, 0.0).max(axis=1, initial=0.0)
     pushed = np.where(line.speed > MIN_SPEED, pushed, 0.0)
     u = unit(nodes.heading[vehicles])
@@ -131,32 +117,12 @@ def anticipated(nodes: NodeTable, classes: tuple[str, ...], geometry: ConeGeomet
     return position
 
 
-def information_setting() -> Any:
-    """The field of an edge rule that holds its `EdgeInformation`."""
-    return settings_group(
-        lambda: None,
-        "weight edges by their information gain, as edges into well-known velocities tell little; null: full weight",
-    )
-
-
-@dataclass(frozen=True)
-class EdgeInformation(Settings):
-    """Weight edges by their information gain."""
-
-    spread: NonNegative = setting(
-        0.5, "standard deviation of the difference between the velocities of a pair, m/s; higher: edges gain less"
-    )
-    unseen_acceleration: NonNegative = setting(
-        0.0, "growth of the velocity deviation of undetected objects, m/s^2; higher: edges out of them gain less"
-    )
-
-    def variances(self, nodes: NodeTable) -> FloatArray:
-        """s^2 (n,) of the module."""
-        if nodes.unseen is None:
-            return nodes.velocity_variance
-        return np.asarray(nodes.velocity_variance + (self.unseen_acceleration * nodes.unseen) ** 2)
-
-
+INFORMATION_GAIN = (
+    "true: weight edges by their information gain, so that they act on objects that are hidden, and hardly on others; "
+    "false: full weight"
+)
+SPREAD = 0.5  # standard deviation of the difference between the velocities of a pair, m/s
+UNSEEN_ACCELERATION = 2.0  # growth of the velocity deviation of undetected objects, m/s^2
 LEAST = 1e-9  # probability that a certain object does not exist
 
 
@@ -229,9 +195,7 @@ class Neighbours(Settings):
     """Edges between moving objects that are close and head the same way; by default they share their velocity."""
 
     map_classes: ClassVar[tuple[str, ...]] = ()
-    interaction: SharedVelocity | CarFollowing | SharedCourse = settings_group(
-        SharedVelocity, "interaction function of the edges"
-    )
+    interaction: SharedVelocity | CarFollowing = settings_group(SharedVelocity, "interaction function of the edges")
     rate: NonNegative = setting(
         0.3, "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6"
     )
@@ -249,27 +213,19 @@ class Neighbours(Settings):
         1.0, "no edge to or from objects slower than this, m/s; usual 0.5 to 2; higher: slow traffic is left alone"
     )
     max_degree: NonNegativeInt = setting(4, "largest number of edges into one object, the strongest; higher: slower")
-    information_gain: EdgeInformation | None = information_setting()
-    parked: bool = setting(
-        False, "couple only objects that were never seen moving and whose velocity is known better than speed_scale"
-    )
+    information_gain: bool = setting(False, INFORMATION_GAIN)
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        able = of_classes(nodes.label, self.classes)
-        if not self.parked:
-            able &= np.hypot(*nodes.velocity.T) >= self.min_speed
-        else:  # the velocity of a new track is not known well enough
-            able &= nodes.velocity_variance < self.speed_scale**2
-            able &= nodes.has_moved == 0 if nodes.has_moved is not None else False
+        able = of_classes(nodes.label, self.classes) & (np.hypot(*nodes.velocity.T) >= self.min_speed)
         target, source = pairs_within(nodes.position, _acted(nodes, able), able, self.max_distance)
         if len(target) == 0:
             return NO_PAIRS
-        _, moved, variance, spread = _columns(nodes, self.information_gain)
+        _, _, variance, spread = _columns(nodes, self.information_gain)
         direction = nodes.along(target, source).direction
-        columns = nodes.position, nodes.velocity, nodes.heading, moved, variance
+        columns = nodes.position, nodes.velocity, nodes.heading, variance
         scales = self.rate, self.distance_scale, self.heading_scale, self.speed_scale
-        limits = self.max_distance, self.min_speed, self.parked, self.max_degree
+        limits = self.max_distance, self.min_speed, self.max_degree
         return Pairs(*neighbour_rates(target, source, direction, *columns, *scales, *limits, spread))
 
 
@@ -282,7 +238,7 @@ class Following(Settings):
     """
 
     map_classes: ClassVar[tuple[str, ...]] = ()
-    interaction: SharedVelocity | CarFollowing | SharedCourse | IntelligentDriver | SmoothDriver = settings_group(
+    interaction: SharedVelocity | CarFollowing | IntelligentDriver | SmoothDriver = settings_group(
         CarFollowing, "interaction function of the edges"
     )
     rate: NonNegative = setting(1.0, "strength of an edge right behind the leader, straight ahead, 1/s; usual 0.5 to 4")
@@ -304,7 +260,7 @@ class Following(Settings):
     heading_scale: PositiveOrInf = setting(
         0.4, "sigma of the kernel on the difference of headings, rad; .inf: no kernel; higher: edges in bends, too"
     )
-    information_gain: EdgeInformation | None = information_setting()
+    information_gain: bool = setting(False, INFORMATION_GAIN)
     parked: bool = setting(
         False, "true: vehicles that were never seen moving follow, too, leaders within lateral_scale"
     )
@@ -314,8 +270,8 @@ class Following(Settings):
     leaders: Leaders = setting(
         "any", "which vehicles lead where nothing stands between: any; moving: once seen moving; stationary: all others"
     )
-    cones: ConeGeometry | None = settings_group(
-        lambda: None, "predict where cones push leaders and followers aside; null: use their present positions"
+    cones: bool = setting(
+        False, "true: leaders and followers are where cones will push them aside, not where they are now"
     )
     classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
     towed: tuple[str, ...] = setting(
@@ -323,8 +279,8 @@ class Following(Settings):
     )
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        if self.cones is not None:
-            nodes = replace(nodes, position=anticipated(nodes, self.classes, self.cones))
+        if self.cones:
+            nodes = replace(nodes, position=anticipated(nodes, self.classes))
         target, source = self._ahead(nodes)
         if len(target) == 0:
             return NO_PAIRS
@@ -350,20 +306,17 @@ class Following(Settings):
         return pairs_ahead(nodes.position, nodes.heading, follows, able, *lane)
 
 
+PUSHING_DISTANCE = 4.0  # m; beyond, the force is less than a thousandth of that of a touch
+PUSHING = 4  # sources of one object, the nearest
+
+
 @dataclass(frozen=True)
 class Repulsion(Settings):
     """Edges between pedestrians that keep away from each other; `sources: [wall]`: from walls of the road map."""
 
-    interaction: SocialForce = settings_group(SocialForce, "the repulsive force")
-    rate: NonNegative = setting(1.0, "factor on the force, 1/s; 1: all of it")
-    max_distance: NonNegative = setting(
-        4.0, "no edge beyond this distance, m; usual 2 to 6; higher: more edges, slower"
-    )
-    max_degree: NonNegativeInt = setting(
-        4, "largest number of sources of one object, the nearest; usual 2 to 8; higher: slower"
-    )
-    classes: tuple[str, ...] = setting(("pedestrian",), "classes that are pushed")
-    sources: tuple[str, ...] = setting(("pedestrian",), "classes that push")
+    classes: ClassVar[tuple[str, ...]] = ("pedestrian",)
+    interaction: ClassVar[SocialForce] = SocialForce()
+    sources: tuple[str, ...] = setting(("pedestrian",), "classes that push; more: pushed by more")
 
     @property
     def map_classes(self) -> tuple[str, ...]:
@@ -377,15 +330,12 @@ class Repulsion(Settings):
         given = self.interaction.given(nodes, target, source)
         apart = nearest_offset(nodes.position[target] - nodes.position[source], given)
         distance = np.hypot(*apart.T)
-        near = (distance <= self.max_distance).nonzero()[0]
-        near = near[strongest(target[near], -distance[near], len(nodes), self.max_degree)]
-        return Pairs(target[near], source[near], np.full(len(near), self.rate))
+        near = (distance <= PUSHING_DISTANCE).nonzero()[0]
+        near = near[strongest(target[near], -distance[near], len(nodes), PUSHING)]
+        return Pairs(target[near], source[near], np.ones(len(near)))
 
 
 _STEEPEST = 1.5  # rad, turn of an arc
-
-HIDDEN = EdgeInformation(spread=0.5, unseen_acceleration=2.0)
-"""Edges act on objects that are hidden, and hardly on others."""
 
 
 def traffic_rules() -> tuple[Following, Neighbours]:
@@ -398,7 +348,7 @@ def traffic_rules() -> tuple[Following, Neighbours]:
         lateral_scale=1.2,
         min_separation=0.8,
         leaders="moving",
-        information_gain=HIDDEN,
+        information_gain=True,
     )
     group = Neighbours(
         classes=("pedestrian",),
@@ -408,7 +358,7 @@ def traffic_rules() -> tuple[Following, Neighbours]:
         heading_scale=3.0,
         speed_scale=1.0,
         min_speed=0.2,
-        information_gain=HIDDEN,
+        information_gain=True,
     )
     return leader, group
 
@@ -418,11 +368,12 @@ def _acted(nodes: NodeTable, able: BoolArray) -> BoolArray:
     return able if nodes.acted is None else able & nodes.acted
 
 
-def _columns(nodes: NodeTable, information: EdgeInformation | None) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+def _columns(nodes: NodeTable, information: bool) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Of n nodes existence, whether they have moved, and variances of velocities, each (n,); the spread, -1: no gain"""
     ones = np.ones(len(nodes))
     exists = ones if nodes.existence is None else nodes.existence
     moved = ones if nodes.has_moved is None else np.asarray(nodes.has_moved, dtype=np.float64)
-    if information is None:
+    if not information:
         return exists, moved, ones, -1.0
-    return exists, moved, information.variances(nodes), information.spread
+    unseen = 0.0 if nodes.unseen is None else UNSEEN_ACCELERATION * nodes.unseen
+    return exists, moved, np.asarray(nodes.velocity_variance + unseen**2), SPREAD

@@ -11,7 +11,7 @@ from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import NodeTable, applies
 from saga_fg.model.motion import distinct_types
-from saga_fg.model.scene_graph import Edges, ModeRecord, NonlinearEdges, SceneGraph
+from saga_fg.model.scene_graph import Courses, Edges, NonlinearEdges, SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, checked, checked_rows, unchecked
 
 E = TypeVar("E", Edges, NonlinearEdges)
@@ -23,7 +23,7 @@ def build_graph(
     rules: Sequence[EdgeRule],
     explained_noise: float = 0.0,
     noise_scale: FloatArray | None = None,
-    modes: tuple[ModeRecord, ...] = (),
+    courses: tuple[Courses, ...] = (),
     interacting: BoolArray | None = None,
     min_rate: float = 1e-3,
 ) -> SceneGraph:
@@ -32,7 +32,7 @@ def build_graph(
     Edges weaker than `min_rate` (1/s) are left out.
 
     A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
-    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it. `modes` are those
+    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it. `courses` are those
     of the graph. Rules see, and tie, the nodes that are `interacting` (n,), None: all.
 
     Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
@@ -73,7 +73,7 @@ def build_graph(
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:
         scale = scale * noise_scale
-    parts = {"edges": tuple(groups), "diffusion_scale": scale, "nonlinear": tuple(nonlinear), "modes": modes}
+    parts = {"edges": tuple(groups), "diffusion_scale": scale, "nonlinear": tuple(nonlinear), "courses": courses}
     return unchecked(SceneGraph, nodes=graph_nodes.id, types=graph_nodes.types, kinds=types, **parts)
 
 

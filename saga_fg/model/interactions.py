@@ -9,12 +9,11 @@ heading of node i and R_ij the rotation from the heading of j to that of i:
 
     shared velocity    dv_i/dt += rate ( R_ij v_j - v_i ),  da_i/dt -= rate a_i  where a_i is of the state
     car-following      dv_i/dt += rate u_i ( u_j.v_j - u_i.v_i + ( s_ij - gap_ij - headway u_i.v_i ) / tau )
-    shared course      dv_i/dt += -rate m_j m_j.v_i,  m_j normal to u_j
 
 s_ij is the way along the path of i, linearised at the estimate: it changes by
 t_j.dp_j - u_i.dp_i, with t_j the direction of the path at j. On a straight path it is u_i.(p_j - p_i).
 
-Car-following is Helly's linear law (Helly 1959); with the gap taken from the present estimate it keeps the formation.
+Car-following is Helly's linear law (Helly 1959); its gap is that of the present estimate: it keeps the formation.
 
 Predicted paths of nodes: where others are along the way of a vehicle, and beside it.
 
@@ -26,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -238,21 +237,13 @@ class CarFollowing(Settings):
     headway: NonNegative = setting(
         0.0, "growth of the desired gap with the follower's speed, s; usual 0 to 2; higher: larger gaps at speed"
     )
-    gap: Literal["present", "standstill"] = setting(
-        "present", "desired gap: present: that of the present estimate; standstill: standstill_gap + headway * speed"
-    )
-    standstill_gap: NonNegative = setting(
-        2.0,
-        "gap at rest, bumper to bumper, m; used only with gap: standstill; usual 1 to 3; higher: followers "
-        "keep further back",
-    )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
         way = nodes.along(target, source)
         t_j = unit(way.direction)
         along, onward = u_i[:, :, None] * u_i[:, None, :], u_i[:, :, None] * t_j[:, None, :]
-        constant = self._gap(nodes, target, source, way.ahead, u_i) - way.ahead
+        constant = -self.headway * (nodes.velocity[target] * u_i).sum(axis=1)
         constant += ((nodes.position[source] * t_j) - (nodes.position[target] * u_i)).sum(axis=1)
         return velocity_triples(
             nodes,
@@ -264,26 +255,6 @@ class CarFollowing(Settings):
             by_other_velocity=u_i[:, :, None] * u_j[:, None, :],
             constant=-u_i * (constant / self.time_constant)[:, None],
         )
-
-    def _gap(
-        self, nodes: NodeTable, target: IntArray, source: IntArray, ahead: FloatArray, u_i: FloatArray
-    ) -> FloatArray:
-        """Desired distance between the centres at speed zero, m (E,)."""
-        if self.gap == "standstill":
-            return np.asarray(self.standstill_gap + (nodes.length[target] + nodes.length[source]) / 2)
-        return np.asarray(ahead - self.headway * (nodes.velocity[target] * u_i).sum(axis=1))
-
-
-@dataclass(frozen=True)
-class SharedCourse:
-    """A node turns to the heading of its leader: its velocity across that heading decays."""
-
-    needs: ClassVar[Needs] = (VELOCITY, ())
-
-    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
-        u_j = unit(nodes.heading[source])
-        m_j = np.stack([-u_j[:, 1], u_j[:, 0]], axis=-1)
-        return velocity_triples(nodes, target, source, by_velocity=-m_j[:, :, None] * m_j[:, None, :])
 
 
 def unit(heading: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -70,13 +70,8 @@ class ConstantVelocity(Settings):
         1.0, "spectral density of the acceleration, m^2/s^3; usual 0.3 to 3; higher: follows detections faster"
     )
 
-    @property
-    def components(self) -> tuple[str, ...]:
-        return ("x", "y", "vx", "vy")
-
-    @property
-    def generator(self) -> FloatArray:
-        return _planar([[0.0, 1.0], [0.0, 0.0]])
+    components: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy")
+    generator: ClassVar[FloatArray] = _planar([[0.0, 1.0], [0.0, 0.0]])
 
     @property
     def diffusion(self) -> FloatArray:
@@ -98,9 +93,7 @@ class ConstantAcceleration(Settings):
         float("inf"), "time constant with which the acceleration fades, s; usual 1 to 10; .inf: never"
     )
 
-    @property
-    def components(self) -> tuple[str, ...]:
-        return ("x", "y", "vx", "vy", "ax", "ay")
+    components: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy", "ax", "ay")
 
     @property
     def generator(self) -> FloatArray:
@@ -153,9 +146,7 @@ class Curvilinear(Settings):
         0.3, "share of objects that turn; usual 0.1 to 0.5; higher: small turn rates are believed sooner"
     )
 
-    @property
-    def components(self) -> tuple[str, ...]:
-        return ("x", "y", "vx", "vy", "ax", "ay")
+    components: ClassVar[tuple[str, ...]] = ("x", "y", "vx", "vy", "ax", "ay")
 
     @property
     def generator(self) -> FloatArray:
@@ -180,22 +171,15 @@ class Curvilinear(Settings):
 
 @dataclass(frozen=True)
 class RandomWalk(Settings):
-    """Components that drift without a velocity; with drift 0 they stand still (a stop line, a pole)."""
+    """A position that drifts without a velocity; with drift 0 it stands still (a stop line, a pole)."""
 
-    names: tuple[str, ...] = setting(("x", "y"), "components of the state")
+    components: ClassVar[tuple[str, ...]] = ("x", "y")
+    generator: ClassVar[FloatArray] = np.zeros((2, 2))
     drift: NonNegative = setting(0.0, "spectral density of the drift, unit^2/s; 0: never moves")
 
     @property
-    def components(self) -> tuple[str, ...]:
-        return self.names
-
-    @property
-    def generator(self) -> FloatArray:
-        return np.zeros((len(self.names), len(self.names)))
-
-    @property
     def diffusion(self) -> FloatArray:
-        return self.drift * np.eye(len(self.names))
+        return self.drift * np.eye(2)
 
 
 @dataclass(frozen=True)

@@ -1,23 +1,23 @@
 """Interaction functions that are not linear: accelerations by the states of two nodes.
 
-p' = p + dt v + dt^2 / 2 a,        v' = v + dt a,         a = sum_j rate_j tau a_j(x, x_j), held over the interval
+p' = p + dt v + dt^2 / 2 a,        v' = v + dt a,         a = sum_j rate_j a_j(x, x_j), held over the interval
 
     following   a = f(v . u, r - length, w . u) u          d = p_leader - p, r = |d|, u = d / |d|, w the leader's
                                                            velocity, f of the Intelligent Driver Model
-    repulsion   a = A exp( (reach - r) / B ) u,            d from the neighbour, or the nearest point of a wall, to p
+    repulsion   a = A exp( (`RADII` - r) / B ) u,           d from the neighbour, or the nearest point of a wall, to p
 
 The second is the circular specification of the social force (Helbing, Farkas, Vicsek 2000, doi 10.1038/35035023,
 equation 2 without body contact). The first is that of Treiber, Hennecke, Helbing (2000, doi
 10.1103/PhysRevE.62.1805, equations 3 and 4) with round corners: at a corner a least-squares solution has no
 linearisation, and solvers do not converge.
 
-    f0 = a - g / (1 + (g / G)^4)^(1/4),    g = a (v / v_free)^4 + a (s* / s)^2,    G = a + max_deceleration
+    f0 = a - g / (1 + (g / G)^4)^(1/4),    g = a (v / v_free)^4 + a (s* / s)^2,    G = a + `MAX_DECELERATION`
     s* = s0 + S(v T + v (v - w) / (2 sqrt(a b))),    S(x) = log(1 + e^x) for max(0, x), s likewise, m
     f  = -v / t_stop + h S((f0 + v / t_stop) / h)    for max(f0, -v / t_stop): vehicles do not reverse; h 0.05 m/s^2
 
 Laws and their derivatives are continuous everywhere, or estimates do not settle where two walk into each other. Nearer
 than w, r and u are the soft distance and its gradient (`factors.measurement`): the repulsion stays the downhill slope
-of its potential A B exp( (reach - r) / B ), and at distance zero nothing acts. w is 0.3 m, of vehicles 1 m: estimates
+of its potential A B exp( (`RADII` - r) / B ), and at distance zero nothing acts. w is 0.3 m, of vehicles 1 m: estimates
 come so near, centres of road users do not; bodies are 0.46 m deep (Fruin, Pedestrian Planning and Design, 1971).
 Of a wall of pieces k, from c_k along the unit vector t_k for L_k, with tau = t_k . (p - c_k) and h = 0.05 m,
 
@@ -33,14 +33,14 @@ The Intelligent Driver Model as an interaction function: following a leader, and
 
 is the acceleration at speed v with the gap s along the path, bumper to bumper, to a leader of speed w (Treiber,
 Hennecke, Helbing 2000, doi 10.1103/PhysRevE.62.1805, equations 3 and 4). A line to stop at is a stationary leader.
-Vehicles do not reverse, so braking is at most -v / t_stop. An edge of rate 1 / tau acts with the full acceleration,
+Vehicles do not reverse, so braking is at most -v / t_stop. An edge of rate 1/s acts with the full acceleration,
 linearised at the estimate (v', s', w'):
 
-    dv_i/dt += rate tau u_i ( f + f_v (v - v') + f_s (s - s') + f_w (w - w') )
+    dv_i/dt += rate u_i ( f + f_v (v - v') + f_s (s - s') + f_w (w - w') )
 
-A vehicle does not start behind a stationary one, f <= max(v, w) / tau: parked cars and queues stay at rest. A gap of
-at least `hidden_vehicle_gap` may hold an undetected vehicle, so that a driver does not speed up into it: he approaches
-at most the speed of the leader, f <= (w - v) / tau, and before a line he keeps his speed at most, f <= 0.
+A vehicle does not start behind a stationary one, f <= max(v, w) / s: parked cars and queues stay at rest. A gap of
+at least `HIDDEN_VEHICLE_GAP` may hold an undetected vehicle, so that a driver does not speed up into it: he approaches
+at most the speed of the leader, f <= (w - v) / s, and before a line he keeps his speed at most, f <= 0.
 """
 
 from __future__ import annotations
@@ -57,9 +57,14 @@ from factors import NonlinearInteraction
 from factors.measurement import soft_distance
 from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.settings import NonNegative, Positive, PositiveOrInf, Settings, setting, settings_group
+from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 
 LEAST_GAP = 0.5  # m; smaller gaps are below their own noise
+MAX_DECELERATION = 6.0  # m/s^2, usual 4 to 8
+STOP_TIME = 0.4  # t_stop, s, with which the last of the speed fades
+HIDDEN_VEHICLE_GAP = 7.0  # m: a car that no sensor sees fits in, so that nobody speeds up into such a gap
+STRENGTH, FALLOFF = 2.0, 0.5  # A, m/s^2, and B, m, of the social force
+RADII = 0.6  # m, sum of those of two bodies
 
 
 class Linearised(NamedTuple):
@@ -87,23 +92,11 @@ class IntelligentDriver(Settings):
         15.0, "v_free: desired speed on a free road, m/s; usual the speed limit; higher: vehicles speed up further"
     )
     headway: Positive = setting(1.0, "T: desired time headway, s; usual 0.8 to 2; higher: larger gaps")
-    standstill_gap: NonNegative = setting(2.0, "s0: gap at rest, bumper to bumper, m; usual 1 to 3")
-    acceleration: Positive = setting(1.0, "a: maximum acceleration, m/s^2; usual 0.5 to 2")
-    deceleration: Positive = setting(1.5, "b: comfortable deceleration, m/s^2; usual 1 to 3")
-    max_deceleration: Positive = setting(
-        6.0, "limit of the deceleration, m/s^2; usual 4 to 8; higher: harder braking is predicted"
+    standstill_gap: NonNegative = setting(
+        2.0, "s0: gap at rest, bumper to bumper, m; usual 1 to 3; higher: longer gaps"
     )
-    stop_time: Positive = setting(
-        0.4, "t_stop: time constant with which the last of the speed fades, s; usual 0.2 to 1; higher: slower stops"
-    )
-    hidden_vehicle_gap: PositiveOrInf = setting(
-        7.0, "gap that may hold an undetected vehicle, into which nobody speeds up, m; .inf: there are none"
-    )
-    time_constant: Positive = setting(
-        1.0,
-        "tau: an edge of rate 1 / tau has the full acceleration of the law, s; higher: edges of one rate "
-        "act more strongly",
-    )
+    acceleration: Positive = setting(1.0, "a: maximum acceleration, m/s^2; usual 0.5 to 2; higher: quicker starts")
+    deceleration: Positive = setting(1.5, "b: comfortable deceleration, m/s^2; usual 1 to 3; higher: later braking")
 
     def alone(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
         """f (E,) without an undetected vehicle in the gap; v, w >= 0 m/s, s m."""
@@ -123,18 +116,17 @@ class IntelligentDriver(Settings):
             2 * a * share**2 / s,
             by_gap_wanted * np.where(closing, -v / root, 0.0),
         )
-        hardest = Linearised(none - self.max_deceleration, none, none, none)
-        halt = Linearised(-v / self.stop_time, none - 1 / self.stop_time, none, none)
-        f = hardest.where(f.value < -self.max_deceleration, f)
+        hardest = Linearised(none - MAX_DECELERATION, none, none, none)
+        halt = Linearised(-v / STOP_TIME, none - 1 / STOP_TIME, none, none)
+        f = hardest.where(f.value < -MAX_DECELERATION, f)
         f = halt.where(f.value < halt.value, f)
-        rate = np.where(np.maximum(v, w) < f.value * self.time_constant, 1 / self.time_constant, 0.0)
-        start = Linearised(rate * np.maximum(v, w), rate * (v >= w), none, rate * (v < w))
-        return start.where(rate > 0, f)
+        start = Linearised(np.maximum(v, w), np.where(v < w, 0.0, 1.0), none, np.where(v < w, 1.0, 0.0))
+        return start.where(start.value < f.value, f)
 
     def following(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
         """Acceleration (E,) behind a leader."""
-        rate, none = 1 / self.time_constant, np.zeros_like(v)
-        return self._capped(v, s, w, Linearised(rate * (w - v), none - rate, none, none + rate))
+        none = np.zeros_like(v)
+        return self._capped(v, s, w, Linearised(w - v, none - 1, none, none + 1))
 
     def stopping(self, v: FloatArray, s: FloatArray) -> Linearised:
         """Acceleration (E,) before a line to stop at."""
@@ -144,7 +136,7 @@ class IntelligentDriver(Settings):
     def _capped(self, v: FloatArray, s: FloatArray, w: FloatArray, highest: Linearised) -> Linearised:
         """f, but at most `highest` where the gap has room for another vehicle."""
         f = self.alone(v, s, w)
-        return highest.where((s >= self.hidden_vehicle_gap) & (highest.value < f.value), f)
+        return highest.where((s >= HIDDEN_VEHICLE_GAP) & (highest.value < f.value), f)
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
@@ -152,9 +144,9 @@ class IntelligentDriver(Settings):
         way = nodes.along(target, source)
         f = self.following(v, way.ahead - (nodes.length[target] + nodes.length[source]) / 2, w)
         at_rest = f._replace(value=f.value - f.by_leader * w)
-        from_leader = self.time_constant * u_i[:, :, None] * u_j[:, None, :] * f.by_leader[:, None, None]
+        from_leader = u_i[:, :, None] * u_j[:, None, :] * f.by_leader[:, None, None]
         along = Along(u_i, unit(way.direction), v)
-        return accelerated(nodes, target, source, along, at_rest, self.time_constant, from_leader)
+        return accelerated(nodes, target, source, along, at_rest, from_leader)
 
 
 def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
@@ -176,7 +168,6 @@ def accelerated(
     source: IntArray,
     path: Along,
     f: Linearised,
-    tau: float,
     by_leader: FloatArray | None = None,
 ) -> Triples:
     """The triples of an acceleration f along a path, linearised at the speed and the gap along it.
@@ -184,11 +175,11 @@ def accelerated(
     by_leader: derivative (E, 2, 2) by the velocity of the source, whose part f leaves out
     """
     u, onward, v = path
-    along = tau * u[:, :, None] * u[:, None, :]
+    along = u[:, :, None] * u[:, None, :]
     gap = (nodes.position[source] * onward - nodes.position[target] * u).sum(axis=1)
     by_gap, by_speed = along * f.by_gap[:, None, None], along * f.by_speed[:, None, None]
-    by_source = tau * u[:, :, None] * onward[:, None, :] * f.by_gap[:, None, None]
-    constant = tau * u * (f.value - f.by_speed * v - f.by_gap * gap)[:, None]
+    by_source = u[:, :, None] * onward[:, None, :] * f.by_gap[:, None, None]
+    constant = u * (f.value - f.by_speed * v - f.by_gap * gap)[:, None]
     return velocity_triples(nodes, target, source, -by_gap, by_speed, by_source, by_leader, constant)
 
 
@@ -209,11 +200,7 @@ class Accelerations(NamedTuple):
 
 @runtime_checkable
 class AccelerationLaw(Protocol):
-    """Acceleration of a node with position and velocity by another; an edge of rate 1 / tau acts with all of it."""
-
-    @property
-    def time_constant(self) -> float:
-        """tau, s."""
+    """Acceleration of a node with position and velocity by another; an edge of rate 1/s acts with all of it."""
 
     @property
     def alone(self) -> FloatArray:
@@ -235,24 +222,12 @@ class SmoothDriver(Settings):
     """A vehicle follows its leader, the source: an intelligent driver whose law has no corners."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
-    driver: IntelligentDriver = settings_group(
-        IntelligentDriver, "parameters of the driver; `hidden_vehicle_gap` is not used"
-    )
-    length: Positive = setting(
-        4.5, "part of the distance between centres that vehicles fill where no boxes are known, m"
-    )
-
-    @property
-    def time_constant(self) -> float:
-        return self.driver.time_constant
-
-    @property
-    def alone(self) -> FloatArray:
-        return np.array(self.length)
+    alone: ClassVar[FloatArray] = np.array(4.5)  # m that vehicles fill of the distance, where no boxes are known
+    driver: IntelligentDriver = settings_group(IntelligentDriver, "parameters of the driver")
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         filled = (nodes.length[target] + nodes.length[source]) / 2
-        return np.where(filled > 0, filled, self.length)
+        return np.where(filled > 0, filled, self.alone)
 
     def accelerations(self, own: FloatArray, other: FloatArray, given: FloatArray) -> Accelerations:
         soft = soft_distance(other[..., :2] - own[..., :2], _BEHIND)
@@ -269,21 +244,11 @@ class SmoothDriver(Settings):
 
 
 @dataclass(frozen=True)
-class SocialForce(Settings):
+class SocialForce:
     """A pedestrian keeps away from another, or from a wall: from the nearest point of the source's outline."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
-    strength: Positive = setting(2.0, "A: acceleration at the distance `reach`, m/s^2; higher: larger berth")
-    falloff: Positive = setting(0.5, "B: distance over which the force falls to a third, m")
-    reach: Positive = setting(0.6, "sum of the radii of both, m; for a wall, one radius")
-
-    @property
-    def time_constant(self) -> float:
-        return 1.0
-
-    @property
-    def alone(self) -> FloatArray:
-        return np.zeros((1, 4))
+    alone: ClassVar[FloatArray] = np.zeros((1, 4))
 
     def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """(E, k, 4) pieces of the outlines, both ends from the source's position; those that are missing far away."""
@@ -300,9 +265,9 @@ class SocialForce(Settings):
         soft = soft_distance(apart, _BESIDE)
         distance, away = soft.value, soft.direction
         weight = softmax(-distance / _ROUND, axis=-1)[..., None, None]
-        force = self.strength * np.exp((self.reach - distance) / self.falloff)[..., None]
+        force = STRENGTH * np.exp((RADII - distance) / FALLOFF)[..., None]
         pushes = force * away
-        by_apart = force[..., None] * (soft.bend() - away[..., :, None] * away[..., None, :] / self.falloff)
+        by_apart = force[..., None] * (soft.bend() - away[..., :, None] * away[..., None, :] / FALLOFF)
         by_distance = (away[..., None, :] @ by_offset)[..., 0, :]
         nearer = ((weight[..., 0] * by_distance).sum(axis=-2, keepdims=True) - by_distance) / _ROUND  # d log(weight)
         by_position = (weight * (by_apart @ by_offset + pushes[..., :, None] * nearer[..., None, :])).sum(axis=-3)
@@ -341,15 +306,15 @@ def smooth_acceleration(driver: IntelligentDriver, v: FloatArray, s: FloatArray,
     gap = LEAST_GAP + np.logaddexp(0.0, s - LEAST_GAP)
     share = wanted / gap
     by_approach = 2 * a * share / gap * expit(approach)
-    G = a + driver.max_deceleration
+    G = a + MAX_DECELERATION
     g = a * (v / driver.free_speed) ** 4 + a * share**2
     slope = -((1 + (g / G) ** 4) ** -1.25)
-    above = (a - g / (1 + (g / G) ** 4) ** 0.25 + v / driver.stop_time) / _HALT  # the halt
+    above = (a - g / (1 + (g / G) ** 4) ** 0.25 + v / STOP_TIME) / _HALT  # the halt
     slope = slope * expit(above)
     by_speed = slope * (4 * a * v**3 / driver.free_speed**4 + by_approach * (driver.headway + (2 * v - w) / root))
     return Linearised(
-        np.asarray(_HALT * np.logaddexp(0.0, above) - v / driver.stop_time),
-        by_speed + (expit(above) - 1) / driver.stop_time,
+        np.asarray(_HALT * np.logaddexp(0.0, above) - v / STOP_TIME),
+        by_speed + (expit(above) - 1) / STOP_TIME,
         slope * (-2 * a * share**2 / gap * expit(s - LEAST_GAP)),
         slope * by_approach * -v / root,
     )

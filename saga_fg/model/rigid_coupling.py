@@ -17,29 +17,23 @@ from saga_fg.model.edge_rules import Pairs
 from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, velocity_triples
 from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.settings import (
-    NonNegative,
-    PositiveOrInf,
-    Settings,
-    setting,
-    settings_group,
-)
+from saga_fg.settings import NonNegative, Settings, setting
+
+OFFSET_TIME = 1.0  # tau: time constant with which a change of the offset is undone, s
+SPEED_SCALE = 2.0  # m/s, sigma of the kernel on the difference of velocities
 
 
 @dataclass(frozen=True)
-class RigidCoupling(Settings):
+class RigidCoupling:
     """A node keeps the velocity of another and its present place relative to it."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
-    time_constant: PositiveOrInf = setting(
-        1.0, "tau: time constant with which a change of the offset is undone, s; .inf: share velocities only"
-    )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         offset = nodes.position[source] - nodes.position[target]
-        stiffness = np.eye(2) / self.time_constant
+        stiffness = np.eye(2) / OFFSET_TIME
         return velocity_triples(
-            nodes, target, source, -stiffness, -np.eye(2), stiffness, np.eye(2), -offset / self.time_constant
+            nodes, target, source, -stiffness, -np.eye(2), stiffness, np.eye(2), -offset / OFFSET_TIME
         )
 
 
@@ -48,20 +42,15 @@ class Attached(Settings):
     """Every object of some classes is attached to the nearest of some others that touches it and moves as it does."""
 
     map_classes: ClassVar[tuple[str, ...]] = ()
-    interaction: RigidCoupling = settings_group(RigidCoupling, "interaction function of the edges, which go both ways")
-    attached: tuple[str, ...] = setting(("trailer",), "classes of attached objects")
-    carriers: tuple[str, ...] = setting(("truck",), "classes of the objects they are attached to")
-    rate: NonNegative = setting(3.0, "strength of an edge, 1/s; usual 1 to 5; higher: held together more firmly")
+    interaction: ClassVar[RigidCoupling] = RigidCoupling()
+    rate: ClassVar[float] = 3.0  # 1/s, usual 1 to 5
+    heading_scale: ClassVar[float] = 0.5  # rad, sigma of the kernel on the difference of headings
+    attached: tuple[str, ...] = setting(("trailer",), "classes of attached objects; more: more pairs are sought")
+    carriers: tuple[str, ...] = setting(("truck",), "classes of the objects they are attached to; likewise")
     max_gap: NonNegative = setting(
         2.0,
         "largest distance between centres beyond half of both lengths, m; usual 1 to 3; higher: looser "
         "pairs are coupled, too",
-    )
-    heading_scale: PositiveOrInf = setting(
-        0.5, "sigma of the kernel on the difference of headings, rad; .inf: no kernel; higher: edges in bends, too"
-    )
-    speed_scale: PositiveOrInf = setting(
-        2.0, "sigma of the kernel on the difference of velocities, m/s; .inf: no kernel"
     )
 
     def pairs(self, nodes: NodeTable) -> Pairs:
@@ -71,7 +60,7 @@ class Attached(Settings):
         apart = _distance(nodes.position, parts, carriers) - (nodes.length[parts, None] + nodes.length[carriers]) / 2
         turn = wrap_angle(nodes.heading[parts, None] - nodes.heading[carriers])
         difference = _distance(nodes.velocity, parts, carriers)
-        exponent = (turn / self.heading_scale) ** 2 + (difference / self.speed_scale) ** 2
+        exponent = (turn / self.heading_scale) ** 2 + (difference / SPEED_SCALE) ** 2
         rate = np.where(apart <= self.max_gap, self.rate * np.exp(-exponent / 2), 0.0)
         of_part, of_carrier = rate.argmax(axis=1), rate.argmax(axis=0)
         rows = np.arange(len(parts))

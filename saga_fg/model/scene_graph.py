@@ -53,7 +53,7 @@ class Edges:
         return len(self.target)
 
 
-class MatchedMotion(NamedTuple):
+class OwnMotions(NamedTuple):
     """Own motions x' = F x + b + q, q ~ N(0, Q), of n nodes over an interval: F, Q (n, d, d), b (n, d)."""
 
     F: FloatArray
@@ -61,16 +61,16 @@ class MatchedMotion(NamedTuple):
     Q: FloatArray
 
 
-class ModeRecord(Protocol):
-    """Mixtures of motion of some nodes at the start of an interval; see `saga_fg.model.modes.ModeTable`."""
+class Courses(Protocol):
+    """Courses of some nodes at the start of an interval; see `saga_fg.model.turning.KnownCourses`."""
 
     @property
     def ids(self) -> IntArray: ...
 
-    def select(self, rows: IntArray) -> ModeRecord: ...
+    def select(self, rows: IntArray) -> Courses: ...
 
-    def predicted(self, dt: float, scale: FloatArray) -> tuple[ModeRecord, MatchedMotion]:
-        """dt seconds later, and the motions that have the same moments; scale (n,) of the process noise."""
+    def predicted(self, dt: float, scale: FloatArray) -> tuple[Courses, OwnMotions]:
+        """dt seconds later, and the motions until then; scale (n,) of the process noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class SceneGraph:
     nonlinear  one or more groups of nonlinear edges, likewise
     diffusion_scale  (n,) > 0, factors on the diffusion of the nodes' own motion, 1 if not given: what an interaction
                      explains of a node's motion is noise no more
-    modes  of nodes whose own motion is a mixture, in place of that of their types
+    courses  known ones of nodes, whose motion along these takes the place of that of their types
 
     Raises `InputError` for edges that name a row the graph has not, triples whose sizes don't fit the nodes,
     or edges of the other kind.
@@ -153,7 +153,7 @@ class SceneGraph:
     edges: tuple[Edges, ...] = ()
     diffusion_scale: FloatArray = None  # type: ignore[assignment]  # an array from construction on
     nonlinear: tuple[NonlinearEdges, ...] = ()
-    modes: tuple[ModeRecord, ...] = ()
+    courses: tuple[Courses, ...] = ()
 
     def __post_init__(self) -> None:
         nodes = checked_ids("nodes", self.nodes)
@@ -211,12 +211,12 @@ class SceneGraph:
         return SceneGraph(self.nodes, self.types)
 
     def after(self, dt: float) -> SceneGraph:
-        """The graph for the rest of an interval of which dt seconds have passed: the same edges, later modes."""
-        if not self.modes:
+        """The graph for the rest of an interval of which dt seconds have passed: the same edges, later courses."""
+        if not self.courses:
             return self
-        scale = (self.diffusion_scale[self.rows(record.ids)] for record in self.modes)
-        later = (record.predicted(dt, s)[0] for record, s in zip(self.modes, scale, strict=True))
-        return replace(self, modes=tuple(later))
+        scale = (self.diffusion_scale[self.rows(record.ids)] for record in self.courses)
+        later = (record.predicted(dt, s)[0] for record, s in zip(self.courses, scale, strict=True))
+        return replace(self, courses=tuple(later))
 
     def rows(self, nodes: IntArray) -> IntArray:
         """Rows of nodes that are in the graph."""
@@ -241,8 +241,8 @@ class SceneGraph:
             triple = (group.A_self[inside], group.A_other[inside], group.b[inside])
             groups.append(Edges(group.interaction, target, source, group.rate[inside], *triple))
         types = tuple(self.types[k] for k in kept.tolist())
-        modes = tuple(m.select(np.flatnonzero(np.isin(m.ids, nodes))) for m in self.modes)
-        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept], tuple(nonlinear), modes)
+        courses = tuple(c.select(np.flatnonzero(np.isin(c.ids, nodes))) for c in self.courses)
+        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept], tuple(nonlinear), courses)
 
     @staticmethod
     def of(nodes: Sequence[int] | IntArray, node_type: NodeType, edges: Sequence[Edges] = ()) -> SceneGraph:

@@ -123,7 +123,7 @@ def _states(rule: MovingRule) -> tuple[bool, ...]:
     """States of objects that a rule acts on: True for seen moving, False for others."""
     match rule:
         case Neighbours():
-            return (not rule.parked,)
+            return (True,)
         case Following():
             return (True, False) if rule.parked else (True,)
         case _:

@@ -7,7 +7,7 @@ a lane ends before the line.
 
 A closed stop line brings the first vehicle to a halt, and through it the queue.
 
-    dv_i/dt += rate tau u ( -v^2 / (2 g) ),    v = u.v_i,    g = u.(p_j - p_i) + bend - length_i / 2 - margin
+    dv_i/dt += rate u ( -v^2 / (2 g) ),    v = u.v_i,    g = u.(p_j - p_i) + bend - length_i / 2 - margin
 
 is the constant deceleration that ends at the line: v the speed along the lane, g the remaining way from the front of
 the vehicle to `margin` before the line, `bend` the extra length of the way along the lane over the straight one.
@@ -17,19 +17,19 @@ Linearised at the estimate (v0, g0):
 
 The rule: of the vehicles that come to a line, the first of each lane that can still stop, at
 
-    rate = rate  closed_j  ramp( v^2 / (2 g) from `reaction_deceleration` to `full_deceleration` )
+    rate = closed_j  ramp( v^2 / (2 g) from `reaction_deceleration` to `full_deceleration` )
 
-since drivers do not brake for a line far away; a vehicle that would have to brake harder than `max_deceleration` goes
-on. A slow one near the line comes to rest where it is: dv_i/dt += -rate tau v / stop_time. Those behind follow by other
+since drivers do not brake for a line far away; a vehicle that would have to brake harder than `MAX_DECELERATION` goes
+on. A slow one near the line comes to rest where it is: dv_i/dt += -rate v / `STOP_TIME`. Those behind follow by other
 interactions. Alternatively the line is a stationary leader of the Intelligent Driver Model
 (`saga_fg.model.nonlinear_interactions`): the vehicle brakes later and harder, and a slow one creeps up to the line.
 
 An open stop line lets the first vehicle go, and through it the queue.
 
-    dv_i/dt += rate open_j ( speed - u.v_i ) u      where u.v_i < speed
+    dv_i/dt += `START_RATE` open_j ( speed - u.v_i ) u      where u.v_i < speed = `CROSSING_SPEED`
 
-so that a standing vehicle starts with rate * speed, and its acceleration fades as it speeds up, as that of queues does
-which a green light discharges.
+so that a standing vehicle starts with `START_RATE` speed, and its acceleration fades as it speeds up, as that of queues
+does which a green light discharges.
 """
 
 from __future__ import annotations
@@ -44,12 +44,10 @@ from saga_fg.model.edge_rules import VEHICLES, Pairs
 from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.model.nonlinear_interactions import (
     LEAST_GAP,
-    Accelerations,
     Along,
     IntelligentDriver,
     Linearised,
     accelerated,
-    smooth_acceleration,
     speed_along,
 )
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
@@ -59,6 +57,11 @@ from saga_fg.types.road_map import LIGHT, STOP_LINE, LanesAcross
 
 SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
 PAST = 2.0  # m; a vehicle waits at a line with its front up to this far beyond it
+MAX_DISTANCE = 100.0  # m; lines further away do not concern a vehicle
+CLEARED = 20.0  # m beyond a line within which vehicles still speed up
+MAX_DECELERATION = 4.5  # m/s^2, usual 3 to 6; drivers who would have to brake harder do not stop
+CROSSING_SPEED = 10.0  # m/s, at which vehicles of a discharged queue cross a line, usual 8 to 14
+START_RATE = 0.2  # 1/s; by it the first acceleration is 2 m/s^2
 
 
 class Approach(NamedTuple):
@@ -150,32 +153,31 @@ def _ends(nodes: NodeTable, source: IntArray) -> FloatArray:
     return np.array([nodes.outline[j] for j in lines.tolist()]).reshape(-1, 2, 2)[row]
 
 
-def _near(nodes: NodeTable, classes: tuple[str, ...], max_distance: float) -> tuple[IntArray, IntArray]:
+def _near(nodes: NodeTable, max_distance: float) -> tuple[IntArray, IntArray]:
     """Vehicles and lines within some distance of each other (E,)."""
     lines = np.flatnonzero(nodes.label == STOP_LINE)
-    vehicles = np.flatnonzero(of_classes(nodes.label, classes))
+    vehicles = np.flatnonzero(of_classes(nodes.label, VEHICLES))
     target, source = np.repeat(vehicles, len(lines)), np.tile(lines, len(vehicles))
     near = np.hypot(*(nodes.position[target] - nodes.position[source]).T) <= max_distance
     return target[near], source[near]
 
 
-def coming_vehicles(nodes: NodeTable, classes: tuple[str, ...], max_distance: float) -> ComingVehicles:
-    """All vehicles that come to a line within some distance; those that wait a little past it among them."""
-    key = ("coming", classes, max_distance)
-    if key not in nodes.derived:
-        target, source = _near(nodes, classes, max_distance)
+def coming_vehicles(nodes: NodeTable) -> ComingVehicles:
+    """All vehicles that come to a line within `MAX_DISTANCE`; those that wait a little past it among them."""
+    if "coming" not in nodes.derived:
+        target, source = _near(nodes, MAX_DISTANCE)
         ways = approach(nodes, target, source)
         speed = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], ways.direction), 0.0)
         front = ways.way - nodes.length[target] / 2
         found = ComingVehicles(target, source, ways, speed, front)
-        nodes.derived[key] = found.select(ways.comes & (front > -PAST))
-    coming: ComingVehicles = nodes.derived[key]
+        nodes.derived["coming"] = found.select(ways.comes & (front > -PAST))
+    coming: ComingVehicles = nodes.derived["coming"]
     return coming
 
 
-def passed_vehicles(nodes: NodeTable, classes: tuple[str, ...], max_distance: float) -> ComingVehicles:
-    """All vehicles that have crossed a line straight on and are within some distance of it."""
-    target, source = _near(nodes, classes, max_distance)
+def passed_vehicles(nodes: NodeTable) -> ComingVehicles:
+    """All vehicles that have crossed a line straight on and are within `CLEARED` of it."""
+    target, source = _near(nodes, CLEARED)
     beyond, across = nodes.position[target] - nodes.position[source], unit(nodes.heading[source])
     ends = _ends(nodes, source)
     aside = across[:, 0] * beyond[:, 1] - across[:, 1] * beyond[:, 0]
@@ -188,9 +190,9 @@ def passed_vehicles(nodes: NodeTable, classes: tuple[str, ...], max_distance: fl
     return ComingVehicles(target, source, Approach(inside, -passed, u, aside), speed, front).select(inside)
 
 
+STOP_TIME = 1.0  # s, time constant with which the last of the speed fades
 HALTING_SPEED = 2.0  # m/s; slower vehicles near a closed line come to rest where they are
 HALTING_GAP = 10.0  # m from the front of the vehicle to the line
-MAX_DECELERATION = 4.5  # drivers who would have to brake harder do not stop, m/s^2
 
 
 @dataclass(frozen=True)
@@ -198,15 +200,9 @@ class Stopping(Settings):
     """Even deceleration to a halt before a line; the source is the line."""
 
     needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
-    time_constant: Positive = setting(1.0, "tau: an edge of rate 1 / tau decelerates as much as is needed, s")
     margin: NonNegative = setting(
-        3.0, "distance left between the front of a stopped vehicle and the line, m; usual 1 to 5"
-    )
-    hardest: Positive = setting(
-        4.5, "limit of the deceleration, m/s^2; usual 3 to 6; higher: harder braking is predicted"
-    )
-    stop_time: Positive = setting(
-        1.0, "time constant with which the last of the speed fades, s; usual 0.5 to 2; higher: slower stops"
+        3.0,
+        "distance left between the front of a stopped vehicle and the line, m; usual 1 to 5; higher: stops earlier",
     )
 
     def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
@@ -215,12 +211,10 @@ class Stopping(Settings):
 
     def law(self, v: FloatArray, g: FloatArray) -> Linearised:
         """The deceleration (E,) at speeds and remaining ways g (E,)."""
-        g = np.maximum(g, v**2 / (2 * self.hardest))
+        g = np.maximum(g, v**2 / (2 * MAX_DECELERATION))
         none = np.zeros_like(v)
         even = Linearised(-(v**2) / (2 * g), -v / g, v**2 / (2 * g**2), none)
-        return Linearised(-v / self.stop_time, none - 1 / self.stop_time, none, none).where(
-            halting(v, g + self.margin), even
-        )
+        return Linearised(-v / STOP_TIME, none - 1 / STOP_TIME, none, none).where(halting(v, g + self.margin), even)
 
     def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
         """Accelerations (E,), m/s^2, at speeds and remaining ways g (E,)."""
@@ -230,7 +224,7 @@ class Stopping(Settings):
         ways = approach(nodes, target, source)
         v = speed_along(nodes, target, ways.direction)
         law = self.law(v, self.gap(nodes, target, ways.way))
-        return accelerated(nodes, target, source, Along(ways.direction, ways.direction, v), law, self.time_constant)
+        return accelerated(nodes, target, source, Along(ways.direction, ways.direction, v), law)
 
 
 @dataclass(frozen=True)
@@ -255,48 +249,7 @@ class DriverStopping:
         v = speed_along(nodes, target, ways.direction)
         f = self.driver.stopping(v, self.gap(nodes, target, ways.way))
         path = Along(ways.direction, ways.direction, v)
-        return accelerated(nodes, target, source, path, f, self.driver.time_constant)
-
-
-@dataclass(frozen=True)
-class SmoothStopping:
-    """Coming to a line as to the end of a queue, without corners in the law; the source is the line."""
-
-    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION)
-    driver: IntelligentDriver = settings_group(
-        IntelligentDriver, "parameters of the driver; `hidden_vehicle_gap` is not used"
-    )
-
-    @property
-    def time_constant(self) -> float:
-        return self.driver.time_constant
-
-    @property
-    def alone(self) -> FloatArray:
-        return np.array([1.0, 0.0, 0.0])
-
-    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
-        """Gap (E,), m, for ways (E,) from the centres to the line."""
-        return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
-
-    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
-        """Accelerations (E,), m/s^2, at speeds and gaps g (E,)."""
-        return smooth_acceleration(self.driver, v, g, np.zeros_like(v)).value
-
-    def given(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
-        """(E, 3) direction of the lane, and the gap less the distance to the line along it."""
-        ways = approach(nodes, target, source)
-        straight = np.einsum("ei,ei->e", nodes.position[source] - nodes.position[target], ways.direction)
-        return np.column_stack([ways.direction, self.gap(nodes, target, ways.way) - straight])
-
-    def accelerations(self, own: FloatArray, other: FloatArray, given: FloatArray) -> Accelerations:
-        u = given[..., :2]
-        v, s = (u * own[..., 2:]).sum(axis=-1), (u * (other - own)[..., :2]).sum(axis=-1) + given[..., 2]
-        f = smooth_acceleration(self.driver, v, s, np.zeros_like(v))
-        along = u[..., :, None] * u[..., None, :]
-        by_gap = f.by_gap[..., None, None] * along
-        by_own = np.concatenate([-by_gap, f.by_speed[..., None, None] * along], axis=-1)
-        return Accelerations(f.value[..., None] * u, by_own, np.concatenate([by_gap, 0 * by_gap], axis=-1))
+        return accelerated(nodes, target, source, path, f)
 
 
 @dataclass(frozen=True)
@@ -304,24 +257,14 @@ class RedLight(Settings):
     """The first vehicle that comes to a closed stop line, and can stop, does."""
 
     map_classes: ClassVar[tuple[str, ...]] = (LIGHT, STOP_LINE)
-    interaction: Stopping | DriverStopping | SmoothStopping = settings_group(
-        Stopping, "interaction function of the edges"
-    )
-    rate: NonNegative = setting(
-        1.0,
-        "strength of an edge of a vehicle that brakes for a line that is surely closed, 1/s; usual 0.5 to "
-        "2; higher: brakes more surely",
-    )
-    max_distance: NonNegative = setting(
-        100.0, "no edge from a line further away, m; usual 50 to 150; higher: vehicles brake from afar"
-    )
+    classes: ClassVar[tuple[str, ...]] = VEHICLES
+    interaction: Stopping | DriverStopping = settings_group(Stopping, "interaction function of the edges")
     reaction_deceleration: NonNegative = setting(
         0.3, "needed deceleration at which drivers begin to react, m/s^2; usual 0.2 to 1; higher: they react later"
     )
     full_deceleration: Positive = setting(
         1.0, "needed deceleration from which they brake fully, m/s^2; usual 0.8 to 2; higher: they brake later"
     )
-    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
 
     def able(self, coming: ComingVehicles) -> ComingVehicles:
         """Coming vehicles that can stop before the line, or halt at it."""
@@ -337,9 +280,9 @@ class RedLight(Settings):
         return ramp, self.interaction.acceleration(coming.speed, g)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        first = self.able(coming_vehicles(nodes, self.classes, self.max_distance)).first()
+        first = self.able(coming_vehicles(nodes)).first()
         weight = np.zeros(len(first.source)) if nodes.closed is None else nodes.closed[first.source]
-        return Pairs(first.target, first.source, self.rate * weight * self.brakes(nodes, first)[0])
+        return Pairs(first.target, first.source, weight * self.brakes(nodes, first)[0])
 
 
 def halting(speed: FloatArray, front: FloatArray) -> BoolArray:
@@ -347,50 +290,35 @@ def halting(speed: FloatArray, front: FloatArray) -> BoolArray:
     return np.asarray((speed < HALTING_SPEED) & (front < HALTING_GAP))
 
 
-CLEARED = 20.0  # m beyond a line within which vehicles still speed up
-
-
 @dataclass(frozen=True)
-class Starting(Settings):
+class Starting:
     """Relaxation to the speed of a queue that is discharged; the source is the line."""
 
     needs: ClassVar[Needs] = (VELOCITY, ())
-    speed: Positive = setting(
-        10.0, "speed at which vehicles cross an open line, m/s; usual 8 to 14; higher: they accelerate for longer"
-    )
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u = approach(nodes, target, source).direction
         return velocity_triples(
-            nodes, target, source, by_velocity=-u[:, :, None] * u[:, None, :], constant=self.speed * u
+            nodes, target, source, by_velocity=-u[:, :, None] * u[:, None, :], constant=CROSSING_SPEED * u
         )
 
 
 @dataclass(frozen=True)
-class GreenLight(Settings):
+class GreenLight:
     """The first vehicle that comes to an open stop line, or has just crossed it, speeds up."""
 
     map_classes: ClassVar[tuple[str, ...]] = (LIGHT, STOP_LINE)
-    interaction: Starting = settings_group(Starting, "interaction function of the edges")
-    rate: NonNegative = setting(
-        0.2,
-        "strength of an edge from a line that is surely open, 1/s: the first acceleration is this times the speed; "
-        "usual 0.1 to 0.3; higher: vehicles start faster",
-    )
-    max_distance: NonNegative = setting(
-        100.0, "no edge from a line further away, m; usual 20 to 150; higher: slow vehicles speed up from afar"
-    )
-    classes: tuple[str, ...] = setting(VEHICLES, "classes of objects that take part")
+    classes: ClassVar[tuple[str, ...]] = VEHICLES
+    interaction: ClassVar[Starting] = Starting()
 
     def acceleration(self, speed: FloatArray) -> FloatArray:
         """Accelerations (E,) of vehicles of these speeds before a line that is surely open, m/s^2."""
-        return self.rate * np.maximum(self.interaction.speed - speed, 0.0)
+        return START_RATE * np.maximum(CROSSING_SPEED - speed, 0.0)
 
     def pairs(self, nodes: NodeTable) -> Pairs:
-        coming = coming_vehicles(nodes, self.classes, self.max_distance)
         found = []
-        for first in (coming.first(), passed_vehicles(nodes, self.classes, CLEARED).first()):
-            slow = first.select(first.speed < self.interaction.speed)
+        for first in (coming_vehicles(nodes).first(), passed_vehicles(nodes).first()):
+            slow = first.select(first.speed < CROSSING_SPEED)
             weight = np.zeros(len(slow.source)) if nodes.open is None else nodes.open[slow.source]
-            found.append(Pairs(slow.target, slow.source, self.rate * weight))
+            found.append(Pairs(slow.target, slow.source, START_RATE * weight))
         return Pairs(*(np.concatenate(column) for column in zip(*found, strict=True)))

@@ -1,9 +1,9 @@
-from .clock import ClockSettings, TimeVerdict
+from .clock import TimeVerdict
 from .clock_offsets import SensorTime
 from .greedy import GreedySettings, GreedyTracker
 from .journal import Journal, Observer, Stage, TrackerView
-from .names import AssociationName
 from .settings import (
+    AssociationName,
     AssociationSettings,
     ClassSettings,
     EgoNodeSettings,
@@ -11,7 +11,6 @@ from .settings import (
     TrackerSettings,
 )
 from .table_tracking import track
-from .track_filters import StationaritySettings
 from .tracker import Tracker
 from .traffic import SpeedPriorSettings, TrafficSettings
 
@@ -19,7 +18,6 @@ __all__ = [
     "AssociationName",
     "AssociationSettings",
     "ClassSettings",
-    "ClockSettings",
     "EgoNodeSettings",
     "ExistenceSettings",
     "GreedySettings",
@@ -29,7 +27,6 @@ __all__ = [
     "SensorTime",
     "SpeedPriorSettings",
     "Stage",
-    "StationaritySettings",
     "TimeVerdict",
     "Tracker",
     "TrackerSettings",

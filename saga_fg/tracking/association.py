@@ -46,6 +46,7 @@ from saga_fg.tracking.update import past_cross_covariances, past_positions
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 
+EXISTENCE_WEIGHT, SCORE_WEIGHT = 0.3, 0.5  # a and b above
 LEAST_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
 
 
@@ -122,7 +123,6 @@ def _chosen(found: CandidatePairs, association: AssociationSettings, cross: Cros
     """The pairs of least cost, each track and detection in one at most."""
     if association.method == "graph" and cross is not None:
         pairs = pair_costs(found.track, found.detection, found.innovation, found.S, cross)
-        pairs = pairs._replace(cost=association.pair_weight * pairs.cost)
         chosen = QuadraticMatching(found.track, found.detection, found.gain, pairs).solve()
     else:
         choose = cheapest_first if association.method == "greedy" else least_total
@@ -140,8 +140,7 @@ def _candidates(
     x, z = boxes.position[:, :2], detected.position[:, :2]
     pairs, gates = near_pairs(x, z, reach), np.array([gate(each) for each in share.tolist()])
     found = CandidatePairs(*gated_pairs(*pairs, x, tracks.P, gates, of_track, z, measurements.R, of_detection))
-    probability, association = measurements.probability, settings.association
-    unmatched = _unmatched(found, tracks.chance, probability, of_detection, association, clutter_area)
+    unmatched = _unmatched(found, tracks.chance, measurements.probability, of_detection, clutter_area)
     return found._replace(gain=found.gain - unmatched)
 
 
@@ -150,7 +149,6 @@ def _unmatched(
     expected: FloatArray,
     probability: FloatArray,
     of_detection: IntArray,
-    settings: AssociationSettings,
     clutter_area: float,
 ) -> FloatArray:
     """(K,) cost of leaving pairs unmatched; for an infinite area so large that as many as possible are matched.
@@ -161,8 +159,7 @@ def _unmatched(
         dearest = found.gain.max(initial=0.0)
         return np.full(len(found.gain), dearest + 1 + len(found.gain) * (dearest - found.gain.min(initial=dearest)))
     false = np.maximum(np.bincount(of_detection, weights=1 - probability), LEAST_CLUTTER)
-    of_track = settings.existence_weight * _log_odds(expected)
-    by_score = settings.score_weight * _log_odds(probability)
+    of_track, by_score = EXISTENCE_WEIGHT * _log_odds(expected), SCORE_WEIGHT * _log_odds(probability)
     by_density = np.log(2 * math.pi * false / clutter_area)[of_detection]
     return np.asarray(2 * (of_track[found.track] + (by_score - by_density)[found.detection]))
 

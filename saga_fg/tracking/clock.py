@@ -20,7 +20,7 @@ frames of the others would be late. So it is unconfirmed. So is a frame of a sen
 
 Frames that are left out are evidence for another time, on which the sensors vote by their records. Those that propose
 about the same time set the clock once they outweigh those that go on at the newest one. If no other sensor is live, a
-second frame of the sensor is enough for a jump (one that was never in time needs `reset_after`); and `reset_after`
+second frame of the sensor is enough for a jump (one that was never in time needs `RESET_AFTER`); and `RESET_AFTER`
 frames in a row in which its time decreases set the clock back. Frames that came in a burst after a stall, and frames
 that are sent again, are no evidence. A stream whose steps are longer than `max_jump` is recognised by two equal steps,
 and then has its own limit.
@@ -34,8 +34,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from saga_fg.numerics.arrays import unchecked
-from saga_fg.settings import PositiveInt, PositiveOrInf, Settings, setting
 
+MAX_JUMP = 10.0  # s, as a tracker starts with
+RESET_AFTER = 3  # frames in a row in which the time of a sensor decreases, and that set the clock back
 REMEMBERED = 200  # accepted frames, by which repeated frames are recognised
 MANY_SENSORS = 32  # from here on, sensors of short records are forgotten: names come from outside
 REGULAR = 2.2  # steps of a sensor, up to which the next frame may take: one frame may be missing
@@ -50,18 +51,6 @@ TimeVerdict = Literal["accepted", "late", "unconfirmed", "set_ahead", "set_back"
 the clock was first set to the frame's time."""
 Stamp = tuple[str, float]
 """Sensor and time of a frame, s."""
-
-
-@dataclass(frozen=True)
-class ClockSettings(Settings):
-    """Handling of implausible timestamps."""
-
-    max_jump: PositiveOrInf = setting(
-        10.0, "leave out a frame further than this from the newest until a second confirms its time, s; usual 2 to 30"
-    )
-    reset_after: PositiveInt = setting(
-        3, "set the clock back after this many frames in a row in which the time of a sensor decreases; usual 2 to 10"
-    )
 
 
 @dataclass(frozen=True)
@@ -213,23 +202,21 @@ class Clock:
             elapsed=self.elapsed, reached=self.elapsed, sensors=tuple(r.changed(**forgotten) for r in self.sensors)
         )
 
-    def judged(
-        self, timestamp: float, sensor: str, settings: ClockSettings, max_delay: float
-    ) -> tuple[TimeVerdict, Clock]:
+    def judged(self, timestamp: float, sensor: str, max_jump: float, max_delay: float) -> tuple[TimeVerdict, Clock]:
         """Judge a frame of `sensor` by its timestamp, s; frames up to `max_delay` s old are used."""
         before = self.sensor(sensor) or SensorClock(sensor, timestamp, self.elapsed)
         own = before.arrived(timestamp, self.elapsed - before.seen)
-        limit = max(settings.max_jump, 2 * self.step)
+        limit = max(max_jump, 2 * self.step)
         right = (own,) if own.offset == 0 else (own, own.changed(offset=0.0))  # it may have been set right
         for tried in right:
             if self._agrees(tried, before, limit, max_delay):
-                return "accepted", self._accepting(tried, settings.max_jump)
+                return "accepted", self._accepting(tried, max_jump)
         if (sensor, timestamp) in self.accepted or (before.doubt is not None and timestamp == before.stamp):
             far = abs(timestamp - own.offset - self.newest) > limit
             return "unconfirmed" if far else "late", self  # sent again: no second opinion
         d = min(max(before.step_to(timestamp), 0.0), before.step, QUIET / 4)
         elapsed = max(self.elapsed, before.seen + d)
-        return self._doubting(own.changed(seen=elapsed), elapsed, limit, settings.reset_after, max_delay)
+        return self._doubting(own.changed(seen=elapsed), elapsed, limit, max_delay)
 
     def corrected(self, sensor: str, offset: float) -> Clock:
         """After the offset of a sensor's clock, s, has been estimated anew."""
@@ -283,9 +270,7 @@ class Clock:
         newest = max(self.newest, time)
         return self._changed(newest=newest, accepted=accepted, step=step, elapsed=elapsed, reached=reached)._with(own)
 
-    def _doubting(
-        self, own: SensorClock, elapsed: float, limit: float, reset_after: int, max_delay: float
-    ) -> tuple[TimeVerdict, Clock]:
+    def _doubting(self, own: SensorClock, elapsed: float, limit: float, max_delay: float) -> tuple[TimeVerdict, Clock]:
         """After a frame that is left out, or with which the clock is set."""
         time = own.stamp - own.offset
         far = time > self.newest or self.newest - time > limit
@@ -296,7 +281,7 @@ class Clock:
             own = own.changed(first=time, taken=elapsed if own.time is None else own.taken)
         own = own.changed(run=run)
         with_it = [r for r in self._others(own, elapsed) if self._same(r, own, time, elapsed, max_delay)]
-        enough = self._enough(own, with_it, elapsed, far, limit, reset_after, max_delay)
+        enough = self._enough(own, with_it, elapsed, far, limit, max_delay)
         last = self.newest if own.doubt is None else own.doubt
         own = own.changed(doubt=time)
         if not enough:
@@ -319,7 +304,6 @@ class Clock:
         elapsed: float,
         far: bool,
         limit: float,
-        reset_after: int,
         max_delay: float,
     ) -> bool:
         """Return True if the clock is to be set to the latest time of a sensor, which some others support."""
@@ -336,10 +320,10 @@ class Clock:
         if going_on:
             return False
         if not far:
-            return own.run >= reset_after and (own.time is None or time < own.time)
+            return own.run >= RESET_AFTER and (own.time is None or time < own.time)
         if with_it and own.time is not None and (own.run > 1 or time - self.newest <= limit):
             return True
-        return own.run >= (reset_after if own.time is None else 1 if begins else 2)
+        return own.run >= (RESET_AFTER if own.time is None else 1 if begins else 2)
 
     def _set(self, own: SensorClock, with_it: list[SensorClock], elapsed: float, step: float) -> Clock:
         """After the clock was set to the time of a frame, which these other sensors support."""

@@ -16,14 +16,16 @@ from saga_fg.errors import require_type
 from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import Columns, FloatArray, IntArray, StrArray
 from saga_fg.numerics.gating import near_pairs
-from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting, settings_group
-from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
+from saga_fg.settings import PositiveOrInf, Settings, setting, settings_group
+from saga_fg.tracking.clock import MAX_JUMP, Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.by_class import DEFAULT, class_numbers
 from saga_fg.types.frame import Frame
 from saga_fg.types.track import Tracks
 
+MAX_DELAY = 0.5  # s; older frames are left out
+BASELINE = 0.2  # s, least time between two positions whose difference gives a velocity; shorter: noise
 NOMINAL_VARIANCE = 1.0  # the method knows no covariance; Tracks need one, m^2 and (m/s)^2
 
 
@@ -38,16 +40,6 @@ class GreedySettings(Settings):
     )
     max_coasting: PositiveOrInf = setting(
         1.2, "delete a track this long after its last detection, s; usual 1 to 6; higher: bridges longer occlusions"
-    )
-    baseline: NonNegative = setting(
-        0.2, "least time between two positions whose difference gives a velocity, s; higher: smoother, later velocities"
-    )
-    min_score: Fraction = setting(
-        0.0, "discard detections with a lower probability; higher: fewer false tracks, more misses"
-    )
-    clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
-    max_delay: NonNegative = setting(
-        0.5, "discard frames that are older than the newest by more than this, s; higher: more late frames are used"
     )
 
 
@@ -102,16 +94,15 @@ class GreedyTracker:
         require_type("frame", frame, Frame)
         sensor = sensor_model(self.sensors, frame.sensor)
         detections = sensor.in_world(frame)
-        settings, timestamp = self.settings, frame.timestamp + sensor.time_offset
-        verdict, self._clock = self._clock.judged(timestamp, frame.sensor, settings.clock, settings.max_delay)
+        timestamp = frame.timestamp + sensor.time_offset
+        verdict, self._clock = self._clock.judged(timestamp, frame.sensor, MAX_JUMP, MAX_DELAY)
         self.time_verdict, now = verdict, self._clock.newest
         if verdict in ("late", "unconfirmed"):
             return self.tracks(now)
         if verdict == "set_back":
             self._memory = self._memory.select(np.empty(0, dtype=np.int64))
-        p = sensor.probability(detections.score, detections.boxes.label)
-        rows = np.flatnonzero(p >= self.settings.min_score)
-        boxes, p = detections.boxes.select(rows), p[rows]
+        boxes = detections.boxes
+        p = sensor.probability(detections.score, boxes.label)
         memory = self._memory
         match = self._match(boxes, p, now)
         seen = match >= 0
@@ -119,7 +110,7 @@ class GreedyTracker:
         anchor, anchor_time = position.copy(), np.full(len(boxes), now)
         elapsed = now - memory.anchor_time[match[seen]]
         # where the anchor is too young for a difference, since detections are noisy, the velocity stays
-        young = elapsed < max(self.settings.baseline - 1e-6, 1e-6)
+        young = elapsed < BASELINE - 1e-6
         moved = (position[seen] - memory.anchor[match[seen]]) / np.maximum(elapsed, 1e-6)[:, None]
         difference = np.where(young[:, None], memory.velocity[match[seen]], moved)
         velocity[seen] = np.where(np.isfinite(velocity[seen]), velocity[seen], difference)
@@ -162,7 +153,7 @@ class GreedyTracker:
     @property
     def max_jump(self) -> float:
         """Distance from the newest frame from which another has to be confirmed, s."""
-        return self.settings.clock.max_jump
+        return MAX_JUMP
 
     def snapshot(self) -> GreedySnapshot:
         """Everything that the tracker knows, as a value."""

@@ -55,7 +55,7 @@ r is the existence of the old track at its latest detection, N(m, P) its state, 
 N(a, D) its place if it is.
 
 The old track is then updated with the state of the new one, as with a measurement of position and velocity, and the
-new one is marginalised. Only a track that has been detected up to `confirming_detections` times hands over, is
+new one is marginalised. Only a track that has been detected up to `CONFIRMING` times hands over, is
 resolved, and had its first detection after the latest one of the old track.
 
 Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 8.4:
@@ -78,12 +78,13 @@ from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pa
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.track_filters import BoxFilter, Kinematics, Stationarity, TurnRate, after_evidence, log_density
 from saga_fg.tracking.track_table import TrackTable
-from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 from saga_fg.tracking.traffic import speed_prior
 from saga_fg.tracking.update import update_range_rates
 from saga_fg.types.boxes import Boxes, paired_bev_iou, touching_pairs
 
 _ROUNDING = 1 + 1e-6
+CONFIRMING = 3  # detections that confirm a track of one sensor, and up to which it may be an earlier one; usual 2 to 5
 NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite: a disc of 40 m, in which most objects are detected
 
 
@@ -164,9 +165,9 @@ def least_log_odds(state: TrackerState) -> float:
 
 def log_survival(state: TrackerState) -> FloatArray:
     """(n,) log of the probability that the track is an object that is still there."""
-    table, lifetime = state.table, state.settings.existence.lifetime
+    table = state.table
     real = np.maximum(table.last_existence, 1e-3)
-    return np.asarray(np.log(real) - table.coasting(state.time) / lifetime)
+    return np.asarray(np.log(real) - table.coasting(state.time) / LIFETIME)
 
 
 OVERLAP = 0.05  # bird's-eye IoU above which a new track is unresolved
@@ -305,8 +306,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
 
 def required_hits(state: TrackerState, sensor: Sensor) -> float:
     """Detections of a sensor alone that confirm a track which it has initiated."""
-    settings = state.settings
-    return float(settings.min_hits if sensor.initiation == "alone" else settings.confirming_detections)
+    return float(state.settings.min_hits if sensor.initiation == "alone" else CONFIRMING)
 
 
 def initial_kinematics(
@@ -314,7 +314,7 @@ def initial_kinematics(
 ) -> tuple[Kinematics, FloatArray]:
     """The kinematics of new tracks from the measurements `rows` (k,), with their boxes, if they move; and the
     probability (k,) that they are stationary."""
-    R, prior, measured = measurements.R[rows], state.settings.stationarity.prior, measurements.with_velocity[rows]
+    R, prior, measured = measurements.R[rows], state.settings.stationary_share, measurements.with_velocity[rows]
     place = boxes.position[:, :2]
     velocity, P_velocity, stationary = unmeasured_velocity(state, boxes.label, place, boxes.yaw, prior)
     if not measured.any():
@@ -370,7 +370,7 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
     resolved, detected = table.unresolved == 0, np.zeros(len(table), dtype=bool)
     detected[matching.track] = settings.association.relink_above < 1
     detections = table.sensors.hits.sum(axis=1)
-    new = (detected & resolved & (detections > 1) & (detections <= settings.confirming_detections)).nonzero()[0]
+    new = (detected & resolved & (detections > 1) & (detections <= CONFIRMING)).nonzero()[0]
     if len(new) == 0:
         return new, new, new
     old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
@@ -381,7 +381,7 @@ def _candidates(state: TrackerState, matching: Matching) -> tuple[IntArray, IntA
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
     """(k,) logs of `moving` and `stationary`, see the module."""
-    table, prior = state.table, state.settings.stationarity.prior
+    table, prior = state.table, state.settings.stationary_share
     first = np.ones(len(new), dtype=bool)
     first[1:] = new[1:] != new[:-1]  # a new track is in many pairs, one after the other
     each, of_pair = new[first], first.cumsum() - 1
@@ -397,7 +397,7 @@ def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[Fl
 def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatArray) -> None:
     """Update tracks `old` (k,) with all that is known of tracks `new` (k,); stationary (k,): then, the probability."""
     table, joint, box = state.table, state.joint, state.table.box
-    if state.settings.stationarity.prior > 0:
+    if state.settings.stationary_share > 0:
         place, P = table.stationarity.position[new], np.tile(np.eye(4), (len(new), 1, 1))
         P[:, :2, :2] = table.stationarity.P[new]
         z, without_velocity = np.concatenate([place, 0 * place], axis=1), np.zeros(len(new), dtype=bool)

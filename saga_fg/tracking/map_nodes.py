@@ -61,6 +61,7 @@ from saga_fg.types.road_map import (
     LIGHT,
     MAP_CLASSES,
     MAX_LIGHT_DISTANCE,
+    NON_COMPLIANCE,
     STATES,
     STOP_LINE,
     WALL,
@@ -199,7 +200,7 @@ class FirstVehicles(Columns):
         stop, go = _first(rules, RedLight), _first(rules, GreenLight)
         if stop is None:
             return self
-        first = stop.able(coming_vehicles(nodes, stop.classes, stop.max_distance).first())
+        first = stop.able(coming_vehicles(nodes).first())
         first = first.select(first.target < len(detected))
         first = first.select(detected[first.target])
         v, ids, line = first.speed, nodes.id[first.target], nodes.id[first.source]
@@ -232,7 +233,7 @@ class FirstVehicles(Columns):
         log_likelihood = self.log_likelihood.copy()
         log_likelihood[mine] += (self.weight[mine] / V)[:, None] * change * (dv[:, None] - change / 2)
         log_likelihood -= log_likelihood.max(axis=1, keepdims=True, initial=-np.inf) if len(log_likelihood) else 0.0
-        return replace(self, log_likelihood=np.maximum(log_likelihood, np.log(settings.non_compliance)))
+        return replace(self, log_likelihood=np.maximum(log_likelihood, np.log(NON_COMPLIANCE)))
 
 
 def _first(rules: Sequence[EdgeRule], kind: type[Rule]) -> Rule | None:
@@ -345,11 +346,6 @@ class MapNodes:
         if self.beliefs and dt > 0:
             later = self.settings.predicted(np.array(list(self.beliefs.values())), dt)
             self.beliefs = dict(zip(self.beliefs, later, strict=True))
-
-    @property
-    def infers(self) -> bool:
-        """True if states of lights are inferred from traffic."""
-        return bool(self.beliefs) and self.settings.non_compliance < 1
 
     def infer(self, ids: IntArray, velocity: FloatArray, variance: FloatArray, time: float) -> None:
         """Update the states of the lights by tracks (k,) detected at `time`, s, with velocities (k, 2) of variances

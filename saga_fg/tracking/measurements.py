@@ -40,7 +40,7 @@ from saga_fg.types.by_class import class_settings, class_values
 from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import COLOUR_LABELS
 
-WEAK_RATIO = 0.5  # of probabilities, below which a detection near another one is much weaker; 0.3 to 0.7 do alike
+WEAK_RATIO = 0.5  # of probabilities, below which a detection near another one is much weaker
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad
 
 
@@ -160,7 +160,8 @@ def suppress_duplicates(
 
 
 EGO_ID = 0  # tracks begin at 1, nodes of the map count down from -1
-_ID = np.array([EGO_ID])
+EGO_LABEL, EGO_LENGTH = "car", 4.5  # class in edge rules; m
+_ID, _LABEL = np.array([EGO_ID]), np.array([EGO_LABEL])
 
 
 @dataclass(eq=False)
@@ -177,8 +178,7 @@ class EgoNode:
     @classmethod
     def of(cls, settings: TrackerSettings) -> EgoNode:
         """A node without a position."""
-        label = "" if settings.ego is None else settings.ego.label
-        return cls(settings.ego, class_settings(settings.classes, ClassSettings, label))
+        return cls(settings.ego, class_settings(settings.classes, ClassSettings, EGO_LABEL))
 
     def __len__(self) -> int:
         return int(self.present)
@@ -205,16 +205,16 @@ class EgoNode:
         """Take in the vehicle's position at a frame of `time`, s; `origin` (2,) of local positions."""
         if self.settings is None or frame.world_T_ego is None or time <= self.time:
             return
-        pose, R, label = frame.world_T_ego, np.zeros((1, 4, 4)), np.array([self.settings.label])
+        pose, R = frame.world_T_ego, np.zeros((1, 4, 4))
         R[0, :2, :2] = self.settings.deviation**2 * np.eye(2)
         z = np.concatenate([pose[:2, 3] - origin, np.zeros(2)])[None]
         relative = RelativePositions(np.zeros((1, 3)), R[:, :2, :2]) if self.settings.estimated else None
         if self.present:
-            joint.update(_ID, label, z, R, np.zeros(1, dtype=bool), 0.0, relative)
+            joint.update(_ID, _LABEL, z, R, np.zeros(1, dtype=bool), 0.0, relative)
         else:
             speed = self.motion.initial_speed_deviation**2 * np.eye(2)[None]
-            joint.add(_ID, label, Kinematics(z[:, :2], z[:, 2:], R[:, :2, :2], speed), relative=relative)
-        velocity = joint.kinematics_of(_ID, label).velocity[0]
+            joint.add(_ID, _LABEL, Kinematics(z[:, :2], z[:, 2:], R[:, :2, :2], speed), relative=relative)
+        velocity = joint.kinematics_of(_ID, _LABEL).velocity[0]
         self.present, self.time, self.yaw = True, time, float(yaw_of(pose[:3, :3]))
         self.has_moved = self.has_moved or bool(np.hypot(*velocity) > MOVING)
 
@@ -222,17 +222,16 @@ class EgoNode:
         """Return the node table of the tracks with the vehicle after them."""
         if self.settings is None or not self.present:
             return tracks
-        label = np.array([self.settings.label])
-        now, moved, unseen = joint.kinematics_of(_ID, label), tracks.has_moved, tracks.unseen
+        now, moved, unseen = joint.kinematics_of(_ID, _LABEL), tracks.has_moved, tracks.unseen
         existence = tracks.existence
         return NodeTable(
             np.concatenate([tracks.id, _ID]),
-            np.concatenate([tracks.label, label]),
-            tracks.types + joint.types_of(label),
+            np.concatenate([tracks.label, _LABEL]),
+            tracks.types + joint.types_of(_LABEL),
             np.concatenate([tracks.position, now.position]),
             np.concatenate([tracks.velocity, now.velocity]),
             np.append(tracks.heading, self.yaw),
-            np.append(tracks.length, self.settings.length),
+            np.append(tracks.length, EGO_LENGTH),
             np.append(tracks.velocity_variance, np.trace(now.P_velocity[0]) / 2),
             None if moved is None else np.append(moved, self.has_moved),
             unseen=None if unseen is None else np.append(unseen, 0.0),

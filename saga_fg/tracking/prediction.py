@@ -188,7 +188,7 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
     noise = _predict_stationarity(state, dt)
     paths = predicted_paths(state, unseen)
     explained, nodes, lights = state.settings.explained_noise, node_table(state, paths), state.map_nodes
-    if watched and lights.infers:
+    if watched and lights.beliefs:
         lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)
     likely = table.confirmed | (table.existence >= LEAST_EXISTENCE) | (table.coasting(state.time) == 0)
     interacting = np.concatenate([likely, np.ones(len(nodes) - len(table), dtype=bool)])
@@ -204,11 +204,11 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
 
 def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:
     """Predict which tracks are stationary; return the factors on the process noise of all nodes."""
-    settings, stationarity = state.settings.stationarity, state.table.stationarity
-    if settings.prior == 0:
+    stationarity = state.table.stationarity
+    if state.settings.stationary_share == 0:
         return None
-    stationarity.predict(dt, state.kinematics(), settings)
-    return np.concatenate([stationarity.noise_scale(settings), np.ones(len(state.ego) + len(state.map_nodes))])
+    stationarity.predict(dt, state.kinematics())
+    return np.concatenate([stationarity.noise_scale, np.ones(len(state.ego) + len(state.map_nodes))])
 
 
 def node_table(state: TrackerState, paths: Paths | None = None) -> NodeTable:
@@ -218,7 +218,7 @@ def node_table(state: TrackerState, paths: Paths | None = None) -> NodeTable:
     """
     table, box, now = state.table, state.table.box, state.reported_kinematics()
     velocity, P = now.velocity, now.P_velocity
-    moves = 1 - table.stationarity.probability if state.settings.stationarity.prior > 0 else 0.0
+    moves = 1 - table.stationarity.probability if state.settings.stationary_share > 0 else 0.0
     tracks = NodeTable(
         table.id,
         table.label,
@@ -297,7 +297,7 @@ def _joint_covariance(state: TrackerState, rows: IntArray, own: FloatArray) -> F
     """(2n, 2n) of the positions of the tracks `rows` (n,), whose own covariances are `own` (n, 2, 2)."""
     table, n = state.table.select(rows), len(rows)
     P = state.joint.position_covariance(table.id, table.label).reshape(n, 2, n, 2)
-    if state.settings.stationarity.prior > 0:
+    if state.settings.stationary_share > 0:
         moves = np.where(table.coasting(state.time) > 0, 1 - table.stationarity.probability, 1.0)
         P = P * (moves[:, None] * moves)[:, None, :, None]
     P[np.arange(n), :, np.arange(n)] = own
@@ -340,7 +340,7 @@ def edge_effects(graph: SceneGraph, dt: float, nodes: NodeTable) -> list[EdgeEff
         states = np.concatenate([nodes.position, nodes.velocity], axis=1)
         own, other = (states[[row_of[node] for node in ends]] for ends in (i, j))
         a = law_edges.law.accelerations(own, other, law_edges.given).value
-        moved = held((law_edges.law.time_constant * law_edges.rate[:, None] * a)[:, :, None], dt)[:, :, 0]
+        moved = held((law_edges.rate[:, None] * a)[:, :, None], dt)[:, :, 0]
         each = zip(i, j, law_edges.rate.tolist(), moved, strict=True)
         effects += [EdgeEffect(t, s, law_edges.interaction, rate, x[:2], x[2:]) for t, s, rate, x in each]
     return effects

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, require_rules, traffic_rules
 from saga_fg.model.lanes import ConeLine, InLane
-from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.stability import require_stable
 from saga_fg.model.stop_lines import GreenLight, RedLight
-from saga_fg.model.turning import Bicycle, CoordinatedTurn
+from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.settings import (
     Fraction,
     FractionBelowOne,
@@ -30,24 +30,22 @@ from saga_fg.settings import (
     settings_group,
 )
 from saga_fg.tracking.by_name import require_estimator_name
-from saga_fg.tracking.clock import ClockSettings
-from saga_fg.tracking.names import AssociationName
-from saga_fg.tracking.track_filters import StationaritySettings
+from saga_fg.tracking.clock import MAX_JUMP
 from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.road_map import RoadMap, SignalSettings
+
+AssociationName = Literal["hungarian", "greedy", "graph"]
 
 
 @dataclass(frozen=True)
 class ClassSettings(Settings):
     """Motion, initiation, association and deletion of the tracks of one class."""
 
-    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn | Bicycle | Mixture = (
-        settings_group(
-            lambda: ConstantVelocity(acceleration_noise=2.0),
-            "motion model of the class; curvilinear for vehicles with measured headings; random_walk for objects that "
-            "never move, such as cones",
-        )
+    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn = settings_group(
+        lambda: ConstantVelocity(acceleration_noise=2.0),
+        "motion model of the class; curvilinear for vehicles with measured headings; random_walk for objects that "
+        "never move, such as cones",
     )
     initial_speed_deviation: Positive = setting(
         5.0, "standard deviation of the velocity of a new track along its heading, m/s; usual 1 (pedestrians) to 8"
@@ -95,23 +93,10 @@ class AssociationSettings(Settings):
     method: AssociationName = setting(
         "hungarian", "hungarian: least total cost; greedy: cheapest pair first; graph: distances of pairs count too"
     )
-    pair_weight: NonNegative = setting(
-        1.0, "weight of the distances between objects with method graph; 0: none, 1: as the model says"
-    )
     clutter_area: PositiveOrInf = setting(
         math.inf,
         "area over which false detections spread, m^2; usual 3000 to 10000; higher: more doubtful pairs "
         "match; .inf: all in the gate",
-    )
-    existence_weight: NonNegative = setting(
-        0.3,
-        "weight of a track's existence probability in the cost of leaving it unmatched; 0: none, 1: as the "
-        "model says; without effect while clutter_area is .inf",
-    )
-    score_weight: NonNegative = setting(
-        0.5,
-        "weight of a detection's probability in the cost of leaving it unmatched; 0: none, 1: as the model "
-        "says; without effect while clutter_area is .inf",
     )
     relink_above: Fraction = setting(
         0.9,
@@ -129,9 +114,6 @@ class AssociationSettings(Settings):
 class ExistenceSettings(Settings):
     """Existence probability of a track: when it is confirmed, reported and deleted."""
 
-    lifetime: PositiveOrInf = setting(
-        30.0, "mean time until an undetected object has left the scene, s; higher: undetected tracks live longer"
-    )
     neutral_score: Fraction = setting(
         0.2, "detection probability that leaves the existence unchanged; higher: weak detections count against"
     )
@@ -168,9 +150,10 @@ class EgoNodeSettings(Settings):
     estimated: bool = setting(
         False, "true: estimate the ego pose with the objects, by factor providers; false: use that of the frames"
     )
-    label: str = setting("car", "class of the ego vehicle in edge rules")
-    length: Positive = setting(4.5, "length of the ego vehicle, m; usual 4 to 5")
-    deviation: Positive = setting(0.02, "standard deviation of the ego position about its pose, m; usual 0.01 to 0.1")
+    deviation: Positive = setting(
+        0.02,
+        "standard deviation of the ego position about its pose, m; usual 0.01 to 0.1; higher: smoother",
+    )
 
 
 @dataclass(frozen=True)
@@ -238,15 +221,14 @@ class TrackerSettings(Settings):
     traffic: TrafficSettings = settings_group(
         TrafficSettings, "memory of where traffic went and how fast, for the paths and speeds of others"
     )
-    stationarity: StationaritySettings = settings_group(
-        StationaritySettings, "estimation of which objects are stationary"
+    stationary_share: FractionBelowOne = setting(
+        0.0, "share of new objects that are stationary; 0: off; usual 0.5 where many cars are parked; higher: more rest"
     )
-    confirming_detections: PositiveInt = setting(
-        3,
-        "detections that confirm a track initiated by a sensor with `initiation: confirmed`, and up to which a track "
-        "may hand over to an earlier one; usual 2 to 5; higher: fewer doubtful tracks",
+    max_jump: PositiveOrInf = setting(
+        MAX_JUMP,
+        "leave out a frame further than this from the newest until a second confirms its time, s; usual 2 to 30; "
+        "higher: longer pauses are no jumps",
     )
-    clock: ClockSettings = settings_group(ClockSettings, "handling of implausible timestamps")
     max_delay: NonNegative = setting(
         0.5, "discard frames that are older than the newest by more than this, s; higher: more late frames are used"
     )

@@ -55,7 +55,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.errors import InputError
 from saga_fg.kernels.paths import known_turning, predicted_turning, updated_turning
 from saga_fg.kernels.tracks import (
     faced_boxes,
@@ -69,7 +68,6 @@ from saga_fg.kernels.tracks import (
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.numerics.assignment import mahalanobis_of_pairs
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.settings import Fraction, NonNegative, Settings, setting
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
 from saga_fg.types.track import speed_deviation
 
@@ -245,32 +243,11 @@ class TurnRate(Columns):
 HALTING_SPEED = 1.0  # m/s, scale of the speeds from which an object comes to rest at once: walking, or the last metre
 _MOST_LOG_ODDS = 12.0  # so that later evidence can still change the probability
 NOISE_SCALE = 0.05  # factor on the process noise of a stationary object
-
-
-@dataclass(frozen=True)
-class StationaritySettings(Settings):
-    """Probability that an object is stationary."""
-
-    prior: Fraction = setting(
-        0.0, "share of new objects that are stationary; 0: off; usual 0.5 where many cars are parked"
-    )
-    start_rate: NonNegative = setting(
-        0.02, "rate at which stationary objects start to move, 1/s; higher: departing cars are followed sooner"
-    )
-    stop_rate: NonNegative = setting(
-        0.05,
-        "rate at which slow objects come to rest, 1/s; usual 0.02 to 0.1; higher: they are held as stationary sooner",
-    )
-    drift: NonNegative = setting(
-        0.02, "standard deviation of the drift of a stationary position in one second, m; usual 0 to 0.1"
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.prior == 1 or NOISE_SCALE == 0:
-            raise InputError(
-                "prior and noise_scale: expected a prior below 1 and a scale above 0, since everything may move"
-            )
+START_RATE, STOP_RATE = (
+    0.02,
+    0.05,
+)  # 1/s, of stationary objects that start, of slow ones that halt; to 0.1
+DRIFT = 0.02  # m, usual 0 to 0.1, standard deviation of the drift of a stationary position in one second
 
 
 @dataclass(eq=False)
@@ -291,9 +268,9 @@ class Stationarity(Columns):
         """Return the rows of new tracks."""
         return cls(now.position.copy(), now.P.copy(), probability)
 
-    def predict(self, dt: float, moving: Kinematics, settings: StationaritySettings) -> None:
+    def predict(self, dt: float, moving: Kinematics) -> None:
         """Predict by `dt` s; `moving` is the joint filter's state before."""
-        rates = dt, settings.start_rate, settings.stop_rate, settings.drift, HALTING_SPEED
+        rates = dt, START_RATE, STOP_RATE, DRIFT, HALTING_SPEED
         self.probability, self.position, self.P = predicted_places(
             self.probability, self.position, self.P, *moving, *rates
         )
@@ -311,7 +288,8 @@ class Stationarity(Columns):
                 *still, z, R, *moving, with_velocity, _MOST_LOG_ODDS
             )
 
-    def noise_scale(self, settings: StationaritySettings) -> FloatArray:
+    @property
+    def noise_scale(self) -> FloatArray:
         """(n,) factor on the process noise, expected over both states."""
         return np.asarray(1 - self.probability * (1 - NOISE_SCALE))
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -83,10 +83,6 @@ class Tracker:
             if not callable(getattr(provider, "factors", None)):
                 raise InputError(f"providers: expected factor providers, with a method factors, got {provider!r:.40}")
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
-        max_jump = self.settings.clock.max_jump
-        if math.isfinite(self.settings.max_coasting):
-            max_jump = max(max_jump, self.settings.max_coasting)
-        self._clock = replace(self.settings.clock, max_jump=max_jump)
         self._state = TrackerState(self.settings, self.rules, self.providers)
         self._last_step_failed = False
 
@@ -135,7 +131,7 @@ class Tracker:
         """Take a frame into a state."""
         sensor = self.sensor(frame.sensor)
         timestamp = frame.timestamp + sensor.time_offset
-        if state.accept_time(timestamp, frame.sensor, self._clock, self.max_delay):
+        if state.accept_time(timestamp, frame.sensor, self.max_jump, self.max_delay):
             time = state.relative(state.clock.time_of(timestamp, frame.sensor))
             return self._process_frame(state, frame, sensor, time)
         compare_left_out(state, timestamp, frame, sensor)
@@ -289,7 +285,8 @@ class Tracker:
     @property
     def max_jump(self) -> float:
         """Distance from the newest frame from which another has to be confirmed, s; tracks can outlive shorter ones."""
-        return self._clock.max_jump
+        settings = self.settings
+        return max(settings.max_jump, settings.max_coasting if math.isfinite(settings.max_coasting) else 0.0)
 
     @property
     def max_delay(self) -> float:

@@ -24,7 +24,7 @@ from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.by_name import new_estimator
-from saga_fg.tracking.clock import Clock, ClockSettings, TimeVerdict
+from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
@@ -39,6 +39,8 @@ from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import MAP_CLASSES
 
 log = logging.getLogger(__name__)
+
+LIFETIME = 30.0  # s, mean time until an undetected object has left the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +132,7 @@ class TrackerState:
         now, still, coasting = self.kinematics(), self.table.stationarity, self.table.coasting(self.time) > 0
         if rows is not None:
             now, still, coasting = now.select(rows), still.select(rows), coasting[rows]
-        return still.reported(now, coasting) if self.settings.stationarity.prior > 0 else now
+        return still.reported(now, coasting) if self.settings.stationary_share > 0 else now
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""
@@ -158,13 +160,13 @@ class TrackerState:
             place = frame.detections.boxes.position[0, :2]
         self.origin = np.round(place)
 
-    def accept_time(self, timestamp: float, sensor: str, settings: ClockSettings, max_delay: float) -> bool:
+    def accept_time(self, timestamp: float, sensor: str, max_jump: float, max_delay: float) -> bool:
         """Judge the timestamp of a frame, s; return whether it is to be used, at `clock.time_of` it.
 
         Where the clock was set back, all tracks are deleted; where it was set ahead, those that coast for too long.
         """
         before, known = self.clock.newest, self.clock.sensor(sensor)
-        verdict, self.clock = self.clock.judged(timestamp, sensor, settings, max_delay)
+        verdict, self.clock = self.clock.judged(timestamp, sensor, max_jump, max_delay)
         self.time_verdict, own = verdict, self.clock.sensor(sensor)
         if known is not None and own is not None and own.segment != known.segment:
             self.shared = self.shared.without(sensor)

@@ -31,7 +31,7 @@ from saga_fg.tracking.joint_state import moved_to_present, past_position
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_filters import MOVING
-from saga_fg.tracking.tracker_state import TrackerState
+from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 from saga_fg.tracking.traffic import Passages
 
 
@@ -77,7 +77,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     t, d = matching.track, matching.detection
     z = np.concatenate([boxes.position[d, :2] - state.origin, boxes.velocity[d]], axis=1)
     R, with_velocity = measurements.R[d], measurements.with_velocity[d]
-    if state.settings.stationarity.prior > 0:
+    if state.settings.stationary_share > 0:
         position, P = past_positions(state, delay)
         moving = state.kinematics()._replace(position=position, P=P).select(t)
         table.stationarity.update(t, z, R, moving, with_velocity)
@@ -103,7 +103,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
 
 def infer_signals(state: TrackerState, matching: Matching) -> None:
     """Update the states of traffic lights by the tracks that have just been detected."""
-    if state.map_nodes.infers and len(state.map_nodes.drivers):
+    if state.map_nodes.beliefs and len(state.map_nodes.drivers):
         t, now = matching.track, state.reported_kinematics()
         P = now.P_velocity[t]
         variance = (P[:, 0, 0] + P[:, 1, 1]) / 2
@@ -190,5 +190,5 @@ def _existence(
 ) -> FloatArray:
     """Existence (n,) after a frame in which tracks are `missed` (n,), by the chance (n,) to detect them, and those of
     `rows` (k,) have detections of a probability (k,)."""
-    survival = math.exp(-elapsed / settings.lifetime)
+    survival = math.exp(-elapsed / LIFETIME)
     return existences(before, missed, chance, rows, probability, survival, settings.neutral_score)

@@ -19,7 +19,7 @@ k (`saga_fg.tracking.map_nodes`).
 The belief is the discrete part of a hybrid node; it mixes the interaction functions of the node's edges: with
 probability p_closed = p_red + p_amber a stop line holds traffic, with p_green it lets it go, so that the rates of those
 edges are multiplied by them, which is the mean of the dynamics (the first moment of an interacting-multiple-model
-prediction, Blom and Bar-Shalom 1988); `likeliest` selects the likelier one instead.
+prediction, Blom and Bar-Shalom 1988).
 
 Source: Rabiner, A tutorial on hidden Markov models, 1989 (forward recursion).
 """
@@ -30,7 +30,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import scipy.linalg
@@ -38,7 +38,7 @@ import scipy.linalg
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import Feet, Polylines
-from saga_fg.settings import Positive, Range, Settings, required_setting, setting
+from saga_fg.settings import Positive, Settings, required_setting, setting
 
 Point = tuple[float, float]
 LIGHT, STOP_LINE, LANE, WALL = "traffic_light", "stop_line", "lane", "wall"
@@ -154,6 +154,8 @@ COLOURS = ("red", "amber", "green")
 STATES = ("red", "amber", "starting", "green")
 COLOUR_OF_STATE = np.array([0, 1, 2, 2])  # (4,) numbers in COLOURS
 COLOUR_LABELS = tuple(f"traffic_light_{colour}" for colour in COLOURS)  # labels of detections that report a colour
+START_DELAY = 1.5  # s, mean time from green until the first driver starts; usual 1 to 2
+NON_COMPLIANCE = 0.1  # h, share of drivers who turn at red or cannot leave at green; usual 0.05 to 0.3
 LEAST_BELIEF = 1e-6  # no state is ever ruled out
 MAX_LIGHT_DISTANCE = 4.0  # a reported light belongs to no known light further away than this, m
 
@@ -171,29 +173,16 @@ class SignalSettings(Settings):
     green_duration: Positive = setting(
         15.0, "mean duration of green, s; usual 10 to 60; higher: lights are believed to stay green longer"
     )
-    start_delay: Positive = setting(
-        1.5,
-        "mean time from green until the first driver starts, s; usual 1 to 2; higher: queues are expected to "
-        "start later",
-    )
     driver_noise: Positive = setting(
         2.0,
         "spectral density of the acceleration of drivers before a line about that of the rules, m^2/s^3; usual 0.5 to "
         "4; higher: colours are inferred from traffic more slowly",
     )
-    non_compliance: Annotated[float, Range(0, 1, above=True)] = setting(
-        0.1,
-        "share of drivers who do not drive as the light tells them, as they turn at red or cannot leave at green; "
-        "usual 0.05 to 0.3; higher: one vehicle tells less; 1: colours are not inferred from traffic",
-    )
-    belief: Literal["mixed", "likeliest"] = setting(
-        "mixed", "effect of a stop line: mixed: by the probability that it is closed; likeliest: all or nothing"
-    )
 
     @cached_property
     def _durations(self) -> FloatArray:
         """(4,) s."""
-        return np.array([self.red_duration, self.amber_duration, self.start_delay, self.green_duration])
+        return np.array([self.red_duration, self.amber_duration, START_DELAY, self.green_duration])
 
     @cached_property
     def generator(self) -> FloatArray:
@@ -214,14 +203,11 @@ class SignalSettings(Settings):
 
     def closed(self, belief: FloatArray) -> FloatArray:
         """(n,) weight with which stop lines of lights with these beliefs (n, 4) hold traffic."""
-        return self._weight(belief[:, 0] + belief[:, 1])
+        return np.asarray(belief[:, 0] + belief[:, 1])
 
     def open(self, belief: FloatArray) -> FloatArray:
         """(n,) weight with which stop lines of lights with these beliefs (n, 4) let waiting vehicles go."""
-        return self._weight(belief[:, 3])
-
-    def _weight(self, chance: FloatArray) -> FloatArray:
-        return np.asarray(chance if self.belief == "mixed" else (chance > 0.5).astype(np.float64))
+        return np.asarray(belief[:, 3])
 
 
 def colours(belief: FloatArray) -> FloatArray:

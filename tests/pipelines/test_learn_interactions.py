@@ -25,7 +25,7 @@ from pipelines.learning.interactions import (
 )
 from saga_fg.errors import InputError
 from saga_fg.learning import FittedInteractions, fit_interactions
-from saga_fg.model.edge_rules import HIDDEN, Following, Neighbours
+from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing
 from saga_fg.model.stability import LearnedInteractions
 from tests.saga_fg.following_pairs import RATE, following_pairs
@@ -61,7 +61,7 @@ def test_the_form_that_does_best_on_recordings_held_out_is_the_form_that_is_writ
     assert ratios[found.forms[group]] < 1
     cars = [rule for rule in found.interactions.edges if "car" in rule.classes]
     of_config = config.tracker.edges[0].information_gain
-    gain = {"everywhere": None, "hidden": HIDDEN, "refitted": of_config, SHIPPED: of_config}
+    gain = {"everywhere": False, "hidden": True, "refitted": of_config, SHIPPED: of_config}
     assert {rule.information_gain for rule in cars} == {gain[found.forms[group]]}
     assert {run.contender for run in found.runs} == {BASE, SHIPPED, LEARNED}
     for name, scene in scenes.items():
@@ -109,7 +109,7 @@ def test_a_search_begins_with_the_rules_of_an_earlier_result(monkeypatch, scenes
         return FittedInteractions(tuple(template), 0.0)
 
     with_template(monkeypatch, fit=fit)
-    start = LearnedInteractions(edges=(replace(FOLLOW, information_gain=HIDDEN),))
+    start = LearnedInteractions(edges=(replace(FOLLOW, information_gain=True),))
     found = learn_interactions(scenes, "two scenes", load_config("file"), start, QUICK)
     assert set(begun) == {start.edges}
     assert set(found.ratios[found_group(found)]) == {"refitted", SHIPPED}

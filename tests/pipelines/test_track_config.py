@@ -33,10 +33,10 @@ def test_a_users_file_lies_over_the_shipped_defaults(tmp_path: Path) -> None:
 
 def test_a_mistake_in_a_users_file_names_file_and_key(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text("tracker:\n  existence:\n    lifetme: 3\n")
+    path.write_text("tracker:\n  existence:\n    delete_belw: 0.3\n")
     with pytest.raises(InputError) as caught:
         load_config("nuscenes", path)
-    assert str(caught.value) == f"{path}: tracker.existence.lifetme: unknown key, did you mean 'lifetime'?"
+    assert str(caught.value) == f"{path}: tracker.existence.delete_belw: unknown key, did you mean 'delete_below'?"
 
 
 @pytest.mark.parametrize("settings", [TrackConfig, SimulatorSettings])

@@ -7,7 +7,7 @@ import numpy as np
 from saga_fg import ConstantVelocity, NodeType, RandomWalk
 from saga_fg.estimators import Measurements
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import ConeGeometry, Following
+from saga_fg.model.edge_rules import Following
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.lanes import ConeLine, InLane
@@ -68,7 +68,7 @@ def bent_lane(turn=0.0, shift=(0.0, 0.0)):
     return table(moved, np.zeros(2), {1: points @ R.T + shift}, {1: 3.5})
 
 
-RULES = (RedLight(), GreenLight(), InLane(), ConeLine(), Attached(), Following(cones=ConeGeometry()))
+RULES = (RedLight(), GreenLight(), InLane(), ConeLine(), Attached(), Following(cones=True))
 
 
 def crossing(closed):

@@ -174,7 +174,7 @@ def test_a_nonlinear_interaction_is_linearised_at_the_smoothed_states():
     smoother = GraphFilter(lag=10.0)
     rng = np.random.default_rng(2)
     smoother.add([1, 2], [[0.0, 0, 1, 0], [3.0, 0.5, -1, 0]], np.tile(np.eye(4), (2, 1, 1)))
-    away = NonlinearEdges(SocialForce(falloff=2.0), [0, 1], [1, 0], np.ones(2), np.zeros((2, 1, 4)))
+    away = NonlinearEdges(SocialForce(), [0, 1], [1, 0], np.ones(2), np.zeros((2, 1, 4)))
     for _ in range(6):
         smoother.predict(discretise(SceneGraph(np.array([1, 2]), (CAR, CAR), nonlinear=(away,)), 0.2))
         seen = rng.normal([[0.0, 0.0], [2.0, 0.5]], 0.3)

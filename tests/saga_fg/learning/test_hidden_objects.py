@@ -8,13 +8,11 @@ import pytest
 from saga_fg import InputError
 from saga_fg.learning import HiddenObjects, hidden_objects
 from saga_fg.learning.hidden_objects import STEP
-from saga_fg.model.edge_rules import EdgeInformation, Following, Neighbours, Repulsion
+from saga_fg.model.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.tracking import ClassSettings, Tracker, TrackerSettings
-from saga_fg.tracking.track_filters import StationaritySettings
 from tests.saga_fg.following_pairs import GAP, following_pairs, scene_of
 
 SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.02, yaw=0.02)})}
@@ -24,7 +22,7 @@ FOLLOW = Following(SharedVelocity(), rate=0.5, gap_scale=20.0)
 
 def settings_of(motion):
     classes = {"default": ClassSettings(motion=motion, initial_speed_deviation=8.0, max_distance=20.0)}
-    return TrackerSettings(classes=classes, edges=(), stationarity=StationaritySettings(prior=0.2))
+    return TrackerSettings(classes=classes, edges=(), stationary_share=0.2)
 
 
 VELOCITY = settings_of(ConstantVelocity(1.0))
@@ -45,7 +43,7 @@ def turning(moments=60):
     return dataclasses.replace(scene, frames=frames, ground_truth=truth)
 
 
-GAINED = (dataclasses.replace(FOLLOW, information_gain=EdgeInformation(0.5, 2.0)), Neighbours(rate=0.4))
+GAINED = (dataclasses.replace(FOLLOW, information_gain=True), Neighbours(rate=0.4))
 
 
 @pytest.mark.parametrize(
@@ -130,6 +128,4 @@ def test_nothing_to_learn_from_and_nonlinear_interactions():
         hidden_objects(dataclasses.replace(scene, ground_truth=None), VELOCITY, SENSORS)
     sample = hidden_objects(following_pairs(pairs=1, moments=40), VELOCITY, SENSORS, ONCE)
     with pytest.raises(InputError, match="linear motions and interactions"):
-        sample.predict(VELOCITY, (Repulsion(classes=("car",), sources=("car",)),))
-    with pytest.raises(InputError, match="or mixtures"):
-        sample.predict(settings_of(Mixture()), ())
+        sample.predict(VELOCITY, (Repulsion(),))

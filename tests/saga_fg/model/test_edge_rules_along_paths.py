@@ -39,9 +39,7 @@ def test_a_straight_path_is_no_path():
         )
 
 
-@pytest.mark.parametrize(
-    "law", [CarFollowing(time_constant=2.0, gap="standstill", headway=1.0), IntelligentDriver(headway=1.0)]
-)
+@pytest.mark.parametrize("law", [CarFollowing(time_constant=2.0, headway=1.0), IntelligentDriver(headway=1.0)])
 def test_laws_take_the_gap_along_the_path(law):
     """At the estimate, the acceleration is that behind a leader straight ahead, as far away as this one on the path."""
     nodes, places, headings = round_the_corner()

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs, Repulsion
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
+from saga_fg.model.nonlinear_interactions import SmoothDriver
 from tests.saga_fg.model.drawn_traffic import random_traffic, straight, table
 from tests.saga_fg.random_graphs import BUS, CAR, CONE
 
@@ -56,7 +57,7 @@ def test_a_graph_of_several_rules_groups_edges_by_the_types_of_their_ends():
 @given(seeds)
 def test_rules_see_the_nodes_that_interact_alone(seed):
     rng = np.random.default_rng(seed)
-    nodes, rules = random_traffic(rng), (Following(), Neighbours(), Repulsion(classes=("car",), sources=("car",)))
+    nodes, rules = random_traffic(rng), (Following(), Neighbours(), Following(SmoothDriver()))
     nodes = replace(nodes, outline={3: np.zeros((2, 2)), 7: np.ones((2, 2))}, unseen=rng.uniform(size=len(nodes)))
     interacting = rng.random(len(nodes)) < 0.6
     some = nodes.select(np.flatnonzero(interacting))

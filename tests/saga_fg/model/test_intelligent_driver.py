@@ -11,14 +11,12 @@ from saga_fg import InputError
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.graph_building import build_graph
-from saga_fg.model.nonlinear_interactions import IntelligentDriver
+from saga_fg.model.nonlinear_interactions import HIDDEN_VEHICLE_GAP, MAX_DECELERATION, STOP_TIME, IntelligentDriver
 from saga_fg.model.stability import require_stable
 from saga_fg.model.stop_lines import DriverStopping, RedLight
 from tests.saga_fg.road_scenes import queue, table
 
-DRIVER = IntelligentDriver(
-    free_speed=14.0, headway=1.2, acceleration=1.5, deceleration=2.0, hidden_vehicle_gap=math.inf
-)
+DRIVER = IntelligentDriver(free_speed=14.0, headway=1.2, acceleration=1.5, deceleration=2.0)
 speeds, gaps = st.floats(0, 16), st.floats(0.6, 80)
 
 
@@ -45,15 +43,15 @@ def test_derivatives_are_those_of_the_law(v, s, w):
 @given(v=st.floats(0.5, 13.5))
 def test_in_equilibrium_nobody_accelerates(v):
     gap = (DRIVER.standstill_gap + v * DRIVER.headway) / math.sqrt(1 - (v / DRIVER.free_speed) ** 4)
-    assert value(DRIVER.following, v, gap, v) == pytest.approx(0, abs=1e-9)
-    assert value(DRIVER.following, v, gap - 0.5, v) < 0 < value(DRIVER.following, v, gap + 0.5, v)
+    assert value(DRIVER.alone, v, gap, v) == pytest.approx(0, abs=1e-9)
+    assert value(DRIVER.alone, v, gap - 0.5, v) < 0 < value(DRIVER.alone, v, gap + 0.5, v)
 
 
 @given(v=speeds, s=gaps, w=speeds)
 def test_drivers_brake_within_limits_and_never_backwards(v, s, w):
     braking = -value(DRIVER.following, v, s, w)
-    assert braking <= DRIVER.max_deceleration + 1e-9
-    assert braking <= v / DRIVER.stop_time + 1e-9
+    assert braking <= MAX_DECELERATION + 1e-9
+    assert braking <= v / STOP_TIME + 1e-9
 
 
 def test_who_stands_behind_one_who_stands_stays():
@@ -65,11 +63,10 @@ def test_who_stands_behind_one_who_stands_stays():
 
 @given(v=speeds, w=speeds, s=st.floats(7, 80))
 def test_nobody_speeds_up_into_a_gap_with_room_for_another(v, w, s):
-    driver = IntelligentDriver(hidden_vehicle_gap=7.0)
-    assert value(driver.following, v, s, w) <= w - v + 1e-9
-    assert value(driver.stopping, v, s) <= 0
-    close = value(driver.following, v, 6.9, w)
-    assert close == value(IntelligentDriver(hidden_vehicle_gap=math.inf).following, v, 6.9, w)
+    assert value(DRIVER.following, v, s, w) <= w - v + 1e-9
+    assert value(DRIVER.stopping, v, s) <= 0
+    close = HIDDEN_VEHICLE_GAP - 0.1
+    assert value(DRIVER.following, v, close, w) == value(DRIVER.alone, v, close, w)
 
 
 def test_a_queue_comes_to_a_halt_before_the_line():

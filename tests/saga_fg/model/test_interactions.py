@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from saga_fg import NodeType, RandomWalk
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.random_graphs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
@@ -19,7 +18,6 @@ INTERACTIONS = [
     SharedVelocity(along_heading=True),
     CarFollowing(),
     CarFollowing(headway=1.2, time_constant=2.5),
-    CarFollowing(gap="standstill", headway=0.8, standstill_gap=3.0),
 ]
 
 
@@ -33,10 +31,7 @@ def acceleration(interaction, nodes, i, j, p_i, v_i, p_j, v_j):
     if isinstance(interaction, SharedVelocity):
         turn = nodes.heading[i] - nodes.heading[j] if interaction.along_heading else 0.0
         return yaw_transform(yaw=turn)[:2, :2] @ v_j - v_i
-    if interaction.gap == "standstill":
-        gap = interaction.standstill_gap + (nodes.length[i] + nodes.length[j]) / 2
-    else:
-        gap = u_i @ (nodes.position[j] - nodes.position[i]) - interaction.headway * (u_i @ nodes.velocity[i])
+    gap = u_i @ (nodes.position[j] - nodes.position[i]) - interaction.headway * (u_i @ nodes.velocity[i])
     excess = u_i @ (p_j - p_i) - gap - interaction.headway * (u_i @ v_i)
     return u_i * (u_j @ v_j - u_i @ v_i + excess / interaction.time_constant)
 
@@ -153,7 +148,6 @@ def test_many_edges_are_the_edges_one_by_one():
 
 
 def test_interactions_say_which_types_they_act_on():
-    rider = NodeType("drifting", RandomWalk(("vx", "vy"), drift=0.1))
     for interaction in INTERACTIONS:
         assert all(applies(interaction.needs, a, b) for a in MOVING for b in MOVING)  # type: ignore[attr-defined]
         assert not any(
@@ -161,8 +155,6 @@ def test_interactions_say_which_types_they_act_on():
             for a in MOVING
             for b in (CONE, POLE)  # type: ignore[attr-defined]
         )
-    assert applies(SharedVelocity.needs, CAR, rider)
-    assert not applies(CarFollowing.needs, CAR, rider)
 
 
 def test_shared_velocity_takes_the_acceleration_of_the_follower_not_that_of_the_leader():

@@ -12,7 +12,7 @@ from pipelines.configuration import read_settings, write_settings
 from saga_fg import InputError
 from saga_fg.learning import TEMPLATE
 from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.interactions import CarFollowing, SharedCourse, SharedVelocity, velocity_triples
+from saga_fg.model.interactions import CarFollowing, SharedVelocity, velocity_triples
 from saga_fg.model.stability import LearnedInteractions
 
 
@@ -57,7 +57,7 @@ def test_dynamics_that_run_away_are_refused():
 @settings(max_examples=30)
 @given(
     st.floats(0.001, 20),
-    st.sampled_from([SharedVelocity(), SharedVelocity(True), SharedCourse()]),
+    st.sampled_from([SharedVelocity(), SharedVelocity(True)]),
     st.floats(0.5, 1e3) | st.just(math.inf),
 )
 def test_shipped_interactions_are_stable_at_every_rate(rate, interaction, tau):

@@ -42,8 +42,8 @@ def test_a_fading_acceleration_falls_by_e_in_its_time_constant():
 
 
 def test_a_random_walk_stands_still_without_drift():
-    pole = NodeType("pole", RandomWalk(("x", "y", "z")))
-    assert pole.dim == 3
+    pole = NodeType("pole", RandomWalk())
+    assert pole.dim == 2
     assert not pole.generator.any()
     assert not pole.diffusion.any()
     assert NodeType("cone", RandomWalk(drift=0.2)).diffusion.tolist() == (0.2 * np.eye(2)).tolist()

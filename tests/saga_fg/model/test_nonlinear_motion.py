@@ -1,4 +1,4 @@
-"""Nonlinear motion and interactions in every back end: turning cars behind each other, a bicycle, pedestrians, a wall.
+"""Nonlinear motion and interactions in every back end: turning cars behind each other, pedestrians, a wall.
 
 Given the same linearisation all back ends agree; smoothers linearise again, and reach the minimum that GTSAM's
 Levenberg-Marquardt finds on the graph they export.
@@ -20,12 +20,12 @@ from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.motion import RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
-from saga_fg.model.turning import Bicycle, CoordinatedTurn
+from saga_fg.model.turning import CoordinatedTurn
 from tests.saga_fg.graph_keys import keys_of
 
-CAR, BIKE = NodeType("car", CoordinatedTurn(0.5, 0.02)), NodeType("bike", Bicycle(0.5))
+CAR, VAN = NodeType("car", CoordinatedTurn(0.5)), NodeType("van", CoordinatedTurn(1.0))
 WALKER, WALL = NodeType("walker", ConstantVelocity(0.3)), NodeType("wall", RandomWalk(drift=0.01))
-TYPES = (CAR, CAR, BIKE, WALKER, WALKER, WALL, CAR)
+TYPES = (CAR, CAR, VAN, WALKER, WALKER, WALL, CAR)
 NODES = np.arange(10, 17)
 START = [
     [0.0, 0.0, 8.0, 0.5, 0.1],
@@ -44,7 +44,7 @@ BACK_ENDS = {
 
 
 def scene(nonlinear=True):
-    """A car follows a car and shares its velocity, a bicycle follows it, pedestrians and a wall push each other."""
+    """A car follows a car and shares its velocity, a van follows it, pedestrians and a wall push each other."""
     eye = np.zeros((1, 5, 5))
     eye[0, [2, 3], [2, 3]] = 1.0
     shared = Edges(SharedVelocity.__name__, [1], [0], [0.4], -eye, eye, np.zeros((1, 5)))
@@ -136,10 +136,10 @@ def test_a_flow_is_the_motion_the_law_and_the_linear_edges():
         moved.update(zip(flow.rows[:, 0].tolist(), flow.predict(columns), strict=True))
     assert sorted(moved) == [0, 1, 2, 3, 4, 6]
     np.testing.assert_allclose(moved[0], CAR.motion.flow(np.array(START[0]), dt), atol=1e-12)  # type: ignore[attr-defined]
-    bike, leader = np.array(START[2]), np.array(START[1])
-    a = SmoothDriver().accelerations(bike[:4], leader[:4], np.array(3.5)).value
+    van, leader = np.array(START[2]), np.array(START[1])
+    a = SmoothDriver().accelerations(van[:4], leader[:4], np.array(3.5)).value
     pushed = np.concatenate([dt * dt / 2 * a, dt * a, [0.0]])
-    np.testing.assert_allclose(moved[2], BIKE.motion.flow(bike, dt) + pushed, atol=1e-12)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(moved[2], VAN.motion.flow(van, dt) + pushed, atol=1e-12)  # type: ignore[attr-defined]
     straight = [*START[1][:4], 0.0]
     linear = discretise(SceneGraph(graph.nodes, graph.types, graph.edges), dt)
     (flow,) = (f for f in nonlinear_dynamics(linear) if f.rows.shape[1] == 2)

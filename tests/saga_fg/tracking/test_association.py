@@ -6,7 +6,7 @@ import pytest
 from saga_fg import Boxes, Sensor, TrackerSettings
 from saga_fg.numerics.assignment import CrossCovariances, cheapest_first, least_total
 from saga_fg.tracking import AssociationSettings, ClassSettings
-from saga_fg.tracking.association import ExpectedTracks, match
+from saga_fg.tracking.association import EXISTENCE_WEIGHT, SCORE_WEIGHT, ExpectedTracks, match
 from saga_fg.tracking.measurements import FrameMeasurements
 
 CAR = (4.0, 2.0, 1.5)
@@ -65,23 +65,24 @@ def test_without_an_area_all_that_is_inside_the_gate_is_matched():
 
 
 def test_a_track_that_nobody_believes_in_takes_no_detection_from_afar():
-    for expected, matched in ((0.8, [(0, 0)]), (0.01, [])):
-        assert pairs(boxes([0.0]), boxes([3.0]), expected=expected, clutter_area=100.0, existence_weight=1.0) == matched
-    assert pairs(boxes([0.0]), boxes([0.5]), expected=0.01, clutter_area=100.0, existence_weight=1.0) == [(0, 0)]
+    for expected, matched in ((0.8, [(0, 0)]), (1e-6, [])):
+        assert pairs(boxes([0.0]), boxes([3.0]), expected=expected, clutter_area=100.0) == matched
+    assert pairs(boxes([0.0]), boxes([0.5]), expected=1e-6, clutter_area=100.0) == [(0, 0)]
 
 
-def test_the_stronger_of_two_detections_is_preferred_where_scores_count():
+def test_the_stronger_of_two_detections_is_preferred():
     found = boxes([0.5, -0.6])
-    assert pairs(boxes([0.0]), found, [0.1, 0.9], clutter_area=1000.0, score_weight=0.0) == [(0, 0)]
-    assert pairs(boxes([0.0]), found, [0.1, 0.9], clutter_area=1000.0, score_weight=1.0) == [(0, 1)]
+    assert pairs(boxes([0.0]), found, [0.5, 0.5], clutter_area=1000.0) == [(0, 0)]
+    assert pairs(boxes([0.0]), found, [0.1, 0.9], clutter_area=1000.0) == [(0, 1)]
 
 
 def test_the_decision_is_that_of_the_likelihood_ratio():
-    """At face value a pair is matched where the track explains the detection better than a miss and a false alarm."""
+    """A pair is matched where the track explains a detection better than a miss and a false alarm, each weighted."""
     p, r, density, S = 0.7, 0.6, 2e-3, 1.0 + 0.09
-    limit = np.sqrt(2 * S * np.log(r / (1 - r) * p / (1 - p) / (2 * np.pi * density * S)))
+    a, b = EXISTENCE_WEIGHT, SCORE_WEIGHT
+    limit = np.sqrt(2 * S * (a * np.log(r / (1 - r)) + b * np.log(p / (1 - p)) - np.log(2 * np.pi * density * S)))
     for x, matched in ((limit - 0.01, [(0, 0)]), (limit + 0.01, [])):
-        weights = {"clutter_area": (1 - p) / density, "existence_weight": 1.0, "score_weight": 1.0}
+        weights = {"clutter_area": (1 - p) / density}
         assert pairs(boxes([0.0]), boxes([x]), p, r, **weights) == matched
 
 
@@ -89,7 +90,7 @@ def test_among_many_weak_detections_a_match_needs_to_be_nearer():
     """They say that the detector is wrong often."""
     crowd = boxes([2.5, *np.arange(50.0, 100.0)])
     for others, matched in ((0.9, [(0, 0)]), (0.05, [])):
-        weights = {"clutter_area": 1000.0, "existence_weight": 1.0, "score_weight": 1.0}
+        weights = {"clutter_area": 1000.0}
         assert pairs(boxes([0.0]), crowd, [0.5, *np.full(50, others)], **weights) == matched
 
 
@@ -109,7 +110,7 @@ ROW = np.arange(0.0, 25.0, 5.0)  # a group in a row, one behind the other
 
 def test_a_group_that_is_displaced_as_one_keeps_its_order():
     """Everybody is nine tenths of the spacing further on: one by one, the detection of the one behind is nearer."""
-    weights = {"sigma": 1.5, "clutter_area": 1e4, "score_weight": 0.0, "existence_weight": 0.0}
+    weights = {"sigma": 1.5, "clutter_area": 1e4}
     swapped, kept = [(k + 1, k) for k in range(4)], [(k, k) for k in range(5)]
     tracks, found = boxes(ROW), boxes(ROW + 4.5)
     assert [
@@ -119,7 +120,7 @@ def test_a_group_that_is_displaced_as_one_keeps_its_order():
 
 
 def test_the_one_that_is_missed_leaves_the_others_where_they_are():
-    weights = {"sigma": 1.5, "clutter_area": 1e4, "score_weight": 0.0, "existence_weight": 0.0}
+    weights = {"sigma": 1.5, "clutter_area": 1e4}
     seen = np.array([0, 1, 3, 4])
     chosen = pairs(boxes(ROW), boxes(ROW[seen] + 4.5), method="graph", shared=0.98, **weights)
     assert chosen == [(int(k), row) for row, k in enumerate(seen)]
@@ -128,19 +129,18 @@ def test_the_one_that_is_missed_leaves_the_others_where_they_are():
 def test_the_graph_ties_classes_together():
     """The bus has but one detection; that the cars moved alike says which is whose."""
     tracks, found = boxes([0.0, 5.0, 30.0], ["car", "car", "bus"]), boxes([4.0, 9.0, 34.0], ["car", "car", "bus"])
-    weights = {"sigma": 3.0, "clutter_area": 1e4, "score_weight": 0.0, "existence_weight": 0.0}
+    weights = {"sigma": 3.0, "clutter_area": 1e4}
     assert pairs(tracks, found, method="graph", shared=0.98, **weights) == [(0, 0), (1, 1), (2, 2)]
 
 
-@pytest.mark.parametrize("changed", [{"shared": 0.0}, {"shared": 0.9, "pair_weight": 0.0}])
-def test_without_anything_in_common_the_graph_matches_as_hungarian(changed):
+def test_without_anything_in_common_the_graph_matches_as_hungarian():
     rng = np.random.default_rng(0)
     weights = {"sigma": 2.0, "clutter_area": 1e3}
     for _ in range(20):
         tracks, found = (
             boxes(rng.uniform(0, 15, 6), rng.choice(["car", "bus"], 6), y=rng.normal(size=6)) for _ in "ab"
         )
-        assert pairs(tracks, found, method="graph", **changed, **weights) == pairs(tracks, found, **weights)
+        assert pairs(tracks, found, method="graph", shared=0.0, **weights) == pairs(tracks, found, **weights)
 
 
 def test_greedy_assignment_in_the_order_of_cost():

@@ -25,7 +25,7 @@ from tests.saga_fg.traffic_frames import at_pose, frame, seen, straight, turning
 
 PLACE = np.array([4000.0, -7000.0])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
-APART = EgoNodeSettings(estimated=True, label="ego")  # of no class that follows
+APART = EgoNodeSettings(estimated=True)
 
 
 def turning(t: float) -> np.ndarray:
@@ -238,8 +238,6 @@ def test_what_is_refused() -> None:
         Tracker(TrackerSettings(ego=EgoNodeSettings(estimated=True)))
     with pytest.raises(InputError, match=r"ego\.estimated: expected association without pairs"):
         TrackerSettings(ego=EgoNodeSettings(True), estimator="isam2", association=AssociationSettings(method="graph"))
-    with pytest.raises(InputError, match="length: expected a finite number > 0"):
-        EgoNodeSettings(length=0.0)
     told = drawn(0, 1)[0][0]
     for settings, providers in ((TrackerSettings(), ()), (TrackerSettings(estimator="isam2"), (Odometry(START),))):
         with pytest.raises(InputError, match="world_T_ego: expected a pose, since nothing estimates it"):

@@ -11,10 +11,11 @@ from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.tracker_state import LIFETIME
 from saga_fg.tracking.update import _existence
 from tests.saga_fg.traffic_frames import frame
 
-SETTINGS = ExistenceSettings(lifetime=np.inf)
+SETTINGS = ExistenceSettings()
 
 
 def score(probability, hits, opportunities, coasting=False, existence=0.9, settings=SETTINGS, best=0.0):
@@ -34,15 +35,14 @@ def after_miss(r, p_detect, elapsed, settings):
 
 def after_hit(r, probability, settings):
     missed, every = np.zeros(len(r), dtype=bool), np.arange(len(r))
-    return _existence(r, missed, np.zeros(len(r)), every, probability, 1.0, settings)
+    return _existence(r, missed, np.zeros(len(r)), every, probability, 0.0, settings)
 
 
 def test_a_miss_is_the_likelier_the_less_the_track_exists():
     r = np.array([0.1, 0.5, 0.9])
     expected = r * 0.1 / (r * 0.1 + (1 - r))
-    assert after_miss(r, np.full(3, 0.9), 1.0, SETTINGS) == pytest.approx(expected)
-    assert after_miss(r, np.zeros(3), 1.0, SETTINGS) == pytest.approx(r), "nobody looked"
-    assert after_miss(r, np.zeros(3), 2.0, ExistenceSettings(lifetime=4.0)) == pytest.approx(r * np.exp(-0.5))
+    assert after_miss(r, np.full(3, 0.9), 0.0, SETTINGS) == pytest.approx(expected)
+    assert after_miss(r, np.zeros(3), 2.0, SETTINGS) == pytest.approx(r * np.exp(-2.0 / LIFETIME)), "nobody looked"
 
 
 def test_a_detection_as_probable_as_clutter_says_nothing():

@@ -10,14 +10,13 @@ from saga_fg.graph import Additions
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.journal import Journal
-from saga_fg.tracking.track_filters import StationaritySettings
 from tests.saga_fg.traffic_frames import frame, run
 
 SETTINGS = TrackerSettings(
     {"default": ClassSettings(ConstantVelocity(acceleration_noise=0.5), max_deviation=1.0, max_distance=3.0)},
     edges=(),
     association=AssociationSettings(clutter_area=3000.0),
-    stationarity=StationaritySettings(prior=0.5),
+    stationary_share=0.5,
 )
 EGO = yaw_transform(0.0, 0.0, 0.0, 0.0)
 

@@ -12,7 +12,6 @@ from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
-from saga_fg.tracking.track_filters import StationaritySettings
 from saga_fg.types.boxes import MAX_POSITION
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
@@ -41,7 +40,7 @@ def followed(estimator="kalman", edges=(LED,), until=3.0, **values):
 
 @pytest.mark.parametrize("stationary", [0.0, 0.5])
 def test_a_prediction_is_what_frames_without_detections_would_lead_to(stationary):
-    tracker = followed(stationarity=StationaritySettings(prior=stationary))
+    tracker = followed(stationary_share=stationary)
     now = tracker.step(frame(3.0, []))
     found = tracker.predict(HORIZONS)
     assert found.timestamp == 3.0
@@ -86,7 +85,7 @@ def test_every_estimator_predicts_as_the_textbook(name, kind, monkeypatch):
 
 @pytest.mark.parametrize("stationary", [0.0, 0.5])
 def test_joint_covariances_are_positive_definite_and_hold_those_of_each_track(stationary):
-    tracker = followed(stationarity=StationaritySettings(prior=stationary))
+    tracker = followed(stationary_share=stationary)
     assert tracker.predict([1.0]).joint_covariance is None
     found = tracker.predict([0.0, *HORIZONS], joint=True)
     for P, own in zip(found.joint_covariance, found.position_covariance, strict=True):

@@ -9,14 +9,13 @@ from saga_fg import ConstantVelocity, InputError, Tracker, TrackerSettings
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.initiation import relinkable
-from saga_fg.tracking.track_filters import StationaritySettings
 from tests.saga_fg.traffic_frames import columns, frame, run
 
 SETTINGS = TrackerSettings(
     {"default": ClassSettings(ConstantVelocity(acceleration_noise=0.5), max_deviation=1.0, max_distance=3.0)},
     edges=(),
     association=AssociationSettings(clutter_area=3000.0),
-    stationarity=StationaritySettings(prior=0.5),
+    stationary_share=0.5,
 )
 OFF = replace(SETTINGS, association=AssociationSettings(clutter_area=3000.0, relink_above=1.0))
 EGO = yaw_transform(0.0, 0.0, 0.0, 0.0)

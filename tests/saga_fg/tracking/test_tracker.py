@@ -16,6 +16,7 @@ from saga_fg import (
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
+from saga_fg.tracking.tracker_state import LIFETIME
 from tests.saga_fg.traffic_frames import NAN, SIZE, at_pose, columns, frame, run, seen, straight, turning_vehicle
 
 TENTHS = np.arange(0, 5, 0.1)
@@ -23,7 +24,7 @@ TENTHS = np.arange(0, 5, 0.1)
 
 def settings(edges=(), **values):
     """Independent objects of one kind of class settings."""
-    existence = {k: values.pop(k) for k in ("report_above", "confirm_above", "delete_below", "lifetime") if k in values}
+    existence = {k: values.pop(k) for k in ("report_above", "confirm_above", "delete_below") if k in values}
     overall = {
         k: values.pop(k) for k in ("max_delay", "max_coasting", "report_coasting", "max_out_of_view") if k in values
     }
@@ -169,10 +170,10 @@ def test_how_often_nobody_looks_does_not_matter_to_belief():
     sensors = {"blind": Sensor(detection_probability=0.0)}
     scores = []
     for count in (1, 20):
-        tracker = Tracker(settings(max_deviation=20.0, lifetime=2.0), sensors)
+        tracker = Tracker(settings(max_deviation=20.0), sensors)
         tracker.step(frame(0.0, [(0, 0)], score=0.5))
         scores.append(run(tracker, [frame(t, [], "blind") for t in np.linspace(0, 1, count + 1)[1:]])[-1].score[0])
-    assert scores[0] == pytest.approx(0.5 * 0.5 * np.exp(-1.0 / 2.0))
+    assert scores[0] == pytest.approx(0.5 * 0.5 * np.exp(-1.0 / LIFETIME))
     assert scores[1] == pytest.approx(scores[0])
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from saga_fg import GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
-from saga_fg.tracking import ClassSettings, ClockSettings, GreedySettings
+from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.clock import REMEMBERED, Clock
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
@@ -138,20 +138,13 @@ def test_frames_that_are_sent_again_say_nothing_of_the_clock(make):
 
 def test_how_far_the_clock_may_jump_can_be_set():
     for settings, expected in (
-        (TrackerSettings(clock=ClockSettings(max_jump=100.0)), "accepted"),
+        (TrackerSettings(max_jump=100.0), "accepted"),
         (TrackerSettings(max_coasting=80.0), "accepted"),  # tracks live that long
-        (TrackerSettings(clock=ClockSettings(max_jump=5.0)), "unconfirmed"),
+        (TrackerSettings(max_jump=7.0), "unconfirmed"),
     ):
         tracker = Tracker(settings)
         run(tracker, [frame(-0.1, [(0, 0)]), frame(0.0, [(0, 0)])])
         assert verdicts(tracker, [frame(60.0, [(0, 0)])]) == [expected]
-    greedy = GreedyTracker(GreedySettings(clock=ClockSettings(max_jump=5.0)))
-    assert verdicts(greedy, [frame(t, [(0, 0)]) for t in (0.0, 0.1, 6.0)]) == [*["accepted"] * 2, "unconfirmed"]
-    patient = Tracker(TrackerSettings(clock=ClockSettings(reset_after=6)))
-    run(patient, [*at(0.0, np.arange(5) / 10), frame(9.0, [])])
-    assert verdicts(patient, at(0.0, 0.5 + np.arange(6) / 10)) == [*["late"] * 5, "set_back"]
-    with pytest.raises(InputError, match="reset_after: expected a finite number > 0"):
-        ClockSettings(reset_after=0)
 
 
 def test_tracks_that_outlive_a_jump_are_predicted():
@@ -170,7 +163,7 @@ def test_tracks_that_outlive_a_jump_are_predicted():
 def test_names_of_sensors_without_end_are_not_remembered():
     clock = Clock()
     for k in range(3 * REMEMBERED):
-        _, clock = clock.judged(0.1 * k, f"sensor {k}", ClockSettings(), 0.5)
+        _, clock = clock.judged(0.1 * k, f"sensor {k}", 10.0, 0.5)
     assert len(clock.accepted) == REMEMBERED
     tracker = Tracker()
     for k in range(200):

@@ -16,19 +16,19 @@ def independent(**values):
 
 
 def test_a_weak_sensor_alone_needs_repeated_evidence():
-    tracker = Tracker(independent(confirming_detections=4), WEAK)
+    tracker = Tracker(independent(), WEAK)
     reported = [len(t) for t in run(tracker, [frame(t, (10.0, 0.0), "camera") for t in TENTHS[:6]])]
-    assert reported == [0, 0, 0, 1, 1, 1]
+    assert reported == [0, 0, 1, 1, 1, 1]
 
 
 def test_what_waits_for_confirmation_may_be_reported_with_a_share_of_its_score():
-    tracker = Tracker(independent(confirming_detections=3, tentative_score_factor=0.25), WEAK)
+    tracker = Tracker(independent(tentative_score_factor=0.25), WEAK)
     scores = [t.score.tolist() for t in run(tracker, [frame(t, (10.0, 0.0), "camera", score=0.8) for t in TENTHS[:3]])]
     assert scores == [[pytest.approx(0.2)], [pytest.approx(0.2)], [pytest.approx(0.8)]]
 
 
 def test_another_sensor_confirms_it_at_once():
-    tracker = Tracker(independent(confirming_detections=100), WEAK)
+    tracker = Tracker(independent(), WEAK)
     frames = [frame(0.0, (10.0, 0.0), "camera"), frame(0.05, (10.0, 0.0), "lidar"), frame(0.1, (10.0, 0.0), "camera")]
     assert [t.id.tolist() for t in run(tracker, frames)] == [[], [1], [1]]
 

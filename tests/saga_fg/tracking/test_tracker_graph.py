@@ -163,7 +163,7 @@ def braking_behind_a_wall(method, estimator="kalman", gap=4.5):
     """Ids of five cars before and after they pass behind a wall, where all of them brake."""
     rng = np.random.default_rng(0)
     edges = (Neighbours(rate=1.0, distance_scale=20.0, speed_scale=np.inf),)
-    association = AssociationSettings(method=method, clutter_area=1e4, existence_weight=0.0)
+    association = AssociationSettings(method=method, clutter_area=1e4)
     far = {"default": ClassSettings(motion=ConstantVelocity(10.0), max_deviation=np.inf, max_distance=15.0)}
     told = PATIENT | {"classes": far}
     tracker = Tracker(TrackerSettings(edges=edges, association=association, estimator=estimator, **told))

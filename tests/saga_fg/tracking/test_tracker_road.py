@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettings
-from saga_fg.model.edge_rules import ConeGeometry, Following, Pairs
+from saga_fg.model.edge_rules import Following, Pairs
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.lanes import ConeLine, InLane
 from saga_fg.model.motion import ConstantVelocity, RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.stop_lines import GreenLight, RedLight, SmoothStopping
+from saga_fg.model.stop_lines import GreenLight, RedLight
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.prediction import node_table
 from saga_fg.types.road_map import COLOURS, Lane, RoadMap, StopLine, TrafficLight, colours
@@ -24,7 +24,7 @@ MAP = RoadMap(
     (Lane("lane", ((-200.0, 0.0), (50.0, 0.0))),),
 )
 FOLLOW = Following(interaction=SharedVelocity(), rate=1.0, max_gap=40)
-EDGES = (RedLight(), GreenLight(), InLane(), ConeLine(), Attached(), replace(FOLLOW, cones=ConeGeometry()))
+EDGES = (RedLight(), GreenLight(), InLane(), ConeLine(), Attached(), replace(FOLLOW, cones=True))
 SETTINGS = TrackerSettings(
     classes={
         "default": ClassSettings(motion=ConstantVelocity(acceleration_noise=0.5), max_deviation=np.inf),
@@ -69,7 +69,7 @@ def test_cars_are_expected_to_brake_for_a_red_light_one_after_the_other():
 
 @pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
 def test_drivers_without_corners_brake_for_a_red_light_one_after_the_other(estimator):
-    edges = RedLight(interaction=SmoothStopping()), replace(FOLLOW, interaction=SmoothDriver(), lateral_scale=3.0)
+    edges = RedLight(), replace(FOLLOW, interaction=SmoothDriver(), lateral_scale=3.0)
     settings = replace(SETTINGS, edges=edges, estimator=estimator, max_coasting=20.0)
     red, green = (tracked(queue_frames(colour, duration=2.0), settings) for colour in ("red", "green"))
     assert speeds_at(red, 4.9)[1] < speeds_at(green, 4.9)[1] - 2.0
@@ -121,12 +121,9 @@ def test_an_unreported_light_is_believed_by_who_stops_and_who_goes():
     assert starting["green"] > before["green"] + 0.15
 
 
-def test_two_vehicles_tell_more_than_one_and_drivers_who_do_not_comply_nothing():
+def test_two_vehicles_tell_more_than_one():
     one, two = (believed(light_frames(lambda time: 3.0, road_map=wide(width), width=width)) for width in (1, 2))
     assert two["red"] + two["amber"] > one["red"] + one["amber"]
-    off = replace(SETTINGS, signals=replace(SETTINGS.signals, non_compliance=1.0))
-    untold = believed(light_frames(lambda time: 3.0), settings=off)
-    assert untold["red"] == pytest.approx(SETTINGS.signals.stationary[0], abs=1e-6)
 
 
 def wide(lanes):

@@ -15,8 +15,9 @@ from hypothesis import HealthCheck, example, given, settings
 from saga_fg import Boxes, Detection, Detections, Frame, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import JointKalmanFilter
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.tracking import ClassSettings, ClockSettings
+from saga_fg.tracking import ClassSettings
 from saga_fg.tracking import tracker as tracker_module
+from saga_fg.tracking.clock import RESET_AFTER
 from saga_fg.types.boxes import MAX_POSITION
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
@@ -92,7 +93,7 @@ def test_a_valid_frame_is_tracked_after_whatever_came_before(estimator, corrupti
             except InputError:
                 continue
         # late frames are left out until their clock is believed, and a track is reported from its second hit on
-        times = epoch + 0.1 * (len(corruptions) + np.arange(ClockSettings().reset_after + 1))
+        times = epoch + 0.1 * (len(corruptions) + np.arange(RESET_AFTER + 1))
         tracks = [tracker.step(frame(t, FAR, sensor="radar")) for t in times.tolist()][-1]
     finally:
         logging.disable(logging.NOTSET)

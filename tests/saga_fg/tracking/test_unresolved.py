@@ -6,7 +6,6 @@ import pytest
 from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, initiation
-from saga_fg.tracking.track_filters import StationaritySettings
 from tests.saga_fg.traffic_frames import NAN, run
 
 SIZES = {"motorcycle": (2.1, 0.8, 1.5), "pedestrian": (0.7, 0.7, 1.8)}
@@ -40,7 +39,7 @@ def counted_tracks(label, spacing, seed):
     """Mean number of tracks that count, over and above the objects that are detected; of a row of 8 for 15 s."""
     row, rng = np.stack([spacing * np.arange(8), np.zeros(8)], axis=1), np.random.default_rng(seed)
     association = AssociationSettings(clutter_area=3000.0)
-    tracker = Tracker(settings(association=association, stationarity=StationaritySettings(prior=0.5)))
+    tracker = Tracker(settings(association=association, stationary_share=0.5))
     excess = []
     for k in range(30):
         frame = doubled(rng, row, 0.5 * k, label)

@@ -11,12 +11,11 @@ import pytest
 
 from pipelines.serving.state import TreeWriter, read_tree
 from saga_fg import Tracker
-from saga_fg.tracking import ClockSettings
-from saga_fg.tracking.clock import MANY_SENSORS, Clock, weighted_median
+from saga_fg.tracking.clock import MANY_SENSORS, MAX_JUMP, Clock, weighted_median
 from saga_fg.tracking.clock_offsets import MOST_SAMPLES, PairSamples
 from tests.saga_fg.traffic_frames import columns, frame
 
-SETTINGS, MAX_DELAY, START = ClockSettings(), 0.5, 5.0
+MAX_DELAY, START = 0.5, 5.0
 RATES = {"lidar": 10.0, "camera": 12.0}
 
 
@@ -37,7 +36,7 @@ def shares(rates, wrong, stamp, start=START):
     """Share of the frames of each right sensor that is used, and all verdicts."""
     clock, used, sent, verdicts = Clock(), dict.fromkeys(rates, 0), dict.fromkeys(rates, 0), []
     for time, name, shown in arrivals(rates, wrong, stamp, start=start):
-        verdict, clock = clock.judged(shown, name, SETTINGS, MAX_DELAY)
+        verdict, clock = clock.judged(shown, name, MAX_JUMP, MAX_DELAY)
         verdicts.append(verdict)
         sent[name] += time >= START
         used[name] += time >= START and verdict not in ("late", "unconfirmed")
@@ -83,7 +82,7 @@ def test_of_two_the_one_that_kept_its_step_goes_on(subtests):
 def test_a_clock_that_all_sensors_share_may_be_set(jump):
     clock, left_out = Clock(), 0
     for time, name, _ in arrivals({**RATES, "radar": 15.0}, "", lambda t, k: t):
-        verdict, clock = clock.judged(time + jump * (time >= START), name, SETTINGS, MAX_DELAY)
+        verdict, clock = clock.judged(time + jump * (time >= START), name, MAX_JUMP, MAX_DELAY)
         left_out += verdict in ("late", "unconfirmed")
     assert clock.newest == pytest.approx(25.0 + jump, abs=0.1)
     assert left_out <= 6
@@ -92,7 +91,7 @@ def test_a_clock_that_all_sensors_share_may_be_set(jump):
 def test_a_pause_of_all_sensors_costs_two_frames_at_most():
     clock, left_out = Clock(), 0
     for time, name, _ in arrivals({**RATES, "radar": 15.0}, "", lambda t, k: t):
-        verdict, clock = clock.judged(time + 4.0 * (time >= START), name, SETTINGS, MAX_DELAY)
+        verdict, clock = clock.judged(time + 4.0 * (time >= START), name, MAX_JUMP, MAX_DELAY)
         left_out += verdict != "accepted"
     assert left_out <= 2
 
@@ -105,7 +104,7 @@ def test_a_burst_of_two_sensors_after_a_stall_sets_nothing():
             continue
         due, held = ([*held, (time, name)], []) if time >= START + 2.0 else ([(time, name)], held)
         for t, sensor in due:
-            verdict, clock = clock.judged(t, sensor, SETTINGS, MAX_DELAY)
+            verdict, clock = clock.judged(t, sensor, MAX_JUMP, MAX_DELAY)
             verdicts.append(verdict)
     assert set(verdicts) <= {"accepted", "late"}
     assert verdicts[-20:] == ["accepted"] * 20
@@ -115,7 +114,7 @@ def test_frames_in_the_name_of_a_right_sensor_do_not_spoil_its_clock():
     clock, late = Clock(), 0
     for time, name, _ in arrivals({**RATES, "radar": 15.0}, "", lambda t, k: t):
         for shown in (time + 3600.0, time):
-            verdict, clock = clock.judged(shown, name, SETTINGS, MAX_DELAY)
+            verdict, clock = clock.judged(shown, name, MAX_JUMP, MAX_DELAY)
         late += verdict != "accepted"
     assert late <= 2
     assert clock.sensor("lidar").step == pytest.approx(0.1, rel=0.3)
@@ -124,7 +123,7 @@ def test_frames_in_the_name_of_a_right_sensor_do_not_spoil_its_clock():
 def test_a_new_scene_keeps_the_records_and_forgets_the_time():
     clock = Clock()
     for time, name, _ in arrivals(RATES, "", lambda t, k: t):
-        _, clock = clock.judged(time, name, SETTINGS, MAX_DELAY)
+        _, clock = clock.judged(time, name, MAX_JUMP, MAX_DELAY)
     anew = clock.begun_anew()
     assert anew.newest == -np.inf
     assert [r.record for r in anew.sensors] == [r.record for r in clock.sensors]
@@ -134,8 +133,8 @@ def test_a_new_scene_keeps_the_records_and_forgets_the_time():
 def test_sensors_of_short_records_are_forgotten_first():
     clock = Clock()
     for k in range(500):
-        _, clock = clock.judged(0.1 * k, "lidar", SETTINGS, MAX_DELAY)
-        _, clock = clock.judged(0.1 * k, f"sensor {k}", SETTINGS, MAX_DELAY)
+        _, clock = clock.judged(0.1 * k, "lidar", MAX_JUMP, MAX_DELAY)
+        _, clock = clock.judged(0.1 * k, f"sensor {k}", MAX_JUMP, MAX_DELAY)
     assert len(clock.sensors) == MANY_SENSORS
     assert clock.sensor("lidar").kept == 500
 

@@ -1,5 +1,0 @@
-"""Names of association methods in settings and options."""
-
-from typing import Literal
-
-AssociationName = Literal["hungarian", "greedy", "graph"]
