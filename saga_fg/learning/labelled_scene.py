@@ -236,7 +236,8 @@ def measured_trajectories(
         for matched in match_to_truth(scene, sensors, gate):
             truth, sensor = matched.annotations, sensor_model(sensors, matched.frame.sensor)
             time = matched.frame.timestamp + sensor.time_offset
-            boxes, R = matched.detections.boxes, sensor.detection_covariance(matched.detections, matched.origin)
+            boxes = matched.detections.boxes
+            R = sensor.detection_covariance(matched.detections, matched.origin)[:, :2, :2]
             (yaw_noise,) = sensor.deviations(boxes.label, "yaw")
             for j, i in zip(matched.detection.tolist(), matched.truth.tolist(), strict=True):
                 rows = objects.setdefault((str(truth.boxes.label[i]), str(truth.id[i])), [])

@@ -251,7 +251,8 @@ def _move_along_courses(
 @lru_cache(maxsize=64)
 def _moved_back(node_type: NodeType, dt: float) -> FloatArray:
     """exp(-A dt) of a type."""
-    return _exponential(-node_type.generator * dt)
+    nothing = np.zeros((1, node_type.dim, node_type.dim))
+    return np.asarray(linear_motions(-node_type.generator[None], nothing, dt, node_type.nilpotency)[0][0])
 
 
 def _own_dynamics(
@@ -315,23 +316,6 @@ def _coupling_blocks(
         values += dt ** (k + 1) * (phi[k + 1][at] @ C)
         C = C @ A[of_edge]
     return Blocks(target, source, values)
-
-
-def _doublings(norm: float, radius: float = _TAYLOR_RADIUS) -> int:
-    """Number of halvings of a matrix of this norm after which its Taylor series converges fast."""
-    return math.ceil(math.log2(norm / radius)) if radius < norm < math.inf else 0
-
-
-def _exponential(Z: FloatArray) -> FloatArray:
-    """exp(Z) of matrices (..., d, d): the Taylor series of Z / 2^s, squared s times."""
-    doublings = _doublings(float(np.abs(Z).sum(axis=-1).max(initial=0.0)))
-    Z, eye = Z / 2**doublings, np.eye(Z.shape[-1])
-    result = eye + Z / _TAYLOR_DEGREE
-    for j in range(_TAYLOR_DEGREE - 1, 0, -1):
-        result = eye + Z @ result / j
-    for _ in range(doublings):
-        result = result @ result
-    return np.asarray(result)
 
 
 def _merged(F: list[Blocks], n: int) -> tuple[Blocks, ...]:

@@ -296,7 +296,7 @@ class Following(Settings):
         """All pairs that may be in a lane: target rows, source rows."""
         able = of_classes(nodes.label, self.classes)
         follows = _acted(nodes, able) & ~of_classes(nodes.label, self.towed)
-        if not self.parked and nodes.has_moved is not None:
+        if not self.parked:
             follows = follows & (nodes.has_moved > 0)
         paths = NO_PATHS if nodes.paths is None else nodes.paths
         path = np.full(len(nodes), -1)
@@ -370,10 +370,7 @@ def _acted(nodes: NodeTable, able: BoolArray) -> BoolArray:
 
 def _columns(nodes: NodeTable, information: bool) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Of n nodes existence, whether they have moved, and variances of velocities, each (n,); the spread, -1: no gain"""
-    ones = np.ones(len(nodes))
-    exists = ones if nodes.existence is None else nodes.existence
-    moved = ones if nodes.has_moved is None else np.asarray(nodes.has_moved, dtype=np.float64)
+    exists, moved = nodes.existence, np.asarray(nodes.has_moved, dtype=np.float64)
     if not information:
-        return exists, moved, ones, -1.0
-    unseen = 0.0 if nodes.unseen is None else UNSEEN_ACCELERATION * nodes.unseen
-    return exists, moved, np.asarray(nodes.velocity_variance + unseen**2), SPREAD
+        return exists, moved, np.ones(len(nodes)), -1.0
+    return exists, moved, nodes.velocity_variance + (UNSEEN_ACCELERATION * nodes.unseen) ** 2, SPREAD

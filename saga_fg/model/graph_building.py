@@ -51,8 +51,7 @@ def build_graph(
             target, source, rate = _pairs(rule, nodes)
             if len(target) == 0:
                 continue
-            if nodes.existence is not None:
-                rate = rate * nodes.existence[source]
+            rate = rate * nodes.existence[source]
             keep = (rate >= min_rate).nonzero()[0]
             target, source, rate = target[keep], source[keep], rate[keep]
             pair_kind = kind[target] * len(first) + kind[source]

@@ -69,7 +69,7 @@ class Paths(Columns):
         from that cone than the margin, or the path turns by more than `SHARP`. At a corner a place may be farther from
         the path than aside.
         """
-        return _cones(self, most)
+        return path_cones(self.position, most, SHARP, _ROUNDING)
 
     def of_nodes(self, rows: IntArray) -> Paths:
         """The paths of the nodes `rows` (k,), ascending, which are counted from 0 then."""
@@ -99,20 +99,6 @@ class Along(NamedTuple):
     predicted: BoolArray
 
 
-def _cones(paths: Paths, most: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`Paths.cones`."""
-    return path_cones(paths.position, most, SHARP, _ROUNDING)
-
-
-def along_paths(
-    position: FloatArray, heading: FloatArray, paths: Paths | None, target: IntArray, source: IntArray
-) -> Along:
-    """Places of nodes `source` (E,) on the paths of nodes `target` (E,); position (n, 2), heading (n,) of all nodes."""
-    paths, path = NO_PATHS if paths is None else paths, np.full(len(position), -1)
-    path[paths.row] = np.arange(len(paths.row))
-    return Along(*places_along(position, heading, path, paths.position, target, source))
-
-
 POSITION = ("x", "y")
 VELOCITY = ("vx", "vy")
 ACCELERATION = ("ax", "ay")
@@ -125,13 +111,13 @@ class NodeTable:
 
     id (n,); label (n,) classes; types n node types; position (n, 2) m; velocity (n, 2) m/s; heading (n,) rad;
     length (n,) m along the heading; velocity_variance (n,) mean variance of a velocity component, (m/s)^2;
-    has_moved (n,) probability that a node was ever in motion, which distinguishes parked from waiting cars; None if
-    unknown; closed (n,) the weight in [0, 1] with which a stop line is closed, by the belief on its light, None
-    where there are no lights; outline: by row, the polyline (k, 2) of a stop line (its left and right end)
-    or of a lane (its centre); width: by row, of a lane, m; unseen (n,) time since a node was last detected, s, None if
-    unknown; existence (n,) probability that a node is a real object, None: all are; open (n,) the weight with which a
-    stop line lets waiting vehicles go; lanes: those that cross stop lines, these by row; paths: predicted ones;
-    acted (n,) mask of nodes that others may act on, None: all; derived: values that rules share, kept with the table
+    has_moved (n,) probability that a node was ever in motion, which distinguishes parked from waiting cars, 1 if left
+    out; closed, open (n,) the weights with which a stop line holds traffic and lets waiting vehicles go, by the belief
+    on its light, 0 if left out; unseen (n,) time since a node was last detected, s, 0 if left out; existence (n,)
+    probability that a node is a real object, 1 if left out; outline: by row, the polyline (k, 2) of a stop line (its
+    left and right end) or of a lane (its centre); width: by row, of a lane, m; lanes: those that cross stop lines,
+    these by row; paths: predicted ones; acted (n,) mask of nodes that others may act on, None: all; derived: values
+    that rules share, kept with the table
     """
 
     id: IntArray
@@ -142,24 +128,41 @@ class NodeTable:
     heading: FloatArray
     length: FloatArray
     velocity_variance: FloatArray
-    has_moved: FloatArray | BoolArray | None = None
-    closed: FloatArray | None = None
+    has_moved: FloatArray | BoolArray = None  # type: ignore[assignment]  # arrays from construction on
+    closed: FloatArray = None  # type: ignore[assignment]
     outline: Mapping[int, FloatArray] = field(default_factory=dict)
     width: Mapping[int, float] = field(default_factory=dict)
-    unseen: FloatArray | None = None
-    existence: FloatArray | None = None
-    open: FloatArray | None = None
+    unseen: FloatArray = None  # type: ignore[assignment]
+    existence: FloatArray = None  # type: ignore[assignment]
+    open: FloatArray = None  # type: ignore[assignment]
     lanes: LanesAcross | None = None
     paths: Paths | None = None
     acted: BoolArray | None = None
     derived: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        usual = {"has_moved": 1.0, "closed": 0.0, "open": 0.0, "unseen": 0.0, "existence": 1.0}
+        for name, value in usual.items():
+            if getattr(self, name) is None:
+                vars(self)[name] = np.full(len(self), value)
+
     def __len__(self) -> int:
         return len(self.id)
 
+    def append(self, other: NodeTable) -> NodeTable:
+        """With the nodes of another, which have no paths, after these; its lanes are by the rows of the whole."""
+        mine, its, n = vars(self), vars(other), len(self)
+        columns = {k: np.concatenate([v, its[k]]) for k, v in mine.items() if isinstance(v, np.ndarray)}
+        for name in ("outline", "width"):
+            columns[name] = {**mine[name], **{n + row: value for row, value in its[name].items()}}
+        whole = {"types": self.types + other.types, "lanes": other.lanes, "derived": {}}
+        return unchecked(NodeTable, **mine | columns | whole)
+
     def along(self, target: IntArray, source: IntArray) -> Along:
         """Places of nodes `source` (E,) along the paths of nodes `target` (E,)."""
-        return along_paths(self.position, self.heading, self.paths, target, source)
+        paths, path = NO_PATHS if self.paths is None else self.paths, np.full(len(self), -1)
+        path[paths.row] = np.arange(len(paths))
+        return Along(*places_along(self.position, self.heading, path, paths.position, target, source))
 
     def select(self, rows: IntArray) -> NodeTable:
         """The nodes `rows` (k,), ascending. Raises `TypeError` for a column of a kind that cannot be selected."""

@@ -206,10 +206,6 @@ class SceneGraph:
     def edge_count(self) -> int:
         return sum(len(group) for group in self._groups)
 
-    def without_edges(self) -> SceneGraph:
-        """The nodes without edges, as for independent filters."""
-        return SceneGraph(self.nodes, self.types)
-
     def after(self, dt: float) -> SceneGraph:
         """The graph for the rest of an interval of which dt seconds have passed: the same edges, later courses."""
         if not self.courses:

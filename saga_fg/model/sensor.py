@@ -212,40 +212,32 @@ class Sensor(Settings):
 
         Where each has an origin (N, 2) of its own that is the position itself, range and bearing add no noise.
         """
-        offset = position - origin
-        own, along, across, low_score_growth = self.deviations(
-            label, "position", "range_noise", "bearing_noise", "low_score_growth"
-        )
-        # along and across the line of sight u: (a r u)(a r u)^T + (b r n)(b r n)^T = b^2 r^2 I + (a^2 - b^2) r^2 u u^T
-        along, across, factor = along**2, across**2, _score_factor(low_score_growth, probability)
-        isotropic = factor * (own**2 + across * np.einsum("ni,ni->n", offset, offset))
-        rays = (factor * (along - across))[:, None, None] * (offset[:, :, None] * offset[:, None, :])
-        return np.asarray(isotropic[:, None, None] * np.eye(2) + rays)
+        return self._covariance(label, position - origin, probability, np.full((len(label), 2, 2), np.nan))[:, :2, :2]
 
     def detection_covariance(
         self, detections: Detections, origin: FloatArray | None, probability: FloatArray | None = None
     ) -> FloatArray:
-        """R (N, 2, 2), m^2, of the positions of detections in world coordinates; origin (2,): the sensor's place.
+        """R (N, 4, 4) of positions, m^2, and velocities, (m/s)^2, in the world; origin (2,): the sensor's place.
 
         Without a place of the sensor (None) the range is unknown, and its part of the noise is left out. A covariance
         that came with the detection is taken as it is. probability (N,): of the scores, where it is known already.
         """
         label, position = detections.boxes.label, detections.boxes.position[:, :2]
         probability = self.probability(detections.score, label) if probability is None else probability
-        R = self.position_covariance(label, position, probability, position if origin is None else origin)
-        reported = detections.position_covariance
-        return np.where(np.isfinite(reported[:, :1, :1]), reported, R)
+        offset = position - (position if origin is None else origin)
+        return self._covariance(label, offset, probability, detections.position_covariance)
 
-    def velocity_covariance(self, label: StrArray, probability: FloatArray) -> FloatArray:
-        """R (N, 2, 2), (m/s)^2."""
-        deviation, low_score_growth = self.deviations(label, "velocity", "low_score_growth")
-        variance = deviation**2 * _score_factor(low_score_growth, probability)
-        return np.asarray(variance[:, None, None] * np.eye(2))
+    def _covariance(
+        self, label: StrArray, offset: FloatArray, probability: FloatArray, reported: FloatArray
+    ) -> FloatArray:
+        """R (N, 4, 4) at offsets (N, 2) from the sensor; `reported` (N, 2, 2) of positions, where finite."""
+        names = "position", "range_noise", "bearing_noise", "velocity", "low_score_growth"
+        return measured_covariances(offset, *self.deviations(label, *names), probability, reported)
 
     def range_rate_variance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """(N,), (m/s)^2."""
         deviation, low_score_growth = self.deviations(label, "range_rate", "low_score_growth")
-        return np.asarray(deviation**2 * _score_factor(low_score_growth, probability))
+        return np.asarray((deviation * (1 + low_score_growth * (1 - probability))) ** 2)
 
     def covariance_calibration(self, label: StrArray, probability: FloatArray) -> tuple[FloatArray, FloatArray]:
         """For reported covariances of positions (N,): the factor on deviations, and the deviation of the bias, m."""
@@ -283,22 +275,6 @@ class Sensor(Settings):
         R = world_T_sensor[:3, :3]
         local = position @ R[:2, :2] - (world_T_sensor[:3, 3] @ R)[:2]
         return np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
-
-
-def measurement_covariance(
-    sensor: Sensor, detections: Detections, origin: FloatArray | None, probability: FloatArray
-) -> FloatArray:
-    """R (N, 4, 4) of positions, m^2, and velocities, (m/s)^2, as by `detection_covariance`, `velocity_covariance`."""
-    boxes, reported = detections.boxes, detections.position_covariance
-    names = "position", "range_noise", "bearing_noise", "velocity", "low_score_growth"
-    own, along, across, velocity, growth = sensor.deviations(boxes.label, *names)
-    offset = boxes.position[:, :2] - (boxes.position[:, :2] if origin is None else origin)
-    return measured_covariances(offset, own, along, across, velocity, growth, probability, reported)
-
-
-def _score_factor(low_score_growth: FloatArray, probability: FloatArray) -> FloatArray:
-    """(N,) what a score below 1 multiplies a variance by."""
-    return np.asarray((1 + low_score_growth * (1 - probability)) ** 2)
 
 
 def checked_sensors(sensors: Mapping[str, Sensor] | None) -> dict[str, Sensor]:

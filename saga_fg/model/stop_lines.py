@@ -216,15 +216,8 @@ class Stopping(Settings):
         even = Linearised(-(v**2) / (2 * g), -v / g, v**2 / (2 * g**2), none)
         return Linearised(-v / STOP_TIME, none - 1 / STOP_TIME, none, none).where(halting(v, g + self.margin), even)
 
-    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
-        """Accelerations (E,), m/s^2, at speeds and remaining ways g (E,)."""
-        return self.law(v, g).value
-
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
-        ways = approach(nodes, target, source)
-        v = speed_along(nodes, target, ways.direction)
-        law = self.law(v, self.gap(nodes, target, ways.way))
-        return accelerated(nodes, target, source, Along(ways.direction, ways.direction, v), law)
+        return _stopping(self, nodes, target, source)
 
 
 @dataclass(frozen=True)
@@ -240,16 +233,20 @@ class DriverStopping:
         """Gap (E,), m, for ways (E,) from the centres to the line."""
         return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
 
-    def acceleration(self, v: FloatArray, g: FloatArray) -> FloatArray:
-        """Accelerations (E,), m/s^2, at speeds and gaps g (E,)."""
-        return self.driver.stopping(v, g).value
+    def law(self, v: FloatArray, g: FloatArray) -> Linearised:
+        """The acceleration (E,) at speeds and gaps g (E,)."""
+        return self.driver.stopping(v, g)
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
-        ways = approach(nodes, target, source)
-        v = speed_along(nodes, target, ways.direction)
-        f = self.driver.stopping(v, self.gap(nodes, target, ways.way))
-        path = Along(ways.direction, ways.direction, v)
-        return accelerated(nodes, target, source, path, f)
+        return _stopping(self, nodes, target, source)
+
+
+def _stopping(law: Stopping | DriverStopping, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+    """The triples of a law before lines."""
+    ways = approach(nodes, target, source)
+    v = speed_along(nodes, target, ways.direction)
+    f = law.law(v, law.gap(nodes, target, ways.way))
+    return accelerated(nodes, target, source, Along(ways.direction, ways.direction, v), f)
 
 
 @dataclass(frozen=True)
@@ -277,12 +274,11 @@ class RedLight(Settings):
         needed = coming.speed**2 / (2 * g) - self.reaction_deceleration
         ramp = np.clip(needed / max(self.full_deceleration - self.reaction_deceleration, 1e-9), 0.0, 1.0)
         ramp = np.where(halting(coming.speed, coming.front), 1.0, ramp)
-        return ramp, self.interaction.acceleration(coming.speed, g)
+        return ramp, self.interaction.law(coming.speed, g).value
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         first = self.able(coming_vehicles(nodes)).first()
-        weight = np.zeros(len(first.source)) if nodes.closed is None else nodes.closed[first.source]
-        return Pairs(first.target, first.source, weight * self.brakes(nodes, first)[0])
+        return Pairs(first.target, first.source, nodes.closed[first.source] * self.brakes(nodes, first)[0])
 
 
 def halting(speed: FloatArray, front: FloatArray) -> BoolArray:
@@ -319,6 +315,5 @@ class GreenLight:
         found = []
         for first in (coming_vehicles(nodes).first(), passed_vehicles(nodes).first()):
             slow = first.select(first.speed < CROSSING_SPEED)
-            weight = np.zeros(len(slow.source)) if nodes.open is None else nodes.open[slow.source]
-            found.append(Pairs(slow.target, slow.source, START_RATE * weight))
+            found.append(Pairs(slow.target, slow.source, START_RATE * nodes.open[slow.source]))
         return Pairs(*(np.concatenate(column) for column in zip(*found, strict=True)))

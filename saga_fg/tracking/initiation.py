@@ -291,8 +291,6 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         last_in_view=np.full(k, state.time),
         confirmed=(p >= state.settings.existence.confirm_above) & (unresolved == 0),
         has_moved=np.zeros(k, dtype=bool),
-        opportunities=np.ones(k),
-        hits=np.ones(k),
         required_hits=np.full(k, required_hits(state, measurements.sensor)),
         unresolved=unresolved,
         box=BoxFilter.initiated(boxes.size, p, boxes.position[:, 2], z_noise, boxes.yaw, yaw_noise),
@@ -414,7 +412,6 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
     box.update(old, box.size[new], box.size_weight[new], box.z[new], z_noise, box.yaw[new], yaw_noise)
     table.turn.update(old, table.turn.heading[new], np.sqrt(table.turn.P[new, 0, 0]))
     table.sensors.join(old, new)
-    table.hits, table.opportunities = table.sensors.best_hits()
     for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected, table.last_in_view):
         column[old] = column[new]
     table.best_score[old] = np.maximum(table.best_score[old], table.best_score[new])

@@ -208,14 +208,21 @@ class FirstVehicles(Columns):
         free = np.zeros_like(v) if go is None else go.acceleration(v)
         closed = ramp * braking + (1 - ramp) * free
         waiting = np.where(halting(v, first.front), 0.0, free)
-        exists = np.ones(len(nodes)) if nodes.existence is None else nodes.existence
         same = (ids[:, None] == self.id) & (line[:, None] == self.line)
         log_likelihood = np.where(same.any(axis=1)[:, None], same.astype(np.float64) @ self.log_likelihood, 0.0)
         expected = np.column_stack([closed, closed, waiting, free])
         variance = nodes.velocity_variance[first.target]
         then = np.full(len(v), time)
         now = FirstVehicles(
-            ids, line, then, v, first.approach.direction, variance, expected, exists[first.target], log_likelihood
+            ids,
+            line,
+            then,
+            v,
+            first.approach.direction,
+            variance,
+            expected,
+            nodes.existence[first.target],
+            log_likelihood,
         )
         kept = self.select(~np.isin(self.id, nodes.id[: len(detected)][detected]) & (self.time > time - LONGEST))
         return kept.append(now)
@@ -300,10 +307,13 @@ class MapNodes:
         """Probabilities of the colours of a light, by colour; raises `KeyError` for one that is no node."""
         return dict(zip(COLOURS, colours(self.beliefs[light]).tolist(), strict=True))
 
-    def add(self, road_map: RoadMap, origin: FloatArray, joint: JointTrackState) -> None:
-        """Add the new elements of a map to the nodes and to the joint state, whose positions are from `origin` (2,)."""
+    def add(self, road_map: RoadMap, origin: FloatArray, joint: JointTrackState) -> RoadMap | None:
+        """Add the new elements of a map to the nodes and to the joint state, whose positions are from `origin` (2,).
+
+        Returned is the map in the names that its elements have here; None where it is the latest one again.
+        """
         if road_map is self._latest:
-            return
+            return None
         self._latest = road_map
         road_map = in_known_names(road_map, self._known)
         new = [each for each in _elements(road_map) if each[1] in self.classes and each[0] not in self.name]
@@ -311,6 +321,7 @@ class MapNodes:
             self._add_nodes(new, road_map.deviation, origin, joint)
         self._add_roads(road_map)
         self._known = {each.name: each for each in elements(road_map)} | dict(self._known)
+        return road_map
 
     def _add_nodes(
         self, new: Sequence[tuple[str, str, Place, str]], deviation: float, origin: FloatArray, joint: JointTrackState
@@ -365,7 +376,7 @@ class MapNodes:
             return
         seen = sensor.in_world(frame)
         seen = seen.select(of_classes(seen.boxes.label, COLOUR_LABELS))
-        R = sensor.detection_covariance(seen, sensor.origin(frame))
+        R = sensor.detection_covariance(seen, sensor.origin(frame))[:, :2, :2]
         position, _, P, _ = joint.kinematics_of(self.id[lights], self.label[lights])
         z = seen.boxes.position[:, :2] - origin
         d2, log_det = mahalanobis(position, P, z, R)
@@ -387,43 +398,34 @@ class MapNodes:
             ids, label = self.id[lights[row]], self.label[lights[row]]
             joint.update(ids, label, measured, full, np.zeros(k, dtype=bool), delay)
 
-    def appended_to(self, tracks: NodeTable, origin: FloatArray, joint: JointTrackState) -> NodeTable:
-        """Return the node table of the tracks with the nodes of the map after them."""
-        n, m = len(tracks), len(self)
-        if m == 0:
-            return tracks
+    def table(self, first: int, origin: FloatArray, joint: JointTrackState) -> NodeTable:
+        """The nodes of the map, which are rows of a larger table from `first` on; positions are from `origin` (2,)."""
         position = joint.kinematics_of(self.id, self.label).position
-        moved, existence = tracks.has_moved, tracks.existence
-        beliefs = [self.beliefs[light] for light in self.light if light]
-        states = np.array(beliefs).reshape(-1, len(STATES))
-        governed = n + np.flatnonzero([bool(light) for light in self.light])
-        closed, opened = np.zeros(n + m), np.zeros(n + m)
+        governed = np.flatnonzero([bool(light) for light in self.light])
+        states = np.array([self.beliefs[light] for light in self.light if light]).reshape(-1, len(STATES))
+        closed, opened = np.zeros((2, len(self)))
         closed[governed], opened[governed] = self.settings.closed(states), self.settings.open(states)
         lanes = None
         if self.across is not None:
             lines = (self.label == STOP_LINE).nonzero()[0]
             middles = np.array([self.place[k].middle for k in lines.tolist()])
-            lanes = self.across.placed(origin, position[lines] + origin - middles, n + lines)
-        outline = {n + k: place.outline + position[k] for k, place in enumerate(self.place) if len(place.outline)}
-        width = {n + k: place.width for k, place in enumerate(self.place) if place.width > 0}
+            lanes = self.across.placed(origin, position[lines] + origin - middles, first + lines)
+        none = np.zeros(len(self))
         return NodeTable(
-            np.concatenate([tracks.id, self.id]),
-            np.concatenate([tracks.label, self.label]),
-            tracks.types + joint.types_of(self.label),
-            np.concatenate([tracks.position, position]),
-            np.concatenate([tracks.velocity, np.zeros((m, 2))]),
-            np.concatenate([tracks.heading, [place.heading for place in self.place]]),
-            np.concatenate([tracks.length, np.zeros(m)]),
-            np.concatenate([tracks.velocity_variance, np.zeros(m)]),
-            None if moved is None else np.concatenate([moved, np.zeros(m, dtype=bool)]),
-            closed,
-            outline,
-            width,
-            None if tracks.unseen is None else np.concatenate([tracks.unseen, np.zeros(m)]),
-            None if existence is None else np.concatenate([existence, np.ones(m)]),
-            opened,
-            lanes,
-            tracks.paths,
+            self.id,
+            self.label,
+            joint.types_of(self.label),
+            position,
+            np.zeros((len(self), 2)),
+            np.array([place.heading for place in self.place]),
+            none,
+            none,
+            has_moved=none,
+            closed=closed,
+            open=opened,
+            outline={k: place.outline + position[k] for k, place in enumerate(self.place) if len(place.outline)},
+            width={k: place.width for k, place in enumerate(self.place) if place.width > 0},
+            lanes=lanes,
         )
 
 

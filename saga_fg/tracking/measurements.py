@@ -28,7 +28,7 @@ from factors import relative_detection_factors
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, key_of
 from saga_fg.model.interactions import POSITION, NodeTable
-from saga_fg.model.sensor import MAX_MEASURED_SPEED, Sensor, measurement_covariance
+from saga_fg.model.sensor import MAX_MEASURED_SPEED, Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, of_classes, unchecked
 from saga_fg.numerics.gating import near_pairs
 from saga_fg.numerics.geometry import yaw_of
@@ -105,7 +105,7 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     if len(kept) < len(keep):
         keep, detections, probability = keep[kept], detections.select(kept), probability[kept]
     boxes = detections.boxes
-    R = measurement_covariance(sensor, detections, viewpoint, probability)
+    R = sensor.detection_covariance(detections, viewpoint, probability)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
     limit = MAX_MEASURED_SPEED if sensor.use_velocity else -1.0
     covariance_scale, position_bias = sensor.covariance_calibration(boxes.label, probability)
@@ -218,26 +218,13 @@ class EgoNode:
         self.present, self.time, self.yaw = True, time, float(yaw_of(pose[:3, :3]))
         self.has_moved = self.has_moved or bool(np.hypot(*velocity) > MOVING)
 
-    def appended_to(self, tracks: NodeTable, joint: JointTrackState) -> NodeTable:
-        """Return the node table of the tracks with the vehicle after them."""
-        if self.settings is None or not self.present:
-            return tracks
-        now, moved, unseen = joint.kinematics_of(_ID, _LABEL), tracks.has_moved, tracks.unseen
-        existence = tracks.existence
-        return NodeTable(
-            np.concatenate([tracks.id, _ID]),
-            np.concatenate([tracks.label, _LABEL]),
-            tracks.types + joint.types_of(_LABEL),
-            np.concatenate([tracks.position, now.position]),
-            np.concatenate([tracks.velocity, now.velocity]),
-            np.append(tracks.heading, self.yaw),
-            np.append(tracks.length, EGO_LENGTH),
-            np.append(tracks.velocity_variance, np.trace(now.P_velocity[0]) / 2),
-            None if moved is None else np.append(moved, self.has_moved),
-            unseen=None if unseen is None else np.append(unseen, 0.0),
-            existence=None if existence is None else np.append(existence, 1.0),
-            paths=tracks.paths,
-        )
+    def table(self, joint: JointTrackState) -> NodeTable:
+        """The vehicle as a node table of one row."""
+        now = joint.kinematics_of(_ID, _LABEL)
+        heading, length, moved = np.array([self.yaw]), np.array([EGO_LENGTH]), np.array([float(self.has_moved)])
+        variance = np.trace(now.P_velocity, axis1=1, axis2=2) / 2
+        types = joint.types_of(_LABEL)
+        return NodeTable(_ID, _LABEL, types, now.position, now.velocity, heading, length, variance, moved)
 
 
 def relative_covariances(joint: JointTrackState, ids: IntArray, label: StrArray) -> FloatArray:

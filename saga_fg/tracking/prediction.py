@@ -233,7 +233,10 @@ def node_table(state: TrackerState, paths: Paths | None = None) -> NodeTable:
         existence=np.where(table.confirmed, 1.0, table.existence),
         paths=paths,
     )
-    return state.map_nodes.appended_to(state.ego.appended_to(tracks, state.joint), state.origin, state.joint)
+    nodes = tracks.append(state.ego.table(state.joint)) if len(state.ego) else tracks
+    if len(state.map_nodes) == 0:
+        return nodes
+    return nodes.append(state.map_nodes.table(len(nodes), state.origin, state.joint))
 
 
 LOOKAHEAD_STEP = 0.5  # s, the longest with the same edges; a shorter `max_step` counts

@@ -93,8 +93,8 @@ def known_places(state: TrackerState) -> BoolArray:
 
 def reported_score(table: TrackTable, rows: IntArray, coasting: BoolArray, settings: ExistenceSettings) -> FloatArray:
     """(k,) score of the boxes of tracks `rows` (k,); coasting (k,): not detected now."""
-    hits, opportunities = table.hits[rows], table.opportunities[rows]
-    hit_ratio = (hits / (opportunities + settings.prior_opportunities)) ** settings.hit_ratio_weight
+    hits, opportunities = table.sensors.best_hits()
+    hit_ratio = (hits[rows] / (opportunities[rows] + settings.prior_opportunities)) ** settings.hit_ratio_weight
     evidence = np.maximum(table.score[rows], LASTING_SHARE * table.best_score[rows])
     return np.asarray(evidence * hit_ratio * np.where(coasting, table.existence[rows], 1.0))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -25,6 +25,7 @@ from saga_fg.settings import (
     Positive,
     PositiveInt,
     PositiveOrInf,
+    Range,
     Settings,
     setting,
     settings_group,
@@ -65,7 +66,7 @@ class ClassSettings(Settings):
     weak_nms_distance: NonNegative = setting(
         0.0, "discard a detection this close to a much more probable one, m; usual 1 to 4, 0: never"
     )
-    gate: Fraction = setting(
+    gate: FractionBelowOne = setting(
         0.999, "gate probability: share of true pairs inside the chi-square gate; usual 0.99 to 0.9999; higher: wider"
     )
     max_distance: PositiveOrInf = setting(
@@ -80,11 +81,6 @@ class ClassSettings(Settings):
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.gate == 1:
-            raise InputError("gate: expected a share below 1, since a gate of 1 lets everything through")
-
 
 @dataclass(frozen=True)
 class AssociationSettings(Settings):
@@ -98,23 +94,18 @@ class AssociationSettings(Settings):
         "area over which false detections spread, m^2; usual 3000 to 10000; higher: more doubtful pairs "
         "match; .inf: all in the gate",
     )
-    relink_above: Fraction = setting(
+    relink_above: Annotated[float, Range(0, 1, above=True)] = setting(
         0.9,
         "re-link a track that was not detected with a detection that would initiate another one, from this "
         "probability on; usual 0.8 to 0.99; higher: fewer wrong links, more lost identities, 1: never",
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.relink_above == 0:
-            raise InputError("relink_above: expected a probability above 0, since every pair has one of 0 and more")
 
 
 @dataclass(frozen=True)
 class ExistenceSettings(Settings):
     """Existence probability of a track: when it is confirmed, reported and deleted."""
 
-    neutral_score: Fraction = setting(
+    neutral_score: Annotated[float, Range(0, 1, above=True, below=True)] = setting(
         0.2, "detection probability that leaves the existence unchanged; higher: weak detections count against"
     )
     report_above: Fraction = setting(
@@ -136,11 +127,6 @@ class ExistenceSettings(Settings):
     delete_below: Fraction = setting(
         0.02, "delete an unconfirmed track below this existence probability; higher: false tracks end sooner"
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.neutral_score in (0, 1):
-            raise InputError(f"neutral_score: expected a probability inside 0 to 1, got {self.neutral_score!r}")
 
 
 @dataclass(frozen=True)

@@ -168,8 +168,6 @@ class TrackTable(Columns):
     last_in_view      (n,) time when it was last inside a sensor's field of view
     confirmed         (n,) whether misses no longer delete it
     has_moved         (n,) whether it was ever clearly in motion
-    opportunities     (n,) frames in which its best sensor could have detected it
-    hits              (n,) frames in which that sensor detected it
     required_hits     (n,) detections after which it is no longer tentative, if they are of one sensor
     unresolved        (n,) further frames to tell it from the track that it overlaps, see `saga_fg.tracking.initiation`
     box               size, height and heading
@@ -191,8 +189,6 @@ class TrackTable(Columns):
     last_in_view: FloatArray
     confirmed: BoolArray
     has_moved: BoolArray
-    opportunities: FloatArray
-    hits: FloatArray
     required_hits: FloatArray
     unresolved: FloatArray
     box: BoxFilter
@@ -209,7 +205,7 @@ class TrackTable(Columns):
             np.empty(0, dtype="<U1"),
             *(number,) * 9,
             *(truth,) * 2,
-            *(number,) * 4,
+            *(number,) * 2,
             BoxFilter.empty(),
             Stationarity.empty(),
             TurnRate.empty(),

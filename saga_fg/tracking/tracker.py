@@ -144,9 +144,9 @@ class Tracker:
             state.set_origin(frame)
         before, delay = state.time, max(0.0, state.time - time)
         for road_map in (self.settings.road_map, frame.road_map):
-            if road_map is not None:
-                state.map_nodes.add(road_map, state.origin, state.joint)
-                state.traffic.add_lanes(road_map)
+            named = None if road_map is None else state.map_nodes.add(road_map, state.origin, state.joint)
+            if named is not None:
+                state.traffic.add_lanes(named.lanes)
         state.joint.set_frame(frame, state.origin)
         predict(state, max(time, before))
         frame = state.ego.located(frame, state.world_T_ego)

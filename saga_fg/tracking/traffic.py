@@ -36,9 +36,9 @@ of the moving ones, with the weights 1 - b_0 and k_j (1 - b_j).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -50,7 +50,7 @@ from saga_fg.model.interactions import Paths
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, distinct, shallow_copy
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.track_filters import Kinematics
-from saga_fg.types.road_map import Lane, RoadMap
+from saga_fg.types.road_map import Lane
 
 SPACING = 2.0  # m between the passages of a track
 FIRST_LANE = -2  # ids of lanes count down from here, so that they are never those of tracks
@@ -139,68 +139,25 @@ class Passages(Columns):
         return cls(ids, np.empty(0, dtype="U1"), np.empty((0, 2)), none, none, none, none, none, moves)
 
 
-@dataclass(frozen=True, eq=False)
-class Marks(Columns):
-    """n places (n, 2) from which tracks `id` (n,), ascending, go `SPACING` m to their next passage; time (n,), s."""
-
-    id: IntArray
-    position: FloatArray
-    time: FloatArray
-
-    @classmethod
-    def of(cls, passages: Passages) -> Self:
-        """The marks of passages, in their order."""
-        return cls(passages.id, passages.position, passages.time)
-
-
-@dataclass(frozen=True, eq=False)
-class TrailPoints(Columns):
-    """n points of trails: track (n,), position (n, 2), world, m, heading (n,), rad, speed (n,), m/s, and whether it is
-    known (n,)."""
-
-    id: IntArray
-    position: FloatArray
-    heading: FloatArray
-    speed: FloatArray
-    timed: BoolArray
-
-    @classmethod
-    def empty(cls) -> Self:
-        """No points."""
-        none = np.empty(0)
-        return cls(np.empty(0, dtype=np.int64), np.empty((0, 2)), none, none, np.empty(0, dtype=np.bool_))
-
-    @classmethod
-    def of(cls, passages: Passages) -> Self:
-        """The passages of those that move."""
-        rows = passages.moves.nonzero()[0]
-        timed = np.isfinite(passages.variance[rows])
-        return cls(
-            passages.id[rows], passages.position.take(rows, 0), passages.heading[rows], passages.speed[rows], timed
-        )
-
-    @classmethod
-    def of_lane(cls, lane: Lane, ids: int) -> Self:
-        """The points along a lane."""
-        centre = np.array(lane.centre)
-        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
-        at = np.linspace(0.0, way[-1], max(2, round(way[-1] / SPACING) + 1))
-        place = np.stack([np.interp(at, way, each) for each in centre.T], axis=-1)
-        heading = np.arctan2(*np.gradient(place, axis=0)[:, ::-1].T)
-        return cls(np.full(len(at), ids), place, heading, np.zeros(len(at)), np.zeros(len(at), dtype=np.bool_))
-
-
-P = TypeVar("P", Passages, Marks)
+def _lane_points(lane: Lane, ids: int) -> Passages:
+    """Passages along a lane, of no known speed."""
+    centre = np.array(lane.centre)
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
+    at = np.linspace(0.0, distance[-1], max(2, round(distance[-1] / SPACING) + 1))
+    place = np.stack([np.interp(at, distance, each) for each in centre.T], axis=-1)
+    heading, none = np.arctan2(*np.gradient(place, axis=0)[:, ::-1].T), np.zeros(len(at))
+    number, moves = np.full(len(at), ids), np.ones(len(at), dtype=np.bool_)
+    return Passages(number, np.full(len(at), lane.name), place, heading, none, none + np.inf, none, none, moves)
 
 
 @dataclass(eq=False)
 class Trails:
-    """Points of trails, found by cells. These are no part of a state: they are made at need."""
+    """Passages that make trails, found by cells. These are no part of a state: they are made at need."""
 
-    points: TrailPoints
+    points: Passages
     _cells: tuple[float, IntArray, IntArray] | None = field(default=None, init=False, repr=False)
 
-    def __reduce__(self) -> tuple[type[Trails], tuple[TrailPoints]]:
+    def __reduce__(self) -> tuple[type[Trails], tuple[Passages]]:
         return Trails, (self.points,)
 
     def __len__(self) -> int:
@@ -215,17 +172,20 @@ class Trails:
 
 @dataclass(eq=False)
 class Traffic:
-    """The passages of the last `memory` seconds: those that tracks have left behind, in the order of time, and where
-    tracks were last; the marks of all tracks, by id; and the trails along the lanes of the map."""
+    """The passages of the last `memory` seconds, and the trails along the lanes of the map.
+
+    left    those that tracks have left behind, in the order of time
+    marked  the latest of these of each track, by id
+    latest  where tracks were last
+    """
 
     settings: TrafficSettings
     left: Passages = field(default_factory=Passages.empty)
-    marked: Marks = field(default_factory=lambda: Marks.of(Passages.empty()))
+    marked: Passages = field(default_factory=Passages.empty)
     latest: Passages = field(default_factory=Passages.empty)
-    lanes: Trails = field(default_factory=lambda: Trails(TrailPoints.empty()))
-    _known: Mapping[str, tuple[tuple[int, Lane], ...]] = field(default_factory=dict)
+    lanes: Trails = field(default_factory=lambda: Trails(Passages.empty()))
+    _known: Mapping[str, tuple[int, Lane]] = field(default_factory=dict)
     _next_lane: int = FIRST_LANE
-    _map: RoadMap | None = None
     _oldest: float = -np.inf  # no passage is older, s
     _trails: Trails | None = field(default=None, init=False, repr=False)
 
@@ -249,42 +209,32 @@ class Traffic:
         moved = _moved(passing, marked).nonzero()[0]
         if len(moved):
             new = passing.select(moved)
-            left, marked = left.append(new), marked.select(_others(marked.id, new.id)).append(Marks.of(new))
+            left, marked = left.append(new), marked.select(_others(marked.id, new.id)).append(new)
             marked = marked.select(np.argsort(marked.id))
         self.left, self.marked = left, marked
 
-    def add_lanes(self, road_map: RoadMap) -> None:
-        """Take in the lanes of a map that are not known yet, by their names and centre lines.
-
-        Map tiles may use a name again. A lane beside a known one of its name is that one corrected, and replaces it.
-        """
-        if road_map is self._map or self.settings.reach == 0:
+    def add_lanes(self, lanes: Sequence[Lane]) -> None:
+        """Take in lanes that are not known yet; one of a known name with another centre line replaces that."""
+        known = {name: lane.centre for name, (_, lane) in self._known.items()}
+        new = [lane for lane in lanes if known.get(lane.name) != lane.centre]
+        if not new or self.settings.reach == 0:
             return
-        self._map = road_map
-        known, new, replaced = dict(self._known), [], set[int]()
-        for lane in road_map.lanes:
-            alike = known.get(lane.name, ())
-            if any(lane.centre == other.centre for _, other in alike):
-                continue
-            before = {number for number, other in alike if _beside(lane, other)}
-            replaced |= before
-            kept = tuple(each for each in alike if each[0] not in before)
-            known[lane.name] = (*kept, (self._next_lane, lane))
-            new.append(TrailPoints.of_lane(lane, self._next_lane))
-            self._next_lane -= 1
-        if new:
-            points = self.lanes.points
-            points = points.select(~np.isin(points.id, list(replaced))) if replaced else points
-            self.lanes, self._known = Trails(TrailPoints.concatenate([points, *new])), known
+        ids = range(self._next_lane, self._next_lane - len(new), -1)
+        replaced = [self._known[lane.name][0] for lane in new if lane.name in known]
+        points = self.lanes.points.select(~np.isin(self.lanes.points.id, replaced))
+        parts = [_lane_points(lane, number) for lane, number in zip(new, ids, strict=True)]
+        self.lanes = Trails(Passages.concatenate([points, *parts]))
+        self._known = {**self._known, **{lane.name: (k, lane) for k, lane in zip(ids, new, strict=True)}}
+        self._next_lane -= len(new)
 
     def trails(self) -> Trails:
         """The passages of those that move."""
         if self._trails is None:
-            self._trails = Trails(TrailPoints.of(self.left).append(TrailPoints.of(self.latest)))
+            self._trails = Trails(self.left.select(self.left.moves).append(self.latest.select(self.latest.moves)))
         return self._trails
 
 
-def _since(passages: P, time: float) -> P:
+def _since(passages: Passages, time: float) -> Passages:
     """The passages at or after a time, s."""
     old = passages.time < time
     return passages.select(~old) if old.any() else passages
@@ -296,14 +246,7 @@ def _others(ids: IntArray, known: IntArray) -> IntArray:
     return np.array([row for row, name in enumerate(ids.tolist()) if name not in names], dtype=np.int64)
 
 
-def _beside(a: Lane, b: Lane) -> bool:
-    """True if the middle of each of two lanes is within the width of the other."""
-    p, q = (TrailPoints.of_lane(each, FIRST_LANE).position for each in (a, b))
-    apart = min(a.width, b.width)
-    return all(np.hypot(*(x - y[len(y) // 2]).T).min() < apart for x, y in ((p, q), (q, p)))
-
-
-def _moved(passing: Passages, marked: Marks) -> BoolArray:
+def _moved(passing: Passages, marked: Passages) -> BoolArray:
     """(n,) whether tracks are at least `SPACING` m from their marks, or have none."""
     if len(marked) == 0:
         return np.ones(len(passing), dtype=np.bool_)
@@ -319,7 +262,7 @@ TURN = 0.3  # rad, sigma of the kernel on the difference of headings
 AGREEMENT = 0.2  # rad, deviation of the headings of trails from which they say little
 _BEND = 20.0  # m, along which a curvature of one's own fades
 _LEAST = 1e-9
-_NONE = Trails(TrailPoints.empty())
+_NONE = Trails(Passages.empty())
 
 
 def paths(
@@ -345,7 +288,8 @@ def _cell_columns(
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray, Any, Any]:
     """Trails as arrays for the kernel: tracks, places, headings, speeds, flags of known speeds, and grid cells."""
     points = trails.points
-    return points.id, points.position, points.heading, points.speed, points.timed, *trails.cells(cell)
+    timed = np.isfinite(points.variance)
+    return points.id, points.position, points.heading, points.speed, timed, *trails.cells(cell)
 
 
 _FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits

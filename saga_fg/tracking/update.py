@@ -173,7 +173,6 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     fused = table.sensors.probability(state.time, max(SCORE_MEMORY, measurements.delay))
     table.score = np.where(np.isfinite(fused), fused, table.score)
     table.best_score = np.maximum(table.best_score, table.score)
-    table.hits, table.opportunities = table.sensors.best_hits()
     table.covariance_scale[t], table.position_bias[t] = measurements.covariance_scale[d], measurements.position_bias[d]
     table.last_detected[t] = np.maximum(table.last_detected[t], time)
     table.last_in_view[t] = state.time

@@ -49,7 +49,7 @@ def test_in_equilibrium_nobody_accelerates(v):
 
 @given(v=speeds, s=gaps, w=speeds)
 def test_drivers_brake_within_limits_and_never_backwards(v, s, w):
-    braking = -value(DRIVER.following, v, s, w)
+    braking = -value(DRIVER.alone, v, s, w)
     assert braking <= MAX_DECELERATION + 1e-9
     assert braking <= v / STOP_TIME + 1e-9
 

@@ -33,8 +33,6 @@ def test_a_heterogeneous_graph():
     assert graph.dims.tolist() == [4, 4, 4, 2]
     assert graph.edge_count == 4
     assert len(pulls) == 2
-    bare = graph.without_edges()
-    assert (bare.edge_count, bare.nodes.tolist(), bare.types) == (0, graph.nodes.tolist(), graph.types)
 
 
 def test_graphs_without_nodes_or_edges():

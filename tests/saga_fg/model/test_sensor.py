@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from saga_fg import InputError, Sensor
+from saga_fg import Boxes, Detections, InputError, Sensor
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 from saga_fg.numerics.geometry import transform_points, yaw_transform
 
@@ -56,9 +56,9 @@ def test_deviations_grow_as_the_score_falls():
     noise = NoiseModel(position=0.2, low_score_growth=1.5)
     assert covariance(noise, (5.0, 0.0), probability=1.0) == pytest.approx(0.04 * np.eye(2))
     assert covariance(noise, (5.0, 0.0), probability=0.4) == pytest.approx((0.2 * (1 + 1.5 * 0.6)) ** 2 * np.eye(2))
-    velocity = Sensor(noise={"default": NoiseModel(velocity=0.5, low_score_growth=1.0)}).velocity_covariance(
-        labels("car", "car"), np.array([1.0, 0.5])
-    )
+    sensor = Sensor(noise={"default": NoiseModel(velocity=0.5, low_score_growth=1.0)})
+    seen = Detections(Boxes.of(["car", "car"], np.zeros((2, 3))), np.ones(2))
+    velocity = sensor.detection_covariance(seen, None, np.array([1.0, 0.5]))[:, 2:, 2:]
     assert velocity == pytest.approx(np.stack([0.25 * np.eye(2), (0.5 * 1.5) ** 2 * np.eye(2)]))
 
 
@@ -69,7 +69,6 @@ def test_each_class_has_its_noise_and_the_default_serves_all_others():
     assert sensor.deviations(labels(), "position", "yaw").shape == (2, 0)
     none = np.empty((0, 2))
     assert sensor.position_covariance(labels(), none, np.empty(0), np.zeros(2)).shape == (0, 2, 2)
-    assert sensor.velocity_covariance(labels(), np.empty(0)).shape == (0, 2, 2)
 
 
 # scores

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipelines.config import load_config
 from saga_fg.tracking import ExistenceSettings
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
-from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.track_table import SensorEvidence, TrackTable
 from saga_fg.tracking.tracker_state import LIFETIME
 from saga_fg.tracking.update import _existence
 from tests.saga_fg.traffic_frames import frame
@@ -22,9 +22,12 @@ def score(probability, hits, opportunities, coasting=False, existence=0.9, setti
     """Reported scores of tracks with these attributes."""
     probability = np.atleast_1d(np.asarray(probability, dtype=float))
     n = len(probability)
-    counts = {"hits": np.full(n, hits * 1.0), "opportunities": np.full(n, opportunities * 1.0)}
+    sensors = SensorEvidence.empty(n, ["lidar"])
+    sensors.hits[:], sensors.opportunities[:] = hits, opportunities
     best = np.maximum(probability, best)
-    table = replace(TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, **counts)
+    table = replace(
+        TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, sensors=sensors
+    )
     return reported_score(table, np.arange(n), np.full(n, coasting), settings)
 
 

@@ -60,4 +60,5 @@ def test_lights_of_two_tiles_have_beliefs_of_their_own():
     nodes = tracker.map_nodes
     assert nodes.name == ("light", "line", "light (2)", "line (2)")
     assert nodes.light == ("light", "light", "light (2)", "light (2)")
+    assert len(set(tracker.snapshot().traffic.lanes.points.id.tolist())) == 2  # that lead traffic, by the same names
     assert nodes.belief("light (2)")["red"] > 0.9 > 0.6 > nodes.belief("light")["red"]

@@ -75,7 +75,7 @@ def test_another_class_does_not_take_it():
 
 
 def test_a_probability_of_zero_is_refused():
-    with pytest.raises(InputError, match="relink_above: expected a probability above 0"):
+    with pytest.raises(InputError, match="relink_above: expected a number above 0 to 1"):
         AssociationSettings(relink_above=0.0)
 
 

@@ -139,8 +139,9 @@ def test_all_lines_of_a_light_gain_and_those_of_others_do_not():
         StopLine("far", (80.0, 1.75), (80.0, -1.75), "other"),
     )
     tracker = tracked(light_frames(lambda time: 3.0, road_map=RoadMap(lights, lines)))
-    nodes = tracker.map_nodes.appended_to(node_table(tracker._state), np.zeros(2), tracker._state.joint)
-    closed = dict(zip(tracker.map_nodes.name, nodes.closed[-len(tracker.map_nodes) :], strict=True))
+    closed = dict(
+        zip(tracker.map_nodes.name, node_table(tracker._state).closed[-len(tracker.map_nodes) :], strict=True)
+    )
     assert closed["line"] == closed["across"] > 0.75 > closed["far"]
 
 

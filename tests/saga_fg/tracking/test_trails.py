@@ -141,7 +141,7 @@ def of_map(*lanes):
     """The memory of nobody but a map, of lanes by their places (k, 2)."""
     traffic = Traffic(TrafficSettings())
     named = tuple(Lane(f"lane-{k}", tuple(map(tuple, centre.tolist()))) for k, centre in enumerate(lanes))
-    traffic.add_lanes(RoadMap(lanes=named))
+    traffic.add_lanes(named)
     return traffic
 
 
@@ -182,25 +182,15 @@ def test_oncoming_lanes_lead_nobody():
 def test_lanes_are_known_once_and_not_at_a_reach_of_zero():
     traffic = of_map(BEND)
     known = traffic.lanes
-    traffic.add_lanes(RoadMap(lanes=(Lane("lane-0", tuple(map(tuple, BEND.tolist()))),)))
+    traffic.add_lanes(named_lane(BEND))
     assert traffic.lanes is known
     off = Traffic(TrafficSettings(reach=0.0))
-    off.add_lanes(RoadMap(lanes=(Lane("lane-0", tuple(map(tuple, BEND.tolist()))),)))
+    off.add_lanes(named_lane(BEND))
     assert len(off.lanes) == 0
 
 
 def named_lane(centre):
-    return RoadMap(lanes=(Lane("lane-0", tuple(map(tuple, np.asarray(centre).tolist()))),))
-
-
-def test_two_tiles_of_a_map_may_use_the_name_of_a_lane():
-    traffic, whole = of_map(BEND[:6]), path(of_map(BEND))
-    traffic.add_lanes(named_lane(BEND[5:]))
-    assert len(np.unique(traffic.lanes.points.id)) == 2
-    assert path(traffic).position[0] == pytest.approx(whole.position[0], abs=0.3)
-    known = traffic.lanes
-    traffic.add_lanes(named_lane(BEND[:6]))
-    assert traffic.lanes is known
+    return (Lane("lane-0", tuple(map(tuple, np.asarray(centre).tolist()))),)
 
 
 def test_a_corrected_lane_replaces_the_one_of_its_name():
