@@ -1,4 +1,4 @@
-"""Edge rules: which nodes of the estimated graph interact, through which function, and at what rate.
+"""Edge rules: which nodes interact, through which function, at what rate; and the scene graph that they make.
 
 rate_ij = r_j * rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
               r_j * rate * exp( -ahead_ij / gap_scale ) * ...                                  behind a leader
@@ -30,9 +30,9 @@ the distance c that drivers keep between cones and the middle of their vehicle,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -45,8 +45,10 @@ from saga_fg.model.interactions import (
     Interaction,
     NodeTable,
     SharedVelocity,
+    applies,
     unit,
 )
+from saga_fg.model.motion import distinct_types
 from saga_fg.model.nonlinear_interactions import (
     AccelerationLaw,
     IntelligentDriver,
@@ -54,8 +56,8 @@ from saga_fg.model.nonlinear_interactions import (
     SocialForce,
     nearest_offset,
 )
-from saga_fg.model.scene_graph import NonlinearEdges
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
+from saga_fg.model.scene_graph import Courses, Edges, NonlinearEdges, SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes, unchecked
 from saga_fg.numerics.gating import near_pairs
 from saga_fg.settings import (
     NonNegative,
@@ -374,3 +376,93 @@ def _columns(nodes: NodeTable, information: bool) -> tuple[FloatArray, FloatArra
     if not information:
         return exists, moved, np.ones(len(nodes)), -1.0
     return exists, moved, nodes.velocity_variance + (UNSEEN_ACCELERATION * nodes.unseen) ** 2, SPREAD
+
+
+_MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
+E = TypeVar("E", Edges, NonlinearEdges)
+
+
+def build_graph(
+    nodes: NodeTable,
+    rules: Sequence[EdgeRule],
+    explained_noise: float = 0.0,
+    noise_scale: FloatArray | None = None,
+    courses: tuple[Courses, ...] = (),
+    interacting: BoolArray | None = None,
+    min_rate: float = 1e-3,
+) -> SceneGraph:
+    """The scene graph of `nodes` with the edges `rules` choose, their rates times the existence of their sources.
+
+    Edges weaker than `min_rate` (1/s) are left out.
+
+    A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
+    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it. `courses` are those
+    of the graph. Rules see, and tie, the nodes that are `interacting` (n,), None: all.
+
+    Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
+    """
+    groups: list[Edges] = []
+    nonlinear: list[NonlinearEdges] = []
+    total_rate = np.zeros(len(nodes))
+    graph_nodes, types = nodes, distinct_types(nodes.types)
+    row = np.arange(len(nodes)) if interacting is None else interacting.nonzero()[0]
+    if len(row) < len(nodes):
+        nodes = nodes.select(row)
+    if len(nodes) > 1:
+        first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
+        kind = np.array([first.setdefault(t.components, len(first)) for t in types[0]])[types[1][row]]
+        for rule in rules:
+            target, source, rate = _pairs(rule, nodes)
+            if len(target) == 0:
+                continue
+            rate = rate * nodes.existence[source]
+            keep = (rate >= min_rate).nonzero()[0]
+            target, source, rate = target[keep], source[keep], rate[keep]
+            pair_kind = kind[target] * len(first) + kind[source]
+            for k in np.bincount(pair_kind).nonzero()[0]:
+                mine = (pair_kind == k).nonzero()[0]
+                t, s = target[mine], source[mine]
+                law, shipped = rule.interaction, _shipped(rule) and _shipped(rule.interaction)
+                if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
+                    continue
+                ends = {"target": row[t], "source": row[s], "rate": rate[mine]}
+                if hasattr(law, "triples"):
+                    triples = law.triples(nodes, t, s)._asdict()
+                    groups.append(_made(Edges, shipped, interaction=type(law).__name__, **ends, **triples))
+                else:
+                    ends["given"] = law.given(nodes, t, s)
+                    nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
+                total_rate += np.bincount(row[t], weights=rate[mine], minlength=len(total_rate))
+    scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
+    if noise_scale is not None:
+        scale = scale * noise_scale
+    parts = {"edges": tuple(groups), "diffusion_scale": scale, "nonlinear": tuple(nonlinear), "courses": courses}
+    return unchecked(SceneGraph, nodes=graph_nodes.id, types=graph_nodes.types, kinds=types, **parts)
+
+
+def _made(kind: type[E], shipped: bool, **columns: Any) -> E:
+    """Edges, which are checked unless their rule and law are of this package."""
+    return unchecked(kind, **columns) if shipped else kind(**columns)
+
+
+def _pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
+    """The pairs of a rule; `InputError` for rows or rates of a user's that are not valid."""
+    return rule.pairs(nodes) if _shipped(rule) else _checked_pairs(rule, nodes)
+
+
+def _shipped(part: object) -> bool:
+    """True if a rule or law is of this package, and none that was derived from one."""
+    return type(part).__module__.startswith("saga_fg.")
+
+
+def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
+    """The pairs of a user's rule; `InputError` for rows or rates that are not valid."""
+    what = f"edge rule {type(rule).__name__}"
+    pairs = rule.pairs(nodes)
+    target = checked_rows(f"{what}: target", pairs[0])
+    source = checked_rows(f"{what}: source", pairs[1], len(target))
+    for name, rows in (("target", target), ("source", source)):
+        if len(rows) and (rows.min() < 0 or rows.max() >= len(nodes)):
+            bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
+            raise InputError(f"{what}: {name}: row {bad} is outside {len(nodes)} nodes")
+    return Pairs(target, source, checked(f"{what}: rate", pairs[2], (len(target),)))

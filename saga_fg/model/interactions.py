@@ -152,10 +152,10 @@ class NodeTable:
     def append(self, other: NodeTable) -> NodeTable:
         """With the nodes of another, which have no paths, after these; its lanes are by the rows of the whole."""
         mine, its, n = vars(self), vars(other), len(self)
-        columns = {k: np.concatenate([v, its[k]]) for k, v in mine.items() if isinstance(v, np.ndarray)}
+        columns: dict[str, Any] = {k: np.concatenate([v, its[k]]) for k, v in mine.items() if isinstance(v, np.ndarray)}
         for name in ("outline", "width"):
             columns[name] = {**mine[name], **{n + row: value for row, value in its[name].items()}}
-        whole = {"types": self.types + other.types, "lanes": other.lanes, "derived": {}}
+        whole: dict[str, Any] = {"types": self.types + other.types, "lanes": other.lanes, "derived": {}}
         return unchecked(NodeTable, **mine | columns | whole)
 
     def along(self, target: IntArray, source: IntArray) -> Along:

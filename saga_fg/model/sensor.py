@@ -232,7 +232,8 @@ class Sensor(Settings):
     ) -> FloatArray:
         """R (N, 4, 4) at offsets (N, 2) from the sensor; `reported` (N, 2, 2) of positions, where finite."""
         names = "position", "range_noise", "bearing_noise", "velocity", "low_score_growth"
-        return measured_covariances(offset, *self.deviations(label, *names), probability, reported)
+        own, along, across, velocity, growth = self.deviations(label, *names)
+        return measured_covariances(offset, own, along, across, velocity, growth, probability, reported)
 
     def range_rate_variance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """(N,), (m/s)^2."""

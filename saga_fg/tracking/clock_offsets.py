@@ -15,10 +15,14 @@ true ones agree: the estimate is the mean of the densest cluster, as a line over
 The offset of a sensor against the consensus is the median, weighted by record, of its offsets against all sensors,
 itself (0) included. So of three sensors the one that is wrong is told from the others; of two, the one with the shorter
 record is taken to be wrong, and a sensor in time is trusted before one that is not.
+
+A frame that was left out for its time is compared like one that was used, without any influence on the tracks. A sensor
+whose offset is steady, well known and worth it is corrected from then on: so one whose frames were left out comes back.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -28,6 +32,9 @@ import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 from saga_fg.tracking.clock import Clock, weighted_median
+from saga_fg.tracking.measurements import FrameMeasurements
+
+log = logging.getLogger(__name__)
 
 WINDOW = 2.5  # s; candidates are up to this far apart along their velocity
 LEAST_SPEED = 2.0  # m/s; slower objects tell little, and errors of their velocity matter
@@ -354,3 +361,31 @@ def sensor_times(clock: Clock, shared: SharedObservations) -> dict[str, SensorTi
         used: Literal["used", "left out"] = "used" if each.doubt is None else "left out"
         result[each.name] = SensorTime(*values, each.jitter, each.step, each.offset, count, used)
     return result
+
+
+def compared(
+    clock: Clock, shared: SharedObservations, stamp: float, measurements: FrameMeasurements
+) -> tuple[Clock, SharedObservations]:
+    """Compare a frame with this timestamp, s, with those of the other sensors, and correct the clocks that are known.
+
+    Nothing happens with a single sensor, and where positions depend on an estimated pose of the vehicle.
+    """
+    if len(clock.sensors) < 2 or measurements.relative is not None:
+        return clock, shared
+    d = np.argsort(-measurements.probability, kind="stable")[:MOST_OBJECTS]
+    R, boxes = measurements.R[d], measurements.boxes
+    variance = (R[:, 0, 0] + R[:, 1, 1]) / 2
+    objects = SeenObjects.of(measurements.name, stamp, boxes.label[d], boxes.position[d, :2], variance)
+    now = shared.with_frame(objects, clock.elapsed)
+    if all(a.estimate is b.estimate for a, b in zip(shared.pairs, now.pairs, strict=False)):
+        return clock, now
+    for name, found in now.estimates(clock.records()).items():
+        own = clock.sensor(name)
+        assert own is not None
+        if found.significant or (found.steady and own.offset != 0):
+            offset = round(found.offset, 6)
+            if own.offset == 0:
+                text = "the clock of %s is %+.3f s off (+- %.3f s), by %d objects in common: corrected from now on"
+                log.warning(text, name, offset, found.deviation, found.observations)
+            clock = clock.corrected(name, offset)
+    return clock, now

@@ -41,7 +41,7 @@ import numpy as np
 
 from saga_fg.kernels.paths import mean_courses
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.graph_building import build_graph
+from saga_fg.model.edge_rules import build_graph
 from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Paths
 from saga_fg.model.motion import Curvilinear
 from saga_fg.model.nonlinear_interactions import held

@@ -28,8 +28,7 @@ from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.by_name import new_provider
 from saga_fg.tracking.clock import TimeVerdict
-from saga_fg.tracking.clock_comparison import compare_clocks, compare_left_out
-from saga_fg.tracking.clock_offsets import SensorTime, sensor_times
+from saga_fg.tracking.clock_offsets import SensorTime, compared, sensor_times
 from saga_fg.tracking.initiation import hand_over, initiate_tracks, resolve_tracks
 from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
@@ -116,16 +115,12 @@ class Tracker:
             failed_before, self._last_step_failed = self._last_step_failed, isinstance(error, Exception)
             if not (failed_before and self._last_step_failed and len(self._state)):
                 raise
-            state, reported = self._step_without_tracks(frame)
+            state = self._state.copied()
+            state.clear()
+            reported = self._step(state, frame)  # fails where the frame is to blame
             log.warning("tracks %s are deleted, they can't go on: %s", self._state.table.id.tolist(), error)
         self._state, self._last_step_failed = state, False
         return reported
-
-    def _step_without_tracks(self, frame: Frame) -> tuple[TrackerState, Tracks]:
-        """Take a frame into a copy of the state without its tracks; fails where the frame is to blame."""
-        state = self._state.copied()
-        state.clear()
-        return state, self._step(state, frame)
 
     def _step(self, state: TrackerState, frame: Frame) -> Tracks:
         """Take a frame into a state."""
@@ -134,7 +129,10 @@ class Tracker:
         if state.accept_time(timestamp, frame.sensor, self.max_jump, self.max_delay):
             time = state.relative(state.clock.time_of(timestamp, frame.sensor))
             return self._process_frame(state, frame, sensor, time)
-        compare_left_out(state, timestamp, frame, sensor)
+        several, placed = len(state.clock.sensors) > 1, frame.coordinates == "world" or frame.world_T_ego is not None
+        if several and placed and len(frame):  # left out of the tracks, but it tells about the clocks
+            measurements = frame_measurements(frame, sensor, self.settings.classes)
+            state.clock, state.shared = compared(state.clock, state.shared, timestamp, measurements)
         state.assignment = Assignment.empty()
         return report_tracks(state, state.clock.newest)
 
@@ -156,7 +154,8 @@ class Tracker:
 
         measurements = frame_measurements(frame, sensor, self.settings.classes)
         measurements = measurements.with_context(delay, state.ego.relative_positions(measurements, frame))
-        compare_clocks(state, frame.timestamp + sensor.time_offset, measurements)
+        stamp = frame.timestamp + sensor.time_offset
+        state.clock, state.shared = compared(state.clock, state.shared, stamp, measurements)
         state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
         self._notify("measure", state, frame.sensor, measurements)
 

@@ -26,7 +26,7 @@ from pipelines.learning.interactions import (
 from saga_fg.errors import InputError
 from saga_fg.learning import FittedInteractions, fit_interactions
 from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.interactions import CarFollowing
+from saga_fg.model.interactions import VELOCITY, CarFollowing, velocity_triples
 from saga_fg.model.stability import LearnedInteractions
 from tests.saga_fg.following_pairs import RATE, following_pairs
 
@@ -74,8 +74,17 @@ def test_the_form_that_does_best_on_recordings_held_out_is_the_form_that_is_writ
     assert type(found.held_out["one"].edges[0]) is type(found.interactions.edges[0])
 
 
+class Halting:
+    """Followers come to a halt."""
+
+    needs = (VELOCITY, ())
+
+    def triples(self, nodes, target, source):
+        return velocity_triples(nodes, target, source, by_velocity=-np.eye(2))
+
+
 def test_edges_that_raise_errors_are_left_out_and_the_base_motion_remains(monkeypatch, scenes):
-    with_template(monkeypatch, replace(FOLLOW, interaction=CarFollowing(1.0, 5.0, "standstill")))
+    with_template(monkeypatch, replace(FOLLOW, interaction=Halting()))
     config = load_config("file")
     config = replace(config, tracker=replace(config.tracker, edges=()))
     found = learn_interactions(scenes, "two scenes", config, settings=QUICK)
@@ -84,7 +93,7 @@ def test_edges_that_raise_errors_are_left_out_and_the_base_motion_remains(monkey
 
 
 def test_the_base_motion_is_the_tracker_that_is_written_if_no_form_helps(monkeypatch, scenes):
-    with_template(monkeypatch, replace(FOLLOW, interaction=CarFollowing(1.0, 5.0, "standstill")))
+    with_template(monkeypatch, replace(FOLLOW, interaction=Halting()))
     config = load_config("file")
     tracker = replace(config.tracker, edges=(), traffic=replace(config.tracker.traffic, memory=60.0))
     config, tried = replace(config, tracker=tracker), []

@@ -8,8 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import InputError
-from saga_fg.model.edge_rules import SPREAD, UNSEEN_ACCELERATION, Following, Neighbours, Pairs, traffic_rules
-from saga_fg.model.graph_building import build_graph
+from saga_fg.model.edge_rules import (
+    SPREAD,
+    UNSEEN_ACCELERATION,
+    Following,
+    Neighbours,
+    Pairs,
+    build_graph,
+    traffic_rules,
+)
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.model.drawn_traffic import bend, edges, joined, leaders, random_traffic, straight, table
 

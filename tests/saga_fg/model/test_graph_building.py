@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs
-from saga_fg.model.graph_building import build_graph
+from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from tests.saga_fg.model.drawn_traffic import random_traffic, straight, table

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from saga_fg import InputError
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following
-from saga_fg.model.graph_building import build_graph
+from saga_fg.model.edge_rules import Following, build_graph
 from saga_fg.model.nonlinear_interactions import HIDDEN_VEHICLE_GAP, MAX_DECELERATION, STOP_TIME, IntelligentDriver
 from saga_fg.model.stability import require_stable
 from saga_fg.model.stop_lines import DriverStopping, RedLight

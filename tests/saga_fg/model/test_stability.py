@@ -12,8 +12,7 @@ from pipelines.config import TrackConfig
 from pipelines.configuration import read_settings
 from saga_fg import InputError
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.graph_building import build_graph
+from saga_fg.model.edge_rules import Following, Neighbours, build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.stability import highest_rate, require_stable
