@@ -11,11 +11,7 @@ from saga_fg.tracking.clock import REMEMBERED, Clock
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 CARS = straight([(0.0, 0.0), (0.0, 8.0)], [(5.0, 0.0), (6.0, 0.0)])
-MAKERS = {
-    **{name: (lambda name=name: Tracker(TrackerSettings(estimator=name))) for name in ("kalman", "isam2", "fixed-lag")},
-    "kf": lambda: Tracker(TrackerSettings(edges=())),
-    "centerpoint": GreedyTracker,
-}
+MAKERS = {"kalman": Tracker, "centerpoint": GreedyTracker}  # a clock knows no estimators
 ALL = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 
 
