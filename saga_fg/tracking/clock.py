@@ -127,10 +127,6 @@ class SensorClock:
         start = self.first if self.time is None else self.time
         return abs(time - start - (elapsed - self.taken)) <= max_delay + REGULAR * self.step
 
-    def leading(self, apart: float) -> SensorClock:
-        """After a frame so far ahead of the newest time, s; a frame that sets it is at 0."""
-        return self.changed(lead=self.lead + SMOOTHING * (apart - self.lead) if self.lead else apart)
-
     def step_to(self, timestamp: float) -> float:
         """The time, s, from its latest frame to one with this timestamp; from its latest accepted one if that is
         nearer."""
@@ -264,7 +260,9 @@ class Clock:
         elapsed = max(self.elapsed, self.reached + min(max(apart, 0.0), 2.5 * own.step or QUIET / 4))
         reached = elapsed if apart > 0 else self.reached
         own = own.changed(lead=0.0) if own.doubt is not None else own  # it has caught up
-        own = own.leading(min(apart, 0.0)).changed(time=time, seen=elapsed, taken=elapsed, doubt=None, run=0)
+        behind = min(apart, 0.0)
+        lead = own.lead + SMOOTHING * (behind - own.lead) if own.lead else behind
+        own = own.changed(lead=lead, time=time, seen=elapsed, taken=elapsed, doubt=None, run=0)
         accepted = (*self.accepted, (own.name, own.stamp))[-REMEMBERED:]
         step = apart if apart > max_jump else 0.0
         newest = max(self.newest, time)
@@ -274,7 +272,8 @@ class Clock:
         """After a frame that is left out, or with which the clock is set."""
         time = own.stamp - own.offset
         far = time > self.newest or self.newest - time > limit
-        agrees = self._supports(own, time, limit) if far else own.doubt is not None and not self._far(own.doubt, limit)
+        near = own.doubt is not None and abs(own.doubt - self.newest) <= limit
+        agrees = self._supports(own, time, limit) if far else near
         backward = far or own.time is None or time < own.time or own.paced(time, elapsed, max_delay)
         run = (own.run if agrees else 0) + backward
         if own.doubt is None or not agrees:
@@ -343,13 +342,10 @@ class Clock:
         apart = time - r.doubt - (elapsed - r.seen)
         return abs(apart) <= max_delay + min(REGULAR * max(r.step, own.step), QUIET / 2)
 
-    def _far(self, time: float, limit: float) -> bool:
-        return abs(time - self.newest) > limit
-
     def _supports(self, own: SensorClock, time: float, limit: float) -> bool:
         """Return True if a time supports the doubtful one of its sensor: close to it, or the next of a slow stream of
         equal steps."""
-        if own.doubt is None or not (own.doubt > self.newest or self._far(own.doubt, limit)):
+        if own.doubt is None or self.newest - limit <= own.doubt <= self.newest:
             return False
         step = time - own.doubt
         return abs(step) <= limit or 0 < step <= 1.5 * (own.doubt - self.newest)

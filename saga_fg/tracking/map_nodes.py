@@ -79,6 +79,7 @@ from saga_fg.types.road_map import (
 
 Element = TrafficLight | StopLine | Lane | Wall
 E = TypeVar("E", TrafficLight, StopLine, Lane, Wall)
+LABELS: Mapping[type, str] = {TrafficLight: LIGHT, StopLine: STOP_LINE, Lane: LANE, Wall: WALL}
 
 BESIDE = 4.0  # m, to which corrections move an element; others of its name are farther away
 SAME = 0.1  # m, within which maps that write one place twice agree
@@ -133,11 +134,13 @@ def _free(name: str, *taken: Container[str]) -> str:
     return next(each for each in numbered if not any(each in names for names in taken))
 
 
-def _points(of: Element) -> FloatArray:
+def _points(element: Element) -> FloatArray:
     """(k, 2) m."""
-    if isinstance(of, TrafficLight):
-        return np.array([of.position])
-    return of.ends if isinstance(of, StopLine) else np.array(of.centre if isinstance(of, Lane) else of.points)
+    if isinstance(element, TrafficLight):
+        return np.array([element.position])
+    if isinstance(element, StopLine):
+        return element.ends
+    return np.array(element.centre if isinstance(element, Lane) else element.points)
 
 
 def _in_place(a: Element, b: Element) -> bool:
@@ -273,6 +276,14 @@ class Place:
     heading: float
     width: float
 
+    @classmethod
+    def of(cls, element: Element) -> Place:
+        """The place of an element; a lane's middle is one of its points."""
+        points = _points(element)
+        middle = points[len(points) // 2] if isinstance(element, Lane) else points.mean(axis=0)
+        outline = np.empty((0, 2)) if isinstance(element, TrafficLight) else points - middle
+        return cls(middle, outline, getattr(element, "heading", 0.0), getattr(element, "width", 0.0))
+
 
 @dataclass(eq=False)
 class MapNodes:
@@ -316,21 +327,21 @@ class MapNodes:
             return None
         self._latest = road_map
         road_map = in_known_names(road_map, self._known)
-        new = [each for each in _elements(road_map) if each[1] in self.classes and each[0] not in self.name]
+        wanted = [each for each in elements(road_map) if LABELS[type(each)] in self.classes]
+        new = [each for each in wanted if each.name not in self.name]
         if new:
             self._add_nodes(new, road_map.deviation, origin, joint)
         self._add_roads(road_map)
         self._known = {each.name: each for each in elements(road_map)} | dict(self._known)
         return road_map
 
-    def _add_nodes(
-        self, new: Sequence[tuple[str, str, Place, str]], deviation: float, origin: FloatArray, joint: JointTrackState
-    ) -> None:
-        """Add elements (`_elements`) of a map of this deviation, m."""
-        names, labels, places, lights = zip(*new, strict=True)
+    def _add_nodes(self, new: Sequence[Element], deviation: float, origin: FloatArray, joint: JointTrackState) -> None:
+        """Add elements of a map of this deviation, m."""
+        labels, places = [LABELS[type(each)] for each in new], tuple(map(Place.of, new))
+        lights = tuple(each.name if isinstance(each, TrafficLight) else getattr(each, "light", "") for each in new)
         ids = -np.arange(len(self) + 1, len(self) + len(new) + 1, dtype=np.int64)
         self.id, self.label = np.concatenate([self.id, ids]), np.concatenate([self.label, np.array(labels)])
-        self.name += names
+        self.name += tuple(each.name for each in new)
         self.place += places
         self.light += lights
         fresh = {name: self.settings.stationary for name in lights if name and name not in self.beliefs}
@@ -427,22 +438,3 @@ class MapNodes:
             width={k: place.width for k, place in enumerate(self.place) if place.width > 0},
             lanes=lanes,
         )
-
-
-def _elements(road_map: RoadMap) -> list[tuple[str, str, Place, str]]:
-    """Name, class, place and governing light of every element of a map."""
-    none = np.empty((0, 2))
-    elements = [
-        (light.name, LIGHT, Place(np.array(light.position), none, 0.0, 0.0), light.name) for light in road_map.lights
-    ]
-    for line in road_map.stop_lines:
-        middle = line.ends.mean(axis=0)
-        elements.append((line.name, STOP_LINE, Place(middle, line.ends - middle, line.heading, 0.0), line.light))
-    for lane in road_map.lanes:
-        centre = np.array(lane.centre)
-        middle = centre[len(centre) // 2]
-        elements.append((lane.name, LANE, Place(middle, centre - middle, 0.0, lane.width), ""))
-    for wall in road_map.walls:
-        middle = np.mean(wall.points, axis=0)
-        elements.append((wall.name, WALL, Place(middle, np.array(wall.points) - middle, 0.0, 0.0), ""))
-    return elements

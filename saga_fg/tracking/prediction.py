@@ -47,7 +47,7 @@ from saga_fg.model.motion import Curvilinear
 from saga_fg.model.nonlinear_interactions import held
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.turning import KnownCourses, Unseen, turning_time
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, unchecked
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tracking.reporting import reported_rows, untrackable
 from saga_fg.tracking.track_filters import MOVING, TURNING
@@ -242,45 +242,28 @@ def node_table(state: TrackerState, paths: Paths | None = None) -> NodeTable:
 LOOKAHEAD_STEP = 0.5  # s, the longest with the same edges; a shorter `max_step` counts
 
 
-@dataclass(eq=False)
-class _Prediction(Columns):
-    """The tracks at one time: id (n,), position and velocity (n, 2), yaw (n,), covariances (n, 2, 2)."""
-
-    id: IntArray
-    position: FloatArray
-    velocity: FloatArray
-    yaw: FloatArray
-    P: FloatArray
-    P_velocity: FloatArray
-
-
 def look_ahead(state: TrackerState, horizons: FloatArray, joint: bool = False) -> PredictedTracks:
     """Predict the reported tracks to `horizons` (H,), s; changes the state, which is to be a copy.
 
     Left out are tracks that can't be predicted to the last of them. joint: with their joint covariances.
     """
     newest, reported = state.clock.newest, state.table.id[reported_rows(state)]
-    predicted, together = [], []
+    tables, moments, together = [], [], []
     for horizon in horizons.tolist():
         _predict_to(state, state.relative(newest) + horizon)
         rows = np.flatnonzero(np.isin(state.table.id, reported))
-        predicted.append(_prediction(state, rows))
-        together.append(_joint_covariance(state, rows, predicted[-1].P) if joint else np.empty((0, 0)))
-    last = predicted[-1]
-    rows_of = [np.flatnonzero(np.isin(each.id, last.id)) for each in predicted]
-    at = [each.select(rows) for each, rows in zip(predicted, rows_of, strict=True)]
-    return PredictedTracks(
-        newest,
-        horizons,
-        last.id,
-        state.table.label[np.isin(state.table.id, last.id)],
-        np.stack([each.position + state.origin for each in at]),
-        np.stack([each.velocity for each in at]),
-        np.stack([each.yaw for each in at]),
-        np.stack([each.P for each in at]),
-        np.stack([each.P_velocity for each in at]),
-        np.stack([P[np.ix_(k, k)] for P, k in zip(together, map(_pairs, rows_of), strict=True)]) if joint else None,
-    )
+        tables.append(state.table.select(rows))
+        moments.append(state.reported_kinematics().select(rows))
+        together.append(_joint_covariance(state, rows, moments[-1].P) if joint else np.empty((0, 0)))
+    last = tables[-1]
+    kept = [np.flatnonzero(np.isin(table.id, last.id)) for table in tables]
+    moved = [now.select(rows) for now, rows in zip(moments, kept, strict=True)]
+    position, velocity, P, P_velocity = (np.stack(columns) for columns in zip(*moved, strict=True))
+    yaw = np.stack([table.box.yaw[k] for table, k in zip(tables, kept, strict=True)])
+    of_pairs = [(2 * k[:, None] + [0, 1]).ravel() for k in kept]  # the coordinates of the tracks kept
+    whole = np.stack([P[np.ix_(k, k)] for P, k in zip(together, of_pairs, strict=True)]) if joint else None
+    place = position + state.origin
+    return PredictedTracks(newest, horizons, last.id, last.label, place, velocity, yaw, P, P_velocity, whole)
 
 
 def _predict_to(state: TrackerState, time: float) -> None:
@@ -289,11 +272,6 @@ def _predict_to(state: TrackerState, time: float) -> None:
     steps = math.ceil(elapsed / LOOKAHEAD_STEP - 1e-9)
     for k in range(1, steps + 1):
         predict(state, time if k == steps else begin + k * elapsed / steps, ahead=True)
-
-
-def _prediction(state: TrackerState, rows: IntArray) -> _Prediction:
-    table, now = state.table.select(rows), state.reported_kinematics().select(rows)
-    return _Prediction(table.id, now.position, now.velocity, table.box.yaw, now.P, now.P_velocity)
 
 
 def _joint_covariance(state: TrackerState, rows: IntArray, own: FloatArray) -> FloatArray:
@@ -305,11 +283,6 @@ def _joint_covariance(state: TrackerState, rows: IntArray, own: FloatArray) -> F
         P = P * (moves[:, None] * moves)[:, None, :, None]
     P[np.arange(n), :, np.arange(n)] = own
     return np.asarray(P.reshape(2 * n, 2 * n))
-
-
-def _pairs(rows: IntArray) -> IntArray:
-    """(2k,) places of the coordinates of `rows` (k,)."""
-    return np.asarray((2 * rows[:, None] + [0, 1]).ravel())
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,6 +122,8 @@ class SensorEvidence(Columns):
 
     def best_hits(self) -> tuple[FloatArray, FloatArray]:
         """Hits (n,) and opportunities (n,) of the sensor with the best hit ratio of each track."""
+        if len(self) == 0:
+            return np.empty(0), np.empty(0)
         if len(self.sensors) == 1:
             return self.hits[:, 0].astype(np.float64), self.opportunities[:, 0].astype(np.float64)
         best = ((self.hits + 0.0) / (self.opportunities + 1.0)).argmax(axis=1)[:, None]

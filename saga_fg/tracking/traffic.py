@@ -47,7 +47,7 @@ from saga_fg.kernels.components import speeds_ahead
 from saga_fg.kernels.paths import points_by_cell, trail_paths
 from saga_fg.kernels.tracks import prior_of_traffic
 from saga_fg.model.interactions import Paths
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, distinct, shallow_copy
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, common_numbers, shallow_copy
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.types.road_map import Lane
@@ -273,23 +273,14 @@ def paths(
     Their steps are `STEP` m long, their rows 0 to n - 1.
     """
     reach = max(traffic.settings.reach, _LEAST)
-    lanes, trails = (_cell_columns(each, 2 * reach) for each in _found(traffic))
+    found = (traffic.lanes, traffic.trails()) if traffic.settings.reach > 0 else (_NONE, _NONE)
+    columns: list[Any] = []
+    for trails in found:
+        points = trails.points
+        columns += [points.id, points.position, points.heading, points.speed, np.isfinite(points.variance)]
+        columns += trails.cells(2 * reach)
     tracks, scales = (ids, position, heading, curvature), (reach, STEP, _BEND, TURN, PRIOR, AGREEMENT)
-    return Paths(np.arange(len(ids)), *trail_paths(*lanes, *trails, *tracks, steps, NEAREST, *scales))
-
-
-def _found(traffic: Traffic) -> tuple[Trails, Trails]:
-    """The lanes, and the trails of traffic, that lead others."""
-    return (traffic.lanes, traffic.trails()) if traffic.settings.reach > 0 else (_NONE, _NONE)
-
-
-def _cell_columns(
-    trails: Trails, cell: float
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray, Any, Any]:
-    """Trails as arrays for the kernel: tracks, places, headings, speeds, flags of known speeds, and grid cells."""
-    points = trails.points
-    timed = np.isfinite(points.variance)
-    return points.id, points.position, points.heading, points.speed, timed, *trails.cells(cell)
+    return Paths(np.arange(len(ids)), *trail_paths(*columns, *tracks, steps, NEAREST, *scales))
 
 
 _FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
@@ -320,24 +311,11 @@ def speed_prior(
     settings, sets = traffic.settings.speed_prior, (traffic.left, traffic.latest)
     if settings.weight == 0 or len(label) == 0 or not any(map(len, sets)):
         return SpeedPrior(np.full(len(label), stationary), np.zeros(len(label)), variance.copy())
-    number: dict[str, int] = {}
-    left, latest = (_columns(each, number) for each in sets)
-    new = _class_numbers(label, number), position, heading, variance
+    labels = common_numbers(*(each.label for each in sets), label)
+    columns: list[Any] = []
+    for each, of in zip(sets, labels, strict=False):
+        columns += [each.id, of, each.position, each.heading, each.speed, each.variance, each.stationary]
+    new = labels[-1], position, heading, variance
     scales = settings.weight, settings.ahead_scale, settings.lateral_scale, HEADING_SCALE, SPREAD
     limits = settings.max_speed_deviation**2, _FARTHEST
-    return SpeedPrior(*prior_of_traffic(*left, *latest, *new, stationary, *scales, *limits))
-
-
-_Columns = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
-
-
-def _columns(each: Passages, number: dict[str, int]) -> _Columns:
-    """The columns of passages that the prior is made of, their classes by number."""
-    of = _class_numbers(each.label, number)
-    return each.id, of, each.position, each.heading, each.speed, each.variance, each.stationary
-
-
-def _class_numbers(label: StrArray, number: dict[str, int]) -> IntArray:
-    """(n,) numbers of the classes of labels (n,), by `number`, to which new ones are added."""
-    names, of_row = distinct(label)
-    return np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)[of_row]
+    return SpeedPrior(*prior_of_traffic(*columns, *new, stationary, *scales, *limits))
