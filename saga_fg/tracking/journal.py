@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import gtsam
@@ -273,6 +274,7 @@ def _rounded(values: ArrayLike) -> Any:
 
 Event = dict[str, Any]
 LISTED = 5  # candidates of an event
+RETURNED = "it is the return of an earlier track"
 NEAR = 4.0  # candidates up to this multiple of the gate, as a squared distance, are listed
 
 
@@ -302,12 +304,14 @@ class Journal:
             graph = graph_of_frame(self._before, now, self._start)
             self._write({"event": "graph", "time": now.timestamp, "sensor": now.sensor, **graph})
             self._before = now
-            self._write_handovers(now)
+            assert self._matched is not None
+            self._write_ends(self._matched, now, lambda row: RETURNED)
             self._write_initiations(now)
         elif stage == "delete":
             now = view()
             self._write_unsettled(now)
-            self._write_deletions(now)
+            assert self._before is not None
+            self._write_ends(self._before, now, partial(self._reason, self._before))
             self._write_clocks(now)
             self._before = now
 
@@ -413,31 +417,24 @@ class Journal:
             }
             self._write(event)
 
-    def _write_handovers(self, now: TrackerView) -> None:
-        last = self._matched
-        assert last is not None
+    def _write_ends(self, last: TrackerView, now: TrackerView, reason: Callable[[int], str]) -> None:
+        """Write why the tracks of the view before, `last`, are not in this one; reason: by rows of `last`."""
         for row in np.flatnonzero(~np.isin(last.table.id, now.table.id)).tolist():
-            event = self._event("deleted", last, int(last.table.id[row]), row)
-            coasting, existence = 0.0, float(last.table.existence[row])
-            reason = "it is the return of an earlier track"
-            self._write(event | {"coasting": coasting, "existence": existence, "reason": reason})
-
-    def _write_deletions(self, now: TrackerView) -> None:
-        last, settings = self._before, self._settings
-        assert last is not None
-        for row in np.flatnonzero(~np.isin(last.table.id, now.table.id)).tolist():
-            event = self._event("deleted", last, int(last.table.id[row]), row)
-            coasting = float(last.timestamp - last.table.last_detected[row])
+            event, why = self._event("deleted", last, int(last.table.id[row]), row), reason(row)
+            coasting = 0.0 if why == RETURNED else float(last.timestamp - last.table.last_detected[row])
             existence = float(last.table.existence[row])
-            if coasting > settings.max_coasting:
-                reason = f"not detected for longer than {settings.max_coasting:g} s"
-            elif not last.table.confirmed[row] and existence < settings.existence.delete_below:
-                reason = f"existence below {settings.existence.delete_below:g} before it was confirmed"
-            elif coasting > 0:
-                reason = "its place is no longer known well enough to report it or to find it again"
-            else:
-                reason = "another track took its place"
-            self._write(event | {"coasting": coasting, "existence": existence, "reason": reason})
+            self._write(event | {"coasting": coasting, "existence": existence, "reason": why})
+
+    def _reason(self, last: TrackerView, row: int) -> str:
+        """Why a track was deleted."""
+        settings, coasting = self._settings, float(last.timestamp - last.table.last_detected[row])
+        if coasting > settings.max_coasting:
+            return f"not detected for longer than {settings.max_coasting:g} s"
+        if not last.table.confirmed[row] and last.table.existence[row] < settings.existence.delete_below:
+            return f"existence below {settings.existence.delete_below:g} before it was confirmed"
+        if coasting > 0:
+            return "its place is no longer known well enough to report it or to find it again"
+        return "another track took its place"
 
     def _event(self, kind: str, view: TrackerView, id_: int, row: int) -> Event:
         return {

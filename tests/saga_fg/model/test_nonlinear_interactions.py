@@ -51,16 +51,6 @@ def test_pedestrians_push_each_other_away_and_stacks_are_the_same():
     assert law.predict(here, [], 0.1).tolist() == here.tolist()
 
 
-@pytest.mark.parametrize("law", [SmoothDriver(), SocialForce()], ids=["following", "repulsion"])
-def test_jacobians_are_the_derivatives(law):
-    rng, law = np.random.default_rng(1), interaction(law)
-    x, others = 4 * rng.normal(size=(6, 4)), [8 * rng.normal(size=(6, 4)) + 3]
-    F, (G,) = law.jacobians(x, others, 0.3)
-    expected = stacked_differences(lambda a, b: law.predict(a, [b], 0.3), [x, *others])
-    np.testing.assert_allclose(F, expected[0], atol=1e-7)
-    np.testing.assert_allclose(G, expected[1], atol=1e-7)
-
-
 PIECES = np.array([[-5.0, 0.0, 0.0, 1.0], [0.0, 1.0, 4.0, 0.0]])  # a wall with a corner
 GIVEN = {
     "driver": (SmoothDriver(), np.array(4.0)),

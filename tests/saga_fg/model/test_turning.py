@@ -10,7 +10,7 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.turning import CoordinatedTurn
 
 TURN = CoordinatedTurn()
-SMALL = (0.0, 1e-12, 1e-4, 0.0099, 0.0101, 0.3, -2.0, 7.0)
+SMALL = (0.0, 0.0099, 0.0101, -2.0)
 
 
 def states(last, seed=0):
