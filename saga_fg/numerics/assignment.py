@@ -56,11 +56,14 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import scipy.sparse
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.numerics.gating import chi_square_quantile
+
+_DENSE = 10_000  # pairs of rivals up to which one matrix of all is the fastest
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,18 +135,30 @@ def least_total(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:
     row, column, gain = row[paying], column[paying], gain[paying]
     alone = (np.bincount(row)[row] == 1) & (np.bincount(column)[column] == 1)
     rival = (~alone).nonzero()[0]
-    if len(rival):
-        rows, r = np.unique(row[rival], return_inverse=True)
-        columns, c = np.unique(column[rival], return_inverse=True)
+    if len(rival) == 0:
+        return paying
+    rows, r = np.unique(row[rival], return_inverse=True)
+    columns, c = np.unique(column[rival], return_inverse=True)
+    if len(rows) * len(columns) <= _DENSE:
+        parts = [np.arange(len(rival))]
+    else:  # one assignment for each set of rivals, in which nobody shares a row or a column with others
         n, m = len(rows), len(columns)
-        # a column of its own for each row, at the gain of no pair, makes every row matched
-        cost = np.concatenate([gain[rival], np.zeros(n)]) - gain.min() + 1
-        places = np.concatenate([r, np.arange(n)]), np.concatenate([c, m + np.arange(n)])
-        matched, to = min_weight_full_bipartite_matching(csr_array((cost, places), (n, m + n)))
-        chosen = np.full(n, -1)
-        chosen[matched] = to
-        alone[rival[chosen[r] == c]] = True
+        _, part = connected_components(coo_array((np.ones(len(r)), (r, n + c)), (n + m, n + m)), directed=False)
+        order = np.argsort(part[r], kind="stable")
+        parts = np.split(order, np.flatnonzero(np.diff(part[r][order])) + 1)
+    for part in parts:
+        alone[_assigned(r[part], c[part], gain[rival[part]], rival[part])] = True
     return np.asarray(paying[alone])
+
+
+def _assigned(row: IntArray, column: IntArray, gain: FloatArray, number: IntArray) -> IntArray:
+    """The numbers of the pairs of the assignment of least total gain."""
+    rows, r = np.unique(row, return_inverse=True)
+    columns, c = np.unique(column, return_inverse=True)
+    dense, numbers = np.zeros((len(rows), len(columns))), np.full((len(rows), len(columns)), -1)
+    dense[r, c], numbers[r, c] = gain, number
+    chosen = numbers[linear_sum_assignment(dense)]
+    return np.asarray(chosen[chosen >= 0])
 
 
 def cheapest_first(row: IntArray, column: IntArray, gain: FloatArray) -> IntArray:
