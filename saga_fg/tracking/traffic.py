@@ -38,7 +38,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -132,6 +132,12 @@ class Passages(Columns):
         found = cls(ids, label, now.position, heading, speed, variance, stationary, np.full(len(ids), time), moves)
         return found if np.isfinite(heading).all() else found.select(np.isfinite(heading))
 
+    def speeds(
+        self, of: IntArray
+    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """The columns that the prior of speeds is made of; of (n,): the classes by number."""
+        return self.id, of, self.position, self.heading, self.speed, self.variance, self.stationary
+
     @classmethod
     def empty(cls) -> Self:
         """No passages."""
@@ -163,11 +169,17 @@ class Trails:
     def __len__(self) -> int:
         return len(self.points)
 
-    def cells(self, size: float) -> tuple[IntArray, IntArray]:
-        """The points by cells of this size, m, see `saga_fg.kernels.paths.points_by_cell`."""
-        if self._cells is None or self._cells[0] != size:
-            self._cells = size, *points_by_cell(self.points.position, size)
-        return self._cells[1:]
+    def columns(
+        self, cell: float
+    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray, IntArray, IntArray]:
+        """Tracks, places, headings, speeds, whether these are known, and the points by cells of this size, m.
+
+        See `saga_fg.kernels.paths.points_by_cell`.
+        """
+        of = self.points
+        if self._cells is None or self._cells[0] != cell:
+            self._cells = cell, *points_by_cell(of.position, cell)
+        return of.id, of.position, of.heading, of.speed, np.isfinite(of.variance), *self._cells[1:]
 
 
 @dataclass(eq=False)
@@ -274,13 +286,9 @@ def paths(
     """
     reach = max(traffic.settings.reach, _LEAST)
     found = (traffic.lanes, traffic.trails()) if traffic.settings.reach > 0 else (_NONE, _NONE)
-    columns: list[Any] = []
-    for trails in found:
-        points = trails.points
-        columns += [points.id, points.position, points.heading, points.speed, np.isfinite(points.variance)]
-        columns += trails.cells(2 * reach)
+    lanes, trails = (each.columns(2 * reach) for each in found)
     tracks, scales = (ids, position, heading, curvature), (reach, STEP, _BEND, TURN, PRIOR, AGREEMENT)
-    return Paths(np.arange(len(ids)), *trail_paths(*columns, *tracks, steps, NEAREST, *scales))
+    return Paths(np.arange(len(ids)), *trail_paths(*lanes, *trails, *tracks, steps, NEAREST, *scales))
 
 
 _FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
@@ -311,11 +319,9 @@ def speed_prior(
     settings, sets = traffic.settings.speed_prior, (traffic.left, traffic.latest)
     if settings.weight == 0 or len(label) == 0 or not any(map(len, sets)):
         return SpeedPrior(np.full(len(label), stationary), np.zeros(len(label)), variance.copy())
-    labels = common_numbers(*(each.label for each in sets), label)
-    columns: list[Any] = []
-    for each, of in zip(sets, labels, strict=False):
-        columns += [each.id, of, each.position, each.heading, each.speed, each.variance, each.stationary]
-    new = labels[-1], position, heading, variance
+    of_left, of_latest, of_new = common_numbers(traffic.left.label, traffic.latest.label, label)
+    left, latest = traffic.left.speeds(of_left), traffic.latest.speeds(of_latest)
+    new = of_new, position, heading, variance
     scales = settings.weight, settings.ahead_scale, settings.lateral_scale, HEADING_SCALE, SPREAD
     limits = settings.max_speed_deviation**2, _FARTHEST
-    return SpeedPrior(*prior_of_traffic(*columns, *new, stationary, *scales, *limits))
+    return SpeedPrior(*prior_of_traffic(*left, *latest, *new, stationary, *scales, *limits))

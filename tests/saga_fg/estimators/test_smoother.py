@@ -186,7 +186,7 @@ def test_what_is_nonlinear_is_linearised_at_the_smoothed_states():
         np.array([[30.0, 5, 1, 0], [33.0, 5, -1, 0]]),
         RangeBearing(state_dim=4),
     )
-    away = NonlinearEdges(SocialForce(falloff=2.0), [0, 1], [1, 0], np.ones(2), np.zeros((2, 1, 4)))
+    away = NonlinearEdges(SocialForce(), [0, 1], [1, 0], np.ones(2), np.zeros((2, 1, 4)))
     for estimator in (recording, window):
         estimator.add([1, 2], truth + 0.5, np.tile(np.eye(4), (2, 1, 1)))
     for _ in range(8):
