@@ -248,9 +248,9 @@ class Vehicles:
         z = there[:, :2] + 0.3 * np.random.default_rng(view.epoch).normal(size=(len(there), 2))
         now = np.array([view.key(OBJECT, i) for i in self.slots.tolist()], dtype=np.uint64)
         H = np.tile(np.eye(2, 4), (len(there), 1, 1))
-        factors: list[Any] = [*gaussian_factors(now[:, None], [H], z, 0.09 * np.eye(2))]
+        factors: list[Any] = [gaussian_factors(now[:, None], [H], z, 0.09 * np.eye(2))]
         if view.epoch == 0:
-            factors += prior_factors(now, there, 0.5 * np.eye(4))
+            factors.append(prior_factors(now, there, 0.5 * np.eye(4)))
         else:
             before, behind = view.before(OBJECT), self.behind
             last = np.array([before[i].key for i in self.slots.tolist()], dtype=np.uint64)
@@ -262,7 +262,9 @@ class Vehicles:
             elif len(behind):
                 motion = interaction(SmoothDriver())
                 there[behind] = motion.predict(x[behind], [x[behind - 1]], DT)
-                factors.append(motion.factors(now[behind], last[behind], last[behind - 1, None], 4, DT, Q))
+                factors.append(
+                    motion.factors(now[behind], np.stack([last[behind], last[behind - 1]], axis=1), 4, DT, Q)
+                )
         return Additions([NewVariable(OBJECT, i, x) for i, x in zip(self.slots.tolist(), there, strict=True)], factors)
 
 
@@ -270,4 +272,4 @@ def _linear(now: Any, last: Any, rows: IntArray, parts: Sequence[FloatArray]) ->
     """x' = F x, plus a leader's share if there are two parts, of the vehicles in some places."""
     keys = np.stack([now[rows], last[rows], last[rows - 1]][: 1 + len(parts)], axis=1)
     J = [np.tile(M, (len(rows), 1, 1)) for M in (np.eye(4), *(-part for part in parts))]
-    return [*gaussian_factors(keys, J, np.zeros((len(rows), 4)), Q)] if len(rows) else []
+    return [gaussian_factors(keys, J, np.zeros((len(rows), 4)), Q)] if len(rows) else []

@@ -28,7 +28,7 @@ import scipy.linalg
 import scipy.sparse
 
 from benchmarks.flocks import DT, Flock, FlockFrame
-from factors import interaction_factors, linear_detection_factors, nonlinear_graph, position, prior_factors
+from factors import gaussian_factors, interaction_factors, nonlinear_graph, prior_factors
 from saga_fg.estimators import Estimator, Gaussian, GraphFilter, kalman_predict, kalman_update
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
@@ -109,7 +109,9 @@ class GtsamWindow:
         self._smoother = gtsam.IncrementalFixedLagSmoother(lag * DT + 1e-6, parameters)
         self._n, self._frames = len(flock), 0
         keys = self._keys(0)
-        priors = nonlinear_graph(prior_factors(keys, flock.means, flock.covariances), dict.fromkeys(keys.tolist(), D))
+        priors = nonlinear_graph(
+            prior_factors(keys, flock.means, flock.covariances).native(), dict.fromkeys(keys.tolist(), D)
+        )
         self._smoother.update(priors, _zeros(keys), dict.fromkeys(keys.tolist(), 0.0))
 
     def prepare(self, frame: FlockFrame) -> Step:
@@ -119,10 +121,11 @@ class GtsamWindow:
         order = np.argsort(F.target, kind="stable")
         indptr, Q, b = np.searchsorted(F.target[order], np.arange(self._n + 1)), *_noise(frame, self._n)
         seen = frame.measurements
-        factors = [
+        stacks = [
             *interaction_factors(now, before[F.source[order]], indptr, F.values[order], b, Q),
-            *linear_detection_factors(now[seen.nodes], position(D), seen.z, seen.R),
+            gaussian_factors(now[seen.nodes, None], [seen.H], seen.z, seen.R),
         ]
+        factors = [factor for stack in stacks for factor in stack.native()]
         graph = nonlinear_graph(factors, dict.fromkeys([*before.tolist(), *now.tolist()], D))
         return partial(self._step, graph, _zeros(now), dict.fromkeys(now.tolist(), self._frames * DT))
 

@@ -16,11 +16,12 @@ import numpy as np
 
 from factors import (
     NonlinearInteraction,
+    RangeBearing,
     Robust,
     between_factor,
     pose_prior_factor,
     prior_factors,
-    relative_range_bearing_factors,
+    relative_factors,
 )
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, FactorProvider, GraphView, NewVariable
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, interaction
@@ -180,14 +181,13 @@ class ObjectProvider:
         initial = list(frame.new)
         factors: list[Any] = []
         if initial:
-            factors += prior_factors(
-                [view.key(OBJECT, i) for i in initial], [frame.new[i] for i in initial], INITIAL_STATE_COVARIANCE
-            )
+            keys, states = [view.key(OBJECT, i) for i in initial], [frame.new[i] for i in initial]
+            factors.append(prior_factors(keys, states, INITIAL_STATE_COVARIANCE))
         for (motion, _), rows in batches.items():
             earlier = np.array([[before[i].key for i in row] for row in rows], dtype=np.uint64)
             now = [view.key(OBJECT, row[0]) for row in rows]
             Q = process_noise(frame.dt)
-            factors.append(motion.factors(now, earlier[:, 0], earlier[:, 1:], 4, frame.dt, Q))
+            factors.append(motion.factors(now, earlier, 4, frame.dt, Q))
         return Additions(new, factors)
 
 
@@ -207,7 +207,7 @@ class DetectionProvider:
         rows = np.array([[view.key(EGO_POSE, 0), view.key(OBJECT, node)] for node in seen], dtype=np.uint64)
         z = np.stack(list(seen.values()))
         return Additions(
-            factors=[relative_range_bearing_factors(rows, z, RANGE_BEARING_COVARIANCE, 4, robust=self.robust)]
+            factors=[relative_factors(rows, z, RANGE_BEARING_COVARIANCE, 4, robust=self.robust, model=RangeBearing(2))]
         )
 
 

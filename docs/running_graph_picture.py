@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import gtsam
 import numpy as np
 
 from benchmarks.sampled_traffic import SampledTraffic, providers, sample_traffic
 from data_tools.plots import running_graph_picture
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from factors import bearing_range_factor
 from pipelines.config import load_config
 from pipelines.explaining import graph_picture
 from saga_fg import Tracker
@@ -33,7 +33,8 @@ class Post:
     def factors(self, view: GraphView) -> Additions:
         pose, key = self.scene.frames[view.epoch].pose, view.key(LANDMARK, 1, static=True)
         bearing, distance = pose.bearing(POST).theta(), pose.range(POST)
-        seen = bearing_range_factor(view.key(EGO_POSE, 0), key, bearing, distance, np.diag([0.02, 0.1]) ** 2)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.02, 0.1]))
+        seen = gtsam.BearingRangeFactor2D(view.key(EGO_POSE, 0), key, gtsam.Rot2(bearing), distance, noise)
         new = [] if view.static(LANDMARK) else [NewVariable(LANDMARK, 1, POST, static=True, label="post")]
         return Additions(new, [seen])
 

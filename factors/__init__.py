@@ -1,79 +1,46 @@
 """GTSAM factors of saga-fg: plain arrays, keys and callables in; gtsam and numpy only.
 
-Linear families give native `gtsam.JacobianFactor`s, which no solver needs Python for. Nonlinear ones give a
-`ResidualFactor`, which `solve` linearises and `as_custom_factor` makes one of GTSAM's, or many at once, for speed, as
-`ResidualFactors`. One family a file.
+Linear families give native `gtsam.JacobianFactor`s, or many of one shape as `GaussianFactors`. Nonlinear ones give
+`ResidualFactors`, which `solve` linearises together, and which `custom_factors` makes GTSAM's. What GTSAM has itself
+(ranges, bearings, places, attitudes, priors) is taken from it as it is.
 """
 
-from factors.absolute import (
-    attitude_factor,
-    joint_prior_factor,
-    position_factor,
-    prior_factor,
-    prior_factors,
-    stacked_prior_factors,
-)
 from factors.between import ERROR_DIM, Pose, between_factor, noise_model, odometry_factors, pose, pose_prior_factor
-from factors.detection import (
-    Camera,
-    PixelBearing,
-    detection_factor,
-    detection_factors,
-    linear_detection_factor,
-    linear_detection_factors,
-)
 from factors.gaussian import (
     GaussianFactors,
     check_dimensions,
     gaussian_factor,
     gaussian_factors,
     gaussian_graph,
+    joint_prior_factor,
     marginal_factors,
     marginal_moments,
     nonlinear_graph,
-    nonlinear_graph_at,
-    stacked_gaussian_factors,
+    prior_factor,
+    prior_factors,
 )
-from factors.interaction import (
-    NonlinearInteraction,
-    interaction_factor,
-    interaction_factors,
-    stacked_interaction_factors,
-)
-from factors.lane import HesseLine, lane_boundary_factors, lane_keeping_factors, line_factors
-from factors.manifolds import ImuBias, PlanarPose, SpatialPose, Variable, Vector
+from factors.interaction import NonlinearInteraction, interaction_factor, interaction_factors
+from factors.lines_and_planes import HesseLine, lane_keeping_factors, line_factors, plane, plane_factor
+from factors.manifolds import ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
 from factors.measurement import (
     Bearing,
-    Components,
     MeasurementModel,
+    Polar,
     Radar,
     Range,
     RangeBearing,
     RangeRate,
-    box,
-    position,
-    position_velocity,
+    detection_factors,
 )
-from factors.nonlinear import Linearisable, ResidualFactor, ResidualFactors, unwrapped_angles
-from factors.plane import OrientedPlane, on_plane_factor, plane, plane_factor
-from factors.relative import (
-    bearing_range_factor,
-    calibrated_range_factors,
-    point_factors,
-    range_factor,
-    relative_detection_factors,
-    relative_factors,
-    relative_range_bearing_factors,
-)
+from factors.nonlinear import ResidualFactors, residual_factor, unwrapped_angles
+from factors.relative import relative_factors
 from factors.robust import Mixture, Robust, RobustLoss
-from factors.solver import Solution, SolverSettings, linearised, solve
+from factors.solver import Linearisable, Solution, SolverSettings, linearised, solve
 from factors.validation import FactorError, SingularSystemError
 
 __all__ = [
     "ERROR_DIM",
     "Bearing",
-    "Camera",
-    "Components",
     "FactorError",
     "GaussianFactors",
     "HesseLine",
@@ -83,14 +50,13 @@ __all__ = [
     "Mixture",
     "NonlinearInteraction",
     "OrientedPlane",
-    "PixelBearing",
     "PlanarPose",
+    "Polar",
     "Pose",
     "Radar",
     "Range",
     "RangeBearing",
     "RangeRate",
-    "ResidualFactor",
     "ResidualFactors",
     "Robust",
     "RobustLoss",
@@ -100,13 +66,8 @@ __all__ = [
     "SpatialPose",
     "Variable",
     "Vector",
-    "attitude_factor",
-    "bearing_range_factor",
     "between_factor",
-    "box",
-    "calibrated_range_factors",
     "check_dimensions",
-    "detection_factor",
     "detection_factors",
     "gaussian_factor",
     "gaussian_factors",
@@ -114,36 +75,22 @@ __all__ = [
     "interaction_factor",
     "interaction_factors",
     "joint_prior_factor",
-    "lane_boundary_factors",
     "lane_keeping_factors",
     "line_factors",
-    "linear_detection_factor",
-    "linear_detection_factors",
     "linearised",
     "marginal_factors",
     "marginal_moments",
     "noise_model",
     "nonlinear_graph",
-    "nonlinear_graph_at",
     "odometry_factors",
-    "on_plane_factor",
     "plane",
     "plane_factor",
-    "point_factors",
     "pose",
     "pose_prior_factor",
-    "position",
-    "position_factor",
-    "position_velocity",
     "prior_factor",
     "prior_factors",
-    "range_factor",
-    "relative_detection_factors",
     "relative_factors",
-    "relative_range_bearing_factors",
+    "residual_factor",
     "solve",
-    "stacked_gaussian_factors",
-    "stacked_interaction_factors",
-    "stacked_prior_factors",
     "unwrapped_angles",
 ]

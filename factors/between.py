@@ -89,17 +89,15 @@ def between_factor(
     return gtsam.BetweenFactorPose3(one, other, measured, noise)
 
 
-def gaussian_noise(name: str, covariance: ArrayLike, dim: int) -> gtsam.noiseModel.Gaussian:
-    """GTSAM's noise model of a covariance (dim, dim); raises `FactorError` unless it is positive definite."""
-    whitener(name, covariance, dim)
-    return gtsam.noiseModel.Gaussian.Covariance(np.asarray(covariance, dtype=np.float64))
-
-
 def noise_model(
     name: str, covariance: ArrayLike, dim: int, robust: RobustLoss | None = None
 ) -> gtsam.noiseModel.Gaussian | gtsam.noiseModel.Robust:
-    """GTSAM's noise model of a covariance, under a robust loss if one is given."""
-    gaussian = gaussian_noise(name, covariance, dim)
+    """GTSAM's noise model of a covariance (dim, dim), under a robust loss if one is given.
+
+    Raises `FactorError` unless it is positive definite.
+    """
+    whitener(name, covariance, dim)
+    gaussian = gtsam.noiseModel.Gaussian.Covariance(np.asarray(covariance, dtype=np.float64))
     return gaussian if robust is None else robust.model(gaussian)
 
 

@@ -8,6 +8,8 @@ GTSAM keeps it whitened as one block matrix [W A_1 ... W A_n | W b], W R W^T = 1
 three variables at most; a `GaussianConditional` without frontal variables takes any number, and its clone is a plain
 `JacobianFactor`. Handing the block matrix over whole costs half of handing it over block by block.
 
+Priors of a variable, or of several together, are phi(x) = || x - m ||_P^2.
+
 Marginalisation of variables: Gaussian factors that keep their information on the others.
 
     phi(x_b) = max_{x_a} prod phi(x_a, x_b)        ||A_a x_a + A_b x_b - b||^2  ->  ||(Q_2^T A_b) x_b - Q_2^T b||^2
@@ -46,14 +48,13 @@ from factors.validation import (
     FloatArray,
     KeyArray,
     SingularSystemError,
-    check_distinct,
     checked,
     checked_covariances,
+    checked_key_array,
     checked_key_rows,
     checked_keys,
     format_key,
     format_keys,
-    whitener,
     whiteners,
 )
 
@@ -66,21 +67,11 @@ def gaussian_factor(
     keys: n distinct keys, in any order; blocks[k]: (m, d_k); rhs: (m,); covariance: (m, m), None for the identity.
     Raises `FactorError` when shapes disagree, a number is not finite, or the covariance is not positive definite.
     """
-    distinct = checked_keys("keys", keys)
     b = checked("rhs", rhs, (None,))
-    if not distinct or len(blocks) != len(distinct):
-        raise FactorError(f"blocks: expected one block per key, got {len(blocks)} for {len(distinct)} keys")
-    matrices = [
-        checked(f"block of {format_key(key)}", block, (len(b), None))
-        for key, block in zip(distinct, blocks, strict=True)
-    ]
-    dims = [matrix.shape[1] for matrix in matrices]
-    if 0 in dims or not len(b):
-        raise FactorError("blocks: expected at least one row, and one column per block")
-    augmented = np.column_stack([*matrices, b])
-    if covariance is not None:
-        augmented = whitener("covariance", covariance, len(b)) @ augmented
-    return native_factor(distinct, dims, np.asfortranarray(augmented))
+    matrices = [checked(f"blocks[{k}]", block, (len(b), None))[None] for k, block in enumerate(blocks)]
+    noise = np.eye(len(b)) if covariance is None else checked("covariance", covariance, (len(b), len(b)))
+    (factor,) = gaussian_factors([checked_keys("keys", keys)], matrices, b[None], noise).native()
+    return factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,23 +106,15 @@ class GaussianFactors:
 
 def gaussian_factors(
     keys: ArrayLike, blocks: Sequence[ArrayLike], rhs: ArrayLike, covariances: ArrayLike
-) -> list[gtsam.JacobianFactor]:
+) -> GaussianFactors:
     """Return n factors of the same shape, || sum_k `blocks[k][i]` x(keys[i, k]) - rhs[i] ||_covariances[i], i = 1..n.
 
     keys: (n, k), distinct within a row; blocks[k]: (n, m, d_k); rhs: (n, m); covariances: (n, m, m) or one (m, m) for
     all. Whitening and checks are done for all at once, which is what makes them cheap. Raises `FactorError`.
     """
-    return stacked_gaussian_factors(keys, blocks, rhs, covariances).native()
-
-
-def stacked_gaussian_factors(
-    keys: ArrayLike, blocks: Sequence[ArrayLike], rhs: ArrayLike, covariances: ArrayLike
-) -> GaussianFactors:
-    """Return the factors of `gaussian_factors` as arrays."""
     b = checked("rhs", rhs, (None, None))
     n, m = b.shape
     names = checked_key_rows("keys", keys, len(blocks))
-    check_distinct("keys", names)
     if len(names) != n:
         raise FactorError(f"keys: expected {n} rows, one per factor, got {len(names)}")
     matrices = [checked(f"blocks[{k}]", block, (n, m, None)) for k, block in enumerate(blocks)]
@@ -139,8 +122,34 @@ def stacked_gaussian_factors(
     return whitened_factors(names, W, matrices, b)
 
 
+def prior_factor(key: int, mean: ArrayLike, covariance: ArrayLike) -> gtsam.JacobianFactor:
+    """Return the factor || x(key) - mean ||_covariance; mean: (d,), covariance: (d, d), positive definite."""
+    return joint_prior_factor([key], [mean], covariance)
+
+
+def prior_factors(keys: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> GaussianFactors:
+    """Return one prior a key; keys: (n,); means: (n, d); covariances: (n, d, d), or one (d, d) for all."""
+    centers = checked("means", means, (None, None))
+    names = checked_key_array("keys", keys)
+    checked_keys("keys", names.tolist())
+    identity = np.broadcast_to(np.eye(centers.shape[1]), (*centers.shape, centers.shape[1]))
+    return gaussian_factors(names[:, None], [identity], centers, covariances)
+
+
+def joint_prior_factor(keys: Iterable[int], means: Sequence[ArrayLike], covariance: ArrayLike) -> gtsam.JacobianFactor:
+    """Return one factor on all `keys` from their joint covariance: what a filter knows of the past, in one factor.
+
+    means: one vector (d_k,) a key; covariance: (D, D) with D = sum_k d_k, in the order of the keys, positive definite.
+    Raises `FactorError` on anything else.
+    """
+    vectors = [checked("means", mean, (None,)) for mean in means]
+    mean = np.concatenate([np.empty(0), *vectors])
+    ends = np.cumsum([len(vector) for vector in vectors])
+    return gaussian_factor(keys, np.split(np.eye(len(mean)), ends[:-1], axis=1), mean, covariance)
+
+
 def whitened_factors(keys: KeyArray, W: FloatArray, blocks: Sequence[FloatArray], rhs: FloatArray) -> GaussianFactors:
-    """Return the factors || W[i] (sum_k blocks[k][i] x(keys[i, k]) - rhs[i]) ||^2 of `stacked_gaussian_factors`.
+    """Return the factors || W[i] (sum_k blocks[k][i] x(keys[i, k]) - rhs[i]) ||^2 of `gaussian_factors`.
 
     Unchecked, except for empty blocks: keys distinct within a row, shapes and numbers right.
     """

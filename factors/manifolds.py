@@ -28,6 +28,7 @@ from typing import Any, ClassVar, Protocol
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from factors.validation import FactorError, FloatArray, format_key
@@ -47,9 +48,6 @@ class Variable(Protocol):
 
     def local(self, state: Any, other: Any) -> FloatArray:
         """Return the delta (dim,) from `state` to `other`."""
-
-    def size(self, state: Any) -> FloatArray:
-        """Return the magnitude (dim,) of each coordinate, which numerical differences choose their steps by."""
 
     def array(self, state: Any) -> FloatArray:
         """Return the state as numbers, for functions of many states at once."""
@@ -78,15 +76,19 @@ class Vector:
     def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
         return other - state
 
-    def size(self, state: FloatArray) -> FloatArray:
-        return np.abs(state)
-
     def array(self, state: FloatArray) -> FloatArray:
         return state
 
 
 class Manifold:
-    """Steps of a variable of GTSAM's own, by GTSAM's retraction."""
+    """A variable of GTSAM's own: how `gtsam.Values` gives it, what gives its numbers, and GTSAM's retraction."""
+
+    dim: ClassVar[int]
+    at: ClassVar[str]
+    numbers: ClassVar[str]
+
+    def read(self, values: gtsam.Values, key: int) -> Any:
+        return getattr(values, self.at)(key)
 
     def retract(self, state: Any, delta: FloatArray) -> Any:
         return state.retract(delta)
@@ -94,53 +96,36 @@ class Manifold:
     def local(self, state: Any, other: Any) -> FloatArray:
         return np.asarray(state.localCoordinates(other))
 
+    def array(self, state: Any) -> FloatArray:
+        return np.asarray(getattr(state, self.numbers)())
+
 
 @dataclass(frozen=True)
 class PlanarPose(Manifold):
     """A `gtsam.Pose2`; delta = (x, y, heading) in the pose's own frame; as numbers (3, 3)."""
 
-    dim: ClassVar[int] = 3
-
-    def read(self, values: gtsam.Values, key: int) -> gtsam.Pose2:
-        return values.atPose2(key)
-
-    def size(self, state: gtsam.Pose2) -> FloatArray:
-        return np.ones(3)
-
-    def array(self, state: gtsam.Pose2) -> FloatArray:
-        return state.matrix()
+    dim, at, numbers = 3, "atPose2", "matrix"
 
 
 @dataclass(frozen=True)
 class SpatialPose(Manifold):
     """A `gtsam.Pose3`; delta = (rotation vector, translation) in the pose's own frame; as numbers (4, 4)."""
 
-    dim: ClassVar[int] = 6
-
-    def read(self, values: gtsam.Values, key: int) -> gtsam.Pose3:
-        return values.atPose3(key)
-
-    def size(self, state: gtsam.Pose3) -> FloatArray:
-        return np.ones(6)
-
-    def array(self, state: gtsam.Pose3) -> FloatArray:
-        return state.matrix()
+    dim, at, numbers = 6, "atPose3", "matrix"
 
 
 @dataclass(frozen=True)
 class ImuBias(Manifold):
     """A `gtsam.imuBias.ConstantBias`; delta = (of accelerometers, m/s^2, of gyroscopes, rad/s), as numbers the same."""
 
-    dim: ClassVar[int] = 6
+    dim, at, numbers = 6, "atConstantBias", "vector"
 
-    def read(self, values: gtsam.Values, key: int) -> gtsam.imuBias.ConstantBias:
-        return values.atConstantBias(key)
 
-    def size(self, state: gtsam.imuBias.ConstantBias) -> FloatArray:
-        return np.abs(state.vector())
+@dataclass(frozen=True)
+class OrientedPlane(Manifold):
+    """A `gtsam.OrientedPlane3`; delta = (two turns of the normal, rad; distance, m); as numbers (4,): n, d."""
 
-    def array(self, state: gtsam.imuBias.ConstantBias) -> FloatArray:
-        return state.vector()
+    dim, at, numbers = 3, "atOrientedPlane3", "planeCoefficients"
 
 
 def read_states(values: gtsam.Values, keys: Sequence[int], variables: Sequence[Variable]) -> list[Any]:
@@ -188,37 +173,23 @@ def inverse_right_jacobian(vector: FloatArray) -> FloatArray:
 
 
 def central_differences(
-    function: Callable[..., FloatArray], states: Sequence[Any], variables: Sequence[Variable]
+    function: Callable[..., ArrayLike], states: Sequence[Any], variables: Sequence[Variable]
 ) -> list[FloatArray]:
-    """Return the Jacobian (m, dim_k) of `function(*states)`, of shape (m,), with respect to each state."""
-    jacobians = []
-    for k, (state, variable) in enumerate(zip(states, variables, strict=True)):
-        steps = np.cbrt(np.finfo(float).eps * np.maximum(1.0, variable.size(state)))
-        columns = []
-        for step, direction in zip(steps, np.eye(variable.dim), strict=True):
-            ahead, behind = list(states), list(states)
-            ahead[k] = variable.retract(state, step * direction)
-            behind[k] = variable.retract(state, -step * direction)
-            columns.append((np.asarray(function(*ahead)) - np.asarray(function(*behind))) / (2 * step))
-        jacobians.append(np.stack(columns, axis=-1))
-    return jacobians
+    """Return the Jacobian (..., m, d_k) of `function(*states)`, (..., m), with respect to each state.
 
-
-def stacked_differences(function: Callable[..., FloatArray], states: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return the Jacobians (..., m, d_k) of `function(*states)`, (..., m), on vectors, for any number of them at once.
-
-    states[k]: (..., d_k); entry i of the function's value must depend on entry i of its arguments alone.
+    Vectors may be many at once, (..., d_k), where an entry of the function's value depends on the same entry of its
+    arguments alone.
     """
     jacobians = []
-    for k, state in enumerate(states):
-        steps = np.cbrt(np.finfo(float).eps * np.maximum(1.0, np.abs(state)))
+    for k, (state, variable) in enumerate(zip(states, variables, strict=True)):
+        size = np.abs(state) if isinstance(state, np.ndarray) else np.ones(variable.dim)
+        steps = np.cbrt(np.finfo(float).eps * np.maximum(1.0, size))
         columns = []
-        for i in range(state.shape[-1]):
-            ahead, behind = list(states), list(states)
-            ahead[k], behind[k] = state.copy(), state.copy()
-            ahead[k][..., i] += steps[..., i]
-            behind[k][..., i] -= steps[..., i]
-            columns.append((function(*ahead) - function(*behind)) / (2 * steps[..., i, None]))
+        for i in range(variable.dim):
+            delta, ahead, behind = np.zeros_like(steps), list(states), list(states)
+            delta[..., i] = steps[..., i]
+            ahead[k], behind[k] = variable.retract(state, delta), variable.retract(state, -delta)
+            columns.append((np.asarray(function(*ahead)) - np.asarray(function(*behind))) / (2 * steps[..., i, None]))
         jacobians.append(np.stack(columns, axis=-1))
     return jacobians
 

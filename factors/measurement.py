@@ -1,12 +1,6 @@
-"""Measurement models h(x) on vector states: Cartesian and polar, with distances smooth at zero.
+"""Measurement models h(x) on vector states, and detections: measurements of single nodes.
 
-Measurement models h(x) on vector states: the role, and the Cartesian ones, which pick components of the state.
-
-position                 z = p
-position and velocity    z = (p, v)
-box                      z = (p, size, yaw)        yaw is an angle: its difference is wrapped
-
-h(x) = H x,    H = the rows of the identity that belong to the components
+    z = h(x) + v,    v ~ N(0, R)            phi  =  rho( || z - h(x) ||_R )
 
 Polar measurement models: what a radar, sonar or laser range finder sees in the plane.
 
@@ -46,8 +40,11 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from factors.validation import FactorError, FloatArray, checked
+from factors.nonlinear import ResidualFactors, residual_factors
+from factors.robust import RobustLoss
+from factors.validation import FactorError, FloatArray, checked, checked_key_array
 
 
 class MeasurementModel(Protocol):
@@ -69,62 +66,11 @@ class MeasurementModel(Protocol):
     def angles(self) -> Sequence[int]:
         """Components of the measurement that are angles in rad."""
 
-    @property
-    def linear(self) -> bool:
-        """True where h(x) = H x, up to whole turns of the angles."""
-
     def predict(self, x: FloatArray) -> FloatArray:
         """Return h (..., m) at states (..., d)."""
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Return dh/dx (..., m, d) at states (..., d)."""
-
-
-@dataclass(frozen=True)
-class Components:
-    """The measurement of some components of a state, in the order given; `angles` counts among them."""
-
-    state_dim: int
-    components: tuple[int, ...]
-    angles: tuple[int, ...] = ()
-    name: str = "components"
-
-    def __post_init__(self) -> None:
-        checked_components(self.name, self.components, self.state_dim)
-        checked_components("angles", self.angles, len(self.components), least=0)
-
-    @property
-    def dim(self) -> int:
-        return len(self.components)
-
-    @property
-    def linear(self) -> bool:
-        return True
-
-    def predict(self, x: FloatArray) -> FloatArray:
-        return x[..., list(self.components)]
-
-    def jacobian(self, x: FloatArray) -> FloatArray:
-        H = np.eye(self.state_dim)[list(self.components)]
-        return np.broadcast_to(H, (*x.shape[:-1], *H.shape))
-
-
-def position(state_dim: int, position: tuple[int, ...] = (0, 1)) -> Components:
-    """Return the model of a measured position (m); `position`: where it sits in the state."""
-    return Components(state_dim, tuple(position), name="position")
-
-
-def position_velocity(
-    state_dim: int, position: tuple[int, ...] = (0, 1), velocity: tuple[int, ...] = (2, 3)
-) -> Components:
-    """Return the model of a measured position (m) and velocity (m/s), z = (p, v)."""
-    return Components(state_dim, (*position, *velocity), name="position and velocity")
-
-
-def box(state_dim: int, position: tuple[int, ...], size: tuple[int, ...], yaw: int) -> Components:
-    """Return the model of a measured box, z = (p, size, yaw); m and rad."""
-    components = (*position, *size, yaw)
-    return Components(state_dim, components, angles=(len(components) - 1,), name="box")
 
 
 def checked_components(name: str, components: Sequence[int], dim: int, least: int = 1) -> None:
@@ -207,10 +153,6 @@ class Polar:
     def angles(self) -> tuple[int, ...]:
         return tuple(k for k, name in enumerate(self.measured) if name == BEARING)
 
-    @property
-    def linear(self) -> bool:
-        return False
-
     def predict(self, x: FloatArray) -> FloatArray:
         d, sight = self._sight(x)
         z = {RANGE: sight.value, BEARING: np.arctan2(d[..., 1], d[..., 0]) - self.sensor_pose[2]}
@@ -281,3 +223,31 @@ def Radar(
 ) -> Polar:
     """Return the model of a measured range, bearing and range rate."""
     return Polar(state_dim, (RANGE, BEARING, RANGE_RATE), position, velocity, sensor_pose, sensor_velocity)
+
+
+def detection_factors(
+    keys: ArrayLike, model: MeasurementModel, z: ArrayLike, R: ArrayLike, robust: RobustLoss | None = None
+) -> ResidualFactors:
+    """Return n factors rho(|| h(x) - z ||_R) of one model on vector variables, linearised together.
+
+    keys: (n,); z: (n, m) measured; R: (n, m, m), or (m, m) for all, positive definite. Raises `FactorError`, now or
+    when linearised where h is undefined.
+    """
+    rows = checked_key_array("keys", keys)[:, None]
+    measured = checked("z", z, (len(rows), model.dim)).copy()
+    name = f"{model.name} detections"
+    return residual_factors(
+        _Detection(model, measured), rows, (model.state_dim,), R, model.dim, name, robust, model.angles
+    )
+
+
+@dataclass(frozen=True)
+class _Detection:
+    model: MeasurementModel
+    z: FloatArray
+
+    def residual(self, x: FloatArray) -> FloatArray:
+        return self.model.predict(x) - self.z
+
+    def jacobians(self, x: FloatArray) -> Sequence[FloatArray]:
+        return [self.model.jacobian(x)]

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import gtsam
 import numpy as np
@@ -60,41 +60,25 @@ class Robust:
 
     def cost(self, distance: ArrayLike) -> FloatArray:
         """Return rho at each distance (any shape, standard deviations)."""
-        s, c = np.asarray(distance, dtype=np.float64), self.scale
-        q = np.square(s / c)
-        match self.loss:
-            case "huber":
-                return np.where(s <= c, 0.5 * s * s, c * (s - 0.5 * c))
-            case "cauchy":
-                return np.asarray(0.5 * c * c * np.log1p(q))
-            case "geman-mcclure":
-                return np.asarray(0.5 * c * c * (q / (1 + q)))
-            case "tukey":
-                return np.asarray(c * c / 6 * (1 - np.maximum(1 - q, 0) ** 3))
+        return each_of(self._native().loss, distance)
 
     def weight(self, distance: ArrayLike) -> FloatArray:
         """Return w at each distance (any shape, standard deviations)."""
-        s, c = np.asarray(distance, dtype=np.float64), self.scale
-        q = np.square(s / c)
-        match self.loss:
-            case "huber":
-                return np.asarray(c / np.maximum(s, c))
-            case "cauchy":
-                return np.asarray(1 / (1 + q))
-            case "geman-mcclure":
-                return np.asarray(1 / (1 + q) ** 2)
-            case "tukey":
-                return np.asarray(np.maximum(1 - q, 0) ** 2)
+        return each_of(self._native().weight, distance)
 
     def model(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
         """Return GTSAM's noise model for this loss over `noise`."""
-        estimators: dict[Loss, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
-            "huber": gtsam.noiseModel.mEstimator.Huber.Create,
-            "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,
-            "geman-mcclure": gtsam.noiseModel.mEstimator.GemanMcClure.Create,
-            "tukey": gtsam.noiseModel.mEstimator.Tukey.Create,
-        }
-        return gtsam.noiseModel.Robust.Create(estimators[self.loss](self.scale), noise)
+        return gtsam.noiseModel.Robust.Create(self._native(), noise)
+
+    def _native(self) -> Any:
+        names = {"huber": "Huber", "cauchy": "Cauchy", "geman-mcclure": "GemanMcClure", "tukey": "Tukey"}
+        return getattr(gtsam.noiseModel.mEstimator, names[self.loss]).Create(self.scale)
+
+
+def each_of(function: Callable[[float], float], distance: ArrayLike) -> FloatArray:
+    """A function of GTSAM's at each distance (any shape)."""
+    s = np.asarray(distance, dtype=np.float64)
+    return np.array([function(one) for one in s.ravel().tolist()]).reshape(s.shape)
 
 
 @dataclass(frozen=True, eq=False)

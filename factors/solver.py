@@ -1,4 +1,4 @@
-"""Nonlinear least squares over GTSAM's factors and ours together: Gauss-Newton, damped or not, and Levenberg-Marquardt.
+"""Nonlinear least squares over GTSAM's factors and ours together: Gauss-Newton's steps, damped or shortened.
 
     minimise  E(x) = sum_i rho_i( || r_i(x) ||_{R_i} )
 
@@ -8,7 +8,7 @@ Each iteration linearises at x, GTSAM's own factors in C++ and ours by their `li
 
 and moves to x + delta. Robust factors enter with the weights of the present x (iteratively reweighted least squares).
 Of ours, those that come together (`ResidualFactors`) take one call for all; the same factors as `CustomFactor`s in
-GTSAM's optimisers took 25 times as long with a hundred nodes.
+GTSAM's optimisers took 25 times as long with a hundred nodes, and are refused here.
 
 Levenberg-Marquardt starts at lambda = 0, that is as Gauss-Newton, and damps only steps that fail to lower E
 (Nocedal and Wright, Numerical Optimization, 2nd ed. 2006, section 10.3). The line search goes a share a of the
@@ -26,13 +26,12 @@ import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args
 
 import gtsam
 import numpy as np
 
 from factors.gaussian import block_covariances, check_dimensions, marginal_moments, singular_system
-from factors.nonlinear import Linearisable
 from factors.validation import FactorError, FloatArray, SingularSystemError, format_keys
 
 _LOG = logging.getLogger(__name__)
@@ -43,12 +42,25 @@ _PIVOT = 1e-14  # relative to its column
 _ARMIJO = 1e-4  # c of Armijo's rule
 _MIN_SHARE = 2.0**-30  # of a step; where less is needed, it does not lower the error
 
-Method = Literal["levenberg-marquardt", "gauss-newton", "line-search"]
+Method = Literal["levenberg-marquardt", "line-search"]
+
+
+class Linearisable(Protocol):
+    """Factors that GTSAM does not evaluate itself."""
+
+    @property
+    def keys(self) -> tuple[int, ...]: ...
+
+    def error(self, values: gtsam.Values) -> float:
+        """Return the cost, -log phi, at `values`."""
+
+    def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        """Return the factors on the increments from `values`."""
 
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """method: "levenberg-marquardt", "gauss-newton" or "line-search"; max_iterations: linearisations; tolerance: length
+    """method: "levenberg-marquardt" or "line-search"; max_iterations: linearisations; tolerance: length
     of the step, in posterior standard deviations, below which the solution counts as reached; relative_tolerance:
     decrease of the error by a step, as a share of it, below which it does, too; damping: first lambda, tried when a
     plain step fails.
@@ -125,21 +137,19 @@ def solve(
     """Return the minimum of GTSAM's factors in `graph` and ours in `factors` together, from `start`.
 
     Linear factors go into the graph by `nonlinear_graph`. Not converging is no exception: look at `Solution.converged`.
-    Raises `FactorError` when variables and factors do not fit together, a factor fails at `start`, or a
-    `gtsam.CustomFactor` leaves a Jacobian unset, and
-    `SingularSystemError`, naming the variables, when the factors do not determine the solution.
+    Raises `FactorError` when variables and factors do not fit together, a factor fails at `start`, or is a
+    `gtsam.CustomFactor`, and `SingularSystemError`, naming the variables, when the factors do not determine the
+    solution.
     """
     settings = settings or SolverSettings()
-    native = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
-    check_variables(graph, native, factors, start)
+    check_variables(graph, factors, start)
     values, error = start, _error(graph, factors, start)
     if not np.isfinite(error):
         raise FactorError(f"the error at the start is {error}: a factor holds a number that is not finite")
     damping = 0.0
     ordering = None
-    custom = _custom(native)
     for iteration in range(1, settings.max_iterations + 1):
-        linear = _linearised(graph, custom, factors, values)
+        linear = _linearised(graph, factors, values)
         if ordering is None:
             ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         if settings.method == "line-search":
@@ -154,9 +164,8 @@ def solve(
         )
         values, error, damping = move.values, move.error, move.damping
         if damping == 0 and reached:
-            return Solution(values, _final(graph, factors, values, error), iteration, True, graph, factors)
+            return Solution(values, error, iteration, True, graph, factors)
         damping = damping / 10 if damping > settings.damping else 0.0
-    error = _final(graph, factors, values, error)
     return Solution(values, error, settings.max_iterations, False, graph, factors)
 
 
@@ -165,30 +174,22 @@ def linearised(
 ) -> gtsam.GaussianFactorGraph:
     """Return all factors linearised at `values`, on increments from there.
 
-    Raises `FactorError` for a `gtsam.CustomFactor` that leaves a Jacobian unset, which GTSAM would not survive.
+    Raises `FactorError` for a `gtsam.CustomFactor`.
     """
-    return _linearised(graph, custom_factors(graph), factors, values)
+    _native(graph)
+    return _linearised(graph, factors, values)
 
 
 def _linearised(
-    graph: gtsam.NonlinearFactorGraph,
-    custom: Iterable[gtsam.CustomFactor],
-    factors: Iterable[Linearisable],
-    values: gtsam.Values,
+    graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values
 ) -> gtsam.GaussianFactorGraph:
-    check_jacobians(custom, values)
     linear = graph.linearize(values)
     for factor in factors:
         linear.push_back(factor.linearise(values))
     return linear
 
 
-def check_variables(
-    graph: gtsam.NonlinearFactorGraph,
-    native: Iterable[gtsam.NonlinearFactor],
-    factors: Iterable[Linearisable],
-    values: gtsam.Values,
-) -> None:
+def check_variables(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values) -> None:
     """Raise `FactorError` unless factors and values speak of the same variables, and wrapped linear ones fit them.
 
     A variable without a single factor is a `SingularSystemError`.
@@ -201,38 +202,24 @@ def check_variables(
     free = sorted(dims.keys() - used)
     if free:
         raise SingularSystemError(f"no factor speaks of {format_keys(free)}", tuple(free))
-    check_dimensions(  # GTSAM's own factors check their variables themselves, wrapped linear ones do not
-        (factor.factor() for factor in native if isinstance(factor, gtsam.LinearContainerFactor)), dims
-    )
+    wrapped = [factor for factor in _native(graph) if isinstance(factor, gtsam.LinearContainerFactor)]
+    check_dimensions((factor.factor() for factor in wrapped), dims)  # which GTSAM checks of its other factors
 
 
-def custom_factors(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.CustomFactor]:
-    """The factors of a graph that call back to Python, ours or not."""
-    return _custom(graph.at(i) for i in range(graph.size()) if graph.exists(i))
-
-
-def _custom(factors: Iterable[gtsam.NonlinearFactor]) -> list[gtsam.CustomFactor]:
-    return [factor for factor in factors if isinstance(factor, gtsam.CustomFactor)]
-
-
-def check_jacobians(factors: Iterable[gtsam.CustomFactor], values: gtsam.Values) -> None:
-    """Raise `FactorError` for a factor whose Jacobians at `values` would crash GTSAM: unset or of a wrong shape."""
-    dims: dict[int, int] = {}
+def _native(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
+    """The factors of a graph; GTSAM would crash where the function of a `CustomFactor` leaves a Jacobian unset."""
+    factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
     for factor in factors:
-        keys, dims = factor.keys(), dims or values.dims()
-        H = gtsam.JacobianVector([np.empty((0, 0)) for _ in keys])
-        rows = len(factor.unwhitenedError(values, H))
-        for key, jacobian in zip(keys, H, strict=True):
-            shape = (rows, dims[key])
-            if jacobian.shape != shape or not np.isfinite(jacobian).all():
-                where = f"CustomFactor of {format_keys(keys)}: Jacobian by {format_keys([key])}"
-                got = f"shape {jacobian.shape}" if jacobian.size else "none"
-                raise FactorError(f"{where}: expected finite numbers of shape {shape} in H, got {got}")
+        if isinstance(factor, gtsam.CustomFactor):
+            raise FactorError(
+                f"CustomFactor of {format_keys(factor.keys())}: expected a `residual_factor` in its place"
+            )
+    return factors
 
 
 @dataclass(frozen=True)
 class _Move:
-    """values, error: where the step led (nan: nobody asked), length: of the step, in sigmas, or infinite where it is
+    """values, error: where the step led, length: of the step, in sigmas, or infinite where it is
     longer than the tolerance for sure, damping: that it took, exact: whether the error came out as the linearisation
     had said, which means that there is nothing nonlinear.
     """
@@ -255,18 +242,13 @@ def _move(
     settings: SolverSettings,
 ) -> _Move | None:
     """Return the first step, damped as much as it takes, that does not raise the error; None when none does."""
-    careful = settings.method == "levenberg-marquardt"
     undetermined = False
     while damping <= _MAX_DAMPING:
         step = _step(linear, ordering, damping)
         if step is None:
             undetermined |= damping == 0
-            if not careful:
-                raise singular_system(linear)
         else:
             moved = values.retract(step)
-            if not careful:
-                return _Move(moved, float("nan"), _length(linear, step, damping), 0.0, False)
             moved_error = _error_or_infinity(graph, factors, moved)
             gained = error - moved_error > max(settings.tolerance**2, _ROUNDING * error)  # twice what such a step gains
             length = float("inf") if gained else _length(linear, step, damping)
@@ -314,12 +296,6 @@ def _error(graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], v
     except (RuntimeError, ValueError) as error:
         raise FactorError(f"GTSAM could not evaluate the graph: {error}") from error
     return native + sum(factor.error(values) for factor in factors)
-
-
-def _final(
-    graph: gtsam.NonlinearFactorGraph, factors: Iterable[Linearisable], values: gtsam.Values, error: float
-) -> float:
-    return error if np.isfinite(error) else _error(graph, factors, values)
 
 
 def _error_or_infinity(

@@ -56,51 +56,40 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float
 
 def checked_keys(name: str, keys: Iterable[int]) -> tuple[int, ...]:
     """Return `keys` as distinct GTSAM keys (integers from 0 to 2^64 - 1), or raise `FactorError`."""
-    result = []
-    for key in keys:
+    given = list(keys)
+    for key in given:
         if isinstance(key, bool) or not isinstance(key, int | np.integer) or not 0 <= key < 1 << 64:
             raise FactorError(f"{name}: expected integers from 0 to 2^64 - 1, got {key!r}")
-        result.append(int(key))
-    if len(set(result)) != len(result):
-        twice = next(key for key in result if result.count(key) > 1)
-        raise FactorError(f"{name}: expected distinct keys, {format_key(twice)} occurs more than once")
-    return tuple(result)
+    row = np.array([given], dtype=np.uint64)  # at once: of large and small ones NumPy makes floating point numbers
+    return tuple(checked_key_rows(name, row, len(given))[0].tolist()) if given else ()
 
 
 def checked_key_array(name: str, keys: ArrayLike) -> KeyArray:
-    """Return `keys` as a flat array of GTSAM keys, not necessarily distinct, or raise `FactorError`."""
+    """Return `keys` (any shape) as an array of GTSAM keys, not necessarily distinct, or raise `FactorError`."""
     try:
         array = np.asarray(keys)
-    except ValueError as error:
-        raise FactorError(f"{name}: expected a flat array of integers from 0 to 2^64 - 1") from error
-    if array.size == 0:
-        array = np.empty(0, dtype=np.uint64)
-    if array.ndim != 1 or array.dtype.kind not in "iu" or (array.dtype.kind == "i" and int(array.min()) < 0):
-        raise FactorError(f"{name}: expected a flat array of integers from 0 to 2^64 - 1")
+    except (ValueError, OverflowError) as error:
+        raise FactorError(f"{name}: expected rows of the same length, of integers from 0 to 2^64 - 1") from error
+    negative = array.dtype.kind == "i" and array.size > 0 and int(array.min()) < 0
+    if negative or (array.dtype.kind not in "iu" and array.size > 0):
+        raise FactorError(f"{name}: expected integers from 0 to 2^64 - 1")
     return array.astype(np.uint64)
 
 
 def checked_key_rows(name: str, rows: ArrayLike, columns: int) -> KeyArray:
-    """Return `rows` as an array of GTSAM keys (n, columns), columns > 0, or raise `FactorError`; [] are none."""
-    try:
-        array = np.asarray(rows)
-    except ValueError as error:
-        raise FactorError(f"{name}: expected rows of the same length") from error
+    """Return `rows` as an array of GTSAM keys (n, columns), distinct in a row, or raise `FactorError`; [] are none."""
+    array = checked_key_array(name, rows)
     if array.shape == (0,):
-        array = np.empty((0, columns), dtype=np.uint64)
+        array = array.reshape(0, columns)
     if array.ndim != 2 or array.shape[1] != columns or not columns:
         raise FactorError(f"{name}: expected shape (any, {columns}), got {array.shape}")
-    return checked_key_array(name, array.reshape(-1)).reshape(array.shape)
-
-
-def check_distinct(name: str, rows: KeyArray) -> None:
-    """Raise `FactorError` when a key occurs twice within one of the rows (n, k)."""
-    ordered = np.sort(rows, axis=1)
+    ordered = np.sort(array, axis=1)
     twice = ordered[:, 1:] == ordered[:, :-1]
     if twice.any():
         row = int(np.argmax(twice.any(axis=1)))
         key = int(ordered[row, 1:][twice[row]][0])
-        raise FactorError(f"{name}: {format_key(key)} occurs twice in one factor, the one on {format_keys(rows[row])}")
+        raise FactorError(f"{name}: {format_key(key)} occurs twice in one factor, the one on {format_keys(array[row])}")
+    return array
 
 
 def whitener(name: str, covariance: ArrayLike, dim: int) -> FloatArray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.recordings.landmarks import LandmarkLog
 from data_tools.trajectories import absolute_errors, matched, rigid_alignment
-from factors import Robust, SolverSettings, calibrated_range_factors, prior_factor
+from factors import PlanarPose, ResidualFactors, Robust, SolverSettings, prior_factor
 from pipelines.slam.results import planar_trajectory
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver
@@ -104,8 +104,33 @@ class _Ranges:
         used = (drive.pose <= view.epoch) & np.isin(drive.landmark, [*view.static(LANDMARK), *self.places])
         pairs = zip(drive.pose[used].tolist(), drive.landmark[used].tolist(), strict=True)
         rows = [[pose_key(row), landmark_key(number), _CALIBRATION] for row, number in pairs]
-        ranges = calibrated_range_factors(rows, drive.value[used, 0], float(drive.covariance[0, 0, 0]), _LOSS)
+        ranges = _range_factors(rows, drive.value[used, 0], float(drive.covariance[0, 0, 0]))
         return Additions(new, factors, {"ranges": [ranges]})
+
+
+def _range_factors(rows: list[list[int]], z: FloatArray, variance: float) -> ResidualFactors:
+    """r = (1 + s) || l - t || + o - z of poses (R, t), beacons l and the radio's calibration (s, o); z (n,) m.
+
+    With u the unit vector towards the beacon, and the pose moved to t + R v, dr/dv = -(1 + s) u^T R,
+    dr/dl = (1 + s) u^T, dr/ds = || l - t ||, dr/do = 1.
+    """
+
+    def residual(pose: FloatArray, beacon: FloatArray, calibration: FloatArray) -> FloatArray:
+        distance = np.linalg.norm(beacon - pose[:, :2, 2], axis=1)
+        expected: FloatArray = (1 + calibration[:, 0]) * distance + calibration[:, 1]
+        return (expected - z)[:, None]
+
+    def jacobians(pose: FloatArray, beacon: FloatArray, calibration: FloatArray) -> list[FloatArray]:
+        towards = beacon - pose[:, :2, 2]
+        distance = np.linalg.norm(towards, axis=1)
+        if (distance == 0).any():
+            raise InputError("range: the pose is at its beacon, where the direction is undefined")
+        scaled = ((1 + calibration[:, :1]) * towards / distance[:, None])[:, None, :]
+        by_pose = np.concatenate([-scaled @ pose[:, :2, :2], np.zeros((len(z), 1, 1))], axis=2)
+        return [by_pose, scaled, np.stack([distance, np.ones_like(distance)], axis=1)[:, None, :]]
+
+    keys = np.array(rows, dtype=np.uint64).reshape(-1, 3)
+    return ResidualFactors(keys, (PlanarPose(), 2, 2), residual, variance * np.eye(1), jacobians, _LOSS, name="ranges")
 
 
 def compared(drive: LandmarkLog, found: BeaconMap) -> tuple[dict[str, float], dict[str, FloatArray]]:

@@ -14,7 +14,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from factors import PlanarPose, ResidualFactor, SpatialPose, Vector, solve
+from factors import PlanarPose, SpatialPose, Vector, residual_factor, solve
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import (
     LandmarkObservations,
@@ -92,7 +92,7 @@ def _native_factors(seen: LandmarkObservations, poses: int) -> Iterator[gtsam.No
         if seen.kind == "point":
             covariance = np.linalg.inv(information)
             residual = partial(_point_residual, z)
-            yield ResidualFactor(keys, variables, residual, (covariance + covariance.T) / 2).as_custom_factor()
+            yield from residual_factor(keys, variables, residual, (covariance + covariance.T) / 2).custom_factors()
         elif seen.kind == "bearing":
             model = gtsam.noiseModel.Gaussian.Information(information)
             yield gtsam.BearingFactor2D(*keys, gtsam.Rot2(z[0]), model)

@@ -26,9 +26,9 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors import ResidualFactor, ResidualFactors, Solution, SolverSettings, solve
+from factors import Solution, SolverSettings, solve
 from saga_fg.errors import InputError
-from saga_fg.graph.factor_groups import ActiveRows, SingleGroup, StackedGroup
+from saga_fg.graph.factor_groups import ActiveRows, ResidualGroup
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import setting
 
@@ -141,29 +141,17 @@ def solve_graduated(
 
 
 def _loss(rows: ActiveRows) -> GraduatedNonConvexity | None:
-    loss = getattr(_factor(rows), "robust", None)
+    loss = rows.group.factors.robust if isinstance(rows.group, ResidualGroup) else None
     return loss if isinstance(loss, GraduatedNonConvexity) else None
-
-
-def _factor(rows: ActiveRows) -> ResidualFactors | ResidualFactor | None:
-    if isinstance(rows.group, StackedGroup):
-        return rows.group.factors
-    single = rows.group.factor if isinstance(rows.group, SingleGroup) else None
-    return single if isinstance(single, ResidualFactor) else None
 
 
 def _with(rows: ActiveRows, loss: GraduatedNonConvexity | None) -> ActiveRows:
     """Replace the loss of factors."""
-    if isinstance(rows.group, StackedGroup):
-        return replace(rows, group=replace(rows.group, factors=replace(rows.group.factors, robust=loss)))
-    assert isinstance(rows.group, SingleGroup)
-    assert isinstance(rows.group.factor, ResidualFactor)
-    return replace(rows, group=replace(rows.group, factor=replace(rows.group.factor, robust=loss)))
+    assert isinstance(rows.group, ResidualGroup)
+    return replace(rows, group=ResidualGroup(replace(rows.group.factors, robust=loss)))
 
 
 def _distances(rows: ActiveRows, values: gtsam.Values) -> FloatArray:
     """Distances (n,) of the residuals, standard deviations: without a loss the cost is s^2 / 2."""
-    plain = _with(rows, None)
-    if isinstance(plain.group, StackedGroup):
-        return np.sqrt(2 * plain.group.factors.errors(values, rows.chosen))
-    return np.sqrt([2 * plain.error(values)])
+    assert isinstance(rows.group, ResidualGroup)
+    return np.sqrt(2 * replace(rows.group.factors, robust=None).errors(values, rows.chosen))

@@ -17,12 +17,12 @@ from functools import cached_property
 
 import numpy as np
 
-from factors import GaussianFactors, Vector, stacked_gaussian_factors
+from factors import GaussianFactors, Vector, gaussian_factors
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.filtering import Dynamics, corrected, noise_ratio, predict
 from saga_fg.estimators.interval_dynamics import LARGEST_RATIO, merged
 from saga_fg.estimators.measurements import Measurements
-from saga_fg.estimators.object_factors import measurement_factors, prior_factors
+from saga_fg.estimators.object_factors import component_priors, measurement_factors
 from saga_fg.estimators.partition import StateLayout
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable, NewVariable, VariableKind, node_key, node_kind
@@ -144,7 +144,7 @@ class IndependentObjects:
             ]
             graph.add_variables("new objects", new, (epoch.number, epoch.time))
             begun = np.array([node for node in here.tolist() if node not in earlier], dtype=np.int64)
-            graph.add_factors("new objects", list(prior_factors(epoch.x.only(begun), keys)))
+            graph.add_factors("new objects", list(component_priors(epoch.x.only(begun), keys)))
             if dynamics is not None and earlier:
                 going = np.array(list(earlier), dtype=np.int64)
                 factors = list(_motion_factors(dynamics, np.setdiff1d(going, list(kept)), earlier, keys))
@@ -187,7 +187,7 @@ def _motion_factors(
                 noise[Q.target] = Q.values
         names = np.array([[keys[node], earlier[node]] for node in ids], dtype=np.uint64)
         identity = np.broadcast_to(np.eye(F.values.shape[1]), F.values.shape)
-        yield stacked_gaussian_factors(names, [identity, -F.values], own.b[own.layout.spans(rows)], noise[rows])
+        yield gaussian_factors(names, [identity, -F.values], own.b[own.layout.spans(rows)], noise[rows])
 
 
 class IndependentVariables:

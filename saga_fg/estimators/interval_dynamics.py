@@ -175,7 +175,7 @@ class NonlinearDynamics:
         """The factors of all nodes: next_keys (n,), keys (n, 1 + k)."""
         return ResidualFactors(
             rows=np.column_stack([next_keys, keys]),
-            dims=(self.b.shape[1], self.b.shape[1], *(F.shape[2] for F in self.F)),
+            variables=(self.b.shape[1], self.b.shape[1], *(F.shape[2] for F in self.F)),
             residual=self.residual,
             covariances=self.Q,
             jacobians=self.residual_jacobians,

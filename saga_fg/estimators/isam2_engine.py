@@ -228,7 +228,7 @@ class Engine:
             assert isinstance(container, gtsam.LinearContainerFactor)
             factor = container.factor()
             factors.append(factor if isinstance(factor, gtsam.JacobianFactor) else gtsam.JacobianFactor(factor))
-        number = graph.replace_rows(rows, factors, leaving)
+        numbers = graph.replace_rows(rows, factors, leaving)
         self.points.remove(leaving)
         for key in leaving:
             del self._times[key]
@@ -237,8 +237,7 @@ class Engine:
                 self.slots[old] = np.where(groups[old].active, self.slots[old], -1)
             else:
                 del self.slots[old]
-        if number is not None:
-            self.slots[number] = np.array(added)
+        self.slots |= {number: np.array([slot]) for number, slot in zip(numbers, added, strict=True)}
         self._held = dict(groups)
         return True
 

@@ -22,11 +22,11 @@ from factors import (
     GaussianFactors,
     ResidualFactors,
     detection_factors,
+    gaussian_factors,
     interaction_factor,
+    interaction_factors,
     joint_prior_factor,
-    stacked_gaussian_factors,
-    stacked_interaction_factors,
-    stacked_prior_factors,
+    prior_factors,
 )
 from saga_fg.errors import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
@@ -53,21 +53,21 @@ def prior_graph(x: BlockGaussian, time: float) -> SceneFactorGraph:
     states = np.split(x.mean, x.layout.offsets[1:-1]) if names else []
     keys = graph.add_variables("", [NewVariable(*node_kind(n), state) for n, state in zip(names, states, strict=True)])
     try:
-        priors = list(prior_factors(x, dict(zip(names, keys, strict=True))))
+        priors = list(component_priors(x, dict(zip(names, keys, strict=True))))
     except FactorError as error:
         raise InputError(f"graph: {error}") from error
     graph.add_factors("prior", priors)
     return graph
 
 
-def prior_factors(x: BlockGaussian, keys: Mapping[int, int]) -> Iterator[GaussianFactors | gtsam.JacobianFactor]:
+def component_priors(x: BlockGaussian, keys: Mapping[int, int]) -> Iterator[GaussianFactors | gtsam.JacobianFactor]:
     """One prior a component."""
     label, ids = x.partition.label, x.layout.nodes
     alone = np.bincount(label)[label] == 1
     for d in np.unique(x.layout.dims[alone]).tolist():
         rows = np.flatnonzero(alone & (x.layout.dims == d))
         names = [keys[node] for node in ids[rows].tolist()]
-        yield stacked_prior_factors(names, x.mean[x.layout.spans(rows)], x.covariances(rows))
+        yield prior_factors(names, x.mean[x.layout.spans(rows)], x.covariances(rows))
     for number in np.unique(label[~alone]).tolist():
         rows = np.flatnonzero(label == number)
         means = [x.mean[x.layout.offsets[row] : x.layout.offsets[row + 1]] for row in rows.tolist()]
@@ -81,7 +81,7 @@ def measurement_factors(keys: Mapping[int, int], measured: Measured) -> Factors:
         return [detection_factors(names, measured.model, measured.z, measured.R)]
     assert isinstance(measured, Measurements)
     told = measured.H.any(axis=(1, 2))
-    return [stacked_gaussian_factors(names[told, None], [measured.H[told]], measured.z[told], measured.R[told])]
+    return [gaussian_factors(names[told, None], [measured.H[told]], measured.z[told], measured.R[told])]
 
 
 def interval_factors(
@@ -123,7 +123,7 @@ def interval_factors(
             b = dynamics.b[layout.spans(rows)]
             Q = np.stack([noise[row] for row in rows.tolist()])
             names, indptr = now[blocks.source[mine]], np.append(first, len(mine))
-            native += stacked_interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
+            native += interaction_factors(then[rows], names, indptr, blocks.values[mine], b, Q)
     for row in np.flatnonzero(~together & ~moves_nonlinearly).tolist():
         d, node = int(layout.dims[row]), int(layout.nodes[row])
         Q = noise.get(row, np.zeros((d, d)))
@@ -171,7 +171,7 @@ class NewObjects:
             for i, mean in zip(ids, self.means, strict=True)
         ]
         keys = [node_key(i, view.epoch) for i in ids]
-        return Additions(new, [stacked_prior_factors(keys, self.means, self.covariances)])
+        return Additions(new, [prior_factors(keys, self.means, self.covariances)])
 
 
 @dataclass(frozen=True, eq=False)

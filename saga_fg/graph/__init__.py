@@ -14,12 +14,10 @@ from saga_fg.graph.variables import (
     OBJECT,
     GraphError,
     GraphVariable,
-    KeyId,
     NewVariable,
     ProviderError,
     UndeterminedError,
     VariableKind,
-    key_id,
     key_of,
 )
 
@@ -38,14 +36,12 @@ __all__ = [
     "GraphError",
     "GraphVariable",
     "GraphView",
-    "KeyId",
     "NewVariable",
     "ProviderError",
     "SceneFactorGraph",
     "UndeterminedError",
     "VariableKind",
     "ask_all",
-    "key_id",
     "key_of",
     "predictors",
 ]

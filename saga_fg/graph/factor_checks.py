@@ -1,12 +1,10 @@
-"""Checks of the factors that a running graph takes, and error messages that name their variables.
+"""The door of a running graph: checks of the factors that it takes, and errors that name their variables.
 
 | given | becomes |
 |---|---|
-| `gtsam.JacobianFactor`, linear, on vectors themselves | a row of the `LinearGroup` of all that come with it |
-| `factors.GaussianFactors` | a `GaussianGroup` |
-| `factors.ResidualFactors` | a `StackedGroup` |
-| anything else with `keys`, `error` and `linearise` (`factors.Linearisable`) | a `SingleGroup` |
-| `gtsam.CustomFactor` | a `CustomGroup` |
+| `factors.GaussianFactors`; `gtsam.JacobianFactor`s, on vectors themselves, of one shape | a `LinearGroup` |
+| `factors.ResidualFactors` | a `ResidualGroup` |
+| `gtsam.CustomFactor`: GTSAM crashes where its function leaves out a Jacobian | the same, by central differences |
 | any other `gtsam.NonlinearFactor`; a graph of such | a `NativeGroup` each |
 
 GTSAM reads beyond the end of a vector of another dimension than its factor's, answers hard constraints with a system
@@ -15,155 +13,167 @@ that least squares cannot take, and takes a `LinearContainerFactor` without a li
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, cast
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
 from factors import (
     FactorError,
     GaussianFactors,
-    Linearisable,
-    OrientedPlane,
-    PlanarPose,
-    ResidualFactor,
     ResidualFactors,
     SingularSystemError,
-    SpatialPose,
+    Variable,
     Vector,
+    residual_factor,
     unwrapped_angles,
 )
+from factors.manifolds import Manifold
+from factors.robust import each_of
 from factors.validation import format_key
 from saga_fg.errors import InputError
-from saga_fg.graph.factor_groups import (
-    CustomGroup,
-    FactorGroup,
-    GaussianGroup,
-    HeldGroup,
-    LinearGroup,
-    NativeGroup,
-    SingleGroup,
-    StackedGroup,
-    WhitenedRows,
-    first_residual,
-    members,
-)
-from saga_fg.graph.variables import LARGEST_INCREMENT, GraphError, GraphVariable, UndeterminedError, described
-from saga_fg.numerics.arrays import IntArray
+from saga_fg.graph.factor_groups import FactorGroup, HeldGroup, LinearGroup, NativeGroup, ResidualGroup, members
+from saga_fg.graph.variables import GraphError, GraphVariable, UndeterminedError, described
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
-Factor = gtsam.JacobianFactor | GaussianFactors | gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph | Linearisable
-_EXPECTED = "expected a gtsam.JacobianFactor, a GTSAM nonlinear factor, or a factor with keys, error and linearise"
+Factor = gtsam.JacobianFactor | GaussianFactors | ResidualFactors | gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph
+Variables = Mapping[int, GraphVariable]
 
 
-def grouped(provider: str, factors: Any, variables: Mapping[int, GraphVariable]) -> list[FactorGroup]:
-    """Return the groups of what a provider gave. Raises `GraphError`, naming provider, factor and variables."""
-    if isinstance(factors, str | bytes) or not isinstance(factors, Iterable | gtsam.NonlinearFactorGraph):
+def each_factor(provider: str, factors: Any) -> list[Any]:
+    """The factors that a provider gave, those of GTSAM's graphs one by one. Raises `GraphError` for other things."""
+    if isinstance(factors, gtsam.NonlinearFactorGraph):
+        return members(factors)
+    if isinstance(factors, str | bytes) or not isinstance(factors, Iterable):
         raise GraphError(f"provider {provider}: expected a list of factors, got {type(factors).__name__}")
+    nested = [members(one) if isinstance(one, gtsam.NonlinearFactorGraph) else [one] for one in factors]
+    return [factor for some in nested for factor in some]
+
+
+def mentioned_keys(factors: Sequence[Any]) -> set[int]:
+    """Return the keys of factors; `grouped` has the checks."""
+    keys = set[int]()
+    for factor in factors:
+        if isinstance(factor, gtsam.Factor):
+            keys.update(factor.keys())
+        elif isinstance(factor, GaussianFactors | ResidualFactors):
+            keys.update(factor.keys)
+    return keys
+
+
+def grouped(provider: str, factors: Any, variables: Variables) -> list[FactorGroup]:
+    """Return the groups of what a provider gave. Raises `GraphError`, naming provider, factor and variables."""
     groups: list[FactorGroup] = []
-    linear: list[gtsam.JacobianFactor] = []
-    for factor in _flat(factors):
+    alike: dict[tuple[int, ...], list[gtsam.JacobianFactor]] = {}
+    for factor in each_factor(provider, factors):
         if isinstance(factor, gtsam.JacobianFactor):
-            linear.append(factor)
+            dims = [variable.dim for variable in _present(provider, "linear factor", factor.keys(), variables)]
+            _check_linear(provider, factor, variables)
+            alike.setdefault((factor.rows(), *dims), []).append(factor)
         else:
-            groups.append(_group(provider, factor))
-    for factor in linear:
-        _check_linear(provider, factor, variables)
-    if linear:
-        groups.append(LinearGroup.of(linear, variables))
+            groups.append(_group(provider, factor, variables))
+    groups += [LinearGroup(stacked(some, dims)) for (_, *dims), some in alike.items()]
     for group in groups:
         check_variables(provider, group, range(len(group.rows)), variables)
     return [group for group in groups if group.rows]
 
 
-def mentioned_keys(factors: Any) -> set[int]:
-    """Return the keys of all factors that a provider gave, as far as they are such; `grouped` has the checks."""
-    if isinstance(factors, str | bytes) or not isinstance(factors, Iterable | gtsam.NonlinearFactorGraph):
-        return set()
-    keys = set[int]()
-    for factor in _flat(factors):
-        given = getattr(factor, "keys", ())
-        with contextlib.suppress(Exception):  # a user's object: anything
-            keys.update(given() if callable(given) else given)
-    return keys
+def stacked(factors: Sequence[gtsam.JacobianFactor], dims: Sequence[int]) -> GaussianFactors:
+    """Factors of one shape as arrays."""
+    rows = np.array([list(factor.keys()) for factor in factors], dtype=np.uint64)
+    return GaussianFactors(rows, tuple(dims), np.stack([factor.augmentedJacobian().T for factor in factors]))
 
 
-def _flat(factors: Any) -> Iterable[Any]:
-    for factor in _members(factors):
-        if isinstance(factor, gtsam.NonlinearFactorGraph):
-            yield from _members(factor)
-        else:
-            yield factor
-
-
-def _members(factors: Any) -> Iterable[Any]:
-    if isinstance(factors, gtsam.NonlinearFactorGraph):
-        return members(factors)
-    return list(factors)
-
-
-def _group(provider: str, factor: Any) -> FactorGroup:
+def _group(provider: str, factor: Any, variables: Variables) -> FactorGroup:
     kind = type(factor).__name__
     if isinstance(factor, GaussianFactors):
-        return GaussianGroup(factor)
+        return LinearGroup(factor)
     if isinstance(factor, ResidualFactors):
-        return StackedGroup(factor)
+        return ResidualGroup(factor)
     if isinstance(factor, gtsam.LinearContainerFactor):
         raise GraphError(f"provider {provider}: {kind}: expected the linear factor itself, a gtsam.JacobianFactor")
-    if isinstance(factor, gtsam.NonlinearFactor):
-        rows = (tuple(factor.keys()),)
-        if not rows[0]:
-            raise GraphError(f"provider {provider}: {kind}: expected a factor with variables")
-        if isinstance(factor, gtsam.NoiseModelFactor):
-            noise = factor.noiseModel()
-            if noise is None or noise.isConstrained():
-                raise GraphError(f"provider {provider}: {kind}: expected noise with variances, no hard constraint")
-        if isinstance(factor, gtsam.CustomFactor):
-            return CustomGroup(factor, rows)
-        return NativeGroup(factor, rows, kind)
-    if all(callable(getattr(factor, name, None)) for name in ("error", "linearise")) and hasattr(factor, "keys"):
-        return SingleGroup(factor, (_given_keys(provider, factor),), str(getattr(factor, "name", kind)))
-    raise GraphError(f"provider {provider}: {_EXPECTED}, got {kind}")
+    if not isinstance(factor, gtsam.NonlinearFactor):
+        raise GraphError(
+            f"provider {provider}: expected a gtsam.JacobianFactor, a GTSAM nonlinear factor, GaussianFactors or "
+            f"ResidualFactors, got {kind}"
+        )
+    keys = tuple(factor.keys())
+    if not keys:
+        raise GraphError(f"provider {provider}: {kind}: expected a factor with variables")
+    if isinstance(factor, gtsam.NoiseModelFactor):
+        noise = factor.noiseModel()
+        if noise is None or noise.isConstrained():
+            raise GraphError(f"provider {provider}: {kind}: expected noise with variances, no hard constraint")
+    if isinstance(factor, gtsam.CustomFactor):
+        return ResidualGroup(_differentiated(factor, [one.type for one in _present(provider, kind, keys, variables)]))
+    return NativeGroup(factor, (keys,), kind)
 
 
-def _given_keys(provider: str, factor: Any) -> tuple[int, ...]:
-    try:
-        keys = tuple(int(key) for key in factor.keys)
-    except (TypeError, ValueError) as error:
-        raise GraphError(f"provider {provider}: {type(factor).__name__}: expected keys, got {factor.keys!r}") from error
-    if not keys or len(set(keys)) != len(keys):
-        raise GraphError(f"provider {provider}: {type(factor).__name__}: expected distinct keys, got {keys}")
-    return keys
+def _differentiated(factor: gtsam.CustomFactor, types: Sequence[Variable]) -> ResidualFactors:
+    keys, noise = list(factor.keys()), cast("Any", factor.noiseModel())
+    gaussian, robust = noise, None
+    if isinstance(noise, gtsam.noiseModel.Robust):
+        gaussian, robust = noise.noise(), _NativeLoss(noise.robust())
+
+    def residual(*states: Any) -> FloatArray:
+        values = gtsam.Values()  # its own variables alone: GTSAM copies all of them for every call
+        for key, state in zip(keys, states, strict=True):
+            values.insert(key, state)
+        return np.asarray(factor.unwhitenedError(values), dtype=np.float64)
+
+    return residual_factor(keys, types, residual, gaussian.covariance(), robust=robust, name="custom factor")
 
 
-def check_variables(
-    provider: str, group: FactorGroup, rows: Sequence[int], variables: Mapping[int, GraphVariable]
-) -> None:
+@dataclass(frozen=True)
+class _NativeLoss:
+    """A robust loss of GTSAM's."""
+
+    estimator: Any
+
+    def cost(self, distance: ArrayLike) -> FloatArray:
+        return each_of(self.estimator.loss, distance)
+
+    def weight(self, distance: ArrayLike) -> FloatArray:
+        return each_of(self.estimator.weight, distance)
+
+    def model(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
+        return gtsam.noiseModel.Robust.Create(self.estimator, noise)
+
+
+def check_variables(provider: str, group: FactorGroup, rows: Iterable[int], variables: Variables) -> None:
     """Raise `GraphError` unless each variable of some rows is there, of the type and dimension that they expect."""
-    if isinstance(group, GaussianGroup) and len(rows) == len(group.rows) and _fits(group.factors, variables):
-        return
+    types = group.types
     for row in rows:
         mine = _present(provider, group.name, group.rows[row], variables)
-        _check_fit(provider, group.name, mine, _misfit(group, row, mine))
+        if types is not None and not all(map(_fits, types, (one.type for one in mine))):
+            got = ", ".join(str(one.type) for one in mine)
+            _refuse(provider, group.name, mine, f"expected variables {', '.join(map(str, types))}, got {got}")
 
 
-def _check_linear(provider: str, factor: gtsam.JacobianFactor, variables: Mapping[int, GraphVariable]) -> None:
-    """Each variable of a factor of GTSAM's is there, and has its number of columns."""
-    mine = _present(provider, "linear factor", tuple(factor.keys()), variables)
-    total, wrong = sum(variable.dim for variable in mine), ""
+def _fits(expected: Variable, got: Variable) -> bool:
+    """Functions of vectors take all that are read as such."""
+    return expected == got or (
+        isinstance(expected, Vector) and not isinstance(got, Manifold) and expected.dim == got.dim
+    )
+
+
+def _check_linear(provider: str, factor: gtsam.JacobianFactor, variables: Variables) -> None:
+    """The variables of a factor of GTSAM's are vectors, of its number of columns."""
+    mine = [variables[key] for key in factor.keys()]  # noqa: SIM118
+    total = sum(variable.dim for variable in mine)
+    if not all(isinstance(one.type, Vector) for one in mine):
+        _refuse(provider, "linear factor", mine, "expected vectors: it speaks of the variables themselves")
     if factor.cols() - 1 != total:
         wrong = f"expected {total} columns, as the variables have dimensions, got {factor.cols() - 1}"
-    elif factor.isConstrained():
-        wrong = "expected noise with variances, no hard constraint"
-    elif not (np.abs(factor.augmentedJacobian()) <= LARGEST_INCREMENT).all():
-        wrong = f"expected finite numbers, at most {LARGEST_INCREMENT:g} standard deviations"
-    _check_fit(provider, "linear factor", mine, wrong)
+        _refuse(provider, "linear factor", mine, wrong)
+    if factor.isConstrained():
+        _refuse(provider, "linear factor", mine, "expected noise with variances, no hard constraint")
 
 
-def _present(
-    provider: str, name: str, keys: Sequence[int], variables: Mapping[int, GraphVariable]
-) -> list[GraphVariable]:
+def _present(provider: str, name: str, keys: Sequence[int], variables: Variables) -> list[GraphVariable]:
     unknown = [key for key in keys if key not in variables]
     if unknown:
         raise GraphError(
@@ -175,77 +185,18 @@ def _present(
     return [variables[key] for key in keys]
 
 
-def _check_fit(provider: str, name: str, variables: Sequence[GraphVariable], wrong: str) -> None:
-    if wrong:
-        raise GraphError(f"provider {provider}: {name} on {', '.join(map(str, variables))}: {wrong}")
+def _refuse(provider: str, name: str, variables: Sequence[GraphVariable], wrong: str) -> None:
+    raise GraphError(f"provider {provider}: {name} on {', '.join(map(str, variables))}: {wrong}")
 
 
-def check_angles(
-    provider: str, group: FactorGroup, variables: Mapping[int, GraphVariable], values: gtsam.Values
-) -> None:
+def check_angles(provider: str, group: FactorGroup, variables: Variables, values: gtsam.Values) -> None:
     """Raise `GraphError` if the first residual of a group has an angle that nobody wraps."""
-    factor = first_residual(group)
-    if factor is not None and (angles := unwrapped_angles(factor, factor.states(values))):
-        named = ", ".join(str(variables[key]) for key in factor.keys)
-        raise GraphError(
-            f"provider {provider}: {factor.name} on {named}: component {angles[0]} of the residual jumps by a full "
-            f"turn while the pose turns; expected rad, and angles={factor.angles + angles} in the factor"
+    if isinstance(group, ResidualGroup) and group.rows and (angles := unwrapped_angles(group.factors, values)):
+        wrong = (
+            f"component {angles[0]} of the residual jumps by a full turn while the pose turns; "
+            f"expected rad, and angles={group.factors.angles + angles} in the factor"
         )
-
-
-def _misfit(group: FactorGroup, row: int, variables: Sequence[GraphVariable]) -> str:
-    """Describe what does not fit together; "" if everything does."""
-    types = [variable.type for variable in variables]
-    if isinstance(group, LinearGroup) and not all(isinstance(kind, Vector) for kind in types):
-        return "expected vectors: a linear factor speaks of the variables themselves"
-    if isinstance(group, WhitenedRows):
-        if tuple(variable.dim for variable in variables) != group.dims[row]:
-            return f"expected variables of dimensions {group.dims[row]}"
-    elif isinstance(group, GaussianGroup):
-        if not all(kind == Vector(dim) for kind, dim in zip(types, group.factors.dims, strict=True)):
-            return f"expected vectors of {group.factors.dims} entries, got {', '.join(map(str, types))}"
-        if not (np.abs(group.factors.augmented[row]) <= LARGEST_INCREMENT).all():
-            return f"expected finite numbers, at most {LARGEST_INCREMENT:g} standard deviations"
-    elif isinstance(group, StackedGroup):
-        expected = [Vector(dim) if isinstance(dim, int | np.integer) else dim for dim in group.factors.dims]
-        plain = [
-            kind if isinstance(kind, PlanarPose | SpatialPose | OrientedPlane) else Vector(kind.dim) for kind in types
-        ]
-        return _types(expected, plain) if row == 0 or expected != plain else ""
-    elif isinstance(group, SingleGroup) and isinstance(group.factor, ResidualFactor):
-        return _types(group.factor.variables, types)
-    elif isinstance(group, NativeGroup):
-        lengths = _lengths(group.factor)
-        if lengths is not None and any(kind != Vector(lengths) for kind in types):
-            return f"expected vectors of {lengths} entries, got {', '.join(map(str, types))}"
-    return ""
-
-
-def _fits(factors: GaussianFactors, variables: Mapping[int, GraphVariable]) -> bool:
-    """Whether all variables of linear factors are vectors of the right dimensions, and all numbers finite."""
-    for column, dim in zip(factors.rows.T.tolist(), factors.dims, strict=True):
-        vector = Vector(dim)
-        if any((one := variables.get(key)) is None or one.type != vector for key in column):
-            return False
-    return bool((np.abs(factors.augmented) <= LARGEST_INCREMENT).all())
-
-
-def _types(expected: Sequence[Any], got: Sequence[Any]) -> str:
-    if list(expected) == list(got):
-        return ""
-    return f"expected variables {', '.join(map(str, expected))}, got {', '.join(map(str, got))}"
-
-
-def _lengths(factor: gtsam.NonlinearFactor) -> int | None:
-    """Length of the vectors of a factor that GTSAM does not check itself."""
-    if isinstance(factor, gtsam.PriorFactorVector):
-        return len(factor.prior())
-    if isinstance(factor, gtsam.BetweenFactorVector):
-        return len(factor.measured())
-    return None
-
-
-Variables = Mapping[int, GraphVariable]
+        _refuse(provider, group.name, [variables[key] for key in group.rows[0]], wrong)
 
 
 def solver_error(variables: Variables, groups: Mapping[int, HeldGroup], error: Exception) -> GraphError:

@@ -1,18 +1,15 @@
-"""Groups of factors that were added together, and the index of groups by number, name and variable.
+"""Groups of factors of one shape that were added together, and the index of groups by number, name and variable.
 
-Groups of factors that were added together, each factor a row of its group.
-
-A group linearises any of its rows at a `LinearisationPoint`. GTSAM's own factors are linearised by GTSAM, one at a
-time; `ResidualFactors` all at once in NumPy. A `gtsam.CustomFactor` is
-differentiated numerically: GTSAM crashes where its function leaves out a Jacobian, and does not show the function.
+Each factor is a row of its group. A group linearises any of its rows at a `LinearisationPoint`: linear factors and
+`ResidualFactors` all at once in NumPy, GTSAM's own by GTSAM, one at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import ClassVar, Protocol
 
 import gtsam
 import numpy as np
@@ -22,30 +19,33 @@ from scipy.sparse.csgraph import connected_components
 from factors import (
     FactorError,
     GaussianFactors,
-    Linearisable,
-    ResidualFactor,
     ResidualFactors,
+    Variable,
+    Vector,
+    gaussian_graph,
     nonlinear_graph,
-    nonlinear_graph_at,
 )
-from factors.gaussian import gaussian_graph, native_factor, whitened_factors
-from factors.manifolds import central_differences
-from factors.validation import KeyArray
+from factors.gaussian import nonlinear_graph_at, whitened_factors
+from factors.validation import KeyArray, format_keys
 from saga_fg.graph.variables import LARGEST_INCREMENT, GraphError, GraphVariable, LinearisationPoint
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics.arrays import BoolArray, IntArray
 
 Rows = tuple[tuple[int, ...], ...]
 
 
 class FactorGroup(Protocol):
-    """Factors that are kept together; `rows`: the keys of each, `linear`: whether linearising once is enough."""
+    """Factors of one shape; `rows`: the keys of each; `types`: of their variables, None where GTSAM checks them;
+    `linear`: whether linearising once is enough.
+    """
+
+    linear: ClassVar[bool]
 
     @property
     def name(self) -> str: ...
     @property
     def rows(self) -> Rows: ...
     @property
-    def linear(self) -> bool: ...
+    def types(self) -> tuple[Variable, ...] | None: ...
 
     def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         """The rows `chosen`, on increments from the base. Raises what the factors raise."""
@@ -54,94 +54,36 @@ class FactorGroup(Protocol):
         """The rows `chosen` as GTSAM's own factors."""
 
 
-class SolvableGroup(FactorGroup, Protocol):
-    """A group that GTSAM does not evaluate itself."""
-
-    def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
-        """The cost, -log phi, of the rows `chosen` together."""
-
-
 def members(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
     """The factors of a graph."""
     return [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
 
 
 @dataclass(frozen=True, eq=False)
-class WhitenedRows:
-    """Linear factors as arrays; dims: of the variables in `rows`; augmented: [A | b] (m, sum(dims) + 1) of each row.
-
-    Raises `GraphError` where they don't fit together, and for numbers that are not finite.
-    """
-
-    rows: Rows
-    dims: Rows
-    augmented: tuple[FloatArray, ...]
-    name: str = "linear factor"
-    linear: bool = True
-
-    def __post_init__(self) -> None:
-        for keys, dims, augmented in zip(self.rows, self.dims, self.augmented, strict=True):
-            if len(set(keys)) != len(keys) or len(dims) != len(keys) or min(dims, default=0) < 1:
-                raise GraphError(f"{self.name}: expected distinct keys with their dimensions, got {keys} with {dims}")
-            if augmented.dtype != np.float64 or augmented.ndim != 2 or augmented.shape[1] != sum(dims) + 1:
-                raise GraphError(f"{self.name}: expected {sum(dims) + 1} columns, got shape {augmented.shape}")
-            if not (np.abs(augmented) <= LARGEST_INCREMENT).all():
-                raise GraphError(
-                    f"{self.name}: expected finite numbers, at most {LARGEST_INCREMENT:g} standard deviations"
-                )
-
-    @classmethod
-    def of(cls, factors: Sequence[gtsam.JacobianFactor], variables: Mapping[int, GraphVariable]) -> Self:
-        """The arrays of GTSAM's factors on some variables."""
-        rows = tuple(tuple(factor.keys()) for factor in factors)
-        dims = tuple(tuple(variables[key].dim for key in keys) for keys in rows)
-        return cls(rows, dims, tuple(factor.augmentedJacobian() for factor in factors))
-
-    def factor(self, row: int, augmented: FloatArray) -> gtsam.JacobianFactor:
-        """A row's factor, of other numbers."""
-        return native_factor(self.rows[row], self.dims[row], augmented)
-
-    @cached_property
-    def factors(self) -> tuple[gtsam.JacobianFactor, ...]:
-        """Every row as GTSAM's factor."""
-        return tuple(self.factor(row, np.asfortranarray(augmented)) for row, augmented in enumerate(self.augmented))
-
-
-@dataclass(frozen=True, eq=False)
-class LinearGroup(WhitenedRows):
+class LinearGroup:
     """Linear factors on the variables themselves, which are vectors."""
 
-    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
-        result = []
-        for row in chosen.tolist():
-            augmented = np.array(self.augmented[row], order="F")
-            base = np.concatenate([point.base.atVector(key) for key in self.rows[row]])
-            augmented[:, -1] -= augmented[:, :-1] @ base
-            result.append(self.factor(row, augmented))
-        return result
-
-    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
-        dims = {k: d for row in chosen.tolist() for k, d in zip(self.rows[row], self.dims[row], strict=True)}
-        return members(nonlinear_graph([self.factors[row] for row in chosen.tolist()], dims))
-
-
-@dataclass(frozen=True, eq=False)
-class GaussianGroup:
-    """Linear factors of one shape on the variables themselves, which are vectors, as arrays."""
-
     factors: GaussianFactors
-    name: str = "linear factor"
-    linear: bool = True
+    linear: ClassVar[bool] = True
+    name: ClassVar[str] = "linear factor"
 
     def __post_init__(self) -> None:
         keys, dims, augmented = self.factors.rows, self.factors.dims, self.factors.augmented
         shape = (len(keys), sum(dims) + 1)
         if keys.shape != (len(keys), len(dims)) or augmented.shape[:2] != shape or augmented.dtype != np.float64:
             raise GraphError(f"{self.name}: expected arrays of {shape}, got {keys.shape} and {augmented.shape}")
+        usable = (np.abs(augmented) <= LARGEST_INCREMENT).all(axis=(1, 2))
+        if not usable.all():
+            expected = f"expected finite numbers, at most {LARGEST_INCREMENT:g} standard deviations"
+            raise GraphError(f"{self.name} on {format_keys(keys[np.argmin(usable)])}: {expected}")
 
     @cached_property
     def rows(self) -> Rows:
         return tuple(map(tuple, self.factors.rows.tolist()))
+
+    @property
+    def types(self) -> tuple[Variable, ...]:
+        return tuple(map(Vector, self.factors.dims))
 
     def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         origins = np.zeros((len(self.rows), sum(self.factors.dims)))
@@ -156,28 +98,29 @@ class GaussianGroup:
 
 
 @dataclass(frozen=True, eq=False)
-class PriorGroup(WhitenedRows):
-    """Priors left by marginalised variables: linear factors on increments from the base."""
+class PriorGroup(LinearGroup):
+    """A prior left by marginalised variables: a linear factor on increments from the base."""
 
-    name: str = "marginal"
+    name: ClassVar[str] = "marginal"
 
     def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
-        return [self.factors[row] for row in chosen.tolist()]
+        return self.factors.native(chosen=chosen.tolist())
 
     def here(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         """Factors on increments from the linearisation point."""
-        result = []
+        augmented = self.factors.augmented.copy()
         for row in chosen.tolist():
-            keys, dims, augmented = self.rows[row], self.dims[row], np.array(self.augmented[row], order="F")
-            augmented[:, -1] -= augmented[:, :-1] @ np.concatenate([point.increment(key) for key in keys])
-            for key, end, dim in zip(keys, np.cumsum(dims).tolist(), dims, strict=True):
-                columns, D = slice(end - dim, end), point.transport(key)
+            keys, start = self.rows[row], 0
+            augmented[row, -1] -= np.concatenate([point.increment(key) for key in keys]) @ augmented[row, :-1]
+            for key, dim in zip(keys, self.factors.dims, strict=True):
+                columns, D = slice(start, start + dim), point.transport(key)
                 if D is not None:
-                    augmented[:, columns] = augmented[:, columns] @ np.linalg.inv(D)
-            result.append(self.factor(row, augmented))
-        return result
+                    augmented[row, columns] = np.linalg.inv(D).T @ augmented[row, columns]
+                start += dim
+        return replace(self.factors, augmented=augmented).native(chosen=chosen.tolist())
 
     def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
+        """The cost, -log phi, of the rows `chosen` together."""
         return 0.5 * sum(float(np.sum(f.augmentedJacobian()[:, -1] ** 2)) for f in self.here(chosen, point))
 
     def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
@@ -185,11 +128,11 @@ class PriorGroup(WhitenedRows):
 
 
 @dataclass(frozen=True, eq=False)
-class StackedGroup:
+class ResidualGroup:
     """Nonlinear factors of one shape, linearised together."""
 
     factors: ResidualFactors
-    linear: bool = False
+    linear: ClassVar[bool] = False
 
     @cached_property
     def rows(self) -> Rows:
@@ -199,64 +142,34 @@ class StackedGroup:
     def name(self) -> str:
         return self.factors.name
 
+    @property
+    def types(self) -> tuple[Variable, ...]:
+        return self.factors.types
+
     def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         W, jacobians, residuals = self.factors.linearisation(point.values, chosen)
-        keys, rhs, blocks = self.factors.rows[chosen], -residuals, []
-        if point.base is point.values:
-            return whitened_factors(keys, W, jacobians, rhs).native()
-        states, origins = self.factors.states(point.values, chosen), self.factors.states(point.base, chosen)
-        for k, J in enumerate(jacobians):
-            column = keys[:, k].tolist()
-            if states[k].ndim == 2:  # vectors
-                delta = states[k] - origins[k]
-            else:
+        keys, rhs, blocks = self.factors.rows[chosen], -residuals, jacobians
+        if point.base is not point.values:
+            blocks = []
+            for k, J in enumerate(jacobians):
+                column = keys[:, k].tolist()
                 delta = np.stack([point.increment(key) for key in column])
                 D = [point.transport(key) for key in column]
-                J = np.stack([a if d is None else a @ d for a, d in zip(J, D, strict=True)])
-            rhs = rhs + (J @ delta[:, :, None])[:, :, 0]
-            blocks.append(J)
+                if any(one is not None for one in D):
+                    J = np.stack([a if d is None else a @ d for a, d in zip(J, D, strict=True)])
+                rhs = rhs + (J @ delta[:, :, None])[:, :, 0]
+                blocks.append(J)
         largest = np.abs(W).max(initial=0.0) * max(np.abs(numbers).max(initial=0.0) for numbers in (rhs, *blocks))
         if not largest <= LARGEST_INCREMENT:
             raise FactorError(f"expected a residual and Jacobians of at most {LARGEST_INCREMENT:g} standard deviations")
         return whitened_factors(keys, W, blocks, rhs).native()
 
     def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
+        """The cost, -log phi, of the rows `chosen` together."""
         return float(self.factors.errors(point.values, chosen).sum())
 
     def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
-        singles = self.factors.individual_factors()
-        return [singles[row].as_custom_factor() for row in chosen.tolist()]
-
-
-@dataclass(frozen=True, eq=False)
-class SingleGroup:
-    """One factor of ours or a user's, that linearises itself."""
-
-    factor: Linearisable
-    rows: Rows
-    name: str
-    linear: bool = False
-
-    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
-        made = self.factor.linearise(point.values)
-        (keys,) = self.rows
-        if not isinstance(made, gtsam.GaussianFactor | gtsam.GaussianFactorGraph):
-            raise FactorError(f"expected linearise to give a gtsam.GaussianFactor, got {type(made).__name__}")
-        graph = gaussian_graph([made]) if isinstance(made, gtsam.GaussianFactor) else made
-        if set(graph.keyVector()) != set(keys):
-            raise FactorError("expected linearise to speak of all of the factor's keys, and of no others")
-        if isinstance(made, gtsam.GaussianFactor):
-            return [point.from_base(list(made.keys()), made.augmentedJacobian())]
-        A, b = made.jacobian(gtsam.Ordering(list(keys)))
-        return [point.from_base(keys, np.column_stack([A, b]))]
-
-    def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
-        return self.factor.error(point.values)
-
-    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
-        if not isinstance(self.factor, ResidualFactor):
-            raise FactorError(f"{self.name}: expected a ResidualFactor, which GTSAM's solvers can call")
-        return [self.factor.as_custom_factor()]
+        return list(self.factors.custom_factors(chosen.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +179,16 @@ class NativeGroup:
     factor: gtsam.NonlinearFactor
     rows: Rows
     name: str
-    linear: bool = False
+    linear: ClassVar[bool] = False
+
+    @property
+    def types(self) -> tuple[Variable, ...] | None:
+        """Those of factors on vectors, whose lengths GTSAM does not check."""
+        if isinstance(self.factor, gtsam.PriorFactorVector):
+            return (Vector(len(self.factor.prior())),)
+        if isinstance(self.factor, gtsam.BetweenFactorVector):
+            return (Vector(len(self.factor.measured())),) * 2
+        return None
 
     def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         made = self.factor.linearize(point.values)
@@ -277,54 +199,10 @@ class NativeGroup:
 
 
 @dataclass(frozen=True, eq=False)
-class CustomGroup:
-    """A `gtsam.CustomFactor`, by central differences of its residual."""
-
-    factor: gtsam.CustomFactor
-    rows: Rows
-    name: str = "custom factor"
-    linear: bool = False
-
-    def linearised(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
-        (keys,) = self.rows
-        types = [point.variables[key].type for key in keys]
-        states = [kind.read(point.values, key) for key, kind in zip(keys, types, strict=True)]
-        noise = self.factor.noiseModel()
-
-        def residual(*moved: Any) -> FloatArray:
-            return self._residual(keys, moved)
-
-        r = residual(*states)
-        J = central_differences(residual, states, types)
-        whitener = noise.noise() if isinstance(noise, gtsam.noiseModel.Robust) else noise
-        whitened = np.column_stack([whitener.whiten(column) for column in np.column_stack([*J, -r]).T])
-        if isinstance(noise, gtsam.noiseModel.Robust):
-            whitened *= np.sqrt(noise.weight(whitened[:, -1]))
-        return [point.from_base(keys, whitened)]
-
-    def error(self, chosen: IntArray, point: LinearisationPoint) -> float:
-        return float(self.factor.error(point.values))
-
-    def native(self, chosen: IntArray, point: LinearisationPoint) -> list[gtsam.NonlinearFactor]:
-        return [self.factor]
-
-    def _residual(self, keys: Sequence[int], states: Sequence[Any]) -> FloatArray:
-        values = gtsam.Values()  # its own variables alone: GTSAM copies all of them for every call
-        for key, state in zip(keys, states, strict=True):
-            values.insert(key, state)
-        residual = np.asarray(self.factor.unwhitenedError(values), dtype=np.float64)
-        if len(residual) != self.factor.noiseModel().dim():
-            raise FactorError(
-                f"expected a residual of {self.factor.noiseModel().dim()} entries, as its noise, got {len(residual)}"
-            )
-        return residual
-
-
-@dataclass(frozen=True, eq=False)
 class ActiveRows:
     """The rows of a group that are still there, for `factors.solve`."""
 
-    group: SolvableGroup
+    group: PriorGroup | ResidualGroup
     chosen: IntArray
     point: LinearisationPoint
 
@@ -337,12 +215,10 @@ class ActiveRows:
 
     def linearise(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         if isinstance(self.group, PriorGroup):
-            return gaussian_graph(
-                self.group.here(self.chosen, LinearisationPoint(self.point.variables, self.point.base, values))
-            )
-        return gaussian_graph(
-            self.group.linearised(self.chosen, LinearisationPoint(self.point.variables, values, values))
-        )
+            there = LinearisationPoint(self.point.variables, self.point.base, values)
+            return gaussian_graph(self.group.here(self.chosen, there))
+        there = LinearisationPoint(self.point.variables, values, values)
+        return gaussian_graph(self.group.linearised(self.chosen, there))
 
 
 @dataclass(frozen=True)
@@ -384,18 +260,10 @@ class HeldGroup:
         Householder's QR loses digits of rows of small numbers where rows of large ones come after them: with intervals
         of a millisecond, whose interactions have next to no noise, three to five digits.
         """
-        group, most = self.factors, max(map(len, self.factors.rows))
-        sharpest = float(np.abs(group.factors.augmented[:, :-1]).max()) if isinstance(group, GaussianGroup) else most
-        return isinstance(group, PriorGroup), most == 1, -sharpest
-
-
-def first_residual(group: FactorGroup) -> ResidualFactor | None:
-    """The first factor of a group that is made of residual functions."""
-    if isinstance(group, StackedGroup) and len(group.rows):
-        return group.factors.individual_factor(0)
-    if isinstance(group, SingleGroup) and isinstance(group.factor, ResidualFactor):
-        return group.factor
-    return None
+        group = self.factors
+        alone = all(len(keys) == 1 for keys in group.rows)
+        sharpest = float(np.abs(group.factors.augmented[:, :-1]).max()) if isinstance(group, LinearGroup) else 0.0
+        return isinstance(group, PriorGroup), alone, -sharpest
 
 
 class FactorIndex:

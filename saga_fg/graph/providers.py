@@ -16,14 +16,14 @@ it is asked when an epoch begins, while the variables of the epoch before are st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
-from saga_fg.graph.factor_checks import Factor, mentioned_keys, with_names
+from saga_fg.graph.factor_checks import Factor, each_factor, mentioned_keys, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphError, GraphVariable, NewVariable, ProviderError, VariableKind, key_of
 from saga_fg.numerics.arrays import FloatArray
@@ -221,7 +221,7 @@ def _ask(name: str, provider: FactorProvider, graph: SceneFactorGraph, view: Gra
 
 
 def _add(provider: str, factors: Any, name: Hashable, graph: SceneFactorGraph, view: GraphView) -> None:
-    given = list(factors) if isinstance(factors, Iterator) else factors
+    given = each_factor(provider, factors)
     view.take_in(mentioned_keys(given))
     graph.add_factors(provider, given, name)
 

@@ -33,17 +33,23 @@ import numpy as np
 from factors import FactorError, Solution, SolverSettings, Vector, marginal_factors, solve
 from factors.gaussian import Elimination
 from saga_fg.errors import require_type
-from saga_fg.graph.factor_checks import Factor, check_angles, check_variables, factor_error, grouped, solver_error
+from saga_fg.graph.factor_checks import (
+    Factor,
+    check_angles,
+    check_variables,
+    factor_error,
+    grouped,
+    solver_error,
+    stacked,
+)
 from saga_fg.graph.factor_groups import (
     ActiveRows,
     FactorEntry,
     FactorIndex,
-    GaussianGroup,
     HeldGroup,
     LinearGroup,
-    NativeGroup,
     PriorGroup,
-    StackedGroup,
+    ResidualGroup,
 )
 from saga_fg.graph.variables import (
     GraphError,
@@ -80,7 +86,7 @@ class Condensation(Protocol):
 
 
 _MARGINALS = "marginals"
-_RECORDED = (LinearGroup, PriorGroup, GaussianGroup, StackedGroup)  # groups that are values
+_RECORDED = (LinearGroup, ResidualGroup)  # groups that are values
 _FEW = 5  # factors of a kind whose angles are checked: a measured angle of 0 tells nothing
 WIDE = 256  # dimensions that hang together, from which Cholesky, with half the digits, takes half as long as QR
 
@@ -251,15 +257,15 @@ class SceneFactorGraph:
 
     def replace_rows(
         self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
-    ) -> int | None:
+    ) -> list[int]:
         """Put priors, on increments from the base, in place of rows of groups and of the variables `leaving`.
 
-        They are all rows on these. Returns the number of the priors' group.
+        They are all rows on these. Returns the numbers of the priors' groups, one each.
         """
-        number = self._replace(rows, factors, leaving)
+        numbers = self._replace(rows, factors, leaving)
         if factors:
             self._choose(max(factor.cols() - 1 for factor in factors))
-        return number
+        return numbers
 
     def replace_by_prior(self, leaving: Collection[int], prior: gtsam.JacobianFactor) -> None:
         """Put a prior, on increments from the base, in place of all factors on its variables and those `leaving`."""
@@ -267,14 +273,12 @@ class SceneFactorGraph:
 
     def _replace(
         self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
-    ) -> int | None:
+    ) -> list[int]:
         """Take rows of groups out and put priors in, then take out the variables without any factor left."""
-        added = None
+        priors = [PriorGroup(stacked([factor], self.point().dims(factor.keys()))) for factor in factors]
         for number, mine in rows.items():
             self._index.deactivate(number, mine)
-        if factors:
-            prior = PriorGroup.of(factors, self._variables)
-            added = self._index.add(HeldGroup(_MARGINALS, None, prior, np.ones(len(factors), dtype=bool)))
+        added = [self._index.add(HeldGroup(_MARGINALS, None, prior, np.ones(1, dtype=bool))) for prior in priors]
         self._separate()
         for key in leaving:
             del self._variables[key], self.births[key]
@@ -357,11 +361,11 @@ class SceneFactorGraph:
         """
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
         for held, rows in ((held, held.rows) for held in self.sharpest_first()) if part is None else part:
-            if isinstance(held.factors, GaussianGroup | LinearGroup | NativeGroup):
+            if isinstance(held.factors, PriorGroup | ResidualGroup):
+                ours.append(ActiveRows(held.factors, rows, point))
+            else:
                 for factor in held.factors.native(rows, point):
                     native.add(factor)
-            else:
-                ours.append(ActiveRows(held.factors, rows, point))  # type: ignore[arg-type]
         return native, ours
 
     def sharpest_first(self) -> list[HeldGroup]:

@@ -16,8 +16,8 @@ Keys of variables: kind, id and epoch in one number.
     64 bits  =  letter of the kind (8)  |  id (28)  |  epoch (28)
 
 An epoch is a moment of the graph, numbered from 0. What does not move has one variable for all time: its epoch is None,
-stored as all ones. GTSAM prints such a key as a symbol; `key_id` reads it back, and a graph that holds the variable
-names it as people do: "car 12 at 3.40 s".
+stored as all ones. GTSAM prints such a key as a symbol; a graph that holds the variable names it as people do:
+"car 12 at 3.40 s".
 
 Linearisation points of factors: the value of every variable, and its increment from the base.
 
@@ -92,15 +92,6 @@ MAP_NODE = VariableKind("map node", "m")
 KINDS = (OBJECT, EGO_POSE, EGO_VELOCITY, EGO_BIAS, EGO_ERROR, EGO_CALIBRATION, LANDMARK, MAP_NODE)
 
 
-@dataclass(frozen=True)
-class KeyId:
-    """The parts of a key; epoch: None for what has one variable for all time."""
-
-    letter: str
-    id: int
-    epoch: int | None
-
-
 def key_of(kind: VariableKind, id: int, epoch: int | None) -> int:  # noqa: A002 -- GTSAM and the tables call it id
     """Return the key. Raises `GraphError` for an id or epoch that is no whole number from 0 to `LARGEST`."""
     if type(id) is int and type(epoch) is int and 0 <= id <= LARGEST and 0 <= epoch <= LARGEST:
@@ -122,24 +113,13 @@ def node_key(node: int, epoch: int | None) -> int:
     return key_of(*node_kind(node), epoch)
 
 
-def key_id(key: int) -> KeyId:
-    """Return the parts of a key. Raises `GraphError` for one of another scheme."""
-    letter = chr(int(key) >> 2 * _BITS)
-    if not (letter.isascii() and letter.isalpha()):
-        raise GraphError(f"{key}: expected a key made by key_of")
-    when = int(key) & _FOR_ALL_TIME
-    return KeyId(letter, int(key) >> _BITS & _FOR_ALL_TIME, None if when == _FOR_ALL_TIME else when)
-
-
 def described(key: int) -> str:
     """Describe a key whose variable is not known."""
-    try:
-        parts = key_id(key)
-    except GraphError:
+    letter, name, epoch = chr(key >> 2 * _BITS), key >> _BITS & _FOR_ALL_TIME, key & _FOR_ALL_TIME
+    if not (letter.isascii() and letter.isalpha()):
         return f"variable {key}"
-    names = {kind.letter: kind.name for kind in KINDS}
-    name = f"{names.get(parts.letter, f'variable {parts.letter}')} {parts.id}"
-    return name if parts.epoch is None else f"{name} of epoch {parts.epoch}"
+    kind = {one.letter: one.name for one in KINDS}.get(letter, f"variable {letter}")
+    return f"{kind} {name}" if epoch == _FOR_ALL_TIME else f"{kind} {name} of epoch {epoch}"
 
 
 _STEP = 1e-6

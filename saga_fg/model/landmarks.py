@@ -28,8 +28,7 @@ from factors import (
     line_factors,
     plane,
     plane_factor,
-    point_factors,
-    relative_detection_factors,
+    relative_factors,
 )
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -69,7 +68,7 @@ class PointLandmark(Settings):
         return Vector(self.dim)
 
     def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
-        return [point_factors(rows, observed, covariances)]
+        return [relative_factors(rows, observed, covariances, self.dim, range(self.dim))]
 
     def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> FloatArray:
         return world_T_pose[: self.dim, : self.dim] @ observed + world_T_pose[: self.dim, self.dim]
@@ -132,11 +131,11 @@ class PlaneLandmark(Settings):
     def variable(self) -> OrientedPlane:
         return OrientedPlane()
 
-    def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph()
-        for (pose, landmark), z, covariance in zip(rows.tolist(), observed, covariances, strict=True):
-            graph.add(plane_factor(pose, landmark, z, covariance))
-        return graph
+    def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[gtsam.NonlinearFactor]:
+        return [
+            plane_factor(pose, landmark, z, covariance)
+            for (pose, landmark), z, covariance in zip(rows.tolist(), observed, covariances, strict=True)
+        ]
 
     def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> gtsam.OrientedPlane3:
         return plane("observed plane", observed).transform(gtsam.Pose3(world_T_pose).inverse())
@@ -162,7 +161,7 @@ class PoleLandmark(Settings):
         return Vector(2)
 
     def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
-        return [relative_detection_factors(rows, observed, covariances, state_dim=2)]
+        return [relative_factors(rows, observed, covariances, 2)]
 
     def initialise(self, world_T_pose: FloatArray, observed: FloatArray) -> FloatArray:
         return (world_T_pose[:3, :3] @ observed + world_T_pose[:3, 3])[:2]

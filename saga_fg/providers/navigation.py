@@ -29,7 +29,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import ImuBias, ResidualFactor, Robust, SpatialPose, Vector, position_factor, prior_factor
+from factors import ImuBias, PlanarPose, ResidualFactors, Robust, SpatialPose, Vector, prior_factor, residual_factor
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Additions, GraphView
@@ -81,7 +81,8 @@ class Gps(Settings):
         R = R[:dim, :dim]
         robust = None if math.isinf(self.outlier_scale) else Robust("cauchy", self.outlier_scale)
         antenna = _moved_back(view, pose.key, np.array(self.antenna), fix.age)
-        factor = position_factor(pose.key, z, R, antenna, robust)
+        on_vehicle, of_pose = antenna[:dim], PlanarPose() if dim == 2 else SpatialPose()
+        factor = residual_factor([pose.key], [of_pose], partial(_off, z, on_vehicle), R, robust=robust, name="fix")
         if self.gate < 1:
             values = gtsam.Values()
             values.insert(pose.key, view.state(pose.key))
@@ -101,13 +102,14 @@ class Gps(Settings):
         if ANTENNA not in view.static(EGO_CALIBRATION):
             new.append(NewVariable(EGO_CALIBRATION, ANTENNA, place, static=True, label="place of the antenna"))
             priors.append(prior_factor(key, place, ANTENNA_DEVIATION**2 * np.eye(3)))
-        types = (SpatialPose(), Vector(3))
-        function = partial(_by_antenna, z, antenna - place)
-        return Additions(new, [*priors, ResidualFactor((pose.key, key), types, function, R, robust=robust, name="fix")])
+        function = partial(_off, z, antenna - place)
+        factor = residual_factor([pose.key, key], [of_pose, Vector(3)], function, R, robust=robust, name="fix")
+        return Additions(new, [*priors, factor])
 
 
-def _by_antenna(z: FloatArray, moved: FloatArray, pose: gtsam.Pose3, antenna: FloatArray) -> FloatArray:
-    return np.asarray(pose.transformFrom(antenna + moved) - z)
+def _off(z: FloatArray, place: FloatArray, pose: gtsam.Pose2 | gtsam.Pose3, *antenna: FloatArray) -> FloatArray:
+    """How far off a fix is; antenna: where it is estimated, its place, which `place` is then counted from."""
+    return np.asarray(pose.transformFrom(sum(antenna, place)) - z)
 
 
 def _moved_back(view: GraphView, key: int, antenna: FloatArray, age: float) -> FloatArray:
@@ -214,11 +216,11 @@ class Imu(Settings):
         new = NewVariable(EGO_CALIBRATION, INERTIAL, np.zeros(3), static=True, label="rotation of the imu")
         return key, Additions([new], [prior_factor(key, np.zeros(3), ROTATION_DEVIATION**2 * np.eye(3))])
 
-    def _turned(self, keys: tuple[int, ...], measured: gtsam.PreintegratedCombinedMeasurements) -> ResidualFactor:
+    def _turned(self, keys: tuple[int, ...], measured: gtsam.PreintegratedCombinedMeasurements) -> ResidualFactors:
         types = (SpatialPose(), Vector(3), SpatialPose(), Vector(3), ImuBias(), ImuBias(), Vector(3))
         native = gtsam.CombinedImuFactor(*keys[:6], measured)  # type: ignore[call-overload]
         covariance = native.noiseModel().covariance()
-        return ResidualFactor(keys, types, partial(_turned, native, self._place), covariance, name="inertial samples")
+        return residual_factor(keys, types, partial(_turned, native, self._place), covariance, name="inertial samples")
 
     def _preintegrated(
         self, view: GraphView, pose: gtsam.Pose3, bias: gtsam.imuBias.ConstantBias

@@ -27,7 +27,6 @@ import numpy as np
 
 from factors import (
     Pose,
-    ResidualFactor,
     Robust,
     SpatialPose,
     Variable,
@@ -36,6 +35,7 @@ from factors import (
     pose,
     pose_prior_factor,
     prior_factor,
+    residual_factor,
 )
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
@@ -239,7 +239,7 @@ class Wheels(Settings):
                 priors.append(prior_factor(scale, np.ones(1), [[SCALE_DEVIATION**2]]))
         residual = partial(_residual, self._place, view.dt, wheels.speed)
         robust = Robust("cauchy", self.outlier_scale)
-        factor = ResidualFactor(tuple(keys), tuple(types), residual, R, robust=robust, name="speed of the wheels")
+        factor = residual_factor(keys, types, residual, R, robust=robust, name="speed of the wheels")
         return Additions(new, [*priors, factor])
 
 

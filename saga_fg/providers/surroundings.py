@@ -15,10 +15,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
-from factors import ResidualFactors, Robust, lane_keeping_factors, prior_factor, relative_detection_factors
+from factors import ResidualFactors, Robust, lane_keeping_factors, prior_factor, relative_factors
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Additions, GraphView
@@ -61,8 +60,7 @@ class Landmarks(Settings):
                 start = kind.initialise(world_T_pose, seen.value)
                 new[name] = NewVariable(LANDMARK, name, start, static=True, label=kind.name, type=kind.variable)
             rows = np.array([[pose.key, view.key(LANDMARK, name, static=True)]], dtype=np.int64)
-            given = kind.factors(rows, seen.value[None], seen.covariance[None])
-            factors += [given] if isinstance(given, gtsam.NonlinearFactorGraph) else given
+            factors += kind.factors(rows, seen.value[None], seen.covariance[None])
         return Additions(list(new.values()), factors)
 
     def _observations(self, view: GraphView, planar: bool) -> Iterator[tuple[int, Observation]]:
@@ -107,32 +105,29 @@ class LaneKeeping(Settings):
         states = np.array([view.state(one.key)[:4] for one in objects])  # (x, y, vx, vy, ...)
         known, new, factors = view.static(MAP_NODE), list[NewVariable](), list[Factor]()
         for number, lane in enumerate(self.lanes):
-            mine, frames = self._in_lane(lane, states, view.origin)
+            mine, feet_there, normals = self._in_lane(lane, states, view.origin)
             if len(mine) == 0:
                 continue
             key = view.key(MAP_NODE, number, static=True)
             if number not in known:
                 new.append(NewVariable(MAP_NODE, number, np.zeros(1), static=True, label=f"lane {lane.name}"))
                 factors.append(prior_factor(key, np.zeros(1), [[self.map_deviation**2]]))
-            for row, frame in zip(mine.tolist(), frames, strict=True):
+            for row, foot, normal in zip(mine.tolist(), feet_there, normals, strict=True):
                 one = objects[row]
-                rows, variance = np.array([[one.key, key]], dtype=np.uint64), self.deviation**2 / view.dt
+                rows, variances = np.array([[one.key, key]], dtype=np.uint64), [self.deviation**2 / view.dt]
                 loss = Robust("cauchy", _LETS_GO)
-                factors.append(lane_keeping_factors(rows, variance, frame, 1, one.dim, robust=loss))
+                factors.append(lane_keeping_factors(rows, variances, foot[None], normal[None], one.dim, robust=loss))
         return Additions(new, factors)
 
-    def _in_lane(self, lane: Lane, states: FloatArray, origin: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Rows (k,) of the states that go along a lane, and world_T_curve (k, 4, 4) at their feet."""
+    def _in_lane(self, lane: Lane, states: FloatArray, origin: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Rows (k,) of the states that go along a lane, their feet (k, 2) on it, and the normals (k, 2) there."""
         centre, speed = np.array(lane.centre) - origin, np.hypot(*states[:, 2:].T)
         at = feet(centre, states[:, :2])
         along = np.einsum("ni,ni->n", at.direction, states[:, 2:])
         inside = on_it(centre, at.s) & (np.abs(at.e) < lane.width / 2)
         mine = np.flatnonzero(inside & (speed >= MIN_SPEED) & (along >= _ALONG * speed))
-        frames = np.tile(np.eye(4), (len(mine), 1, 1))
         x, y = at.direction[mine].T
-        frames[:, :2, 0], frames[:, :2, 1] = np.stack([x, y], axis=1), np.stack([-y, x], axis=1)
-        frames[:, :2, 3] = at.point[mine]
-        return mine, frames
+        return mine, at.point[mine], np.stack([-y, x], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +153,7 @@ class RelativeDetections:
             raise InputError(NO_POSE)
         rows = np.array([[pose.key, view.key(OBJECT, node)] for node in self.nodes.tolist()], dtype=np.uint64)
         z = self.z[:, : 2 if pose.dim == 3 else 3]
-        return Additions(factors=[relative_detection_factors(rows, z, self.R, self.dim, self.position)])
+        return Additions(factors=[relative_factors(rows, z, self.R, self.dim, self.position)])
 
 
 _SURELY_MOVING = 4.0  # residual from which the loss lets a moving object go, standard deviations

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factors import relative_detection_factors
+from factors import relative_factors
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, key_of
 from saga_fg.model.interactions import POSITION, NodeTable
@@ -240,7 +240,7 @@ def relative_covariances(joint: JointTrackState, ids: IntArray, label: StrArray)
         places = np.tile(T[:n, n], (len(rows), 1))
         places[:, :2] = states[:, [x, y]]
         keys = np.stack([np.zeros(len(rows)), np.arange(1, len(rows) + 1)], axis=1).astype(np.uint64)
-        seen = relative_detection_factors(keys, (places - T[:n, n]) @ T[:n, :n], np.eye(2), node_type.dim, (x, y))
+        seen = relative_factors(keys, (places - T[:n, n]) @ T[:n, :n], np.eye(2), node_type.dim, (x, y))
         assert seen.jacobians is not None
         J_pose, J_state = (np.asarray(J) for J in seen.jacobians(poses, states))
         G = turn @ np.concatenate([J_pose, J_state], axis=2)

@@ -21,9 +21,9 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covar
 if TYPE_CHECKING:  # frames bring observations of landmarks, and are read before anything is estimated
     import gtsam
 
-    from factors import Linearisable, PlanarPose, SpatialPose, Variable
+    from factors import PlanarPose, ResidualFactors, SpatialPose, Variable
 
-LandmarkFactors: TypeAlias = "Sequence[Linearisable] | gtsam.NonlinearFactorGraph"
+LandmarkFactors: TypeAlias = "Sequence[ResidualFactors | gtsam.NonlinearFactor]"
 
 
 class LandmarkType(Protocol):

@@ -3,8 +3,6 @@
 All of it happens in interpreters of their own, because the failure it guards against is the end of the interpreter.
 """
 
-import json
-
 TRAPS = {
     "block of wrong height": "gaussian_factor([1, 2], [I2, np.eye(3)], np.zeros(2))",
     "right-hand side of wrong length": "gaussian_factor([1], [I2], np.zeros(3), np.eye(3))",
@@ -15,8 +13,7 @@ TRAPS = {
     "indefinite covariance": "prior_factor(1, np.zeros(2), -I2)",
     "nan in a mean": "prior_factor(1, [np.nan, 0.0], I2)",
     "nan in a covariance": "prior_factor(1, [0.0, 0.0], [[1.0, np.nan], [np.nan, 1.0]])",
-    "nan in a measurement": "linear_detection_factor(1, position(4), [np.nan, 0.0], I2)",
-    "nan in a nonlinear measurement": "detection_factor(1, Radar(4), [1.0, np.nan, 0.0], np.eye(3))",
+    "nan in a nonlinear measurement": "detection_factors([1], Radar(4), [[1.0, np.nan, 0.0]], np.eye(3))",
     "nan in an interaction": "interaction_factor(1, [2], [[[np.nan]]], [0.0], [[1.0]])",
     "empty factor": "gaussian_factor([], [], [])",
     "factor without rows": "gaussian_factor([1], [np.zeros((0, 2))], np.zeros(0))",
@@ -40,7 +37,6 @@ TRAPS = {
     "covariance of a free variable": "marginal_moments(gaussian_graph([loose]), [1, 2])",
     "solving with a free variable": "solve(nonlinear_graph([loose], {1: 3, 2: 2}), [], values)",
     "custom factor without Jacobians": "solve(graph_of(lambda this, values, H: values.atVector(1)), [], values)",
-    "custom factor with a Jacobian too small": "solve(graph_of(narrow), [], values)",
     "linearising a custom factor without Jacobians": "linearised(graph_of(lambda *_: np.zeros(3)), [], values)",
     "solving with another type of variable": "solve(nonlinear_graph([flat], {1: 2}), [], posed)",
 }
@@ -61,11 +57,6 @@ def graph_of(evaluate):
     graph = nonlinear_graph([gaussian_factor([2], [I2], np.zeros(2))], {{2: 2}})
     graph.add(gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(3, 0.5), [1], evaluate))
     return graph
-
-def narrow(this, values, H):
-    if H is not None:
-        H[0] = np.eye(2)
-    return values.atVector(1)
 
 for name, call in {TRAPS!r}.items():
     print(name, end=": ", flush=True)  # so that a crash tells where
@@ -96,13 +87,12 @@ FAULTS = {
 }
 
 SETTING = """
-import json
 fault = None  # or what the functions do instead of what they should
 def residual(x, y):
     return eval(fault[0]) if fault else x - y[:2]
 def jacobians(x, y):
     return eval(fault[1]) if fault else [np.eye(2), -np.eye(2, 3)]
-factor = ResidualFactor((1, 2), (Vector(2), Vector(3)), residual, np.eye(2), jacobians)
+factor = residual_factor((1, 2), (Vector(2), Vector(3)), residual, np.eye(2), jacobians)
 values = gtsam.Values()
 values.insert(1, np.ones(2))
 values.insert(2, np.zeros(3))
@@ -116,13 +106,12 @@ def test_faulty_functions_in_gtsams_optimisers_are_exceptions(run_apart):
         SETTING
         + f"""
 graph = priors.clone()
-graph.add(factor.as_custom_factor())
+graph.add(factor.custom_factors()[0])
 attempts = (
     lambda: gtsam.LevenbergMarquardtOptimizer(graph, values).optimize(),
     lambda: gtsam.GaussNewtonOptimizer(graph, values).optimize(),
     lambda: graph.linearize(values),
     lambda: solve(priors, [factor], values),
-    lambda: factor.as_tolerant_custom_factor(values, print),
 )
 for name, wrong in {FAULTS!r}.items():
     for attempt in attempts:
@@ -138,44 +127,9 @@ for name, wrong in {FAULTS!r}.items():
 """
     )
     lines = run_apart(code).splitlines()
-    assert len(lines) == 5 * len(FAULTS)
+    assert len(lines) == 4 * len(FAULTS)
     for i, line in enumerate(lines):
-        assert line.startswith(f"{list(FAULTS)[i // 5]}: refused, factor on 1, 2: ")
-
-
-def test_isam2_outlives_faulty_functions(run_apart):
-    code = (
-        SETTING
-        + f"""
-careful = gtsam.ISAM2Params()
-careful.setRelinearizeThreshold(0.0)
-careful.relinearizeSkip = 1
-told = {{}}
-for name, wrong in {FAULTS!r}.items():
-    failures, fault = [], None
-    graph = priors.clone()
-    graph.add(factor.as_tolerant_custom_factor(values, failures.append))
-    isam = gtsam.ISAM2(careful)
-    isam.update(graph, values)
-    right = isam.calculateBestEstimate().atVector(1)
-    fault = wrong
-    isam.update()
-    isam.update()
-    np.testing.assert_allclose(isam.calculateBestEstimate().atVector(1), right, atol=1e-9)
-    assert all(failure.__traceback__ is None for failure in failures)  # its frames would hold what GTSAM lent
-    told[name], fault = [str(failure) for failure in failures], None
-    failures.clear()
-    more = gtsam.Values()
-    more.insert(3, np.zeros(2))
-    isam.update(nonlinear_graph([prior_factor(3, [4.0, 5.0], np.eye(2))], {{3: 2}}), more)
-    np.testing.assert_allclose(isam.calculateBestEstimate().atVector(3), [4.0, 5.0])
-    assert not failures
-print(json.dumps(told))
-"""
-    )
-    told = json.loads(run_apart(code))
-    assert list(told) == list(FAULTS)
-    assert all(failures and failures[0].startswith("factor on 1, 2: ") for failures in told.values())
+        assert line.startswith(f"{list(FAULTS)[i // 4]}: refused, factor on 1, 2: ")
 
 
 def test_traceback_of_a_faulty_function_can_be_printed(run_apart):
@@ -186,7 +140,7 @@ def test_traceback_of_a_faulty_function_can_be_printed(run_apart):
 import gc
 def failing_frames():
     graph = priors.clone()
-    graph.add(factor.as_custom_factor())
+    graph.add(factor.custom_factors()[0])
     try:
         graph.linearize(values)
     except FactorError as error:
@@ -215,7 +169,7 @@ def test_incremental_solver_far_from_zero_is_right(run_apart):
         factors = [prior_factor(0, [50.0, -30.0], np.eye(2))]
         if t:
             factors = [interaction_factor(t, [t - 1], [F], [3.0, -4.0], 0.1 * np.eye(2))]
-            factors.append(linear_detection_factor(t, position(2), [50.0 + 10 * t, -30.0], np.eye(2)))
+            factors.append(prior_factor(t, [50.0 + 10 * t, -30.0], np.eye(2)))
         everything += factors
         start = gtsam.Values()
         start.insert(t, 40 * rng.normal(size=2))

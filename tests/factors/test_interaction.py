@@ -13,9 +13,9 @@ from factors import (
     interaction_factor,
     interaction_factors,
     nonlinear_graph,
-    nonlinear_graph_at,
     prior_factor,
 )
+from factors.gaussian import nonlinear_graph_at
 
 
 def random_states(rng, dims):
@@ -27,8 +27,8 @@ def random_states(rng, dims):
     return states, vectors, values
 
 
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("neighbours", [0, 1, 2, 5, 30])
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("neighbours", [0, 1, 5, 30])
 def test_error_is_the_mahalanobis_distance(seed, neighbours, covariance):
     rng = np.random.default_rng(seed)
     keys = rng.permutation(1000)[: neighbours + 2].tolist()  # unsorted
@@ -74,9 +74,13 @@ def test_whole_step_equals_factors_one_by_one(seed, d, e, covariance):
     rng = np.random.default_rng(seed)
     n = 12
     nexts, keys, indptr, F, b, Q = step(rng, n, rng.integers(0, 6, n), d, e, covariance)
-    together = interaction_factors(nexts, keys, indptr, F, b, Q)
-    assert len(together) == n
-    for i, factor in enumerate(together):
+    made = {
+        factor.keys()[0]: factor
+        for stack in interaction_factors(nexts, keys, indptr, F, b, Q)
+        for factor in stack.native()
+    }
+    assert sorted(made) == nexts.tolist()
+    for i, factor in enumerate(map(made.get, nexts.tolist())):
         own = slice(indptr[i], indptr[i + 1])
         alone = interaction_factor(int(nexts[i]), keys[own].tolist(), list(F[own]), b[i], Q[i])
         assert factor.keys() == alone.keys()
@@ -109,7 +113,7 @@ def test_bad_steps_are_refused_by_name(covariance):
         ({"indptr": [0.0, 2.0, 3.0, 5.0]}, "indptr"),
         ({"keys": [0, 0, 1, 0, 1]}, "0 occurs twice in one factor, the one on 1000, 0, 0"),
         ({"keys": [0, 1000, 1, 0, 1]}, "1000 occurs twice"),
-        ({"next_keys": [1000, 1001, 1000]}, "1000 occurs more than once"),
+        ({"next_keys": [1000, 1001, 1000]}, "1000 occurs twice"),
         ({"next_keys": [1000, 1001, -2]}, "integers"),
     ]
     for change, message in bad:
@@ -119,7 +123,7 @@ def test_bad_steps_are_refused_by_name(covariance):
 
 def test_bad_factor_is_refused(subtests):
     for F, b, Q, message in [
-        ([np.eye(2)], [0.0, 0.0], np.eye(2), "one block per key"),
+        ([np.eye(2)], [0.0, 0.0], np.eye(2), "keys: expected shape"),
         ([np.eye(2), np.eye(3)], [0.0, 0.0], np.eye(2), "F: expected shape"),
         ([np.eye(2), np.eye(2)], [0.0, np.nan], np.eye(2), "finite"),
         ([np.eye(2), np.eye(2)], [0.0, 0.0], np.ones((2, 2)), "singular"),
@@ -148,9 +152,10 @@ def test_chain_of_steps_is_the_kalman_prediction(seed, covariance):
         F = 0.5 * rng.normal(size=(n, n, d, d))
         transitions.append(F.swapaxes(1, 2).reshape(n * d, n * d))
         now, later = 100 * t + np.arange(n), 100 * (t + 1) + np.arange(n)
-        for factor in interaction_factors(
+        (stack,) = interaction_factors(
             later, np.tile(now, n), n * np.arange(n + 1), F.reshape(n * n, d, d), offsets[t], Q
-        ):
+        )
+        for factor in stack.native():
             graph.push_back(factor)
     block = np.zeros((2, n * d, n * d))
     for i in range(n):
@@ -202,7 +207,8 @@ def test_wrong_dimensions_are_refused_when_wrapped():
 
 def test_factors_survive_pickling(covariance):
     rng = np.random.default_rng(6)
-    factors = interaction_factors(*step(rng, 4, [4, 3, 2, 1], 2, 2, covariance))
+    stacks = interaction_factors(*step(rng, 4, [4, 3, 2, 1], 2, 2, covariance))
+    factors = [factor for stack in stacks for factor in stack.native()]
     graph = pickle.loads(pickle.dumps(gaussian_graph(factors)))
     for i, factor in enumerate(factors):
         np.testing.assert_array_equal(graph.at(i).augmentedJacobian(), factor.augmentedJacobian())

@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, Mixture, ResidualFactors, Robust
+from factors import FactorError, Mixture, Robust
 
 LOSSES = ["huber", "cauchy", "geman-mcclure", "tukey"]
 DISTANCES = np.array([0.0, 0.1, 0.999, 1.7, 1.70001, 5.0, 1e3])
@@ -56,17 +56,3 @@ def test_a_mixture_holds_with_its_probability():
     for bad in (-0.1, 1.1, np.nan):
         with pytest.raises(FactorError, match="probability"):
             Mixture(bad)
-
-
-def test_stacked_factors_have_probabilities_of_their_own():
-    rows, z = np.arange(3, dtype=np.uint64)[:, None], np.array([[0.5], [1.0], [2.0]])
-    mixture = Mixture([0.9, 0.5, 0.99])
-    stack = ResidualFactors(rows, (1,), lambda x: x - z, np.eye(1), lambda x: [np.ones((3, 1, 1))], mixture)
-    values = gtsam.Values()
-    for key in range(3):
-        values.insert(key, np.zeros(1))
-    alone = [one.error(values) for one in stack.individual_factors()]
-    np.testing.assert_allclose(stack.errors(values), alone)
-    np.testing.assert_allclose(stack.errors(values, np.array([2, 0])), [alone[2], alone[0]])
-    model = mixture.of_row(1).model(gtsam.noiseModel.Unit.Create(1))
-    assert model.loss(1.0) == pytest.approx(float(Mixture(0.5).cost(1.0)))

@@ -8,21 +8,20 @@ from factors import (
     FactorError,
     PlanarPose,
     RangeBearing,
-    ResidualFactor,
     Robust,
     SingularSystemError,
     SolverSettings,
     SpatialPose,
     Vector,
-    detection_factor,
+    detection_factors,
     gaussian_factor,
     gaussian_graph,
     interaction_factor,
     linearised,
     nonlinear_graph,
-    position,
     prior_factor,
     prior_factors,
+    residual_factor,
     solve,
 )
 
@@ -42,10 +41,10 @@ def rosenbrock(x):
 
 
 def on_vector(residual, key=0, dim=2, m=2, **given):
-    return ResidualFactor((key,), (Vector(dim),), residual, np.eye(m), **given)
+    return residual_factor((key,), (Vector(dim),), residual, np.eye(m), **given)
 
 
-@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "line-search"])
+@pytest.mark.parametrize("method", ["levenberg-marquardt", "line-search"])
 def test_linear_problem_takes_one_step(method, covariance):
     rng = np.random.default_rng(0)
     factors = [prior_factor(X[0], rng.normal(size=3), covariance(rng, 3))]
@@ -76,7 +75,6 @@ def test_damped_methods_come_down_a_curved_valley(method):
 def test_damping_saves_a_step_that_gauss_newton_loses():
     factor = on_vector(lambda x: np.arctan(x), dim=1, m=1)
     start = values_of({0: np.array([3.0])})
-    assert not solve(EMPTY, [factor], start, SolverSettings("gauss-newton", max_iterations=3)).converged
     for method in ("levenberg-marquardt", "line-search"):
         solution = solve(EMPTY, [factor], start, SolverSettings(method))
         assert solution.converged
@@ -87,10 +85,7 @@ def test_a_line_search_ends_the_to_and_fro_of_gauss_newton():
     """x^2 = -1 at a prior of 0.3: the minimum is beside the prior, and full steps jump over it for ever."""
     factors = [on_vector(lambda x: x**2 + 1, dim=1, m=1), on_vector(lambda x: 0.5 * (x - 0.3), dim=1, m=1)]
     start = values_of({0: np.array([1.0])})
-    plain, searched = (
-        solve(EMPTY, factors, start, SolverSettings(method, 60)) for method in ("gauss-newton", "line-search")
-    )
-    assert not plain.converged
+    searched = solve(EMPTY, factors, start, SolverSettings("line-search", 60))
     assert searched.converged
     x = searched.values.atVector(0)[0]
     assert 2 * x * (x**2 + 1) + 0.25 * (x - 0.3) == pytest.approx(0.0, abs=1e-5)
@@ -140,18 +135,17 @@ def test_robust_mean_is_the_weighted_one():
     rng = np.random.default_rng(2)
     z = np.concatenate([rng.normal(size=(40, 2)), 30 + rng.normal(size=(8, 2))])
     robust = Robust("cauchy", 1.0)
-    factors = [detection_factor(0, position(2), measured, np.eye(2), robust) for measured in z]
+    factors = [on_vector(lambda x, measured=measured: x - measured, robust=robust) for measured in z]
     mean = solve(EMPTY, factors, values_of({0: np.median(z, axis=0)})).values.atVector(0)
     weight = robust.weight(np.linalg.norm(z - mean, axis=1))
     np.testing.assert_allclose(mean, (weight[:, None] * z).sum(axis=0) / weight.sum(), atol=1e-5)
     assert np.linalg.norm(mean) < 1.0
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("spatial", [False, True])
-def test_factors_between_poses_and_vectors(spatial, seed):
-    """A point seen from two poses: numerical Jacobians on manifolds, agreement with GTSAM's solver."""
-    rng = np.random.default_rng(seed)
+def test_factors_between_poses_and_vectors(spatial):
+    """Points seen from three poses: agreement with GTSAM's solver."""
+    rng = np.random.default_rng(0)
     d = 3 if spatial else 2
     pose_type = gtsam.Pose3 if spatial else gtsam.Pose2
     variable = SpatialPose() if spatial else PlanarPose()
@@ -170,7 +164,7 @@ def test_factors_between_poses_and_vectors(spatial, seed):
         for j, point in enumerate(points):
             z = seen(pose, point) + 0.01 * rng.normal(size=d)
             ours.append(
-                ResidualFactor(
+                residual_factor(
                     (100 - i, j),
                     (variable, Vector(d)),
                     lambda pose, point, z=z: seen(pose, point) - z,
@@ -183,14 +177,8 @@ def test_factors_between_poses_and_vectors(spatial, seed):
     solution = solve(graph, ours, start)
     assert solution.converged
 
-    H_pose, H_point = (np.zeros((d, n), order="F") for n in (variable.dim, d))
-    state = ours[0].states(solution.values)
-    state[0].transformTo(state[1], H_pose, H_point)
-    for numerical, exact in zip(ours[0].jacobians_at(state), (H_pose, H_point), strict=True):
-        np.testing.assert_allclose(numerical, exact, atol=1e-8)
-
     for factor in ours:
-        graph.add(factor.as_custom_factor())
+        graph.add(factor.custom_factors()[0])
     theirs = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     assert solution.error <= graph.error(theirs) * (1 + 1e-9)
     for i in range(3):
@@ -203,22 +191,22 @@ def test_free_variables_are_named():
     between = gaussian_factor(X[1:3], [np.eye(2), -np.eye(2)], [0.0, 0.0])
     graph = nonlinear_graph([prior_factor(X[0], [0.0, 0.0], np.eye(2)), between], dict.fromkeys(X, 2))
     start = values_of({key: np.ones(2) for key in X[:3]})
-    for method in ("gauss-newton", "levenberg-marquardt", "line-search"):
+    for method in ("levenberg-marquardt", "line-search"):
         with pytest.raises(SingularSystemError, match="does not determine x1, x2") as caught:
             solve(graph, [], start, SolverSettings(method=method))
         assert caught.value.keys == (X[1], X[2])
 
 
 def test_only_the_free_direction_of_a_nonlinear_problem_is_named():
-    ranges = ResidualFactor((X[3],), (Vector(2),), lambda x: [np.hypot(*x) - 5.0], np.eye(1))
-    known = detection_factor(X[1], position(2), [1.0, 2.0], np.eye(2))
+    ranges = residual_factor((X[3],), (Vector(2),), lambda x: [np.hypot(*x) - 5.0], np.eye(1))
+    known = on_vector(lambda x: x - [1.0, 2.0], X[1])
     with pytest.raises(SingularSystemError, match="does not determine x3;"):
         solve(EMPTY, [ranges, known], values_of({X[1]: np.ones(2), X[3]: np.array([3.0, 3.0])}))
 
 
 def test_large_singular_system_is_still_named():
     keys = [gtsam.symbol("x", i) for i in range(1100)]
-    factors = prior_factors(keys[:-1], np.zeros((1099, 3)), np.eye(3))
+    factors = prior_factors(keys[:-1], np.zeros((1099, 3)), np.eye(3)).native()
     factors.append(gaussian_factor([keys[-1]], [np.ones((1, 3))], [0.0]))
     with pytest.raises(SingularSystemError, match="near x1099") as caught:
         solve(nonlinear_graph(factors, dict.fromkeys(keys, 3)), [], values_of(dict.fromkeys(keys, np.ones(3))))
@@ -234,7 +222,7 @@ def test_variable_without_any_factor_is_named():
 def test_factor_on_unknown_variable_is_named():
     graph = nonlinear_graph([prior_factor(X[0], [0.0], [[1.0]])], {X[0]: 1})
     with pytest.raises(FactorError, match="expected x5, which factors speak of"):
-        solve(graph, [detection_factor(X[5], position(2), [0.0, 0.0], np.eye(2))], values_of({X[0]: np.zeros(1)}))
+        solve(graph, [on_vector(lambda x: x, X[5])], values_of({X[0]: np.zeros(1)}))
 
 
 def test_linear_factor_on_another_dimension_is_refused(subtests):
@@ -261,7 +249,7 @@ def test_number_that_is_not_finite_is_found_at_the_start():
 
 def test_solution_passes_on_its_linear_factors():
     model, z = RangeBearing(2), np.array([5.0, 0.5])
-    factors = [detection_factor(0, model, z, np.diag([0.01, 0.001])) for _ in range(2)]
+    factors = [detection_factors([0], model, [z], np.diag([0.01, 0.001])) for _ in range(2)]
     solution = solve(EMPTY, factors, values_of({0: np.array([4.0, 1.0])}))
     again = linearised(EMPTY, factors, solution.values)
     np.testing.assert_allclose(solution.linear.hessian()[0], again.hessian()[0])

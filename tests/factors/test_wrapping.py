@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import PlanarPose, ResidualFactor, SpatialPose, Vector, unwrapped_angles
+from factors import PlanarPose, ResidualFactors, SpatialPose, Vector, residual_factor, unwrapped_angles
 
 POINT = np.array([3.0, -4.0])
 
@@ -40,10 +40,18 @@ def wrapped(pose: gtsam.Pose2) -> np.ndarray:
 def test_a_component_that_jumps_by_a_full_turn_is_an_angle(
     residual: Callable[[Any], Any], angles: tuple[int, ...], expected: tuple[int, ...]
 ) -> None:
-    state = gtsam.Pose2(0.3, 0.2, 2.0)
+    state, values = gtsam.Pose2(0.3, 0.2, 2.0), gtsam.Values()
+    values.insert(7, state)
     size = len(np.atleast_1d(residual(state)))
-    factor = ResidualFactor((7,), (PlanarPose(),), residual, np.eye(size), angles=angles)
-    assert unwrapped_angles(factor, [state]) == expected
+    factor = residual_factor((7,), (PlanarPose(),), residual, np.eye(size), angles=angles)
+    assert unwrapped_angles(factor, values) == expected
+
+    def of_matrices(poses: np.ndarray) -> np.ndarray:
+        return np.array([residual(gtsam.Pose2(T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0]))) for T in poses])
+
+    jacobians = [np.zeros((1, size, 3))]
+    stack = ResidualFactors([[7]], (PlanarPose(),), of_matrices, np.eye(size), lambda _: jacobians, angles=angles)
+    assert unwrapped_angles(stack, values) == expected
 
 
 def test_a_pose_in_space_turns_about_its_vertical_while_the_others_stand() -> None:
@@ -51,8 +59,11 @@ def test_a_pose_in_space_turns_about_its_vertical_while_the_others_stand() -> No
         x, y, _ = pose.transformTo(point)
         return [np.arctan2(y, x) - 0.5]
 
-    factor = ResidualFactor((1, 2), (SpatialPose(), Vector(3)), bearing, [[0.01]])
-    assert unwrapped_angles(factor, [gtsam.Pose3(), np.array([5.0, 1.0, 2.0])]) == (0,)
+    factor = residual_factor((1, 2), (SpatialPose(), Vector(3)), bearing, [[0.01]])
+    values = gtsam.Values()
+    values.insert(1, gtsam.Pose3())
+    values.insert(2, np.array([5.0, 1.0, 2.0]))
+    assert unwrapped_angles(factor, values) == (0,)
 
 
 def test_a_residual_that_is_undefined_elsewhere_is_left_alone() -> None:
@@ -62,5 +73,7 @@ def test_a_residual_that_is_undefined_elsewhere_is_left_alone() -> None:
             raise ValueError("behind the camera")
         return [local[1] / local[0]]
 
-    factor = ResidualFactor((1,), (PlanarPose(),), ahead, [[1.0]])
-    assert unwrapped_angles(factor, [gtsam.Pose2(0, 0, -0.9)]) == ()
+    factor = residual_factor((1,), (PlanarPose(),), ahead, [[1.0]])
+    values = gtsam.Values()
+    values.insert(1, gtsam.Pose2(0, 0, -0.9))
+    assert unwrapped_angles(factor, values) == ()

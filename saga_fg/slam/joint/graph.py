@@ -38,7 +38,7 @@ import numpy as np
 
 from factors import (
     ERROR_DIM,
-    Linearisable,
+    GaussianFactors,
     Mixture,
     ResidualFactors,
     Robust,
@@ -47,7 +47,7 @@ from factors import (
     interaction_factor,
     odometry_factors,
     prior_factor,
-    relative_detection_factors,
+    relative_factors,
 )
 from saga_fg.errors import InputError
 from saga_fg.estimators.graph_window import GraphSolution
@@ -89,13 +89,13 @@ def start_factors(
     return slow, gtsam.PriorFactorPose3(pose_key(epoch), gtsam.Pose3(world_T_ego), sigma)
 
 
-def new_object_factors(now: RecordedEpoch, known: set[int]) -> list[gtsam.JacobianFactor]:
+def new_object_factors(now: RecordedEpoch, known: set[int]) -> list[GaussianFactors]:
     """Priors of new objects; known: ids of the objects of the epoch before."""
     new = np.flatnonzero(~np.isin(now.objects.id, np.array(sorted(known), dtype=np.int64)))
     return _priors(now.epoch, now.objects.select(new))
 
 
-def odometry(record: Record, settings: JointSettings) -> list[Linearisable]:
+def odometry(record: Record, settings: JointSettings) -> list[ResidualFactors]:
     """Poses and slow errors of consecutive epochs."""
     if len(record) < 2:
         return []
@@ -106,7 +106,7 @@ def odometry(record: Record, settings: JointSettings) -> list[Linearisable]:
     return [odometry_factors(rows, steps, dt, motion_covariances(record, settings))]
 
 
-def _priors(k: int, new: RecordedObjects) -> list[gtsam.JacobianFactor]:
+def _priors(k: int, new: RecordedObjects) -> list[GaussianFactors]:
     """All components of new objects but the position: unknown velocities, and others, N(0, 1).
 
     The usual motion of a class must not be a prior of each object: in traffic all go the same way, and a hundred small
@@ -120,13 +120,12 @@ def _priors(k: int, new: RecordedObjects) -> list[gtsam.JacobianFactor]:
         deviation[:, [rest.index(c) for c in VELOCITY]] = _ANY_SPEED
         keys = np.array([[object_key(k, int(name))] for name in new.id[mine]], dtype=np.uint64)
         blocks = np.broadcast_to(H, (len(mine), *H.shape))
-        factors += gaussian_factors(
-            keys, [blocks], np.zeros(deviation.shape), deviation[:, :, None] ** 2 * np.eye(len(rest))
-        )
+        covariances = deviation[:, :, None] ** 2 * np.eye(len(rest))
+        factors.append(gaussian_factors(keys, [blocks], np.zeros(deviation.shape), covariances))
     return factors
 
 
-def detections(record: Record, settings: JointSettings) -> list[Linearisable]:
+def detections(record: Record, settings: JointSettings) -> list[ResidualFactors]:
     """Detections of objects, from the vehicle's pose."""
     robust = None if np.isinf(settings.outlier_scale) else Robust("cauchy", settings.outlier_scale)
     collected: dict[NodeType, list[tuple[int, int, FloatArray, FloatArray]]] = {}
@@ -135,16 +134,16 @@ def detections(record: Record, settings: JointSettings) -> list[Linearisable]:
         R_weighed = now.seen.R / now.seen.probability[:, None, None]
         for name, z, R in zip(now.seen.id.tolist(), now.seen.z, R_weighed, strict=True):
             collected.setdefault(types[name], []).append((pose_key(now.epoch), object_key(now.epoch, name), z, R))
-    factors: list[Linearisable] = []
+    factors: list[ResidualFactors] = []
     for node_type, rows in collected.items():
         x, y = node_type.index(POSITION).tolist()
         pose, thing, z, R = (np.array(column) for column in zip(*rows, strict=True))
         keys = np.column_stack([pose, thing]).astype(np.uint64)
-        factors.append(relative_detection_factors(keys, z, R, node_type.dim, (x, y), robust))
+        factors.append(relative_factors(keys, z, R, node_type.dim, (x, y), robust))
     return factors
 
 
-def stationary_factors(record: Record, stationary: Sequence[FloatArray]) -> list[Linearisable]:
+def stationary_factors(record: Record, stationary: Sequence[FloatArray]) -> list[ResidualFactors]:
     """Between two epochs of an object that may be stationary at both; stationary: probabilities (n,) of each."""
     collected: dict[NodeType, list[tuple[int, int, float, float]]] = {}
     for (before, p_before), (now, p_now) in pairwise(zip(record, stationary, strict=True)):
@@ -154,7 +153,7 @@ def stationary_factors(record: Record, stationary: Sequence[FloatArray]) -> list
             name, node_type = int(names[row]), now.objects.types[int(here[row])]
             keys = object_key(before.epoch, name), object_key(now.epoch, name)
             collected.setdefault(node_type, []).append((*keys, float(p[row]), now.time - before.time))
-    factors: list[Linearisable] = []
+    factors: list[ResidualFactors] = []
     for node_type, rows in collected.items():
         model = _StationaryResidual(node_type.dim, tuple(node_type.index(POSITION)), tuple(node_type.index(VELOCITY)))
         first, second, p, dt = (np.array(column) for column in zip(*rows, strict=True))

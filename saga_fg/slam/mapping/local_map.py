@@ -23,7 +23,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import ResidualFactors, Variable, Vector, linearised, pose
+from factors import ResidualFactors, Variable, Vector, pose
 from factors.manifolds import central_differences
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -86,21 +86,16 @@ def refused(kind: LandmarkType, observed: FloatArray, error: Exception) -> Input
 def _linearised(
     kind: LandmarkType, rows: IntArray, observed: FloatArray, covariances: FloatArray, values: gtsam.Values
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    factors = kind.factors(rows, observed, covariances)
-    if not isinstance(factors, gtsam.NonlinearFactorGraph) and isinstance(factors[0], ResidualFactors):
-        W, (by_pose, by_landmark), r = factors[0].linearisation(values)
-        return (W @ r[:, :, None])[:, :, 0], W @ by_pose, W @ by_landmark
-    if isinstance(factors, gtsam.NonlinearFactorGraph):
-        linear = factors.linearize(values)
-    else:
-        linear = linearised(gtsam.NonlinearFactorGraph(), factors, values)
-    k = kind.pose.dim
-    each = [linear.at(row).jacobian() for row in range(len(rows))]
-    return (
-        np.stack([-b for _, b in each]),
-        np.stack([A[:, :k] for A, _ in each]),
-        np.stack([A[:, k:] for A, _ in each]),
-    )
+    parts, k = [], kind.pose.dim
+    for factor in kind.factors(rows, observed, covariances):
+        if isinstance(factor, ResidualFactors):
+            W, (by_pose, by_landmark), r = factor.linearisation(values)
+            parts.append(((W @ r[:, :, None])[:, :, 0], W @ by_pose, W @ by_landmark))
+        else:
+            A, b = factor.linearize(values).jacobian()
+            parts.append((-b[None], A[None, :, :k], A[None, :, k:]))
+    r, by_pose, by_landmark = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
+    return r, by_pose, by_landmark
 
 
 _SAME = 1e-6  # variance of the difference of a landmark from itself, for the numerics

@@ -26,7 +26,6 @@ import numpy as np
 
 from factors import (
     FactorError,
-    ResidualFactor,
     ResidualFactors,
     Robust,
     Solution,
@@ -35,6 +34,7 @@ from factors import (
     between_factor,
     pose,
     pose_prior_factor,
+    residual_factor,
 )
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.batch import BatchSolver
@@ -146,12 +146,10 @@ def observation_factors(
     for kind, alike in by_kind.items():
         rows = np.array([row for row, _ in alike], dtype=np.int64)
         observed, covariances = (np.stack([getattr(z, name) for _, z in alike]) for name in ("value", "covariance"))
-        made = kind.factors(rows, observed, covariances)
-        factors += made if isinstance(made, Sequence) else [made]
+        factors += kind.factors(rows, observed, covariances)
     if robust is None:
         return factors
-    ours = ResidualFactor | ResidualFactors
-    return [replace(one, robust=robust) if isinstance(one, ours) else one for one in factors]
+    return [replace(one, robust=robust) if isinstance(one, ResidualFactors) else one for one in factors]
 
 
 _MERGE_GATE = 1 - 1e-6  # gate probability of merging duplicates; near 1, since an outlier starts a duplicate
@@ -426,7 +424,7 @@ class _Merged:
         for number, variable in self.old.items():
             key = landmark_key(number)
             off = partial(variable.local, view.state(key))
-            held.append(ResidualFactor((key,), (variable,), off, np.eye(variable.dim), name="held"))
+            held.append(residual_factor((key,), (variable,), off, np.eye(variable.dim), name="held"))
         return Additions(factors=held, named={last: observation_factors(chunk) for last, chunk in self.changed.items()})
 
 

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from factors import Bearing, ResidualFactors, point_factors, relative_factors, relative_range_bearing_factors
+from factors import Bearing, RangeBearing, ResidualFactors, relative_factors
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import (
     BoolArray,
@@ -123,10 +123,9 @@ class LandmarkObservations:
         covariances = np.linalg.inv(self.information)
         covariances = (covariances + covariances.swapaxes(1, 2)) / 2
         if self.kind == "point":
-            return point_factors(keys, self.z, covariances)
-        if self.kind == "bearing":
-            return relative_factors(keys, Bearing(2), self.z, covariances, 2)
-        return relative_range_bearing_factors(keys, self.z, covariances, 2)
+            return relative_factors(keys, self.z, covariances, self.z.shape[1], range(self.z.shape[1]))
+        model = Bearing(2) if self.kind == "bearing" else RangeBearing(2)
+        return relative_factors(keys, self.z, covariances, 2, model=model)
 
     def normal_equations(self, world_T_pose: FloatArray, places: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         """H (n, d, d) and H l (n, d) of each observation; places (L, d): where the landmarks are about."""

@@ -25,8 +25,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import ResidualFactor, SpatialPose, Variable, between_factor, pose_prior_factor
-from saga_fg.graph.factor_checks import Factor
+from factors import SpatialPose, Variable, between_factor, pose_prior_factor, residual_factor
+from saga_fg.graph.factor_checks import Factor, stacked
 from saga_fg.graph.factor_groups import PriorGroup
 from saga_fg.graph.variables import LinearisationPoint
 from saga_fg.numerics.arrays import FloatArray
@@ -87,7 +87,7 @@ class CondensedSubmap:
         W, c = _compressed(columns)
         factor = _Condensed(_pose(point, self.anchor), rel, W, c)
         kinds = (SpatialPose(), SpatialPose())
-        return [ResidualFactor(self.named, kinds, factor.residual, np.eye(len(c)), factor.jacobians, name="submap")]
+        return [residual_factor(self.named, kinds, factor.residual, np.eye(len(c)), factor.jacobians, name="submap")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +119,8 @@ def _stacked(
     marginal: Sequence[gtsam.JacobianFactor], point: LinearisationPoint, first: Sequence[int]
 ) -> tuple[list[int], FloatArray]:
     """Keys, `first` in front, and all rows [J | b] on increments from the point."""
-    group = PriorGroup.of(marginal, point.variables)
-    here = group.here(np.arange(len(marginal)), point)
+    priors = [PriorGroup(stacked([factor], point.dims(factor.keys()))) for factor in marginal]
+    here = [factor for prior in priors for factor in prior.here(np.array([0]), point)]
     found = {key for factor in here for key in factor.keys()}  # noqa: SIM118
     keys = [*(key for key in first if key in found), *sorted(found.difference(first))]
     ends = dict(zip(keys, np.cumsum(point.dims(keys)).tolist(), strict=True))
@@ -167,7 +167,7 @@ def _factor_on(keys: Sequence[int], J: FloatArray, point: LinearisationPoint) ->
         return []
     types = tuple(point.variables[key].type for key in keys)
     states = tuple(kind.read(point.values, key) for kind, key in zip(types, keys, strict=True))
-    return [ResidualFactor(tuple(keys), types, _Held(types, states, W, c).residual, np.eye(len(c)), name="submap")]
+    return [residual_factor(tuple(keys), types, _Held(types, states, W, c).residual, np.eye(len(c)), name="submap")]
 
 
 @dataclass(frozen=True, eq=False)

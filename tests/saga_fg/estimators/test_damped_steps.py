@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from factors import ResidualFactor, Vector, gaussian_factor
+from factors import ResidualFactors, Vector, gaussian_factor, residual_factor
 from pipelines.explaining import story
 from pipelines.serving.messages import tracks_message
 from saga_fg import ConstantVelocity, NodeType, SceneGraph, Tracker, TrackerSettings
@@ -40,8 +40,8 @@ class Uphill:
         mine = [now[node] for node in self.nodes if node in now and view.time <= self.until]
         return Additions(factors=[self._factor(one.key, one.dim) for one in mine])
 
-    def _factor(self, key: int, dim: int) -> ResidualFactor:
-        return ResidualFactor((key,), (Vector(dim),), self._residual, 1e-4 * np.eye(1), self._jacobian)
+    def _factor(self, key: int, dim: int) -> ResidualFactors:
+        return residual_factor((key,), (Vector(dim),), self._residual, 1e-4 * np.eye(1), self._jacobian)
 
     def _residual(self, x: FloatArray) -> FloatArray:
         return x[:1] - 5.0
@@ -61,8 +61,8 @@ class Squares:
         a, b = view.key(OBJECT, 1), view.key(OBJECT, 2)
         new = [NewVariable(OBJECT, 1, np.array([1.0])), NewVariable(OBJECT, 2, np.array([7.0]))]
         one = np.eye(1)
-        square = ResidualFactor((a,), (Vector(1),), lambda x: x**2 + 1, one)
-        cosine = ResidualFactor((b,), (Vector(1),), lambda x: np.sin(x - 7.5), one)
+        square = residual_factor((a,), (Vector(1),), lambda x: x**2 + 1, one)
+        cosine = residual_factor((b,), (Vector(1),), lambda x: np.sin(x - 7.5), one)
         return Additions(new, [square, gaussian_factor([a], [one], [0.3], 4 * one), cosine])
 
 

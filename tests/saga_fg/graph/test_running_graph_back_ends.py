@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from factors import (
-    ResidualFactor,
+    RangeBearing,
     ResidualFactors,
     Robust,
     SolverSettings,
     Vector,
-    bearing_range_factor,
     between_factor,
     gaussian_factor,
     pose_prior_factor,
-    relative_range_bearing_factors,
+    relative_factors,
+    residual_factor,
 )
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.estimators import GraphFilter, JointKalmanFilter
@@ -131,14 +131,15 @@ class Drive:
         if not view.static(LANDMARK):
             new.append(NewVariable(LANDMARK, 1, there + 0.1 * np.sqrt(self.noise), static=True))
         R = self.noise * np.diag([0.01, 0.1]) ** 2
-        factors.append(bearing_range_factor(here, post, true.bearing(there).theta(), true.range(there), R))
+        noise = gtsam.noiseModel.Gaussian.Covariance(R)
+        factors.append(gtsam.BearingRangeFactor2D(here, post, true.bearing(there), true.range(there), noise))
         rows = [[here, one.key] for _, one in sorted(view.now(OBJECT).items())]
         if rows:
             places = np.array([(15.0 + t, 4.0), (20.0, -6.0 + t)]) - view.origin
             rows = rows[:2]
             z = [[true.range(x), true.bearing(x).theta()] for x in places[: len(rows)]]
             seen_from_it = self.noise * np.diag([0.1, 0.01]) ** 2
-            factors.append(relative_range_bearing_factors(rows, z, seen_from_it, 4))
+            factors.append(relative_factors(rows, z, seen_from_it, 4, model=RangeBearing(2)))
         return Additions(new, factors)
 
 
@@ -330,7 +331,7 @@ def test_what_fails_is_named_and_the_tracker_goes_on(name):
             [gaussian_factor([view.key(LANDMARK, 2, static=True)], [np.eye(1, 2)], [0.0])],
         ),
         "provider faulty: wall on car 1 at 0.50 s: .*finite": lambda view, key: Additions(
-            factors=[ResidualFactor((key,), (Vector(4),), lambda x: [np.nan], np.eye(1), name="wall")]
+            factors=[residual_factor((key,), (Vector(4),), lambda x: [np.nan], np.eye(1), name="wall")]
         ),
         "provider faulty: KeyError": lambda view, key: {}[key],
     }

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from factors.manifolds import stacked_differences
+from factors import Vector
+from factors.manifolds import central_differences
 from saga_fg.model import nonlinear_interactions
 from saga_fg.model.nonlinear_interactions import (
     MAX_DECELERATION,
@@ -66,7 +67,11 @@ def test_accelerations_and_their_derivatives(name):
     own, other = 4 * rng.normal(size=(40, 4)), rng.normal(size=(40, 4))
     stacked = np.broadcast_to(given, (40, *given.shape))
     _, by_own, by_other = law.accelerations(own, other, stacked)  # type: ignore[attr-defined]
-    expected = stacked_differences(lambda a, b: law.accelerations(a, b, stacked).value, [own, other])  # type: ignore[attr-defined]
+    expected = central_differences(
+        lambda a, b: law.accelerations(a, b, stacked).value,  # type: ignore[attr-defined]
+        [own, other],
+        [Vector(4)] * 2,
+    )
     np.testing.assert_allclose(by_own, expected[0], atol=1e-6 * max(1.0, np.abs(by_own).max()))
     np.testing.assert_allclose(by_other, expected[1], atol=1e-6 * max(1.0, np.abs(by_own).max()))
 

@@ -175,10 +175,10 @@ class Sideways(PointLandmark):
     """A point of which only the distance to the side is measured."""
 
     def factors(self, rows, observed, covariances):  # type: ignore[no-untyped-def]
-        from factors import ResidualFactor
+        from factors import residual_factor
 
         return [
-            ResidualFactor(
+            residual_factor(
                 tuple(keys),
                 (self.pose, self.variable),
                 lambda pose, place, z=z: (pose.transformTo(place) - z) * [0.0, 1.0],

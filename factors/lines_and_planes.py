@@ -1,0 +1,171 @@
+"""Straight lines and planes seen from the vehicle, and objects that keep to the centre line of a lane.
+
+Straight lines on the ground: curbs, borders of lanes. The state is a line in the plane, (theta, rho), in the Hesse
+normal form
+
+    n . x = rho,      n = (cos theta, sin theta)
+
+Of a piece of it two points z_1, z_2 (3,) are observed, its ends, in the frame of the pose (R, t); where along the line
+they lie says nothing. The residuals are how far off the line they are in the world, from above,
+
+    r_i = n . (R z_i + t) - rho
+
+(E the first two axes), which needs no wrapping and is as good far from the origin as near it. (theta, rho),
+(theta + 2 pi, rho) and (theta + pi, -rho) are one line; `HesseLine` goes from one line to another by the smallest
+turn. With the pose moved to (R Exp(w), t + R v),
+
+    dr_i/dw = -n^T E R [z_i]x    dr_i/dv = n^T E R    dr_i/dtheta = n' . (R z_i + t)    dr_i/drho = -1
+
+A plane n . x + d = 0 of the world (n of length 1, pointing to the side it is seen from: a wall, a facade, the ground)
+is, in the frame of a pose world_T_pose = (R, t),
+
+    n' = R^T n,        d' = n . t + d,        z = (n', d') + noise in the tangent (two angles of the normal, distance)
+
+by GTSAM's `OrientedPlane3Factor` (Trevor, Rogers and Christensen, "Planar surface SLAM with 3D and 2D sensors", ICRA
+2012), which takes whatever four numbers it is given for a plane.
+
+An object at p keeps to a line whose foot below it is a, with the unit normal n to its left, and which lies c aside of
+where a map has it: r = n . (p - a) - c.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factors.manifolds import SpatialPose, Vector, cross_matrix
+from factors.measurement import checked_components
+from factors.nonlinear import ResidualFactors, residual_factors
+from factors.robust import RobustLoss
+from factors.validation import FactorError, FloatArray, checked, checked_keys, whitener
+
+
+@dataclass(frozen=True)
+class HesseLine:
+    """A line in the plane as a vector (theta, rho), rad and m; delta = (turn within a quarter, m)."""
+
+    @property
+    def dim(self) -> int:
+        return 2
+
+    def read(self, values: gtsam.Values, key: int) -> FloatArray:
+        return Vector(2).read(values, key)
+
+    def retract(self, state: FloatArray, delta: FloatArray) -> FloatArray:
+        return state + delta
+
+    def local(self, state: FloatArray, other: FloatArray) -> FloatArray:
+        turn = (other[0] - state[0] + np.pi) % (2 * np.pi) - np.pi
+        if abs(turn) <= np.pi / 2:
+            return np.array([turn, other[1] - state[1]])
+        return np.array([turn - np.copysign(np.pi, turn), -other[1] - state[1]])
+
+    def array(self, state: FloatArray) -> FloatArray:
+        return state
+
+
+def line_factors(
+    rows: ArrayLike, ends: ArrayLike, covariances: ArrayLike, robust: RobustLoss | None = None
+) -> ResidualFactors:
+    """Return n factors of straight lines seen from the vehicle.
+
+    rows: (n, 2) keys of the pose (`gtsam.Pose3`) and of the line (a vector of 2: rad, m); ends: (n, 2, 3), m, in the
+    frame of the pose; covariances: (n, 2, 2), or one for all, m^2, of the two ends across the line. Raises
+    `FactorError`.
+    """
+    measured = checked("ends", ends, (None, 2, 3)).copy()
+    function = _Edge(measured)
+    return residual_factors(function, rows, (SpatialPose(), 2), covariances, 2, "straight lines", robust)
+
+
+@dataclass(frozen=True, eq=False)
+class _Edge:
+    ends: FloatArray
+
+    def residual(self, pose: FloatArray, line: FloatArray) -> FloatArray:
+        n = np.stack([np.cos(line[:, 0]), np.sin(line[:, 0])], axis=1)
+        return np.asarray((self._world(pose) @ n[:, :, None])[:, :, 0] - line[:, 1:])
+
+    def jacobians(self, pose: FloatArray, line: FloatArray) -> Sequence[FloatArray]:
+        c, s = np.cos(line[:, 0]), np.sin(line[:, 0])
+        nR = c[:, None] * pose[:, 0, :3] + s[:, None] * pose[:, 1, :3]
+        J_pose = np.empty((len(pose), 2, 6))
+        for end in (0, 1):
+            J_pose[:, end, :3] = -(nR[:, None, :] @ cross_matrix(self.ends[:, end]))[:, 0]
+            J_pose[:, end, 3:] = nR
+        turned = np.stack([-s, c], axis=1)
+        by_theta = self._world(pose) @ turned[:, :, None]
+        return [J_pose, np.concatenate([by_theta, np.full_like(by_theta, -1.0)], axis=2)]
+
+    def _world(self, pose: FloatArray) -> FloatArray:
+        """The ends (n, 2, 2) from above."""
+        return np.asarray(self.ends @ pose[:, :2, :3].swapaxes(1, 2) + pose[:, None, :2, 3])
+
+
+_UNIT = 1e-6  # what the length of a normal may be off 1
+
+
+def plane(name: str, coefficients: ArrayLike) -> gtsam.OrientedPlane3:
+    """The plane of coefficients (4,) = (n, d); raises `FactorError` unless n has length 1."""
+    values = checked(name, coefficients, (4,))
+    length = float(np.linalg.norm(values[:3]))
+    if abs(length - 1) > _UNIT:
+        raise FactorError(f"{name}: expected a normal of length 1, got {length:.6g}")
+    return gtsam.OrientedPlane3(np.concatenate([values[:3] / length, values[3:]]))
+
+
+def plane_factor(pose_key: int, plane_key: int, z: ArrayLike, covariance: ArrayLike) -> gtsam.NonlinearFactor:
+    """Return GTSAM's factor of a plane seen from a `gtsam.Pose3`.
+
+    z: (4,) = (n', d'), in the pose's frame; covariance: (3, 3) of two turns of the normal (rad) and the distance (m).
+    GTSAM's has no robust version. Raises `FactorError`.
+    """
+    pose_name, plane_name = checked_keys("keys", [pose_key, plane_key])
+    seen = plane("z", z).planeCoefficients()
+    whitener("covariance", covariance, 3)
+    noise = gtsam.noiseModel.Gaussian.Covariance(np.asarray(covariance, dtype=np.float64))
+    return gtsam.OrientedPlane3Factor(seen, noise, pose_name, plane_name)
+
+
+def lane_keeping_factors(
+    rows: ArrayLike,
+    variances: ArrayLike,
+    feet: ArrayLike,
+    normals: ArrayLike,
+    state_dim: int,
+    position: tuple[int, int] = (0, 1),
+    robust: RobustLoss | None = None,
+) -> ResidualFactors:
+    """Return n factors of objects that keep to a line.
+
+    rows: (n, 2) keys of the object (a vector of `state_dim`) and of how far aside the line lies (a vector of 1, m);
+    variances: (n,) m^2: how far objects stray; feet: (n, 2), m; normals: (n, 2); position: where the world position, m,
+    sits in the object's state. Raises `FactorError`.
+    """
+    checked_components("position", position, state_dim, least=2)
+    spread = checked("variances", variances, (None,))
+    shape = (len(spread), 2)
+    function = _Keeping(checked("feet", feet, shape), checked("normals", normals, shape), state_dim, tuple(position))
+    name = "objects keeping to a lane"
+    return residual_factors(function, rows, (state_dim, 1), spread[:, None, None], 1, name, robust)
+
+
+@dataclass(frozen=True, eq=False)
+class _Keeping:
+    feet: FloatArray
+    normals: FloatArray
+    state_dim: int
+    position: tuple[int, ...]
+
+    def residual(self, state: FloatArray, c: FloatArray) -> FloatArray:
+        offset = np.einsum("ni,ni->n", state[:, list(self.position)] - self.feet, self.normals)
+        return np.asarray(offset[:, None] - c)
+
+    def jacobians(self, state: FloatArray, c: FloatArray) -> Sequence[FloatArray]:
+        J_state = np.zeros((len(state), 1, self.state_dim))
+        J_state[:, 0, list(self.position)] = self.normals
+        return [J_state, np.full((len(state), 1, 1), -1.0)]
