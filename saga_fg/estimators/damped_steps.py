@@ -71,8 +71,8 @@ def unsettled_keys(solution: Solution, threshold: float) -> set[int]:
 
 def _parts(graph: SceneFactorGraph) -> list[Part]:
     """Components of the graph with a nonlinear factor."""
-    label, parts = graph.components(), dict[int, Part]()
-    for held in graph.sharpest_first():
+    label, parts = graph.index.components(), dict[int, Part]()
+    for held in graph.index.sharpest_first():
         rows = held.rows
         of_row = np.array([label[held.factors.rows[row][0]] for row in rows.tolist()], dtype=np.int64)
         for number in np.unique(of_row).tolist():

@@ -262,7 +262,7 @@ def joint_gaussian(
     Nodes with their states, other variables with increments from their base; covariance: joint one of some variables.
     Raises `GraphError` where they are not determined.
     """
-    part = graph.components()
+    part = graph.index.components()
     partition = Partition(layout, renumbered(np.array([part[key] for key in keys], dtype=np.int64)))
     members: dict[int, list[int]] = {}
     for k, label in enumerate(partition.label.tolist()):
@@ -339,7 +339,7 @@ def replace_by_prior(
 
     Its variables by id, as they were and as they are now. Raises `InputError` where it has become singular.
     """
-    label = graph.components()
+    label = graph.index.components()
     ids = x.layout.nodes.tolist()
     for number in range(x.partition.count):
         rows = np.flatnonzero(x.partition.label == number)

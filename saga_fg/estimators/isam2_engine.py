@@ -208,7 +208,7 @@ class Engine:
         latest = max(self._times[key] for key in leaving)
         if any(self._times.get(key, -math.inf) <= latest for key in graph.variables.keys() - leaving):
             return False  # some may have been eliminated before those that leave: GTSAM would crash at its next update
-        keys, rows = gtsam.KeyList(), graph.rows_on(leaving)
+        keys, rows = gtsam.KeyList(), graph.index.rows_on(leaving)
         for key in leaving:
             keys.push_back(key)
         try:
@@ -256,7 +256,7 @@ class Engine:
             self.slots[number] = np.full(len(held.active), -1)
             if not held.factors.linear:
                 nonlinear |= {key for row in held.rows.tolist() for key in held.factors.rows[row]}
-        if alone := graph.without_factors():
+        if alone := graph.index.without_factors():
             raise solver_error(graph.variables, graph.groups, SingularSystemError("", tuple(alone)))
         self.points.remove(leaving)
         self.points.add(new)
@@ -285,7 +285,7 @@ class Engine:
         """R of variables in large components, by one Cholesky elimination of all factors; empty where that fails."""
         if len(keys) <= _LARGE:
             return {}
-        label = graph.components()
+        label = graph.index.components()
         count = Counter(label[key] for key in keys)
         large = [key for key in keys if count[label[key]] > _LARGE]
         if not large:
@@ -337,7 +337,7 @@ class Engine:
         linear: list[gtsam.JacobianFactor] = []
         removed: list[int] = []
         point = graph.point()
-        for number in sorted({number for key in moved for number in graph.touching(key)}):
+        for number in sorted({number for key in moved for number in graph.index.touching(key)}):
             held = graph.groups[number]
             if held.factors.linear:
                 continue
@@ -435,7 +435,7 @@ def _hinted(graph: SceneFactorGraph, rows: Sequence[tuple[int, IntArray]], new: 
     separators are the same: n cliques, with a QR of all n states for each. A factor without information on all of them
     makes it one: a sixth of the time for 30 nodes, a tenth for 60.
     """
-    label, together = graph.components(), dict[tuple[int, int], set[int]]()
+    label, together = graph.index.components(), dict[tuple[int, int], set[int]]()
     epoch = {key: -1 if one.epoch is None else one.epoch for key, one in graph.variables.items()}
     for number, mine in rows:
         keys_of = graph.groups[number].factors.rows

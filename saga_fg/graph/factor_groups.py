@@ -277,8 +277,7 @@ class FactorIndex:
         self.groups: dict[int, HeldGroup] = {}
         self.fresh: dict[int, list[gtsam.JacobianFactor]] = {}
         self._named: dict[tuple[str, Hashable], tuple[int, ...]] = {}  # by provider and name
-        self._touching: dict[int, tuple[int, ...]] = {}  # groups with a factor on a variable, now or before
-        self._factor_counts: dict[int, int] = {}  # number of factors on each variable
+        self._touching: dict[int, Mapping[int, int]] = {}  # of each variable: groups, and how many of their rows
         self._components: Mapping[int, int] | None = None  # until factors tie others
         self.count = 0  # of groups that have been
 
@@ -291,13 +290,11 @@ class FactorIndex:
 
     def add_variables(self, keys: Iterable[int]) -> None:
         """Add variables without factors."""
-        keys = list(keys)
-        self._touching |= dict.fromkeys(keys, ())
-        self._factor_counts |= dict.fromkeys(keys, 0)
+        self._touching |= {key: {} for key in keys}
 
     def remove_variable(self, key: int) -> None:
         """Remove a variable that no factor is on."""
-        del self._touching[key], self._factor_counts[key]
+        del self._touching[key]
 
     def add(self, held: HeldGroup) -> int:
         """Add a group; returns its number."""
@@ -310,48 +307,41 @@ class FactorIndex:
         known = self._components or {}
         if any(len(row) > 1 or row[0] not in known for row in held.factors.rows):
             self._components = None
-        for key in {key for row in held.factors.rows for key in row}:
-            if key in self._touching:
-                self._touching[key] += (number,)
-        self._count_rows(held.factors, held.rows.tolist(), 1)
+        self._count_rows(number, held.rows.tolist(), 1)
         if held.name is not None:
             self._named[held.provider, held.name] = (*self.named(held.provider, held.name), number)
 
     def remove(self, number: int) -> None:
         """Remove a group."""
-        held, self._components = self.groups.pop(number), None
-        self.fresh.pop(number, None)
-        if held.name is not None:
-            rest = tuple(n for n in self._named.pop((held.provider, held.name)) if n != number)
-            if rest:
-                self._named[held.provider, held.name] = rest
-        self._count_rows(held.factors, held.rows.tolist(), -1)
-        for key in {key for row in held.factors.rows for key in row}:
-            if key in self._touching:
-                self._touching[key] = tuple(n for n in self._touching[key] if n != number)
+        self.deactivate(number, self.groups[number].rows.tolist())
 
     def deactivate(self, number: int, rows: list[int]) -> None:
         """Take rows out of a group, and the group with its last one."""
         self.fresh.pop(number, None)
+        self._count_rows(number, rows, -1)
         held, self._components = self.groups[number], None
         active = held.active.copy()
         active[rows] = False
-        self._count_rows(held.factors, rows, -1)
         self.groups[number] = replace(held, active=active)
-        if not active.any():
-            self.remove(number)
+        if active.any():
+            return
+        del self.groups[number]
+        if held.name is not None:
+            rest = tuple(n for n in self._named.pop((held.provider, held.name)) if n != number)
+            if rest:
+                self._named[held.provider, held.name] = rest
 
     def named(self, provider: str, name: Hashable) -> tuple[int, ...]:
         """Numbers of the groups that a provider gave under a name."""
         return self._named.get((provider, name), ())
 
-    def touching(self, key: int) -> tuple[int, ...]:
-        """Numbers of the groups with a factor on a variable, now or before."""
+    def touching(self, key: int) -> Iterable[int]:
+        """Numbers of the groups with a factor on a variable."""
         return self._touching[key]
 
     def without_factors(self) -> list[int]:
         """Variables without any factor."""
-        return [key for key, count in self._factor_counts.items() if count == 0]
+        return [key for key, groups in self._touching.items() if not groups]
 
     def components(self) -> Mapping[int, int]:
         """The component of every variable that has factors: what these tie together, directly or through others."""
@@ -370,12 +360,16 @@ class FactorIndex:
         result = {}
         for number in sorted(numbers, key=lambda number: (self.groups[number].elimination_order, number)):
             held = self.groups[number]
-            mine = [row for row in held.rows.tolist() if any(key in keys for key in held.factors.rows[row])]
-            if mine:
-                result[number] = mine
+            result[number] = [row for row in held.rows.tolist() if any(key in keys for key in held.factors.rows[row])]
         return result
 
-    def _count_rows(self, group: FactorGroup, rows: list[int], step: int) -> None:
-        for row in rows:
-            for key in group.rows[row]:
-                self._factor_counts[key] += step
+    def sharpest_first(self) -> list[HeldGroup]:
+        """All groups in the order in which elimination loses the fewest digits."""
+        return sorted(self.groups.values(), key=lambda held: held.elimination_order)
+
+    def _count_rows(self, number: int, rows: list[int], step: int) -> None:
+        """Count rows of a group on their variables; counts are exchanged, never changed: copies share them."""
+        rows_of = self.groups[number].factors.rows
+        for key in (key for row in rows for key in rows_of[row]):
+            counts = {**self._touching[key], number: self._touching[key].get(number, 0) + step}
+            self._touching[key] = {n: count for n, count in counts.items() if count}

@@ -94,14 +94,14 @@ WIDE = 256  # dimensions that hang together, from which Cholesky, with half the 
 class SceneFactorGraph:
     """Variables, factors and values. Every method raises `GraphError` and then has changed nothing.
 
-    elimination: of back ends, "qr" or "cholesky", until priors are left that choose
+    elimination: of back ends, "qr" or "cholesky", until priors are left that choose; index: of the factors
     """
 
     def __init__(self, elimination: Elimination = "qr") -> None:
         self._variables: dict[int, GraphVariable] = {}
         self._base, self._values = gtsam.Values(), gtsam.Values()
         self._shared = False  # with a copy, until one of them changes
-        self._index = FactorIndex()
+        self.index = FactorIndex()
         self.elimination: Elimination = elimination
         self._angles_checked: dict[tuple[str, str], int] = {}
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
@@ -118,7 +118,7 @@ class SceneFactorGraph:
     @property
     def groups(self) -> Mapping[int, HeldGroup]:
         """All factors, by the number of their group, which no other group ever has."""
-        return MappingProxyType(self._index.groups)
+        return MappingProxyType(self.index.groups)
 
     @property
     def values(self) -> gtsam.Values:
@@ -142,7 +142,7 @@ class SceneFactorGraph:
 
     def factors(self) -> Iterator[FactorEntry]:
         """Describe every factor."""
-        for held in self._index.groups.values():
+        for held in self.index.groups.values():
             for row in held.rows.tolist():
                 mine = tuple(self._variables[key] for key in held.factors.rows[row])
                 yield FactorEntry(held.provider, held.factors.name, mine)
@@ -200,7 +200,7 @@ class SceneFactorGraph:
         self._separate()
         self._values.insert(values)
         self._base.insert(values)
-        self._index.add_variables(added)
+        self.index.add_variables(added)
         return list(added)
 
     def add_factors(
@@ -220,21 +220,21 @@ class SceneFactorGraph:
                 check_angles(provider, one.factors, self._variables, self._values)
                 self._angles_checked[kind] = checked + 1
         if name is not None:
-            for number in self._index.named(provider, name):
-                self._index.remove(number)
+            for number in self.index.named(provider, name):
+                self.index.remove(number)
         for one, factors_there in zip(held, linear, strict=True):
             if len(one.active):
-                self._index.fresh[self._index.add(one)] = factors_there
+                self.index.fresh[self.index.add(one)] = factors_there
 
     def marginalise(self, keys: Iterable[int], into: Condensation | None = None) -> None:
         """Integrate variables out; their information on the others stays, in the factors that `into` makes of it."""
         leaving = {key: self.variable(key) for key in keys}
         if not leaving:
             return
-        touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self._index.rows_on(leaving)
+        touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self.index.rows_on(leaving)
         earlier: list[gtsam.JacobianFactor] = []
         for number, mine in rows.items():
-            held = self._index.groups[number]
+            held = self.index.groups[number]
             apart = into is not None and held.provider == into.name and into.anchor in held.factors.rows[mine[0]]
             for factor in self.linearised(held, np.array(mine), point):
                 earlier.append(factor) if apart else touched.push_back(factor)
@@ -249,11 +249,7 @@ class SceneFactorGraph:
 
     def drop(self, keys: Set[int]) -> None:
         """Take out variables with all factors on them, which are on no others: whole components."""
-        self._replace(self._index.rows_on(keys), [], keys)
-
-    def rows_on(self, keys: Collection[int]) -> dict[int, list[int]]:
-        """Rows of groups on any of some variables, by the number of the group, the sharpest first."""
-        return self._index.rows_on(keys)
+        self._replace(self.index.rows_on(keys), [], keys)
 
     def replace_rows(
         self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
@@ -269,7 +265,7 @@ class SceneFactorGraph:
 
     def replace_by_prior(self, leaving: Collection[int], prior: gtsam.JacobianFactor) -> None:
         """Put a prior, on increments from the base, in place of all factors on its variables and those `leaving`."""
-        self.replace_rows(self._index.rows_on({*leaving, *prior.keys()}), [prior], leaving)
+        self.replace_rows(self.index.rows_on({*leaving, *prior.keys()}), [prior], leaving)
 
     def _replace(
         self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
@@ -277,37 +273,24 @@ class SceneFactorGraph:
         """Take rows of groups out and put priors in, then take out the variables without any factor left."""
         priors = [PriorGroup(stacked([factor], self.point().dims(factor.keys()))) for factor in factors]
         for number, mine in rows.items():
-            self._index.deactivate(number, mine)
-        added = [self._index.add(HeldGroup(_MARGINALS, None, prior, np.ones(1, dtype=bool))) for prior in priors]
+            self.index.deactivate(number, mine)
+        added = [self.index.add(HeldGroup(_MARGINALS, None, prior, np.ones(1, dtype=bool))) for prior in priors]
         self._separate()
         for key in leaving:
             del self._variables[key], self.births[key]
-            self._index.remove_variable(key)
+            self.index.remove_variable(key)
             self._values.erase(key)
             self._base.erase(key)
         return added
 
-    def names(self, provider: str) -> list[Hashable]:
-        """The names under which a provider has factors in the graph."""
-        held = (one for one in self._index.groups.values() if one.provider == provider and one.name is not None)
-        return list(dict.fromkeys(one.name for one in held))
-
     def independent(self, keys: Set[int]) -> bool:
         """Whether all factors on some variables are linear, and priors alone tie them to other variables."""
-        for number, mine in self._index.rows_on(keys).items():
-            group = self._index.groups[number].factors
+        for number, mine in self.index.rows_on(keys).items():
+            group = self.index.groups[number].factors
             shared = not isinstance(group, PriorGroup) and any(not keys >= set(group.rows[row]) for row in mine)
             if shared or not group.linear:
                 return False
         return True
-
-    def touching(self, key: int) -> tuple[int, ...]:
-        """Numbers of the groups with a factor on a variable, now or before."""
-        return self._index.touching(key)
-
-    def without_factors(self) -> list[int]:
-        """Variables without any factor."""
-        return self._index.without_factors()
 
     def of(self, kind: VariableKind, epoch: int | None) -> dict[int, GraphVariable]:
         """The variables of a kind and an epoch, None for those for all time, by id."""
@@ -333,12 +316,12 @@ class SceneFactorGraph:
     def moved_to(self, values: gtsam.Values) -> None:
         """Put the variables where a back end has found them; the graph takes the values over."""
         self._values = values
-        self._index.fresh.clear()
+        self.index.fresh.clear()
 
     def linear(self, number: int, point: LinearisationPoint) -> list[gtsam.JacobianFactor]:
         """Active factors of a group, linear, on increments from the base."""
-        if number in self._index.fresh:
-            return self._index.fresh[number]
+        if number in self.index.fresh:
+            return self.index.fresh[number]
         held = self.groups[number]
         return self.linearised(held, held.rows, point)
 
@@ -348,7 +331,7 @@ class SceneFactorGraph:
         try:
             solution = solve(native, ours, self._values, settings)
         except FactorError as error:
-            raise solver_error(self._variables, self._index.groups, error) from error
+            raise solver_error(self._variables, self.index.groups, error) from error
         self.moved_to(gtsam.Values(solution.values))
         return solution
 
@@ -360,7 +343,7 @@ class SceneFactorGraph:
         part: groups with their rows, the sharpest first, by default all
         """
         native, ours, point = gtsam.NonlinearFactorGraph(), list[ActiveRows](), self.point()
-        for held, rows in ((held, held.rows) for held in self.sharpest_first()) if part is None else part:
+        for held, rows in ((held, held.rows) for held in self.index.sharpest_first()) if part is None else part:
             if isinstance(held.factors, PriorGroup | ResidualGroup):
                 ours.append(ActiveRows(held.factors, rows, point))
             else:
@@ -368,18 +351,10 @@ class SceneFactorGraph:
                     native.add(factor)
         return native, ours
 
-    def sharpest_first(self) -> list[HeldGroup]:
-        """All factors in the order in which elimination loses the fewest digits."""
-        return sorted(self._index.groups.values(), key=lambda held: held.elimination_order)
-
-    def components(self) -> Mapping[int, int]:
-        """The component of every variable that has factors: what these tie together, directly or through others."""
-        return self._index.components()
-
     def native(self) -> gtsam.NonlinearFactorGraph:
         """All factors as GTSAM's own, for its solvers from `values`; ours call back into Python, which is slow."""
         graph, point = gtsam.NonlinearFactorGraph(), self.point()
-        for held in self._index.groups.values():
+        for held in self.index.groups.values():
             for factor in held.factors.native(held.rows, point):
                 graph.add(factor)
         return graph
@@ -395,7 +370,7 @@ class SceneFactorGraph:
             self._separate()  # from a third
         self._shared = not share_values
         other.__dict__ |= self.__dict__
-        other._variables, other._index, other.births = dict(self._variables), self._index.copy(), dict(self.births)
+        other._variables, other.index, other.births = dict(self._variables), self.index.copy(), dict(self.births)
         return other
 
     def _separate(self) -> None:
@@ -420,7 +395,7 @@ class SceneFactorGraph:
         try:
             return _jacobians(marginal_factors(touched, keys, "qr"))
         except FactorError as error:
-            raise solver_error(self._variables, self._index.groups, error) from error
+            raise solver_error(self._variables, self.index.groups, error) from error
 
     def _choose(self, widest: int) -> None:
         """QR where what is left of marginalised variables is on few dimensions together, else Cholesky."""
@@ -478,7 +453,7 @@ class GraphRecord:
             tuple(graph.births[one.key] for one in variables),
             graph._added,
             groups,
-            graph._index.count,
+            graph.index.count,
             graph._newest,
             graph.carried_over,
         )
@@ -496,14 +471,14 @@ class GraphRecord:
             insert_state(graph._base, one, base)
             insert_state(graph._values, one, value)
             graph._variables[one.key], graph.births[one.key] = one, born
-        graph._index.add_variables(graph._variables)
+        graph.index.add_variables(graph._variables)
         for number, held in sorted(self.groups.items()):
             require_type("group", held, HeldGroup)
             if not isinstance(held.factors, _RECORDED) or len(held.active) != len(held.factors.rows):
                 raise GraphError(f"factors of {held.provider}: expected arrays, one truth value a row")
             check_variables(held.provider, held.factors, held.rows.tolist(), graph._variables)
-            graph._index.put(number, held)
-        graph._index.count = max(self.count, graph._index.count)
+            graph.index.put(number, held)
+        graph.index.count = max(self.count, graph.index.count)
         graph.epoch, graph.time, graph.previous_time = self.epoch, self.time, self.previous_time
         graph._added, graph._newest, graph.carried_over = self.additions, tuple(self.newest), dict(self.carried_over)
         return graph
