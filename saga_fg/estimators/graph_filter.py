@@ -94,14 +94,15 @@ class GraphFilter(Estimator):
 
     def __copy__(self) -> GraphFilter:
         """A filter that goes its own way; it builds an iSAM2 of its own when it needs one."""
-        twin = shallow_copy(self)
-        twin._smoother = self._smoother.detached()
-        return twin
+        return self._copied(taking_over=False)
 
     def handed_over(self) -> GraphFilter:
         """A filter that goes on with the present iSAM2; this one builds another when it is needed."""
+        return self._copied(taking_over=True)
+
+    def _copied(self, taking_over: bool) -> GraphFilter:
         twin = shallow_copy(self)
-        twin._smoother = self._smoother.handed_over()
+        twin._smoother = self._smoother.copied(taking_over)
         return twin
 
     @property
@@ -358,7 +359,7 @@ class GraphFilter(Estimator):
     def _changing(self) -> Iterator[None]:
         """Change the state, or leave it as it was where that fails."""
         before, smoother = dict(vars(self)), self._smoother
-        self._smoother, self._posterior = smoother.handed_over(), None
+        self._smoother, self._posterior = smoother.copied(taking_over=True), None
         try:
             yield
         except BaseException:

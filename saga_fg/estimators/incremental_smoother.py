@@ -210,16 +210,14 @@ class IncrementalSmoother:
         engine, graph = self._ready(), self._graph
         return joint_gaussian(graph, engine.covariance, layout, keys)
 
-    def detached(self) -> IncrementalSmoother:
-        """Return a smoother of the same graph that builds an iSAM2 of its own when it needs one."""
-        twin = copy.copy(self)
-        twin._times, twin._engine = list(self._times), None
-        return twin
+    def copied(self, taking_over: bool) -> IncrementalSmoother:
+        """Return a smoother of the same graph; one of the two builds another iSAM2 when it is needed.
 
-    def handed_over(self) -> IncrementalSmoother:
-        """Return a smoother that takes over the present iSAM2; this one builds another when it is needed."""
+        taking_over: that is this one, and the copy goes on with the present iSAM2
+        """
         twin = copy.copy(self)
-        twin._times, self._engine = list(self._times), None
+        twin._times = list(self._times)
+        (self if taking_over else twin)._engine = None
         return twin
 
     def snapshot(self) -> SceneFactorGraph:

@@ -457,25 +457,39 @@ def _columns(dims: Mapping[int, int], keys: Iterable[int]) -> IntArray:
 
 
 class Displacements:
-    """Variables with delta_0 (d,), where their factors were linearised, and R (d, d), in a table for each dimension."""
+    """Variables with delta_0 (d,), where their factors were linearised, and R (d, d), in rows without gaps.
+
+    Rows are as wide as the largest variable; what a smaller one does not fill is zero.
+    """
 
     def __init__(self) -> None:
-        self._tables: dict[int, _Table] = {}
+        self._keys: list[int] = []
+        self._row: dict[int, int] = {}
         self._dims: dict[int, int] = {}
+        self._at, self._root = np.zeros((16, 0)), np.zeros((16, 0, 0))
 
-    def add(self, dims: dict[int, int]) -> None:
+    def add(self, dims: Mapping[int, int]) -> None:
         """New variables at their base."""
-        for key, dim in dims.items():
-            self._dims[key] = dim
-            self._tables.setdefault(dim, _Table(dim)).add(key)
+        first, (rows, width) = len(self._keys), self._at.shape
+        more = 2 * len(dims) + rows if first + len(dims) > rows else 0
+        wider = max([width, *dims.values()]) - width
+        if more or wider:
+            self._at = np.pad(self._at, ((0, more), (0, wider)))
+            self._root = np.pad(self._root, ((0, more), (0, wider), (0, wider)))
+        self._keys += dims
+        self._row |= dict(zip(dims, range(first, len(self._keys)), strict=True))
+        self._dims |= dims
 
     def remove(self, keys: Iterable[int]) -> None:
-        """Forget variables."""
+        """Forget variables; the last one takes the row of each."""
         for key in keys:
-            self._tables[self._dims.pop(key)].remove(key)
-
-    def __contains__(self, key: int) -> bool:
-        return key in self._dims
+            row, last = self._row.pop(key), self._keys.pop()
+            del self._dims[key]
+            end = len(self._keys)
+            if last != key:
+                self._keys[row], self._row[last] = last, row
+                self._at[row], self._root[row] = self._at[end], self._root[end]
+            self._at[end], self._root[end] = 0.0, 0.0
 
     def dims(self, keys: Iterable[int]) -> dict[int, int]:
         """Dimensions of variables, by key in their order."""
@@ -488,43 +502,16 @@ class Displacements:
 
     def set_root(self, key: int, R: FloatArray) -> None:
         """Set R of a variable."""
-        table = self._tables[self._dims[key]]
-        table.root[table.row[key]] = R
+        self._root[self._row[key], : len(R), : len(R)] = R
 
     def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
         """Variables that are farther off than the threshold; their linearisation point is reset."""
-        return [key for table in self._tables.values() for key in table.moved(delta, threshold)]
-
-
-class _Table:
-    """Variables of one dimension in rows without gaps."""
-
-    def __init__(self, dim: int) -> None:
-        self.keys: list[int] = []
-        self.row: dict[int, int] = {}
-        self.at = np.zeros((16, dim))
-        self.root = np.zeros((16, dim, dim))
-
-    def add(self, key: int) -> None:
-        n = len(self.keys)
-        if n == len(self.at):
-            self.at, self.root = (np.concatenate([a, np.zeros_like(a)]) for a in (self.at, self.root))
-        self.row[key] = n
-        self.keys.append(key)
-        self.at[n], self.root[n] = 0.0, 0.0
-
-    def remove(self, key: int) -> None:
-        n, last = self.row.pop(key), self.keys.pop()
-        if last != key:
-            self.keys[n], self.row[last] = last, n
-            self.at[n], self.root[n] = self.at[len(self.keys)], self.root[len(self.keys)]
-
-    def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
-        n = len(self.keys)
-        if n == 0:
+        if not self._keys:
             return []
-        now = np.asarray(delta.vector(self.keys)).reshape(n, -1)
-        way = (self.root[:n] @ (now - self.at[:n])[:, :, None])[:, :, 0]
+        n, now = len(self._keys), np.zeros_like(self._at[: len(self._keys)])
+        dims = np.array([self._dims[key] for key in self._keys])
+        now[np.arange(now.shape[1]) < dims[:, None]] = delta.vector(self._keys)
+        way = (self._root[:n] @ (now - self._at[:n])[:, :, None])[:, :, 0]
         rows = np.flatnonzero(np.linalg.norm(way, axis=1) > threshold)
-        self.at[rows] = now[rows]
-        return [self.keys[row] for row in rows.tolist()]
+        self._at[rows] = now[rows]
+        return [self._keys[row] for row in rows.tolist()]

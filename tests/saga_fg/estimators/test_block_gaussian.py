@@ -1,12 +1,10 @@
 """A block-diagonal Gaussian against the same Gaussian as one dense matrix."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 
 from saga_fg.estimators.block_gaussian import BlockGaussian
-from saga_fg.estimators.partition import Partition, StateLayout, regrouped
+from saga_fg.estimators.partition import Partition, StateLayout
 
 
 def random_gaussian(rng, nodes, dims, label):
@@ -99,29 +97,3 @@ def test_nobody_is_correlated_with_nobody():
     none = np.empty(0, dtype=np.int64)
     assert [len(rows) for rows in x.correlated(none)] == [0, 0]
     assert x.between(none, none).shape == (0, 0, 0)
-
-
-def entry_by_entry(blocks, partition):
-    """The whole matrix, (D, D)."""
-    whole = np.zeros((partition.layout.size,) * 2)
-    for places, of_group in zip(partition.groups, blocks, strict=True):
-        for at, block in zip(places, of_group, strict=True):
-            whole[np.ix_(at, at)] = block
-    return whole
-
-
-def test_regrouping_copies_what_shares_a_component_before_and_after(subtests):
-    for sizes, seed in product([[4], [2, 4, 6]], range(10)):
-        with subtests.test(sizes=sizes, seed=seed):
-            rng = np.random.default_rng(seed)
-            dims = rng.choice(sizes, 20)
-            number = rng.integers(0, 8, 20)
-            old = Partition(StateLayout(np.arange(20), dims), np.unique(number, return_inverse=True)[1])
-            blocks = tuple(rng.normal(size=(*places.shape, places.shape[1])) for places in old.groups)
-            source = rng.permutation(20)[:15] if seed % 2 else np.arange(20)
-            later = np.where(rng.random(len(source)) < 0.8, old.label[source], rng.integers(0, 8, len(source)))
-            new = Partition(StateLayout(np.arange(len(source)), dims[source]), np.unique(later, return_inverse=True)[1])
-            places = old.layout.places(source)
-            label = np.repeat(new.label, dims[source])
-            expected = entry_by_entry(blocks, old)[np.ix_(places, places)] * (label[:, None] == label)
-            np.testing.assert_array_equal(entry_by_entry(regrouped(blocks, old, new, source), new), expected)
