@@ -119,7 +119,7 @@ def evaluate_labels(
     The scenes are those in the table. Raises `InputError` for a table that is missing, broken or empty, and for
     scenes and moments that the dataset does not have.
     """
-    rows = read_tracks(table)
+    rows = read_tracks(table, labels=True)
     if len(rows.source) == 0:
         raise InputError(f"{table}: expected labels, there are none")
     scenes: list[str] = []

@@ -121,6 +121,10 @@ class DetectionFileSource(DatasetSource):
     def title(self) -> str:
         return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"
 
+    @property
+    def tracks_suffix(self) -> str:
+        return f".{self.table}"
+
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[Dataset]:
         if truth and self.truth is not None:

@@ -255,8 +255,8 @@ class DatasetSource(ABC):
 
     @property
     def tracks_suffix(self) -> str:
-        """Suffix of the result of one part, in parallel runs: that of the option `table`, or of the usual result."""
-        return f".{self.table}" if hasattr(self, "table") else Path(self.tracks_example).suffix or ".csv"
+        """Suffix of the result of one part, in parallel runs."""
+        return Path(self.tracks_example).suffix or ".csv"
 
     @abstractmethod
     def open(self, truth: bool = False) -> AbstractContextManager[Dataset]:

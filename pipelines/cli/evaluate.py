@@ -123,7 +123,7 @@ def _evaluate_labels(
     agree with the detections.
     """
     table = _table(result)
-    scenes = np.unique(read_tracks(table).scene).tolist()
+    scenes = np.unique(read_tracks(table, labels=True).scene).tolist()
     settings = load_smooth_config(source.family, config)
     chosen = source.restricted(scenes) if scenes else source
     with chosen.open(source.has_truth and not without_truth) as dataset, progress_bar(len(scenes)) as progress:

@@ -138,7 +138,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "tracks": one("tracks.csv", TRACKS, read_tracks),
         "tracks of others": one("others.csv", OTHERS, lambda path: _scenes_of(TruthFile(path))),
         **_arrow(folder),
-        "labels": one("labels.csv", LABELS, read_tracks),
+        "labels": one("labels.csv", LABELS, lambda path: read_tracks(path, labels=True)),
         "pose graph, plane": one("plane.g2o", G2O_2D, read_g2o),
         "pose graph, space": one("space.g2o", G2O_3D, read_g2o),
         "poses, KITTI": one("poses.txt", POSES, read_kitti_poses),

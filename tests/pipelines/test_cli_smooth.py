@@ -36,7 +36,7 @@ def test_nuscenes_labels_are_complete(tmp_path: Path) -> None:
     assert "observed" in run.output
     written = {path.name for path in (tmp_path / "labels").iterdir()}
     assert written == {"labels.csv", "summary.json", "tracking.json", "v1.0-mini", "maps"}
-    rows = read_tracks(tmp_path / "labels" / "labels.csv")
+    rows = read_tracks(tmp_path / "labels" / "labels.csv", labels=True)
     summary = json.loads((tmp_path / "labels" / "summary.json").read_text())["total"]
     assert len(rows.source) == summary["observed"] + summary["filled"] + summary["extended"] > 0
     annotations = json.loads((tmp_path / "labels" / "v1.0-mini" / "sample_annotation.json").read_text())
@@ -53,7 +53,7 @@ def test_own_tables_become_labels_with_gaps_filled(tmp_path: Path) -> None:
             writer.writerow(there if k not in (8, 9) else [0.1 * k, *[""] * 8])
     run = runner.invoke(app, ["smooth", "file", str(table), "-o", str(tmp_path / "labels")])
     assert run.exit_code == 0, run.output
-    rows = read_tracks(tmp_path / "labels" / "labels.csv")
+    rows = read_tracks(tmp_path / "labels" / "labels.csv", labels=True)
     assert rows.source.tolist() == ["filled" if k in (8, 9) else "observed" for k in range(20)]
     assert abs(rows.boxes.yaw).max() < 0.1  # flipped detections, and the car drives along x
     assert abs(rows.boxes.position[8, 0] - 8.0) < 0.2

@@ -213,15 +213,17 @@ class TrackRows(Columns):
         return cls(scene, timestamp, id_, boxes, score, P, V, whole, whole, np.full(n, "observed"), np.full(n, "low"))
 
 
-def read_tracks(path: str | Path, how: TableImport | None = None, lenient: bool = False) -> TrackRows:
-    """Read a table of tracks or labels in any of the formats of detections.
-
-    Raises `InputError` naming file, row and column.
+def read_tracks(
+    path: str | Path, how: TableImport | None = None, lenient: bool = False, labels: bool = False
+) -> TrackRows:
+    """Read a table of tracks in any of the formats of detections. Raises `InputError` naming file, row and column.
 
     how      what it takes to understand it, without effect on a table that saga-fg wrote
     lenient  columns that `how` names need not be there
+    labels   whether the columns of labels have a meaning
     """
-    layout = Layout((*LABEL_COLUMNS, SETTLED, *QUATERNION), REQUIRED, lenient)
+    columns = LABEL_COLUMNS if labels else TRACK_COLUMNS
+    layout = Layout((*columns, SETTLED, *QUATERNION), REQUIRED, lenient)
     return _track_rows(read_raw_table(Path(path), layout, how, own=OWN))
 
 

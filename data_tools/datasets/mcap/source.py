@@ -141,6 +141,10 @@ class McapSource(DatasetSource):
     )
     table: Literal["mcap", "csv", "ndjson"] = option("Format of the results, in parallel.", "mcap", verbs=("track",))
 
+    @property
+    def tracks_suffix(self) -> str:
+        return f".{self.table}"
+
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[McapRecording]:
         yield McapRecording(self._one(), self._options())

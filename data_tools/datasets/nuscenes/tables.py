@@ -355,7 +355,7 @@ def read_annotations(
                 raise TypeError("lengths")
             rows[name].numbers.extend((*translation, *size, *rotation))
             rows[name].names.append((k, instance, label, int(lidar + radar)))
-        except (TypeError, OverflowError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             where = f"{path}: sample {sample}, instance {instance}"
             raise InputError(f"{where}: expected 3, 3 and 4 numbers as translation, size, rotation") from error
     result = {}

@@ -47,7 +47,7 @@ LABELS = [labels_at(0.0, [1, 2]), labels_at(0.5, [1], "filled"), labels_at(1.0, 
 def test_a_table_of_labels_comes_back_as_it_was(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"labels{suffix}"
     write_label_table(path, [(scene_of([0.0, 0.5, 1.0]), LABELS)])
-    rows = read_tracks(path)
+    rows = read_tracks(path, labels=True)
     assert rows.id.tolist() == ["1", "2", "1", "1", "3"]
     assert rows.timestamp.tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
     assert rows.source.tolist() == ["observed", "observed", "filled", "extended", "extended"]

@@ -88,6 +88,14 @@ def test_tracks_are_read_as_they_were_written_and_as_detections(tmp_path: Path) 
         np.testing.assert_array_equal(read.score, tracks(0.5).score)
 
 
+def test_columns_of_labels_have_no_meaning_in_tracks_of_others(tmp_path: Path) -> None:
+    path = tmp_path / "tracks.ndjson"
+    path.write_text('{"timestamp": 0, "id": 1, "x": 1, "y": 2, "quality": 0.5, "sources": 3}\n')
+    assert read_tracks(path).quality.tolist() == ["low"]
+    with pytest.raises(InputError, match="did you mean 'source'"):
+        read_tracks(path, labels=True)
+
+
 def test_a_table_of_tracks_names_what_is_wrong_in_it(tmp_path: Path) -> None:
     path = tmp_path / "tracks.csv"
     path.write_text("timestamp,x,y\n0,1,2\n")

@@ -28,7 +28,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "a.ndjson": read_detections,
     "a.npz": read_detections,
     "tracks.csv": read_tracks,
-    "labels.ndjson": read_tracks,
+    "labels.ndjson": lambda path: read_tracks(path, labels=True),
     "results.json": read_tracking_results,
     "0000.txt": read_kitti_labels,
     "a.g2o": read_g2o,
