@@ -27,7 +27,6 @@ _UNINTERRUPTED = frozenset(
         "multiprocessing.util",
         "numba.core.caching",
         "numba.core.serialize",  # called by kernels for the types of their results
-        "pipelines.scale_out.folder",
         "shutil",
         __name__,
         "tempfile",

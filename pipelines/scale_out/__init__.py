@@ -1,7 +1,7 @@
 """Many scenes in parallel: on the cores of this machine or on a Ray cluster, with a manifest of the results."""
 
-from pipelines.scale_out.job import Job, Manifest, Outcome, Record, SceneTask, file_name, perform
-from pipelines.scale_out.pools import LocalPool, RayPool, new_pool
+from pipelines.scale_out.pools import Job, LocalPool, Outcome, RayPool, SceneTask, new_pool, perform
+from pipelines.scale_out.results import Manifest, OutputFolder, Record, file_name
 from pipelines.scale_out.run import Pool, RunSummary, SmoothTask, TrackTask, run_scenes
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "LocalPool",
     "Manifest",
     "Outcome",
+    "OutputFolder",
     "Pool",
     "RayPool",
     "Record",

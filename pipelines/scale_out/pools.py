@@ -1,16 +1,16 @@
-"""Pools of workers: processes of this machine, or tasks on a Ray cluster.
+"""Scenes as jobs, done by pools of workers: processes of this machine, or tasks on a Ray cluster.
 
-Jobs on this machine: worker processes, each doing one job at a time.
+A job is a pure function of its input and its task's configuration: its results are the same bytes on any machine. Only
+the driver writes to the output. An input that fails costs its own results alone.
 
-Every worker has a pipe of its own, so that one which is killed (the system is out of memory, say) takes down the job
-it was doing and nothing else; `concurrent.futures` gives up all jobs then. That job is tried once more in a new
-worker, and failed if it ends that one, too. Workers end with the driver, however it ends: their pipe closes.
+On this machine every worker has a pipe of its own and does one job at a time, so that one which is killed (the system
+is out of memory, say) takes down the job it was doing and nothing else; `concurrent.futures` gives up all jobs then.
+That job is tried once more in a new worker, and failed if it ends that one, too. Workers end with the driver, however
+it ends: their pipe closes.
 
-Jobs on a Ray cluster (https://docs.ray.io): one task a job, placed, moved and retried by Ray.
-
-Nodes need this package in the same version. Inputs that are read by the driver travel with their job; those that are
-read by the worker (files) must be reachable from every node under the same name. Results travel back to the driver.
-Kernels are compiled once a node.
+On a Ray cluster (https://docs.ray.io) a job is a task, placed, moved and retried by Ray. Nodes need this package in the
+same version. Inputs that are read by the driver travel with their job; those that are read by the worker (files) must
+be reachable from every node under the same name. Results travel back to the driver. Kernels are compiled once a node.
 """
 
 from __future__ import annotations
@@ -22,17 +22,100 @@ import os
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator
+import time
+import traceback
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib.metadata import version
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal, Protocol
 
-from pipelines.scale_out.job import Job, Outcome, perform
-from saga_fg.errors import InputError, MissingExtraError
+from data_tools.datasets.source import Part
+from pipelines.tracking import one_thread
+from saga_fg.errors import InputError, MissingExtraError, SagaError
 from saga_fg.kernels.compilation import load_kernels
+from saga_fg.types.dataset import Dataset
+
+Status = Literal["done", "unchanged", "failed"]
+
+
+class SceneTask(Protocol):
+    """The work on every scene. Picklable."""
+
+    @property
+    def configuration(self) -> str:
+        """YAML text of everything, besides the input, that the results depend on."""
+        ...
+
+    def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
+        """Write the results of input `name` to files in an empty folder; returns counts for people to read."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """input; task; known: the digests for which results are there already, None if all is to be done anew."""
+
+    input: Part
+    task: SceneTask
+    known: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The result of a job.
+
+    digests  of the input's parts, by name
+    files    content of every result by its path relative to the output
+    seconds  from opening the input to the last result
+    reason   one line, for failed jobs
+    version  of saga-fg at the worker
+    """
+
+    name: str
+    status: Status
+    digests: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
+    seconds: float = 0.0
+    reason: str = ""
+    version: str = ""
+
+
+def perform(job: Job) -> Outcome:
+    """Perform a job; an exception becomes a failed outcome.
+
+    Linear algebra is kept to one thread: scenes run in parallel, and sums stay in one order.
+    """
+    name, digests, start = job.input.name, dict[str, str](), time.perf_counter()
+    here = version("saga-fg")
+    try:
+        with one_thread(), tempfile.TemporaryDirectory() as folder, job.input.opened() as at:
+            digests = dict(at.digests)
+            if digests == job.known:
+                return Outcome(name, "unchanged", digests, version=here)
+            counts = job.task.run(name, at.read(), Path(folder))
+            files = {
+                path.relative_to(folder).as_posix(): path.read_bytes()
+                for path in sorted(Path(folder).rglob("*"))
+                if path.is_file()
+            }
+    except Exception as error:
+        reason = str(error)
+        if not isinstance(error, SagaError):
+            reason = f"{_last_frame(error)}{type(error).__name__}: {error}".strip()
+        return Outcome(name, "failed", digests, seconds=time.perf_counter() - start, reason=reason, version=here)
+    return Outcome(name, "done", digests, files, counts, time.perf_counter() - start, version=here)
+
+
+def _last_frame(error: Exception) -> str:
+    """Return the place where an unexpected exception was raised: `file.py:12: `."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"{Path(frames[-1].filename).name}:{frames[-1].lineno}: " if frames else ""
+
 
 ATTEMPTS = 2
 
@@ -43,10 +126,6 @@ class LocalPool:
 
     workers: int = 0
     scratch: Path | None = None
-
-    def __post_init__(self) -> None:
-        if self.workers < 0:
-            raise InputError(f"workers: expected a number >= 0, got {self.workers}")
 
     def outcomes(self, jobs: Iterator[Job], total: int) -> Iterator[Outcome]:
         """Yield the outcomes of `total` jobs as they come; no more jobs are taken than there are idle workers."""
@@ -144,8 +223,6 @@ def _serve(pipe: Connection, scratch: Path | None) -> None:
         except (EOFError, ConnectionError):
             return
 
-
-log = logging.getLogger(__name__)
 
 _AHEAD = 2  # jobs in flight for each CPU, so that none waits for the driver
 

@@ -1,6 +1,4 @@
-"""Tracking and smoothing of many scenes in a pool of workers.
-
-Runs a task over many scenes in a pool of workers; results and manifest go to a folder.
+"""Tracking and smoothing of many scenes in a pool of workers; results and manifest go to a folder.
 
 A scene is skipped if the manifest has it as done with the same inputs, configuration and version, and its results are
 unchanged. One run at a time may write to a folder.
@@ -17,12 +15,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
+from data_tools.datasets.detection_files import write_label_table
 from data_tools.datasets.source import DatasetSource, Part
-from data_tools.files.atomic_files import remove_leftovers
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
-from pipelines.scale_out.folder import OutputFolder
-from pipelines.scale_out.job import Job, Manifest, Outcome, Record, SceneTask, file_name, sha256
+from pipelines.scale_out.pools import Job, Outcome, SceneTask
+from pipelines.scale_out.results import Manifest, OutputFolder, Record, file_name, sha256
 from pipelines.smoothing import SmoothConfig, smooth_dataset
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg.errors import InputError
@@ -78,7 +76,6 @@ def run_scenes(
     manifest = Manifest(folder)
     configuration, here = sha256(task.configuration.encode()), version("saga-fg")
     with folder.held():
-        remove_leftovers(output.resolve().parent, output.resolve().name)
         folder.remove_leftovers()
         scratch = folder.new_folder(".scratch")
         try:
@@ -92,7 +89,7 @@ def run_scenes(
                 if progress is not None:
                     progress(outcome.name, report.scenes, total)
         finally:
-            folder.remove_folder(".scratch")
+            folder.remove(".scratch")
         if finish is not None:
             finish(report)
     return report
@@ -181,8 +178,6 @@ class SmoothTask:
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         """Write the labels; counts objects, and boxes by where they come from."""
-        from data_tools.datasets.detection_files import write_label_table
-
         runs = tuple(smooth_dataset(dataset, self.settings, self.method))
         labels = [(run.scene, run.labels) for run in runs]
         (folder / "labels").mkdir()

@@ -14,8 +14,17 @@ from data_tools.datasets.detection_file_source import DetectionFileSource
 from data_tools.datasets.source import HeldScene, Part
 from data_tools.simulator import SimulatorSettings
 from data_tools.simulator.source import SimulatedScene, SimulatedSource
-from pipelines.scale_out import Job, LocalPool, Manifest, RunSummary, SceneTask, perform, pools, run_scenes
-from pipelines.scale_out.folder import OutputFolder
+from pipelines.scale_out import (
+    Job,
+    LocalPool,
+    Manifest,
+    OutputFolder,
+    RunSummary,
+    SceneTask,
+    perform,
+    pools,
+    run_scenes,
+)
 from saga_fg.errors import InputError
 from tests.pipelines.scale_out_example import CONFIG, TRACK, Broken, Deadly, InThisProcess, content, write_recordings
 
@@ -34,9 +43,9 @@ def written(output: Path) -> dict[str, int]:
 
 def test_results_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     inputs = write_recordings(tmp_path / "in", 5)
-    reports = [run(inputs, tmp_path / str(workers), workers=workers) for workers in (0, 1, 2)]
-    contents = [content(tmp_path / str(workers)) for workers in (0, 1, 2)]
-    assert contents[0] == contents[1] == contents[2]
+    reports = [run(inputs, tmp_path / str(workers), workers=workers) for workers in (0, 2)]
+    contents = [content(tmp_path / str(workers)) for workers in (0, 2)]
+    assert contents[0] == contents[1]
     assert sorted(contents[0]) == [f"a{k:02d}.csv" for k in range(5)]
     assert len(set(contents[0].values())) == 5
     for report in reports:
@@ -82,13 +91,8 @@ def test_other_settings_or_another_method_do_everything_again(tmp_path: Path) ->
     other = replace(CONFIG, tracker=replace(CONFIG.tracker, report_coasting=0.0))
     for task in (replace(TRACK, settings=other), replace(TRACK, method="kf"), TRACK):
         assert run(inputs, output, task).done == ["a00", "a01"]
-
-
-def test_results_of_an_earlier_form_do_not_stay_behind(tmp_path: Path) -> None:
-    inputs, output = write_recordings(tmp_path / "in", 1), tmp_path / "out"
-    run(inputs, output)
     run(inputs, output, replace(TRACK, source=DetectionFileSource(table="ndjson")))
-    assert list(content(output)) == ["a00.ndjson"]
+    assert list(content(output)) == ["a00.ndjson", "a01.ndjson"]  # results of an earlier form do not stay behind
 
 
 def test_the_manifest_says_how_a_result_came_about(tmp_path: Path) -> None:
@@ -126,11 +130,10 @@ def test_a_mistake_in_a_task_names_its_line(tmp_path: Path) -> None:
     assert report.failed["a00"].endswith("ZeroDivisionError: a00")
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_killed_worker_costs_one_attempt_at_one_scene(tmp_path: Path, workers: int) -> None:
+def test_a_killed_worker_costs_one_attempt_at_one_scene(tmp_path: Path) -> None:
     inputs = write_recordings(tmp_path / "in", 4)
     (tmp_path / "deaths").mkdir()
-    report = run(inputs, tmp_path / "out", Deadly("a01", tmp_path / "deaths", 1), workers)
+    report = run(inputs, tmp_path / "out", Deadly("a01", tmp_path / "deaths", 1), 2)
     assert sorted(report.done) == ["a00", "a01", "a02", "a03"]
     assert len(list((tmp_path / "deaths").iterdir())) == 1
     run(inputs, tmp_path / "serial")

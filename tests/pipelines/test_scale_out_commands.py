@@ -63,7 +63,7 @@ def test_failed_scenes_are_named_and_there_is_no_merged_file(
 
     done = TrackTask.run
     monkeypatch.setattr(TrackTask, "run", run)
-    monkeypatch.setattr("pipelines.scale_out.LocalPool", lambda workers, scratch: InThisProcess())
+    monkeypatch.setattr("pipelines.cli.track.new_pool", lambda *_: InThisProcess())
     result = saga_fg(*nuscenes(simulated), "-o", tmp_path / "run", "--workers", "1")
     assert result.exit_code == 1
     assert "3 scenes: 2 done, 0 unchanged, 1 failed" in result.stdout
@@ -241,15 +241,6 @@ def test_labels_are_those_of_one_process(simulated: Path, tmp_path: Path) -> Non
     parts = [path.read_text().splitlines() for path in sorted((tmp_path / "run" / "labels").iterdir())]
     assert [part[0] for part in parts] == [header] * 3
     assert [row for part in parts for row in part[1:]] == rows
-
-
-def test_simulated_scenes_in_parallel(tmp_path: Path) -> None:
-    (tmp_path / "short.yaml").write_text("duration: 1.0\nwarm_up: 2.0\n")
-    smooth = ["smooth", "simulated", "--scenes", "2", "--simulator", tmp_path / "short.yaml"]
-    assert saga_fg(*smooth, "-o", tmp_path / "serial").exit_code == 0
-    assert saga_fg(*smooth, "-o", tmp_path / "run", "--workers", "1").exit_code == 0
-    parts = [path.read_text().splitlines(True) for path in sorted((tmp_path / "run" / "labels").iterdir())]
-    assert "".join([*parts[0], *parts[1][1:]]) == (tmp_path / "serial" / "labels.csv").read_text()
 
 
 def test_kitti_sequences_in_parallel(recordings: Path, tmp_path: Path) -> None:

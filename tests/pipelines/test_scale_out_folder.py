@@ -12,9 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli import app
-from pipelines.scale_out import Manifest, RunSummary, run_scenes
-from pipelines.scale_out.folder import OutputFolder, is_inside
-from pipelines.scale_out.job import file_name
+from pipelines.scale_out import Manifest, OutputFolder, RunSummary, file_name, run_scenes
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 from tests.pipelines.scale_out_example import TRACK, InThisProcess, content, write_recordings
@@ -38,18 +36,17 @@ def unharmed(victim: Path) -> bool:
     return [path.read_text() for path in victim.iterdir()] == ["mine"]
 
 
-@pytest.mark.parametrize("name", ["configuration.yaml", "tracks/a00.csv", "manifest/a00.json"])
-def test_a_link_where_a_file_belongs_is_replaced(tmp_path: Path, victim: Path, name: str) -> None:
-    link = tmp_path / "out" / name
-    link.parent.mkdir(exist_ok=True)
-    link.symlink_to(victim / "a00.csv")
+def test_a_link_where_a_file_belongs_is_replaced(tmp_path: Path, victim: Path) -> None:
+    links = [tmp_path / "out" / name for name in ("configuration.yaml", "tracks/a00.csv", "manifest/a00.json")]
+    for link in links:
+        link.parent.mkdir(exist_ok=True)
+        link.symlink_to(victim / "a00.csv")
     assert run(tmp_path).done == ["a00"]
-    assert not link.is_symlink()
-    assert link.read_text() != "mine"
+    assert not any(link.is_symlink() or link.read_text() == "mine" for link in links)
     assert unharmed(victim)
 
 
-@pytest.mark.parametrize("name", ["tracks", "manifest", ".lock"])
+@pytest.mark.parametrize("name", ["tracks", ".lock"])
 def test_a_link_where_a_folder_or_the_lock_belongs_is_refused(tmp_path: Path, victim: Path, name: str) -> None:
     (tmp_path / "out" / name).symlink_to(victim / "a00.csv" if name == ".lock" else victim)
     with pytest.raises(InputError, match=rf"out/{name}.*: not writable: expected no link on the way"):
@@ -57,13 +54,13 @@ def test_a_link_where_a_folder_or_the_lock_belongs_is_refused(tmp_path: Path, vi
     assert unharmed(victim)
 
 
-@pytest.mark.parametrize("to", ["victim", "victim/a00.csv", "nowhere"])
-def test_a_link_where_the_scratch_folder_belongs_is_removed(tmp_path: Path, victim: Path, to: str) -> None:
-    (tmp_path / "out" / ".scratch").symlink_to(tmp_path / to)
-    assert run(tmp_path).done == ["a00"]
-    assert not (tmp_path / "out" / ".scratch").is_symlink()
-    assert not (tmp_path / "nowhere").exists()
-    assert unharmed(victim)
+def test_a_link_where_the_scratch_folder_belongs_is_removed(tmp_path: Path, victim: Path) -> None:
+    for to in ("victim", "victim/a00.csv", "nowhere"):
+        (tmp_path / "out" / ".scratch").symlink_to(tmp_path / to)
+        run(tmp_path)
+        assert not (tmp_path / "out" / ".scratch").is_symlink()
+        assert not (tmp_path / "nowhere").exists()
+        assert unharmed(victim)
 
 
 def test_leftovers_are_not_looked_for_behind_links(tmp_path: Path, victim: Path) -> None:
@@ -75,50 +72,26 @@ def test_leftovers_are_not_looked_for_behind_links(tmp_path: Path, victim: Path)
     assert not (tmp_path / "out" / ".linked.0123456789ab.tmp").is_symlink()
 
 
-@pytest.mark.parametrize("name", ["../victim/a00.csv", "{victim}/a00.csv", "tracks/../../victim/a00.csv"])
-def test_a_manifest_names_nothing_outside(tmp_path: Path, victim: Path, name: str) -> None:
-    run(tmp_path)
-    path = tmp_path / "out" / "manifest" / "a00.json"
-    record = json.loads(path.read_text())
-    record["results"][name.format(victim=victim)] = "0" * 64
-    path.write_text(json.dumps(record))
-    assert Manifest(OutputFolder(tmp_path / "out")).record("a00") is None
-    assert run(tmp_path).done == ["a00"]
-    assert unharmed(victim)
-    assert list(json.loads(path.read_text())["results"]) == ["tracks/a00.csv"]
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("tracks/a01.csv", "tracks/a00.b.csv", "a01.csv", "tracks/b/a01.csv"),
-        *(
-            "manifest/a01.json",
-            "manifest/a00.json",
-            "manifest/a00/x",
-            ".lock",
-            ".scratch/a00.csv",
-            "configuration.yaml",
-        ),
-    ],
+FORGED = (
+    *("../victim/a00.csv", "{victim}/a00.csv", "tracks/../../victim/a00.csv", "tracks/a01.csv", "tracks/a00.b.csv"),
+    *("a01.csv", "tracks/b/a01.csv", "manifest/a00/x", ".scratch/a00.csv", "configuration.yaml"),
+    *("", ".", "..", "./a00.csv", "a//a00.csv", "a00.csv/", "a00\0.csv"),
 )
-def test_a_manifest_names_nothing_of_others(tmp_path: Path, name: str) -> None:
+
+
+def test_a_manifest_names_nothing_of_others(tmp_path: Path, victim: Path) -> None:
     run(tmp_path, 2)
     out = tmp_path / "out"
     path = out / "manifest" / "a00.json"
-    forged = json.loads(path.read_text())
-    forged["results"][name] = "0" * 64
-    path.write_text(json.dumps(forged))
-    target = out / name
-    if not target.exists():
-        target.parent.mkdir(exist_ok=True, parents=True)
-        target.write_text("mine")
-    before, inode = target.read_bytes(), target.stat().st_ino
-    assert Manifest(OutputFolder(out)).record("a00") is None
+    record, before = json.loads(path.read_text()), content(out)
+    for name in FORGED:
+        forged = record | {"results": record["results"] | {name.format(victim=victim): "0" * 64}}
+        path.write_text(json.dumps(forged))
+        assert Manifest(OutputFolder(out)).record("a00") is None, name
     assert run(tmp_path, 2).done == ["a00"]
-    if name not in ("manifest/a00.json", ".scratch/a00.csv"):
-        assert target.read_bytes() == before
-    assert name != ".lock" or target.stat().st_ino == inode
+    assert content(out) == before
+    assert unharmed(victim)
+    assert list(json.loads(path.read_text())["results"]) == ["tracks/a00.csv"]
 
 
 def test_a_record_of_another_scene_is_none(tmp_path: Path) -> None:
@@ -160,21 +133,19 @@ def test_a_result_behind_a_link_is_neither_believed_nor_removed(tmp_path: Path, 
     assert (tmp_path / "moved" / "a00.csv").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
+def test_a_record_of_other_types_is_none(tmp_path: Path) -> None:
+    run(tmp_path)
+    path = tmp_path / "out" / "manifest" / "a00.json"
+    sound = json.loads(path.read_text())
+    for change in (
         {"results": ["tracks/a00.csv"]},
         {"results": {"tracks/a00.csv": 1}},
         {"inputs": "a00.csv"},
         {"counts": {"frames": "many"}},
         {"counts": None},
-    ],
-)
-def test_a_record_of_other_types_is_none(tmp_path: Path, change: dict[str, object]) -> None:
-    run(tmp_path)
-    path = tmp_path / "out" / "manifest" / "a00.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    assert Manifest(OutputFolder(tmp_path / "out")).record("a00") is None
+    ):
+        path.write_text(json.dumps(sound | change))
+        assert Manifest(OutputFolder(tmp_path / "out")).record("a00") is None
     assert run(tmp_path).done == ["a00"]
 
 
@@ -211,13 +182,3 @@ def test_merged_tables_are_not_written_through_a_link(tmp_path: Path, victim: Pa
     )
     assert (code, error) == (2, f"error: {out / 'v1.0-mini'}: not writable: expected a folder, this is a link\n")
     assert unharmed(victim)
-
-
-@pytest.mark.parametrize("name", ["a", "a/b.csv", "..a", "a..", "%2F"])
-def test_names_inside(name: str) -> None:
-    assert is_inside(name)
-
-
-@pytest.mark.parametrize("name", ["", ".", "..", "/a", "../a", "a/../b", "a/..", "./a", "a//b", "a/", "a\0b", 1, None])
-def test_names_outside(name: object) -> None:
-    assert not is_inside(name)

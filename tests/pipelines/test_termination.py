@@ -144,7 +144,7 @@ import logging, os, pathlib, pkgutil, shutil, signal, sys, tempfile, time, weakr
 import numpy as np
 from data_tools.files.atomic_files import atomic_directory, write_text
 from pipelines.cli.termination import Terminated, ignore_sigterm, raise_on_sigterm
-from pipelines.scale_out.folder import OutputFolder
+from pipelines.scale_out import OutputFolder
 from saga_fg.numerics.arrays import distinct
 
 LABELS = np.array(["a", "b", "a"])  # whose kernel has not been compiled

@@ -1,11 +1,6 @@
-"""One scene as a job, and the manifest of what was done.
+"""The folder of a run: results of scenes, whole or not there, and a manifest of what was done.
 
-One scene as a job: the message to a worker, the work there, and the outcome.
-
-A job is a pure function of its input and its task's configuration: its results are the same bytes on any machine. Only
-the driver writes to the output. An input that fails costs its own results alone.
-
-The manifest of a run: one JSON file a scene, `manifest/NAME.json`, with the origin of its results.
+The manifest has a JSON file a scene, `manifest/NAME.json`, with the origin of its results.
 
     {"scene": "scene-0001", "status": "done", "reason": "", "inputs": {"lidar": SHA256, ...}, "configuration": SHA256,
      "version": "0.1.0", "results": {"tracks/scene-0001.json": SHA256, ...}, "counts": {"tracks": 31, ...},
@@ -15,111 +10,129 @@ A record is written, whole or not at all, after the results it names; results wi
 killed run, and are made anew. Letters that file names cannot have are written as in URLs (%2F).
 
 Results that a record no longer names are removed when its scene is done again. So that a forged record removes nothing
-else, it may only name files of its own scene: `NAME.SUFFIX` in any folder, or what is below `FOLDER/NAME/`.
+else, it may only name files of its own scene: `NAME.SUFFIX` in any folder, or what is below `FOLDER/NAME/`. For the
+same reason nothing is read, written or removed through a link that somebody has planted in the folder, which may be one
+itself: the user names it.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import json
-import tempfile
-import time
-import traceback
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-from importlib.metadata import version
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path, PurePosixPath
-from typing import Literal, Protocol
 from urllib.parse import quote
 
-from data_tools.datasets.source import Part
+from data_tools.files.atomic_files import remove_leftovers, write_bytes
 from data_tools.files.readers import parsed_json
-from pipelines.scale_out.folder import OutputFolder, is_inside
-from pipelines.tracking import one_thread
-from saga_fg.errors import InputError, SagaError
-from saga_fg.types.dataset import Dataset
-
-Status = Literal["done", "unchanged", "failed"]
+from pipelines.scale_out.pools import Outcome
+from saga_fg.errors import InputError
 
 
-class SceneTask(Protocol):
-    """The work on every scene. Picklable."""
+class OutputFolder:
+    """Files by their names relative to a folder, with `/` between the parts of a name."""
 
-    @property
-    def configuration(self) -> str:
-        """YAML text of everything, besides the input, that the results depend on."""
-        ...
+    def __init__(self, path: Path) -> None:
+        """Make the folder where it is missing. Raises `InputError` where that is not possible."""
+        self.path = path
+        with self._writing(""):
+            path.mkdir(parents=True, exist_ok=True)
+            self._root = path.resolve()
 
-    def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
-        """Write the results of input `name` to files in an empty folder; returns counts for people to read."""
-        ...
+    def read(self, name: str) -> bytes | None:
+        """The content of a regular file; None where there is none, or where a link is on the way."""
+        with suppress(OSError):
+            path = self._at(name)
+            if _is_regular(path):
+                return path.read_bytes()
+        return None
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file, whole or not at all. Raises `InputError` where that is not possible without following links."""
+        with self._writing(name):
+            path = self._at(name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not _is_regular(path):  # a link or a pipe is replaced
+                path.unlink(missing_ok=True)
+            write_bytes(path, content)
+
+    def remove(self, name: str) -> None:
+        """Remove a file, a link, or a folder with its content, if there is one."""
+        with suppress(OSError):
+            path = self._at(name)
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+    def new_folder(self, name: str) -> Path:
+        """Make an empty folder in place of anything of its name. Raises `InputError` where that is not possible."""
+        self.remove(name)
+        with self._writing(name):
+            self._at(name).mkdir()
+        return self.path / name
+
+    def remove_leftovers(self) -> None:
+        """Remove temporary files of killed runs, here, in folders below, and of this folder itself."""
+        remove_leftovers(self._root.parent, self._root.name)
+        for folder, _, _ in os.walk(self._root):
+            remove_leftovers(folder)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the folder for the block; the system lets go of it when the process ends, however it does.
+
+        Raises `InputError` if another process holds it.
+        """
+        with self._writing(".lock"):
+            lock = os.open(self._at(".lock"), os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        try:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise InputError(f"{self.path}: another run is writing to this folder") from error
+            yield
+        finally:
+            os.close(lock)
+
+    def _at(self, name: str) -> Path:
+        """Path of a file. Raises `OSError` where a link is on the way."""
+        path = self._root / name
+        if path.parent.resolve() != path.parent:
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+        return path
+
+    @contextmanager
+    def _writing(self, name: str) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            reason = "expected no link on the way" if name and error.errno == errno.ELOOP else error.strerror
+            where = self.path / name
+            raise InputError(f"{where}: not writable: {reason}; expected a folder for the results") from error
 
 
-@dataclass(frozen=True, eq=False)
-class Job:
-    """input; task; known: the digests for which results are there already, None if all is to be done anew."""
-
-    input: Part
-    task: SceneTask
-    known: Mapping[str, str] | None = None
+def _is_regular(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """The result of a job.
-
-    digests  of the input's parts, by name
-    files    content of every result by its path relative to the output
-    seconds  from opening the input to the last result
-    reason   one line, for failed jobs
-    version  of saga-fg at the worker
-    """
-
-    name: str
-    status: Status
-    digests: Mapping[str, str] = field(default_factory=dict)
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    counts: Mapping[str, int] = field(default_factory=dict)
-    seconds: float = 0.0
-    reason: str = ""
-    version: str = ""
-
-
-def perform(job: Job) -> Outcome:
-    """Perform a job; an exception becomes a failed outcome.
-
-    Linear algebra is kept to one thread: scenes run in parallel, and sums stay in one order.
-    """
-    name, digests, start = job.input.name, dict[str, str](), time.perf_counter()
-    here = version("saga-fg")
-    try:
-        with one_thread(), tempfile.TemporaryDirectory() as folder, job.input.opened() as at:
-            digests = dict(at.digests)
-            if digests == job.known:
-                return Outcome(name, "unchanged", digests, version=here)
-            counts = job.task.run(name, at.read(), Path(folder))
-            files = {
-                path.relative_to(folder).as_posix(): path.read_bytes()
-                for path in sorted(Path(folder).rglob("*"))
-                if path.is_file()
-            }
-    except SagaError as error:
-        return Outcome(name, "failed", digests, seconds=time.perf_counter() - start, reason=str(error), version=here)
-    except Exception as error:
-        reason = f"{_last_frame(error)}{type(error).__name__}: {error}".strip()
-        return Outcome(name, "failed", digests, seconds=time.perf_counter() - start, reason=reason, version=here)
-    return Outcome(name, "done", digests, files, counts, time.perf_counter() - start, version=here)
+def is_inside(name: object) -> bool:
+    """Return True for the name of a file below a folder: relative, and without `..`."""
+    if not isinstance(name, str) or "\0" in name:
+        return False
+    path = PurePosixPath(name)
+    return str(path) == name and not path.is_absolute() and ".." not in path.parts and name != "."
 
 
 def sha256(content: bytes) -> str:
     """Return the SHA-256 in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
-
-
-def _last_frame(error: Exception) -> str:
-    """Return the place where an unexpected exception was raised: `file.py:12: `."""
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"{Path(frames[-1].filename).name}:{frames[-1].lineno}: " if frames else ""
 
 
 OF_THE_RUN = ("manifest", ".lock", ".scratch", "configuration.yaml")  # and of no scene
