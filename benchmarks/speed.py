@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,9 +28,9 @@ from benchmarks.recording_sets import recording_set
 from benchmarks.runner import Data, Row, Rows, Seed, counts, growth, in_turn
 from benchmarks.service.round_trip import round_trips
 from pipelines.config import Method, TrackConfig, load_config
-from pipelines.tracking import StageClock
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.tracking import Stage, TrackerView
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
 
@@ -52,6 +53,24 @@ class SpeedCase:
     size: int | None
     frames: Sequence[Frame]
     config: TrackConfig
+
+
+class StageClock:
+    """CPU time of each stage of a frame, added up. `start()` is to be called before every frame."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._mark = 0.0
+
+    def start(self) -> None:
+        """Begin a frame."""
+        self._mark = time.thread_time()
+
+    def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
+        """Add the time of a stage that is done."""
+        now = time.thread_time()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
+        self._mark = now
 
 
 def speed(

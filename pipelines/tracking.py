@@ -1,15 +1,12 @@
-"""Online tracking of recorded scenes, with observers, and without a detector.
-
-Online tracking of recorded scenes: frames in order of time into a tracker, tracks at every moment of the scene.
+"""Online tracking of recorded scenes, with observers: frames into a tracker, tracks at every moment of the scene.
 
 At a moment t of the scene, every frame up to and including t has been taken in; the tracks reported are the tracker's
 state at t, predicted there where the last frame is older. Nothing later than t has any influence.
 
 With horizons, the tracks reported at t are predicted to t plus each of them as well.
 
-This process: the threads of its linear algebra, and its memory.
-
-For matrices as small as a filter's, threads cost more than they bring.
+Of this process, the threads of its linear algebra and its memory: for matrices as small as a filter's, threads cost
+more than they bring.
 """
 
 from __future__ import annotations
@@ -22,7 +19,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -30,9 +26,8 @@ from threadpoolctl import threadpool_limits
 from data_tools.datasets.detection_files import prediction_writer, predictions_path
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking import SensorTime, Stage, TrackerView
+from saga_fg.tracking import GreedyTracker, SensorTime, Stage, Tracker, TrackerView
 from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.frame import Frame
 from saga_fg.types.track import LONGEST_PREDICTION, PredictedTracks, Tracks
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc
@@ -77,39 +72,8 @@ Progress = Callable[[str, int, int], None]
 """Called with the scene's name, the number of its frames done, and the number of all its frames."""
 
 
-class OnlineTracker(Protocol):
-    """A tracker that takes one frame at a time, of any sensor."""
-
-    def step(self, frame: Frame) -> Tracks:
-        """Take in a frame; the tracks at its time."""
-        ...
-
-    def tracks(self, timestamp: float) -> Tracks:
-        """The tracks predicted to `timestamp` (s), without a change of state."""
-        ...
-
-
-@runtime_checkable
-class PredictingTracker(Protocol):
-    """A tracker that predicts its tracks, `saga_fg.tracking.Tracker`."""
-
-    def predict(self, horizons: FloatArray, joint: bool = False) -> PredictedTracks:
-        """The tracks at horizons (H,), s, after the newest frame."""
-        ...
-
-
-@runtime_checkable
-class ClockComparing(Protocol):
-    """A tracker that compares the clocks of its sensors."""
-
-    @property
-    def sensor_times(self) -> dict[str, SensorTime]:
-        """The clock of each sensor against the consensus of all."""
-        ...
-
-    def take_clocks(self, other: Any) -> None:
-        """Take over the usual steps and the records of the sensors from the tracker of the scene before."""
-        ...
+OnlineTracker = Tracker | GreedyTracker
+"""A tracker that takes one frame at a time, of any sensor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +130,7 @@ def track_scene(
 
 def compared_clocks(tracker: OnlineTracker) -> dict[str, SensorTime]:
     """The clocks of a tracker's sensors, where there are several."""
-    clocks = tracker.sensor_times if isinstance(tracker, ClockComparing) else {}
+    clocks = tracker.sensor_times
     return clocks if len(clocks) > 1 else {}
 
 
@@ -174,7 +138,7 @@ def _predicted(
     tracker: OnlineTracker, moment: float, horizons: FloatArray, newest: float
 ) -> tuple[PredictedTracks, ...]:
     """The tracks at times after a moment; none where the newest frame is too far from it."""
-    if not isinstance(tracker, PredictingTracker):
+    if isinstance(tracker, GreedyTracker):
         raise InputError("--predict: expected a method that predicts, saga or kf")
     since = np.asarray(horizons + (moment - newest))
     if since[0] < 0 or since[-1] > LONGEST_PREDICTION:
@@ -221,24 +185,6 @@ def scene_with_frames(dataset: Dataset, name: str) -> Scene:
     if not scene.frames:
         raise InputError(f"scene {name}: expected frames of detections, there are none")
     return scene
-
-
-class StageClock:
-    """CPU time of each stage of a frame, added up. `start()` is to be called before every frame."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._mark = 0.0
-
-    def start(self) -> None:
-        """Begin a frame."""
-        self._mark = time.thread_time()
-
-    def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
-        """Add the time of a stage that is done."""
-        now = time.thread_time()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._mark
-        self._mark = now
 
 
 class InnovationRecorder:

@@ -20,10 +20,10 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn, get_args
 
 import numpy as np
 
@@ -35,18 +35,104 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Coordinates, Detections, Frame
 from saga_fg.types.track import PredictedTracks, Tracks, checked_horizons
 
-REQUESTS = ("status", "subscribe", "predict", "reset")
 MAX_HORIZON = 10.0  # furthest time of a prediction, s
 MAX_HORIZONS = 20  # largest number of times of a prediction
+LONGEST_NAME = 64  # characters of a label or a sensor: names are kept
+REQUIRED = object()
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a message.
+
+    expected  its values in words, for errors
+    read      makes the value of what JSON has; raises `TypeError`, `ValueError` or `OverflowError` for other values
+    default   of a field that is left out; null counts as left out, unless `null` is False
+    """
+
+    expected: str
+    read: Callable[[Any], Any]
+    default: Any = REQUIRED
+    null: bool = True
+
+
+def _number(value: Any) -> float:
+    if type(value) not in (int, float) or not math.isfinite(number := float(value)):
+        raise TypeError
+    return number
+
+
+def _whole_number(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 2**63:
+        raise TypeError
+    return value
+
+
+def _name(value: Any) -> str:
+    if not isinstance(value, str) or not 0 < len(value) <= LONGEST_NAME:
+        raise TypeError
+    return value
+
+
+def _list(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise TypeError
+    return value
+
+
+def _coordinates(value: Any) -> Coordinates:
+    if value not in get_args(Coordinates):
+        raise TypeError
+    return value  # type: ignore[no-any-return]
+
+
+def _horizons(value: Any) -> FloatArray:
+    if not isinstance(value, list) or len(value) > MAX_HORIZONS:
+        raise TypeError
+    horizons = checked_horizons([_value("horizons", _NUMBER, each) for each in value])
+    if horizons[-1] > MAX_HORIZON:
+        raise InputError(f"horizons: expected at most {MAX_HORIZON:g} s, got {horizons[-1]:g}")
+    return horizons
+
+
+def _pose(value: Any) -> FloatArray:
+    return yaw_transform(**_values("ego", value, EGO))
+
+
+def _optional(default: float) -> Field:
+    return Field(_NUMBER.expected, _number, default)
+
 
 POSITION, SIZE, VELOCITY = ("x", "y", "z"), ("length", "width", "height"), ("vx", "vy")
 NUMBERS = (*POSITION, *SIZE, "yaw", *VELOCITY, "score")
-MEASURED = (*NUMBERS, "range_rate")  # of a detection
-FRAME_KEYS = ("type", "seq", "timestamp", "sensor", "coordinates", "ego", "detections")
-DEFAULTS = {"z": 0.0, "score": 1.0}
-_ABSENT = tuple((name, None if name in ("x", "y") else DEFAULTS.get(name, np.nan)) for name in MEASURED)
-_DETECTION_KEYS = frozenset(("label", *MEASURED))
-LONGEST_NAME = 64  # characters of a label or a sensor: names are kept
+_NUMBER = Field("a finite number", _number)
+_NAME = Field(f"a name of 1 to {LONGEST_NAME} characters", _name, null=False)
+DETECTION = {
+    **dict.fromkeys((*NUMBERS, "range_rate"), _optional(math.nan)),
+    "x": _NUMBER,
+    "y": _NUMBER,
+    "z": _optional(0.0),
+    "score": _optional(1.0),
+    "label": replace(_NAME, default="object"),
+}
+EGO = {"x": _NUMBER, "y": _NUMBER, "z": _optional(0.0), "yaw": _NUMBER}
+_TYPE = {"type": Field("the type of a message", _name, "frame")}
+MESSAGES: Mapping[str, Mapping[str, Field]] = {
+    "frame": {
+        **_TYPE,
+        "seq": Field("an integer from 0 on", _whole_number, None),
+        "timestamp": _NUMBER,
+        "sensor": replace(_NAME, default="sensor"),
+        "coordinates": Field(f"one of {', '.join(get_args(Coordinates))}", _coordinates, "world", null=False),
+        "ego": Field("an object with x, y and yaw", _pose, None),
+        "detections": Field("a list", _list),
+    },
+    "status": _TYPE,
+    "subscribe": _TYPE,
+    "predict": {**_TYPE, "horizons": Field(f"a list of at most {MAX_HORIZONS} s", _horizons)},
+    "reset": {**_TYPE, "sensor": replace(_NAME, default=None)},
+}
+"""Fields of the messages that come in, by their type."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +146,7 @@ class FrameMessage:
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """One of `REQUESTS`.
+    """A message that is no frame; kind: its type.
 
     sensor    of a reset of the number of one sensor alone, whose next frame may have any
     horizons  (H,) of a request for predictions, s after the newest frame
@@ -84,28 +170,11 @@ def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Reque
     if not isinstance(message, dict):
         raise InputError(f"message: expected an object, got {_short(message)}")
     kind = message.get("type", "frame")
-    if kind == "frame":
-        return _frame_message(message, settings)
-    if kind not in REQUESTS:
-        raise InputError(f"type: expected frame, {', '.join(REQUESTS)}, got {_short(kind)}")
-    if kind == "reset" and "sensor" in message:
-        _known("", message, ("type", "sensor"))
-        return Request(kind, _name("", message, "sensor", ""))
-    if kind == "predict":
-        _known("", message, ("type", "horizons"))
-        return Request(kind, horizons=stream_horizons(message.get("horizons"), settings))
-    _known("", message, ("type",))
-    return Request(kind)
-
-
-def stream_horizons(given: Any, settings: StreamSettings) -> FloatArray:
-    """Return horizons (H,), s. Raises `InputError` unless they are increasing numbers within the stream's limits."""
-    if not isinstance(given, list) or len(given) > MAX_HORIZONS:
-        raise InputError(f"horizons: expected a list of at most {MAX_HORIZONS} s, got {_short(given)}")
-    horizons = checked_horizons([_number("horizons", {"": each}, "") for each in given])
-    if horizons[-1] > MAX_HORIZON:
-        raise InputError(f"horizons: expected at most {MAX_HORIZON:g} s, got {horizons[-1]:g}")
-    return horizons
+    if not isinstance(kind, str) or kind not in MESSAGES:
+        raise InputError(f"type: expected {', '.join(MESSAGES)}, got {_short(kind)}")
+    values = _values("", message, MESSAGES[kind])
+    del values["type"]
+    return _frame_message(values, settings) if kind == "frame" else Request(kind, **values)
 
 
 def tracks_message(tracks: Tracks) -> dict[str, Any]:
@@ -207,111 +276,61 @@ class LineSplitter:
             self._unfinished += part
 
 
-def _frame_message(message: Mapping[str, Any], settings: StreamSettings) -> FrameMessage:
-    _known("", message, FRAME_KEYS)
-    seq = message.get("seq")
-    if seq is not None and (type(seq) is not int or not 0 <= seq < 2**63):
-        raise InputError(f"seq: expected an integer from 0 on, got {_short(seq)}")
-    rows = message.get("detections")
-    if not isinstance(rows, list):
-        raise InputError(f"detections: expected a list, got {_short(rows)}")
+def _frame_message(values: Mapping[str, Any], settings: StreamSettings) -> FrameMessage:
+    rows = values["detections"]
     if len(rows) > settings.max_detections:
         raise InputError(f"detections: expected at most {settings.max_detections}, got {len(rows)}")
-    coordinates = message.get("coordinates", "world")
     try:
-        detections, yaw = _detections(rows)
-        frame = Frame(
-            timestamp=_number("", message, "timestamp"),
-            sensor=_name("", message, "sensor", "sensor"),
-            detections=detections,
-            world_T_ego=_pose(message["ego"]) if message.get("ego") is not None else None,
-            coordinates=cast(Coordinates, coordinates if isinstance(coordinates, str) else repr(coordinates)),
-        )
+        detections, yaw = _detections([_values(f"detections[{k}]", row, DETECTION) for k, row in enumerate(rows)])
+        frame = Frame(values["timestamp"], values["sensor"], detections, values["ego"], values["coordinates"])
     except InputError as error:  # names the field as a frame has it
         raise InputError(re.sub("^world_T_ego:", "ego:", str(error))) from error
-    return FrameMessage(frame, seq, yaw)
+    return FrameMessage(frame, values["seq"], yaw)
 
 
-def _detections(rows: Sequence[Any]) -> tuple[Detections, FloatArray]:
+def _detections(rows: Sequence[Mapping[str, Any]]) -> tuple[Detections, FloatArray]:
     """The detections, and their headings before they are wrapped."""
-    labels, numbers = _plain_rows(rows) or _checked_rows(rows)
-    columns = dict(zip(MEASURED, numbers.T, strict=True))
 
-    def stacked(names: Sequence[str]) -> FloatArray:
-        return np.stack([columns[name] for name in names], axis=-1)
+    def column(name: str) -> FloatArray:
+        return np.array([row[name] for row in rows], dtype=np.float64)
 
-    boxes = Boxes.of(labels, stacked(POSITION), stacked(SIZE), columns["yaw"], stacked(VELOCITY))
-    return Detections(boxes, columns["score"], columns["range_rate"]), columns["yaw"]
-
-
-def _plain_rows(rows: Sequence[Any]) -> tuple[list[str], FloatArray] | None:
-    """Labels (m,) and numbers (m, len(MEASURED)) of detections; None where one of them is not as it should be."""
-    if not all(type(row) is dict and row.keys() <= _DETECTION_KEYS for row in rows):
-        return None
-    labels = [row.get("label", "object") for row in rows]
-    if not all(type(label) is str and 0 < len(label) <= LONGEST_NAME for label in labels):
-        return None
-    values = [row.get(name, absent) for row in rows for name, absent in _ABSENT]
-    if not {type(value) for value in values} <= {int, float}:
-        return None
-    try:
-        numbers = np.array(values, dtype=np.float64).reshape(len(rows), len(MEASURED))
-    except OverflowError:
-        return None
-    return None if np.isinf(numbers).any() else (labels, numbers)  # JSON has no NaN: that is what is left out
+    position, size, velocity = (np.stack([*map(column, names)], axis=-1) for names in (POSITION, SIZE, VELOCITY))
+    yaw = column("yaw")
+    boxes = Boxes.of([row["label"] for row in rows], position, size, yaw, velocity)
+    return Detections(boxes, column("score"), column("range_rate")), yaw
 
 
-def _checked_rows(rows: Sequence[Any]) -> tuple[list[str], FloatArray]:
-    """Check row by row; raises `InputError` for the first bad one."""
-    numbers = np.empty((len(rows), len(MEASURED)))
-    labels = []
-    for k, row in enumerate(rows):
-        where = f"detections[{k}]"
-        if not isinstance(row, dict):
-            raise InputError(f"{where}: expected an object, got {_short(row)}")
-        _known(f"{where}.", row, ("label", *MEASURED))
-        labels.append(_name(f"{where}.", row, "label", "object"))
-        numbers[k] = [_number(f"{where}.", row, name, absent) for name, absent in _ABSENT]
-    return labels, numbers
-
-
-def _pose(ego: Any) -> FloatArray:
-    if not isinstance(ego, dict):
-        raise InputError(f"ego: expected an object with x, y and yaw, got {_short(ego)}")
-    _known("ego.", ego, ("x", "y", "z", "yaw"))
-    return yaw_transform(*(_number("ego.", ego, name, 0.0 if name == "z" else None) for name in ("x", "y", "z", "yaw")))
-
-
-def _number(where: str, values: Mapping[str, Any], name: str, default: float | None = None) -> float:
-    value = values.get(name)
-    if value is None and default is not None:
-        return default
-    if type(value) not in (int, float):
-        got = "it is left out" if value is None else f"got {_short(value)}"
-        raise InputError(f"{where}{name}: expected a number, {got}")
-    try:
-        number = float(cast(float, value))
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise InputError(f"{where}{name}: expected a finite number, got {_short(value)}")
-    return number
-
-
-def _name(where: str, values: Mapping[str, Any], name: str, default: str) -> str:
-    value = values.get(name, default)
-    if not isinstance(value, str) or not 0 < len(value) <= LONGEST_NAME:
-        raise InputError(f"{where}{name}: expected a name of 1 to {LONGEST_NAME} characters, got {_short(value)}")
-    return value
-
-
-def _known(where: str, values: Mapping[str, Any], names: Sequence[str]) -> None:
-    unknown = values.keys() - set(names)
-    if unknown:
+def _values(where: str, given: Any, fields: Mapping[str, Field]) -> dict[str, Any]:
+    """The values of the fields of an object, which is at `where` in a message; defaults for those left out."""
+    if not isinstance(given, dict):
+        raise InputError(f"{where}: expected an object, got {_short(given)}")
+    if unknown := given.keys() - fields.keys():
         name = min(unknown)
-        nearest = get_close_matches(name, names, n=1, cutoff=0.6)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; expected {', '.join(names)}"
-        raise InputError(f"{where}{_short(name)}: unknown field{hint}")
+        nearest = get_close_matches(name, fields, n=1, cutoff=0.6)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; expected {', '.join(fields)}"
+        raise InputError(f"{_dotted(where, _short(name))}: unknown field{hint}")
+    values = {}
+    for name, each in fields.items():
+        if name in given and not (each.null and given[name] is None):
+            values[name] = _value(_dotted(where, name), each, given[name])
+        elif each.default is REQUIRED:
+            raise InputError(f"{_dotted(where, name)}: expected {each.expected}, it is left out")
+        else:
+            values[name] = each.default
+    return values
+
+
+def _value(where: str, of: Field, given: Any) -> Any:
+    try:
+        return of.read(given)
+    except InputError:
+        raise
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{where}: expected {of.expected}, got {_short(given)}") from None
+
+
+def _dotted(where: str, name: str) -> str:
+    return f"{where}.{name}" if where else name
 
 
 def _refuse_constant(name: str) -> NoReturn:

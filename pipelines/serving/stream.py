@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
@@ -25,10 +25,13 @@ from pipelines.serving.messages import (
     unconfirmed_message,
 )
 from pipelines.serving.settings import LogLimit, StreamSettings
-from pipelines.tracking import ClockComparing, OnlineTracker, PredictingTracker, compared_clocks, resident_memory
+from pipelines.tracking import OnlineTracker, compared_clocks, resident_memory
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking import SensorTime, TimeVerdict
+from saga_fg.tracking import GreedyTracker, SensorTime
+
+if TYPE_CHECKING:
+    from pipelines.serving.state import StateKeeper
 
 log = logging.getLogger(__name__)
 
@@ -42,40 +45,6 @@ COUNTED = (
 )
 
 MAX_HELD = 256  # largest number of frames held back; beyond it the oldest is tracked
-
-
-class StateSaver(Protocol):
-    """Keeper of the stream's state on the disk, `pipelines.serving.state.StateKeeper`."""
-
-    def save(self) -> bool:
-        """Write the state; return True if it is on the disk now."""
-        ...
-
-    def status(self) -> dict[str, Any]:
-        """Return the age of the file and the latest error."""
-        ...
-
-
-class StreamedTracker(OnlineTracker, Protocol):
-    """A tracker that judges the times of frames, and whose state can be kept: `Tracker` and `GreedyTracker`."""
-
-    @property
-    def time_verdict(self) -> TimeVerdict:
-        """Judgement of the latest frame's time."""
-        ...
-
-    @property
-    def max_jump(self) -> float:
-        """Distance from the newest time, s, beyond which a frame has to be confirmed by another."""
-        ...
-
-    def snapshot(self) -> Any:
-        """Return the state as a tree of values."""
-        ...
-
-    def restore(self, snapshot: Any) -> None:
-        """Go on from a snapshot of a tracker of the same settings."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +70,7 @@ class StreamTracker(Generic[Client]):
 
     def __init__(
         self,
-        new_tracker: Callable[[], StreamedTracker],
+        new_tracker: Callable[[], OnlineTracker],
         settings: StreamSettings | None = None,
         doubts: Doubts | None = None,
         horizons: FloatArray | None = None,
@@ -109,7 +78,7 @@ class StreamTracker(Generic[Client]):
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # ms
-        self.keeper: StateSaver | None = None
+        self.keeper: StateKeeper | None = None
         self.version = 0  # grows whenever there is something new to keep
         self._new_tracker = new_tracker
         self._tracker = new_tracker()
@@ -208,10 +177,9 @@ class StreamTracker(Generic[Client]):
             return [(client, self._predictions(message.horizons))]
         answers = self._flush()  # held frames would bring numbers back
         if message.sensor is None:
-            before = self._tracker
+            before: Any = self._tracker
             self._begin_anew()
-            if isinstance(self._tracker, ClockComparing):
-                self._tracker.take_clocks(before)
+            self._tracker.take_clocks(before)
             return [*answers, (client, {"type": "reset"})]
         self._forget(message.sensor)
         self.version += 1
@@ -293,7 +261,7 @@ class StreamTracker(Generic[Client]):
 
     def _predictions(self, horizons: FloatArray) -> Answer:
         """Return the tracks at times after the newest frame, s. Raises `InputError` where there are none."""
-        if not isinstance(self._tracker, PredictingTracker):
+        if isinstance(self._tracker, GreedyTracker):
             raise InputError("predict: expected --method saga or kf, centerpoint predicts nothing")
         return predictions_message(self._tracker.predict(horizons))
 

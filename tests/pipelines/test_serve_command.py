@@ -103,27 +103,27 @@ def test_nobody_there_is_one_line():
     assert done.stderr.startswith("error: /nowhere/x.sock: nobody answers there")
 
 
-@pytest.mark.parametrize(
-    ("said", "message"),
-    [
-        (b"HTTP/1.1 400 Bad Request\r\n", "expected an answer in JSON, got b'HTTP/1.1 400"),
-        (b"[1]\n", "expected an object as answer"),
-        (b'{"type": "tracks"}\n', "expected the status of `saga-fg serve`, got {'type': 'tracks'}"),
-        (b"", "expected the status of `saga-fg serve`: the service has closed the connection"),
-    ],
-)
-def test_the_status_of_another_service_is_one_line(said: bytes, message: str):
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        where = f"127.0.0.1:{listening.getsockname()[1]}"
-        with subprocess.Popen([*COMMAND, "status", where], stderr=subprocess.PIPE, text=True) as asking:
-            connection, _ = listening.accept()
-            with connection:
-                connection.recv(1000)
-                connection.sendall(said)
-            _, error = asking.communicate()
-    assert asking.returncode == 2
-    assert error.startswith(f"error: {where}: {message}")
-    assert len(error.splitlines()) == 1
+OTHER_SERVICES = [
+    (b"HTTP/1.1 400 Bad Request\r\n", "expected an answer in JSON, got b'HTTP/1.1 400"),
+    (b"[1]\n", "expected an object as answer"),
+    (b'{"type": "tracks"}\n', "expected the status of `saga-fg serve`, got {'type': 'tracks'}"),
+    (b"", "expected the status of `saga-fg serve`: the service has closed the connection"),
+]
+
+
+def test_the_status_of_another_service_is_one_line():
+    for said, message in OTHER_SERVICES:
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            where = f"127.0.0.1:{listening.getsockname()[1]}"
+            with subprocess.Popen([*COMMAND, "status", where], stderr=subprocess.PIPE, text=True) as asking:
+                connection, _ = listening.accept()
+                with connection:
+                    connection.recv(1000)
+                    connection.sendall(said)
+                _, error = asking.communicate()
+        assert asking.returncode == 2
+        assert error.startswith(f"error: {where}: {message}")
+        assert len(error.splitlines()) == 1
 
 
 def test_standard_input_to_standard_output(tmp_path: Path):

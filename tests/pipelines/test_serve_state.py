@@ -74,21 +74,17 @@ def test_frames_that_were_held_are_sent_again(tmp_path: Path):
         assert status(address)["taken"] == {"sensor": 12}
 
 
-def test_the_state_of_another_configuration_is_refused(tmp_path: Path, subtests):
-    for other, expected in [
-        (["--method", "kf"], "method: the state is of another one, 'saga' instead of 'kf'"),
-        (["--estimator", "isam2"], "'estimator: kalman' instead of 'estimator: isam2'"),
-    ]:
-        with subtests.test(expected):
-            state = tmp_path / "state"
-            command = [*COMMAND, "serve", "--snapshot", str(state)]
-            subprocess.run(command, input=frame(0), capture_output=True, check=True)
-            before = state.read_bytes()
-            done = subprocess.run([*command, *other], input="", capture_output=True, text=True, check=False)
-            assert done.returncode == 2
-            assert expected in done.stderr
-            assert len(done.stderr.splitlines()) == 1
-            assert state.read_bytes() == before
+def test_the_state_of_another_configuration_is_refused(tmp_path: Path):
+    state = tmp_path / "state"
+    command = [*COMMAND, "serve", "--snapshot", str(state)]
+    subprocess.run(command, input=frame(0), capture_output=True, check=True)
+    before = state.read_bytes()
+    other = [*command, "--estimator", "isam2"]
+    done = subprocess.run(other, input="", capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "'estimator: kalman' instead of 'estimator: isam2'" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert state.read_bytes() == before
 
 
 def test_factors_of_ones_own_cannot_be_kept(tmp_path: Path):
@@ -117,16 +113,6 @@ def test_a_state_file_is_of_one_service(tmp_path: Path):
         server.wait()
     done = subprocess.run(command, input=frame(0), capture_output=True, check=False)  # a killed one holds nothing
     assert done.returncode == 0
-
-
-def test_a_damaged_state_is_refused(tmp_path: Path):
-    state = tmp_path / "state"
-    state.write_bytes(b"saga-fg state 1\nnonsense")
-    command = [*COMMAND, "serve", "--snapshot", str(state)]
-    done = subprocess.run(command, input="", capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {state}: the state file is damaged")
-    assert len(done.stderr.splitlines()) == 1
 
 
 def test_a_pipe_keeps_its_state_too(tmp_path: Path):

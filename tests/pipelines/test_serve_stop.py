@@ -37,8 +37,7 @@ with StopRequest(0.5) as stop:
 """
 
 
-@pytest.mark.parametrize("waiting", ["time.sleep(1)", "pass"])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(("waiting", "number"), [("time.sleep(1)", signal.SIGTERM), ("pass", signal.SIGINT)])
 def test_a_step_without_end_does_not_keep_the_service_alive(waiting: str, number: signal.Signals):
     command = [sys.executable, "-c", STUCK.format(waiting=waiting)]
     with serving(command=command) as (address, server), StreamClient(address) as client:

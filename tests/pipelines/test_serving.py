@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -93,42 +94,46 @@ def test_a_frame_is_read_with_all_its_fields():
     np.testing.assert_array_equal(read.detections.range_rate, [-2.5, np.nan])
 
 
-def test_what_cannot_be_used_is_answered_counted_and_without_effect(subtests):
-    for line, message in [
-        (b"{", "broken JSON"),
-        (b"\xff\xfe", "broken JSON"),
-        (b"[" * 100_000, "broken JSON"),
-        (b"[]", "expected an object"),
-        (b'{"timestamp": NaN, "detections": []}', "JSON, which has no NaN"),
-        (b'{"timestamp": 1e400, "detections": []}', "timestamp: expected a finite number"),
-        (b'{"timestamp": true, "detections": []}', "timestamp: expected a number, got True"),
-        (b'{"detections": []}', "timestamp: expected a number, it is left out"),
-        (b'{"timestamp": 1700000000000000000, "detections": []}', "nanoseconds"),
-        (b'{"timestamp": 1}', "detections: expected a list"),
-        (b'{"timestamp": 1, "detections": [7]}', r"detections\[0\]: expected an object"),
-        (b'{"timestamp": 1, "detections": [{"x": 1}]}', r"detections\[0\].y: expected a number, it is left out"),
-        (b'{"timestamp": 1, "detections": [{"x": 1, "y": "2"}]}', r"detections\[0\].y: expected a number, got '2'"),
-        (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "lenght": 3}]}', "did you mean 'length'"),
-        (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "length": 0}]}', r"size\[0\]: expected positive"),
-        (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "label": ""}]}', "label: expected a name"),
-        (b'{"timestamp": 1, "sensor": {}, "detections": []}', "sensor: expected a name"),
-        (b'{"timestamp": 1, "coordinates": "ego", "detections": []}', "^ego: expected a pose"),
-        (b'{"timestamp": 1, "coordinates": [], "detections": []}', "coordinates: expected one of"),
-        (b'{"timestamp": 1, "ego": {"x": 1, "y": 2}, "detections": []}', "ego.yaw: expected a number"),
-        (b'{"timestamp": 1, "seq": -1, "detections": []}', "seq: expected an integer"),
-        (b'{"timestamp": 1, "timestmap": 1, "detections": []}', "did you mean 'timestamp'"),
-        (b'{"type": "stop"}', "type: expected frame, status, subscribe, predict, reset, got 'stop'"),
-        (b'{"type": "status", "x": 1}', "unknown field"),
-    ]:
-        with subtests.test(message):
-            service = stream()
-            answers(service, frame(0.0))
-            (answer,) = answers(service, line)
-            assert answer["type"] == "error"
-            with pytest.raises(InputError, match=message):
-                raise InputError(answer["message"])
-            assert service.counts["refused"] == 1
-            assert [t["id"] for t in answers(service, frame(0.1))[0]["tracks"]] == [1]
+BAD_LINES = [
+    (b"{", "broken JSON"),
+    (b"\xff\xfe", "broken JSON"),
+    (b"[" * 100_000, "broken JSON"),
+    (b"[]", "expected an object"),
+    (b'{"timestamp": NaN, "detections": []}', "JSON, which has no NaN"),
+    (b'{"timestamp": 1e400, "detections": []}', "timestamp: expected a finite number"),
+    (b'{"timestamp": true, "detections": []}', "timestamp: expected a finite number, got True"),
+    (b'{"detections": []}', "timestamp: expected a finite number, it is left out"),
+    (b'{"timestamp": 1700000000000000000, "detections": []}', "nanoseconds"),
+    (b'{"timestamp": 1}', "detections: expected a list"),
+    (b'{"timestamp": 1, "detections": [7]}', r"detections\[0\]: expected an object"),
+    (b'{"timestamp": 1, "detections": [{"x": 1}]}', r"detections\[0\].y: expected a finite number, it is left out"),
+    (
+        b'{"timestamp": 1, "detections": [{"x": 1, "y": "2"}]}',
+        r"detections\[0\].y: expected a finite number, got '2'",
+    ),
+    (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "lenght": 3}]}', "did you mean 'length'"),
+    (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "length": 0}]}', r"size\[0\]: expected positive"),
+    (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "label": ""}]}', "label: expected a name"),
+    (b'{"timestamp": 1, "sensor": {}, "detections": []}', "sensor: expected a name"),
+    (b'{"timestamp": 1, "coordinates": "ego", "detections": []}', "^ego: expected a pose"),
+    (b'{"timestamp": 1, "coordinates": [], "detections": []}', "coordinates: expected one of"),
+    (b'{"timestamp": 1, "ego": {"x": 1, "y": 2}, "detections": []}', "ego.yaw: expected a finite number"),
+    (b'{"timestamp": 1, "seq": -1, "detections": []}', "seq: expected an integer"),
+    (b'{"timestamp": 1, "timestmap": 1, "detections": []}', "did you mean 'timestamp'"),
+    (b'{"type": "stop"}', "type: expected frame, status, subscribe, predict, reset, got 'stop'"),
+    (b'{"type": "status", "x": 1}', "unknown field"),
+]
+
+
+def test_what_cannot_be_used_is_answered_counted_and_without_effect():
+    service = stream()
+    answers(service, frame(0.0))
+    for line, message in BAD_LINES:
+        (answer,) = answers(service, line)
+        assert answer["type"] == "error"
+        assert re.search(message, answer["message"]), (line, answer["message"])
+    assert service.counts["refused"] == len(BAD_LINES)
+    assert [t["id"] for t in answers(service, frame(0.1))[0]["tracks"]] == [1]
 
 
 def test_limits_hold():
@@ -240,23 +245,20 @@ def test_a_pipe_is_served_to_its_end():
     assert kinds == ["tracks", "error", "error", "tracks"]
 
 
-@pytest.mark.parametrize(
-    ("text", "host", "port", "local"),
-    [
-        ("127.0.0.1:80", "127.0.0.1", 80, True),
-        (":7447", "127.0.0.1", 7447, True),
-        ("[::1]:1", "::1", 1, True),
-        ("localhost:1", "localhost", 1, True),
-        ("0.0.0.0:1", "0.0.0.0", 1, False),
-        ("example.org:1", "example.org", 1, False),
-    ],
-)
-def test_addresses(text, host, port, local):
-    address = parse_address(text)
-    assert (address.host, address.port, address.is_local) == (host, port, local)
+ADDRESSES = [
+    ("127.0.0.1:80", "127.0.0.1", 80, True),
+    (":7447", "127.0.0.1", 7447, True),
+    ("[::1]:1", "::1", 1, True),
+    ("localhost:1", "localhost", 1, True),
+    ("0.0.0.0:1", "0.0.0.0", 1, False),
+    ("example.org:1", "example.org", 1, False),
+]
 
 
-def test_addresses_that_are_none():
+def test_addresses():
+    for text, host, port, local in ADDRESSES:
+        address = parse_address(text)
+        assert (address.host, address.port, address.is_local) == (host, port, local)
     assert parse_address("/tmp/x.sock").is_local
     for text in ("nowhere", "host:", "host:99999", "host:-1", "host:²"):
         with pytest.raises(InputError, match="expected HOST:PORT"):

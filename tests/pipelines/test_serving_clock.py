@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, cast
 
 from pipelines.serving import StreamSettings, StreamTracker
 from pipelines.serving.messages import encode
@@ -14,6 +14,7 @@ class ScriptedTracker:
     """Has a verdict ready for every frame; keeps the times of those it took in."""
 
     max_jump = 10.0
+    sensor_times: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, *verdicts: str) -> None:
         self.verdicts = list(verdicts)
@@ -46,7 +47,7 @@ class Scripted:
 
 def scripted(*verdicts: str, **settings: Any) -> Scripted:
     tracker = ScriptedTracker(*verdicts)
-    return Scripted(tracker, StreamTracker(lambda: tracker, StreamSettings(**settings)))
+    return Scripted(tracker, StreamTracker(lambda: cast(Any, tracker), StreamSettings(**settings)))
 
 
 def test_a_late_frame_is_answered_as_late_and_done_with():

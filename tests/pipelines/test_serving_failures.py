@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import Any, ClassVar, cast
 
 import pytest
 
@@ -17,6 +17,7 @@ class Failing:
 
     time_verdict = "accepted"
     max_jump = 10.0
+    sensor_times: ClassVar[dict[str, Any]] = {}
 
     def step(self, frame: Frame) -> Tracks:
         label = str(frame.detections.boxes.label[0])
@@ -35,7 +36,7 @@ def stream(made: list[Failing], **settings: Any) -> StreamTracker[str]:
         made.append(Failing())
         return made[-1]
 
-    return StreamTracker(new_tracker, StreamSettings(**settings))
+    return StreamTracker(cast(Any, new_tracker), StreamSettings(**settings))
 
 
 def answer(service: StreamTracker[str], seq: int, label: str) -> dict[str, Any]:

@@ -59,21 +59,23 @@ def test_every_frame_has_predictions_where_horizons_are_given():
         assert [each["id"] for each in predicted["tracks"]] == [each["id"] for each in answer["tracks"]]
 
 
-def test_other_horizons_are_refused(subtests):
-    for given, why in [
-        (None, "horizons: expected a list of at most 20 s, got None"),
-        ([0.1] * 21, "horizons: expected a list of at most 20 s"),
-        (["1"], "horizons: expected a number, got '1'"),
-        ([], "horizons: expected increasing seconds"),
-        ([2, 1], "horizons: expected increasing seconds"),
-        ([1, 11], "horizons: expected at most 10 s, got 11"),
-    ]:
-        with subtests.test(why):
-            service = stream()
-            answers(service, frame(0.0))
-            (answer,) = answers(service, predict(given))
-            assert answer["type"] == "error"
-            assert why in answer["message"]
+BAD_HORIZONS = [
+    (None, "horizons: expected a list of at most 20 s, it is left out"),
+    ([0.1] * 21, "horizons: expected a list of at most 20 s"),
+    (["1"], "horizons: expected a finite number, got '1'"),
+    ([], "horizons: expected increasing seconds"),
+    ([2, 1], "horizons: expected increasing seconds"),
+    ([1, 11], "horizons: expected at most 10 s, got 11"),
+]
+
+
+def test_other_horizons_are_refused():
+    service = stream()
+    answers(service, frame(0.0))
+    for given, why in BAD_HORIZONS:
+        (answer,) = answers(service, predict(given))
+        assert answer["type"] == "error"
+        assert why in answer["message"]
 
 
 def test_there_is_nothing_to_predict_from_before_a_frame_or_by_centerpoint():
