@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,17 @@ import numpy as np
 from data_tools.figures import FigureTable, cell
 from data_tools.files.atomic_files import atomic_directory, write_text
 from data_tools.metrics import SceneMetrics, scene_metrics
-from data_tools.plots import Panel, birds_eye_view, png
+from data_tools.plots import png
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.source import write_tables
 from pipelines.config import Method, TrackConfig, load_config
 from pipelines.configuration import write_settings
-from pipelines.report import Report, report_page, scene_of_run
+from pipelines.report import Report, ReportScene, report_page, scene_of_run
 from pipelines.tracking import Progress, TrackedScene, track_scene
+from pipelines.view import SceneView, draw_scene, picture
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import IntArray
-from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.frame import Detections
 
 __all__ = [
     "DemoResult",
@@ -122,8 +121,12 @@ def run_demo(
     with atomic_directory(output) as folder:
         comparison = compare(SimulatedTraffic(simulator, scenes, seed), config, METHODS, progress=progress)
         scene, moment = hardest_moment(comparison)
-        picture = png(_picture(comparison, scene, moment))
-        (folder / "birds_eye.png").write_bytes(picture)
+        shown: tuple[Method, ...] = ("kf", "saga")
+        rules = config.tracker.edges
+        views = {
+            m: scene_of_run({m: comparison.runs[m][scene]}, rules if m == "saga" else (), config.sensors) for m in shown
+        }
+        (folder / "birds_eye.png").write_bytes(png(_picture(views, moment)))
         (folder / "index.html").write_text(report_page(_report(comparison, config, scene, moment)), encoding="utf-8")
     return DemoResult(comparison, output / "birds_eye.png", output / "index.html")
 
@@ -164,23 +167,14 @@ def _hidden_nearby(scene: Scene, radius: float = 40.0, speed: float = 0.5) -> In
     return np.array(counts, dtype=np.int64)
 
 
-def _picture(comparison: Comparison, scene_row: int, moment: int) -> Any:
-    shown: tuple[Method, ...] = ("kf", "saga")
-    runs = {method: comparison.runs[method][scene_row] for method in shown}
-    scene = runs["saga"].scene
-    assert scene.ground_truth is not None
-    panels = [Panel(TITLES[m], run.tracks[: moment + 1]) for m, run in runs.items()]
-    return birds_eye_view(
-        panels, scene.world_T_ego[moment], scene.ground_truth[moment], latest_detections(scene, moment)
-    )
-
-
-def latest_detections(scene: Scene, moment: int) -> Detections:
-    """The detections of each sensor's last frame up to a moment of the scene."""
-    latest = {frame.sensor: frame for frame in scene.frames if frame.timestamp <= scene.timestamps[moment]}
-    tables = [frame.detections for frame in latest.values()]
-    score = np.concatenate([np.empty(0), *(table.score for table in tables)])
-    return Detections(Boxes.concatenate([table.boxes for table in tables]), score)
+def _picture(scenes: Mapping[Method, ReportScene], moment: int) -> Any:
+    """The tracks of methods at a moment of a scene, beside the true objects."""
+    panels = {
+        TITLES[method]: [each for each in draw_scene(SceneView(scene)) if each.moment in (None, moment)]
+        for method, scene in scenes.items()
+    }
+    name = next(iter(scenes.values())).scene.name
+    return picture(panels, f"{name}/ego")
 
 
 _TABLES = tuple(f"scene-[0-9]*/{name}" for name in ("detections.csv", "truth.csv", "settings.yaml"))

@@ -1,8 +1,6 @@
 """Pictures of tracks, paths, graphs and metrics; matplotlib is imported when one is drawn."""
 
 from data_tools.plots.birds_eye import (
-    Panel,
-    birds_eye_view,
     occupancy_picture,
     paths_from_above,
     plot,
@@ -13,8 +11,6 @@ from data_tools.plots.metrics import calibration_plot, error_histograms, recall_
 from data_tools.plots.running_graph import running_graph_picture
 
 __all__ = [
-    "Panel",
-    "birds_eye_view",
     "calibration_plot",
     "error_histograms",
     "occupancy_picture",

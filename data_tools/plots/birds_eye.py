@@ -1,77 +1,20 @@
-"""Pictures from above: objects around the vehicle, tracks, paths, and LiDAR maps.
-
-Bird's-eye pictures of true objects, detections and tracks around the vehicle at one moment.
-
-The picture is drawn in the vehicle's frame, driving direction to the right. True objects are grey areas, hatched where
-no sensor can see them; detections are small crosses; tracks are coloured outlines, paler the lower their score, with
-their past and their way in the next second; dashed while they coast, then with the 95 % ellipse of their position.
-"""
+"""Pictures from above: tracks, paths, and LiDAR maps."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, StrArray
-from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations
 from saga_fg.types.frame import Detections
 from saga_fg.types.track import Tracks
 
-PAST = 3.0  # s, of the paths that are drawn
-COASTING = 0.15  # s without detection from which a track is drawn as coasting
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b", "#637939", "#3949ab")
-Extent = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """One picture of several side by side: the tracks of its moment, the last of `history`, and of those before."""
-
-    title: str
-    history: Sequence[Tracks]
-
-
-def birds_eye_view(
-    panels: Sequence[Panel],
-    world_T_ego: FloatArray,
-    truth: Annotations | None = None,
-    detections: Detections | None = None,
-    extent: Extent = (-40.0, 70.0, -22.0, 22.0),
-) -> Any:
-    """A matplotlib `Figure` with one panel below the other, all of the same moment.
-
-    world_T_ego  (4, 4) pose of the vehicle; `extent` in its frame: rear, front, right, left, m
-    detections   in world coordinates
-    """
-    from matplotlib.figure import Figure
-
-    rear, front, right, left = extent
-    height = 12.0 * (left - right) / (front - rear)
-    figure = Figure(figsize=(12.0, (height + 0.45) * len(panels) + 0.5), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True, sharey=True))
-    ego_T_world = inverse_transform(world_T_ego)
-    for ax, panel in zip(axes, panels, strict=True):
-        ax.set(xlim=(rear, front), ylim=(right, left), aspect="equal", ylabel="left, m")
-        ax.set_title(panel.title, loc="left", fontsize=11)
-        ax.grid(color="#e6e6e6", linewidth=0.6)
-        ax.set_axisbelow(True)
-        ax.fill([2.2, -1.4, -0.6, -1.4], [0.0, 1.1, 0.0, -1.1], color="black", zorder=8)  # the vehicle
-        if truth is not None:
-            _draw_truth(ax, truth, ego_T_world)
-        if detections is not None:
-            x, y = transform_points(ego_T_world, detections.boxes.position)[:, :2].T
-            ax.plot(x, y, "x", color="black", markersize=4, markeredgewidth=0.9, zorder=5)
-        _draw_tracks(ax, panel, ego_T_world, extent)
-    axes[-1].set_xlabel("ahead, m")
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=6, frameon=False, fontsize=9)
-    return figure
 
 
 def png(figure: Any, dpi: int = 110) -> bytes:
@@ -81,53 +24,6 @@ def png(figure: Any, dpi: int = 110) -> bytes:
     return buffer.getvalue()
 
 
-def _draw_truth(ax: Any, truth: Annotations, ego_T_world: FloatArray) -> None:
-    for corners, visible in zip(_outlines(truth.boxes, ego_T_world), truth.visible, strict=True):
-        if visible:
-            ax.fill(*corners.T, facecolor="#cfcfcf", edgecolor="none", zorder=1)
-        else:
-            ax.fill(*corners.T, facecolor="#f3dcc4", edgecolor="#b5651d", hatch="////", linewidth=0.5, zorder=1)
-
-
-def _draw_tracks(ax: Any, panel: Panel, ego_T_world: FloatArray, extent: Extent) -> None:
-    tracks = panel.history[-1]
-    recent = [before for before in panel.history if tracks.timestamp - before.timestamp <= PAST + 1e-9]
-    outlines = _outlines(tracks.boxes, ego_T_world)
-    centres = transform_points(ego_T_world, tracks.boxes.position)[:, :2]
-    velocity = tracks.boxes.velocity @ ego_T_world[:2, :2].T
-    for row, (track, outline, centre) in enumerate(zip(tracks, outlines, centres, strict=True)):
-        if not (extent[0] < centre[0] < extent[1] and extent[2] < centre[1] < extent[3]):
-            continue
-        colour = COLOURS[track.id % len(COLOURS)]
-        coasting = track.coasting > COASTING
-        style = {"color": colour, "alpha": 0.3 + 0.7 * min(max(track.score, 0.0), 1.0), "zorder": 6}
-        closed = np.concatenate([outline, outline[:1]])
-        ax.plot(*closed.T, linewidth=1.4, linestyle="--" if coasting else "-", **style)
-        past = np.concatenate([before.boxes.position[before.id == track.id, :2] for before in recent])
-        ax.plot(
-            *(past @ ego_T_world[:2, :2].T + ego_T_world[:2, 3]).T, color=colour, linewidth=1.0, alpha=0.55, zorder=2
-        )
-        if np.hypot(*velocity[row]) > 0.5:
-            ax.arrow(
-                *centre, *velocity[row], width=0.12, head_width=0.7, length_includes_head=True, linewidth=0, **style
-            )
-        if coasting:
-            ring = centre + ellipse(track.position_covariance) @ ego_T_world[:2, :2].T
-            ax.plot(*ring.T, linewidth=0.8, **style)
-        ax.annotate(
-            str(track.id), centre, xytext=(0, 7), textcoords="offset points", fontsize=7, ha="center",
-            annotation_clip=True, **style,
-        )  # fmt: skip
-
-
-def _outlines(boxes: Boxes, ego_T_world: FloatArray) -> FloatArray:
-    """Return footprints (N, 4, 2) in the vehicle's frame; a metre square where size or heading are unknown."""
-    local = boxes.transformed(ego_T_world)
-    known = np.isfinite(local.size).all(axis=1) & np.isfinite(local.yaw)
-    size = np.where(known[:, None], local.size, 1.0)
-    return Boxes(local.label, local.position, size, np.where(known, local.yaw, 0.0), local.velocity).corners()
-
-
 def ellipse(covariance: FloatArray, probability: float = 0.95) -> FloatArray:
     """Return the ellipse (64, 2) of a probability of a position covariance (2, 2), about the origin."""
     values, vectors = np.linalg.eigh(covariance)
@@ -135,20 +31,6 @@ def ellipse(covariance: FloatArray, probability: float = 0.95) -> FloatArray:
     angle = np.linspace(0.0, 2 * np.pi, 64)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * np.sqrt(squared * np.maximum(values, 0.0))
     return np.asarray(circle @ vectors.T)
-
-
-def _legend() -> list[Any]:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    return [
-        Line2D([], [], color="black", marker=">", linestyle="none", label="own vehicle"),
-        Patch(facecolor="#cfcfcf", label="true object, in view"),
-        Patch(facecolor="#f3dcc4", edgecolor="#b5651d", hatch="////", label="true object, hidden"),
-        Line2D([], [], color="black", marker="x", linestyle="none", markersize=5, label="detection"),
-        Line2D([], [], color=COLOURS[0], linewidth=1.4, label="track"),
-        Line2D([], [], color=COLOURS[1], linewidth=1.4, linestyle="--", label="coasting, 95 % ellipse"),
-    ]
 
 
 UNMEASURED = (1.0, 1.0, 1.0)

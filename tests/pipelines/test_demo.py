@@ -11,8 +11,12 @@ from typer.testing import CliRunner
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.demo import METHODS, Comparison, compare, comparison_table, hardest_moment, latest_detections, run_demo
+from pipelines.demo import METHODS, Comparison, compare, comparison_table, hardest_moment, run_demo
+from pipelines.report import scene_of_run
+from pipelines.report.scenes import latest_detections
+from pipelines.view import SceneView, draw_scene, picture
 from saga_fg import InputError, Scene
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 
 SHORT = SimulatorSettings(duration=3.0, warm_up=5.0)
 
@@ -67,14 +71,23 @@ def test_the_moment_shown_has_the_most_moving_hidden_objects(comparison: Compari
     assert hidden(run.scene, moment) == max(hidden(scene, k) for scene in scenes for k in range(len(scene)))
 
 
-def test_latest_detections_are_those_of_every_sensors_last_frame(comparison: Comparison) -> None:
-    scene = comparison.runs["kf"][0].scene
-    k = 10
-    expected = 0
-    for sensor in scene.sensors:
-        frames = [f for f in scene.frames if f.sensor == sensor and f.timestamp <= scene.timestamps[k]]
-        expected += len(frames[-1])
-    assert len(latest_detections(scene, k)) == expected
+def test_the_picture_shows_a_moment_in_the_vehicles_frame(comparison: Comparison) -> None:
+    run, k = comparison.runs["saga"][0], 10
+    report = scene_of_run({"saga": run}, (), {})
+    drawings = [each for each in draw_scene(SceneView(report)) if each.moment in (None, k)]
+    figure = picture({"one": drawings}, f"{run.scene.name}/ego")
+    (ax,) = figure.axes
+    assert ax.get_title(loc="left") == "one"
+    assert run.scene.ground_truth is not None
+    assert len(ax.patches) == 1 + len(run.scene.ground_truth[k]) + 2 * len(run.tracks[k])  # with the vehicle, ellipses
+    places = transform_points(inverse_transform(run.scene.world_T_ego[k]), run.tracks[k].boxes.position)[:, :2]
+    outlines = [patch.get_xy()[:4].mean(axis=0) for patch in ax.patches if len(patch.get_xy()) == 5]
+    gaps = np.linalg.norm(places[:, None] - np.array(outlines), axis=2)
+    np.testing.assert_allclose(gaps.min(axis=1), 0.0, atol=1e-6)
+    detections, _ = latest_detections(run.scene, {})
+    (crosses,) = (line for line in ax.lines if line.get_marker() == "x")
+    assert len(crosses.get_xdata()) == len(detections[k])
+    np.testing.assert_allclose(ax.patches[0].get_xy().mean(axis=0), [1.4, 0.0], atol=0.5)
 
 
 def test_the_demo_writes_a_picture_and_a_page(tmp_path: Path) -> None:
@@ -85,7 +98,7 @@ def test_the_demo_writes_a_picture_and_a_page(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("data_tools.simulator.settings.scenario_settings", lambda scenario: SHORT)
+    monkeypatch.setattr("pipelines.cli.start.scenario_settings", lambda scenario: SHORT)
     result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["demo", "--output", str(tmp_path / "out"), "--scenes", "1"])
     assert result.exit_code == 0, result.output
     for text in ("occluded position RMSE, m", "ms per frame", *METHODS, "picture: ", "page: "):
