@@ -16,12 +16,12 @@ from data_tools.datasets.source import DatasetSource, Innovations
 from data_tools.evaluation import LEGEND
 from data_tools.files.atomic_files import atomic_directory, write_text
 from data_tools.plots import png
+from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
 from pipelines.cli.options import Source, dataset_commands
 from pipelines.cli.track import RayAddress, Workers, exit_on_failures, run_at_scale
 from pipelines.config import Method, TrackConfig
-from pipelines.doubts import Doubted, Doubts
 from pipelines.evaluation import evaluate_labels, judge_run
 from pipelines.explaining import journal_innovations, journal_of
 from pipelines.scale_out import TrackTask
@@ -95,11 +95,11 @@ def _tracked(
     source: DatasetSource, settings: TrackConfig, method: Method
 ) -> tuple[Mapping[str, SceneResult], Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
-    doubts = Doubts(settings.of_method(method), option_for=source.option_for)
+    checks = Checks(settings.of_method(method), option_for=source.option_for)
     recorder = InnovationRecorder()
     with TemporaryDirectory() as folder, source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
         runs = track_dataset(
-            Doubted(dataset, doubts), lambda: settings.new_tracker(method, recorder), progress=progress
+            CheckedDataset(dataset, checks), lambda: settings.new_tracker(method, recorder), progress=progress
         )
         result = Path(folder) / source.tracks_example
         source.write_tracks(result, dataset, ((run.scene, run.tracks) for run in runs))

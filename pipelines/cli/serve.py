@@ -14,12 +14,12 @@ from typing import Annotated, Any
 
 import typer
 
+from pipelines.checks import Checks
 from pipelines.cli import options as how
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.termination import TERMINATED
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings, write_settings
-from pipelines.doubts import Doubts
 from pipelines.explaining import clock_text
 from pipelines.serving import (
     Address,
@@ -105,9 +105,9 @@ def serve(
     bounds = StreamSettings() if limits is None else load_settings(StreamSettings, limits)
     if reorder is not None:
         bounds = replace(bounds, reorder=reorder)
-    doubts = Doubts(settings.of_method(method), load_config("file"))
+    checks = Checks(settings.of_method(method), load_config("file"))
     horizons = how.horizons(predict, method)
-    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, doubts, horizons)
+    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, checks, horizons)
     return_large_blocks()
     keeper = None if snapshot is None else _restored(stream, snapshot, every, settings, method)
     last_acts = () if keeper is None else (keeper.save, keeper.clear_leftovers)

@@ -11,12 +11,12 @@ import typer
 
 from data_tools.datasets.source import DatasetSource
 from pipelines import smoothing
+from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
 from pipelines.cli.console import counted, progress_bar
 from pipelines.cli.options import Source, dataset_commands
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import write_settings
-from pipelines.doubts import Doubted, Doubts
 from pipelines.explaining import trackers
 from pipelines.report.page import RunRecord, write_run_record
 from pipelines.scale_out import RunSummary, SceneTask, SmoothTask, TrackTask, file_name, new_pool, run_scenes
@@ -168,26 +168,26 @@ def _track(
     options.apart(output, *source.input_files())
     options.check_learn_offsets(learn_offsets, method, at_scale(workers, ray))
     kept, horizons = options.journal(explain, output, at_scale(workers, ray)), options.horizons(predict, method)
-    doubts = Doubts(settings.of_method(method), load_config(source.family), source.option_for)
+    checks = Checks(settings.of_method(method), load_config(source.family), source.option_for)
     if at_scale(workers, ray):
-        doubts.see_first(source)
+        checks.see_first(source)
         task = TrackTask(settings, method, source, horizons)
         report = run_at_scale(source, task, output, workers, ray)
-        doubts.add(task.classes(report.counts))
-        doubts.finish()
+        checks.add(task.classes(report.counts))
+        checks.finish()
         exit_on_failures(report)
         return
     summary = Summary(output)
     with source.open() as dataset:
         scenes = dataset.scenes
         with progress_bar(len(scenes)) as progress, trackers(settings, method, scenes, kept) as new_tracker:
-            looked_at = Doubted(dataset, doubts)
+            looked_at = CheckedDataset(dataset, checks)
             runs = summary.of(track_dataset(looked_at, new_tracker, progress=progress, horizons=horizons))
             with keep_predictions(runs, output, horizons is not None) as kept_runs:
                 source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in kept_runs))
     summary.write_record(method, settings, source.kept())
-    doubts.add(summary.classes)
-    doubts.finish()
+    checks.add(summary.classes)
+    checks.finish()
     summary.show()
     if learn_offsets is not None:
         options.write_offsets(
@@ -237,9 +237,9 @@ def _smooth(
     tracking = options.with_interactions(settings.tracking, method, interactions)
     settings = replace(settings, tracking=tracking.with_association(association))
     usual = smoothing.load_smooth_config(source.family).tracking
-    doubts = Doubts(settings.tracking.of_method(method), usual, source.option_for)
+    checks = Checks(settings.tracking.of_method(method), usual, source.option_for)
     if at_scale(workers, ray):
-        doubts.see_first(source)
+        checks.see_first(source)
         task = SmoothTask(settings, method, source, f".{table}")
         report = run_at_scale(source, task, output, workers, ray, labels=True)
         exit_on_failures(report)
@@ -249,13 +249,13 @@ def _smooth(
         with stream as parts, progress_bar() as progress:
             streamed = smoothing.write_streamed_labels(
                 output,
-                lambda folder: smoothing.smooth_stream(doubts.over(parts), settings, folder, method, progress=progress),
+                lambda folder: smoothing.smooth_stream(checks.over(parts), settings, folder, method, progress=progress),
                 f".{table}",
             )
         _show(output, streamed)
         return
     with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
-        runs = smoothing.smooth_dataset(Doubted(dataset, doubts), settings, method, progress=progress)
+        runs = smoothing.smooth_dataset(CheckedDataset(dataset, checks), settings, method, progress=progress)
         done = smoothing.write_labels(
             output, runs, f".{table}", lambda folder, labels: source.write_labels(folder, dataset, labels)
         )

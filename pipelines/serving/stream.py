@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
-from pipelines.doubts import Doubts
+from pipelines.checks import Checks
 from pipelines.serving.frame_order import Numbering, Reordering
 from pipelines.serving.messages import (
     FrameMessage,
@@ -59,7 +59,7 @@ class StreamTracker(Generic[Client]):
 
     new_tracker  makes a tracker; called at the start, on a reset, and after repeated internal errors
     settings     limits of the stream
-    doubts       warns of what is doubtful in the first frames, None: nothing is said
+    checks       warns of what is doubtful in the first frames, None: nothing is said
     horizons     (H,) s, to which every answer to a frame has predictions; None for none
     keeper       keeps the state in a file, None: nothing is kept
 
@@ -72,7 +72,7 @@ class StreamTracker(Generic[Client]):
         self,
         new_tracker: Callable[[], OnlineTracker],
         settings: StreamSettings | None = None,
-        doubts: Doubts | None = None,
+        checks: Checks | None = None,
         horizons: FloatArray | None = None,
     ) -> None:
         self.settings = settings or StreamSettings()
@@ -87,7 +87,7 @@ class StreamTracker(Generic[Client]):
         self._durable: dict[str, int] = {}
         self._failed_in_a_row = 0
         self._log_limit = LogLimit()
-        self._doubts = doubts
+        self._checks = checks
         self._horizons = horizons
         self._started = time.monotonic()
         self._lock = threading.Lock()
@@ -230,8 +230,8 @@ class StreamTracker(Generic[Client]):
         """Take in one frame. Raises the errors of the tracker."""
         frame, number = message.frame, message.seq
         tracks = self._tracker.step(frame)
-        if self._doubts is not None:
-            self._doubts.watch(frame, message.yaw, tracks)
+        if self._checks is not None:
+            self._checks.watch(frame, message.yaw, tracks)
         verdict = self._tracker.time_verdict
         if verdict == "unconfirmed":
             self.counts["unconfirmed"] += 1

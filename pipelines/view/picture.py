@@ -78,7 +78,8 @@ def _draw(ax: Any, drawing: Drawing, view_T_frame: FloatArray) -> None:
             for row, (centre, colour) in enumerate(zip(shape.centre, _colours(shape), strict=True)):
                 outline = np.zeros((64 if shape.round else 4, 3))
                 outline[:, :2] = (CIRCLE if shape.round else SQUARE) * shape.size[row, :2] / 2
-                ring = placed(transform_points(yaw_transform(*centre, shape.yaw[row]), outline))
+                x, y, z = centre.tolist()
+                ring = placed(transform_points(yaw_transform(x, y, z, float(shape.yaw[row])), outline))
                 style = {
                     "facecolor": "none",
                     "edgecolor": colour,

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from pipelines.checks import Checks
 from pipelines.config import TrackConfig
-from pipelines.doubts import Doubts
 from saga_fg import Curvilinear, TrackerSettings
 from saga_fg.model.lanes import InLane
 from saga_fg.tracking import ClassSettings
@@ -18,7 +18,7 @@ FOLLOWS = {"car": ClassSettings(Curvilinear(course_time=0.7))}
 
 def said(caplog, method="saga", **tracker):
     config = TrackConfig(tracker=replace(TrackerSettings(), **{"road_map": ROAD, **tracker}))
-    doubts = Doubts(config.of_method(method))
+    doubts = Checks(config.of_method(method))
     doubts.finish()
     doubts.finish()
     return [each.getMessage() for each in caplog.records if "lanes" in each.getMessage()]

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipelines.checks import Checks
 from pipelines.config import load_config
-from pipelines.doubts import Doubts
 from pipelines.serving import StreamSettings, StreamTracker, parse_address, serve_pipe
 from pipelines.serving.frame_order import Reordering
 from pipelines.serving.messages import FrameMessage, encode, parse_message
@@ -42,7 +42,7 @@ def test_edge_rules_that_meet_no_class_are_told_once(caplog: pytest.LogCaptureFi
     for label, told in (("truck", 1), ("car", 0)):
         config = load_config("file")
         config = replace(config, tracker=replace(config.tracker, edges=(Following(classes=(label,)),)))
-        service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, Doubts(config))
+        service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, Checks(config))
         caplog.clear()
         answers(service, *(frame(0.1 * k) for k in range(300)))
         assert [record.levelname for record in caplog.records] == ["WARNING"] * told
@@ -51,7 +51,7 @@ def test_edge_rules_that_meet_no_class_are_told_once(caplog: pytest.LogCaptureFi
 def test_what_looks_wrong_in_a_stream_is_told_once(caplog: pytest.LogCaptureFixture):
     config = load_config("file")
     for degrees in (True, False):
-        service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, Doubts(config))
+        service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, Checks(config))
         caplog.clear()
         for k in range(250):
             yaw = (90.0 if k % 2 else 270.0) if degrees else 1.5

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 
+from pipelines.checks import Checks
 from pipelines.config import TrackConfig, load_config
-from pipelines.doubts import Doubts
 from saga_fg import TrackerSettings
 
 
 def said(caplog, **tracker):
     usual = TrackConfig()
-    Doubts(replace(usual, tracker=TrackerSettings(**tracker)), usual)
+    Checks(replace(usual, tracker=TrackerSettings(**tracker)), usual)
     return [each.getMessage() for each in caplog.records]
 
 
@@ -44,5 +44,5 @@ def test_settings_that_act_are_not_doubted(caplog, tracker):
 
 @pytest.mark.parametrize("family", ["nuscenes", "kitti", "file"])
 def test_shipped_settings_are_not_doubted(caplog, family):
-    Doubts(load_config(family), load_config("file"))
+    Checks(load_config(family), load_config("file"))
     assert [each for each in caplog.records if "without effect" in each.getMessage()] == []

@@ -39,7 +39,7 @@ FRAMES = 100  # with tracks, after which a live stream is judged
 SCENES = 3  # of a dataset, whose first frames are judged
 
 
-class Doubts:
+class Checks:
     """Warns of each suspicion once.
 
     settings    of the run
@@ -69,13 +69,13 @@ class Doubts:
         self._tell(_without_effect(settings.tracker, usual.tracker))
 
     def over(self, scenes: Iterable[Scene]) -> Iterator[Scene]:
-        """Pass scenes on, and warn of what is doubtful in the first of them."""
+        """Pass scenes on, and warn of what looks wrong in the first of them."""
         for scene in scenes:
             self.see(scene)
             yield scene
 
     def see(self, scene: Scene) -> None:
-        """Warn of what is doubtful in a scene, one of the first."""
+        """Warn of what looks wrong in a scene, one of the first."""
         sample = Sample.of(scene.frames)
         self._note(sample)
         if self._judged < SCENES:
@@ -164,15 +164,15 @@ def _without_effect(tracker: TrackerSettings, usual: TrackerSettings) -> Iterato
         yield Doubt("estimator", what, "lag is of fixed-lag, tolerance and max_component are of kalman")
 
 
-class Doubted:
+class CheckedDataset:
     """A dataset whose scenes are looked at when they are read."""
 
-    def __init__(self, dataset: Dataset, doubts: Doubts) -> None:
-        self._dataset, self._doubts = dataset, doubts
+    def __init__(self, dataset: Dataset, checks: Checks) -> None:
+        self._dataset, self._checks = dataset, checks
         self.scenes = dataset.scenes
 
     def scene(self, name: str) -> Scene:
-        """Read a scene, and warn of what is doubtful in it."""
+        """Read a scene, and warn of what looks wrong in it."""
         scene = self._dataset.scene(name)
-        self._doubts.see(scene)
+        self._checks.see(scene)
         return scene
