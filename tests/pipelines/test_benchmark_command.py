@@ -24,7 +24,7 @@ def saga_fg(*arguments: str | Path) -> Result:
 
 @pytest.fixture(autouse=True)
 def _here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipelines.scale_out.LocalPool", lambda workers, scratch: InThisProcess())
+    monkeypatch.setattr("pipelines.cli.track.new_pool", lambda *_: InThisProcess())
 
 
 @pytest.fixture(scope="module")

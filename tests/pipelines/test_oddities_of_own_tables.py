@@ -11,13 +11,9 @@ import pytest
 from tests.pipelines.strangers_tables import T0, rows, run_line, saga_fg, write
 
 
-@pytest.mark.parametrize("verb", ["track", "smooth"])
-def test_what_looks_wrong_is_told_once_with_what_mends_it(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, verb: str
-) -> None:
+def test_what_looks_wrong_is_told_once_with_what_mends_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     table = write(tmp_path / "d.csv", rows()[0])
-    output = tmp_path / ("t.csv" if verb == "track" else "labels")
-    assert saga_fg(verb, "file", table, "--sort", "--output", output).exit_code == 0
+    assert saga_fg("smooth", "file", table, "--sort", "--output", tmp_path / "labels").exit_code == 0
     told = [record.getMessage() for record in caplog.records]
     for mend in ("--units angle=deg", "--units score=percent"):
         assert len([line for line in told if line.endswith(f"add {mend}")]) == 1, told
@@ -32,59 +28,50 @@ def added(text: str) -> list[str]:
 UNITS, CLASSES = ("--units", "angle=deg,score=percent"), ("--classes", "VEHICLE=car")
 
 
-@pytest.mark.parametrize(
-    ("renamed", "given", "option"),
-    [
-        ({"l": "wid", "w": "len"}, [*UNITS, *CLASSES], ["--columns", "length=wid,width=len"]),
-        ({"l": "width", "w": "length"}, [*UNITS, *CLASSES], ["--columns", "length=width,width=length"]),
-        ({}, ["--units", "score=percent", *CLASSES], ["--units", "score=percent,angle=deg"]),
-        ({"category": "kind"}, ["--columns", "label=kind", *UNITS], ["--classes", "VEHICLE=car"]),
-    ],
-)
-@pytest.mark.parametrize("command", ["inspect", "track"])
-def test_what_is_told_mends_it_when_pasted(
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    command: str,
-    renamed: dict[str, str],
-    given: list[str],
-    option: list[str],
-) -> None:
-    found = [{renamed.get(name, name): value for name, value in row.items()} for row in rows()[0]]
-    table = write(tmp_path / "d.csv", sorted(found, key=lambda row: row["ts_ns"]))
+PASTED = [
+    ("inspect", {"l": "wid", "w": "len"}, [*UNITS, *CLASSES], ["--columns", "length=wid,width=len"]),
+    ("track", {"l": "width", "w": "length"}, [*UNITS, *CLASSES], ["--columns", "length=width,width=length"]),
+    ("track", {}, ["--units", "score=percent", *CLASSES], ["--units", "score=percent,angle=deg"]),
+    ("inspect", {"category": "kind"}, ["--columns", "label=kind", *UNITS], ["--classes", "VEHICLE=car"]),
+    ("track", {"category": "kind"}, ["--columns", "label=kind", *UNITS], ["--classes", "VEHICLE=car"]),
+]
 
-    def told(*more: str) -> list[str]:
+
+def test_what_is_told_mends_it_when_pasted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def told(command: str, *options: str) -> list[str]:
         caplog.clear()
-        output = [] if command == "inspect" else ["--output", tmp_path / "t.csv"]
-        result = saga_fg(*(["inspect"] if command == "inspect" else ["track", "file"]), table, *given, *more, *output)
+        before, after = (["inspect"], []) if command == "inspect" else (["track", "file"], ["-o", tmp_path / "t.csv"])
+        result = saga_fg(*before, tmp_path / "d.csv", *options, *after)
         assert result.exit_code == 0, result.output
         lines = [*(record.getMessage() for record in caplog.records), *result.stdout.splitlines()]
         return [line for line in lines if "; add --" in line]
 
-    (doubt,) = told()
-    assert shlex.split(doubt.rpartition("; add ")[2]) == option
-    assert not told(*option)
+    for command, renamed, given, option in PASTED:
+        found = [{renamed.get(name, name): value for name, value in row.items()} for row in rows()[0]]
+        write(tmp_path / "d.csv", sorted(found, key=lambda row: row["ts_ns"]))
+        (doubt,) = told(command, *given)
+        assert shlex.split(doubt.rpartition("; add ")[2]) == option
+        assert not told(command, *given, *option)
 
 
+@pytest.mark.parametrize("command", ["inspect", "track"])
 def test_classes_that_are_numbers_are_to_be_filled_in(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, subtests: pytest.Subtests
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, command: str
 ) -> None:
-    for command in ["inspect", "track"]:
-        with subtests.test(command=command):
-            found = [{**row, "category": n % 2} for n, row in enumerate(rows()[0])]
-            table = write(tmp_path / "d.csv", found)
-            units = ["--units", "angle=deg,score=percent"]
-            if command == "inspect":
-                text = saga_fg("inspect", table, *units).stdout
-                assert "saga-fg track file" in text.split("Next, with what fits in place of ...:")[1]
-                assert "--classes 0=...,1=... " in text.split("Next, with what fits in place of ...:")[1]
-            else:
-                assert saga_fg("track", "file", table, *units, "--sort", "-o", tmp_path / "t.csv").exit_code == 0
-                text = caplog.text
-            assert "objects are tracked one by one; fill in and add --classes 0=...,1=..." in text
-            pasted = saga_fg("track", "file", table, "--classes", "0=...,1=...", "-o", tmp_path / "t.csv")
-            assert pasted.exit_code == 2
-            assert "--classes: 0=...: expected a name in place of the dots" in pasted.stderr
+    found = [{**row, "category": n % 2} for n, row in enumerate(rows()[0])]
+    table = write(tmp_path / "d.csv", found)
+    units = ["--units", "angle=deg,score=percent"]
+    if command == "inspect":
+        text = saga_fg("inspect", table, *units).stdout
+        assert "saga-fg track file" in text.split("Next, with what fits in place of ...:")[1]
+        assert "--classes 0=...,1=... " in text.split("Next, with what fits in place of ...:")[1]
+    else:
+        assert saga_fg("track", "file", table, *units, "--sort", "-o", tmp_path / "t.csv").exit_code == 0
+        text = caplog.text
+    assert "objects are tracked one by one; fill in and add --classes 0=...,1=..." in text
+    pasted = saga_fg("track", "file", table, "--classes", "0=...,1=...", "-o", tmp_path / "t.csv")
+    assert pasted.exit_code == 2
+    assert "--classes: 0=...: expected a name in place of the dots" in pasted.stderr
 
 
 def test_settings_for_a_class_or_sensor_that_the_data_lack(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -156,25 +143,24 @@ def test_numbers_of_frames_taken_for_seconds(tmp_path: Path, caplog: pytest.LogC
     assert not caplog.records
 
 
-@pytest.mark.parametrize("tracks", [False, True])
-def test_boxes_of_argoverse_are_not_taken_for_the_world(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, tracks: bool
-) -> None:
-    pose = {"qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "tz_m": 0.0}
-    found = [
-        {"log_id": "a", "timestamp_ns": T0 + k * 10**8, "category": "BUS", "score": 0.5, "length_m": 10.0,
-         "width_m": 2.5, "height_m": 3.0, "tx_m": 5.0 + k, "ty_m": 1.0, **pose, **({"track_id": 3} if tracks else {})}
-        for k in range(30)
-    ]  # fmt: skip
-    table = write(tmp_path / "d.feather.parquet", found)
-    shown = saga_fg("inspect", table).stdout
-    command = f"saga-fg track argoverse2 --dataroot ... --detections {table} --output tracks.feather"
-    if tracks:
-        command = f"saga-fg evaluate argoverse2 {table} --dataroot ..."
-    assert shown.endswith(f"Next, with what fits in place of ...:\n  {command}\n")
-    if not tracks:
-        assert saga_fg("track", "file", table, "--classes", "BUS=bus", "-o", tmp_path / "t.csv").exit_code == 0
-        assert f"in the frame of the vehicle, and are taken for the world; read them with the poses of their logs: {command}" in caplog.text  # fmt: skip # noqa: E501
+def test_boxes_of_argoverse_are_not_taken_for_the_world(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for tracks in [False, True]:
+        pose = {"qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "tz_m": 0.0}
+        found = [
+            {"log_id": "a", "timestamp_ns": T0 + k * 10**8, "category": "BUS", "score": 0.5, "length_m": 10.0,
+             "width_m": 2.5, "height_m": 3.0, "tx_m": 5.0 + k, "ty_m": 1.0,
+             **pose, **({"track_id": 3} if tracks else {})}
+            for k in range(30)
+        ]  # fmt: skip
+        table = write(tmp_path / "d.feather.parquet", found)
+        shown = saga_fg("inspect", table).stdout
+        command = f"saga-fg track argoverse2 --dataroot ... --detections {table} --output tracks.feather"
+        if tracks:
+            command = f"saga-fg evaluate argoverse2 {table} --dataroot ..."
+        assert shown.endswith(f"Next, with what fits in place of ...:\n  {command}\n")
+        if not tracks:
+            assert saga_fg("track", "file", table, "--classes", "BUS=bus", "-o", tmp_path / "t.csv").exit_code == 0
+            assert f"in the frame of the vehicle, and are taken for the world; read them with the poses of their logs: {command}" in caplog.text  # fmt: skip # noqa: E501
 
 
 def test_a_look_at_a_table_without_doubts(tmp_path: Path) -> None:
@@ -204,9 +190,7 @@ POSE = {"ego_x": 0.0, "ego_y": 0.0, "ego_yaw": 0.0}
 GOOD = {"timestamp": 0.0, "x": 1.0, "y": 2.0, "scene": "a", "vx": 0.5, "length": 4.0, **POSE}
 
 
-def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(
-    tmp_path: Path, subtests: pytest.Subtests
-) -> None:
+def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(tmp_path: Path) -> None:
     for row, message in [
         ({"x": 2e9}, "line 5: x: expected a finite number within 1e+09, got 2e+09"),
         ({"y": -1e300}, "line 5: y: expected a finite number within 1e+09, got -1e+300"),
@@ -217,16 +201,15 @@ def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(
         ({"ego_yaw": 1.0}, "line 6: ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time"),
         ({"scene": "n" * 300}, "line 5: scene: expected a name of at most 256 characters"),
     ]:
-        with subtests.test(message):
-            found = [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("abcd")]
-            table = write(tmp_path / "d.csv", [*found[:3], found[3] | row, found[3]])
-            tracked = saga_fg("track", "file", table, "--output", tmp_path / "t.csv")
-            assert tracked.exit_code == 2
-            assert tracked.stderr.startswith(f"error: {table}: ")
-            assert message in tracked.stderr
-            look = saga_fg("inspect", table)
-            assert message in look.stdout + look.stderr
-            assert look.exit_code == 2 or "Next, when the table is mended:" in look.stdout
+        found = [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("abcd")]
+        table = write(tmp_path / "d.csv", [*found[:3], found[3] | row, found[3]])
+        tracked = saga_fg("track", "file", table, "--output", tmp_path / "t.csv")
+        assert tracked.exit_code == 2
+        assert tracked.stderr.startswith(f"error: {table}: ")
+        assert message in tracked.stderr
+        look = saga_fg("inspect", table)
+        assert message in look.stdout + look.stderr
+        assert look.exit_code == 2 or "Next, when the table is mended:" in look.stdout
 
 
 def test_a_look_sees_scenes_that_are_scattered_in_a_long_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

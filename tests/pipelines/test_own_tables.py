@@ -7,7 +7,6 @@ import re
 import shlex
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -99,47 +98,42 @@ def test_tracks_of_another_tracker_and_its_own_clock(tmp_path: Path) -> None:
         assert figures["hota"]["car"]["centre"]["hota"] > 0.85
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_tracks_that_do_not_fit_the_truth(tmp_path: Path) -> None:
+    for change, message in [
         ({"ts_ns": lambda t: t + 10**12}, "expected tracks at the times of the ground truth"),
         ({"scene": lambda _: "b"}, None),
-    ],
-)
-def test_tracks_that_do_not_fit_the_truth(tmp_path: Path, change: dict[str, Any], message: str | None) -> None:
-    _, true = rows()
-    gt = write(tmp_path / "gt.csv", true)
-    moved = write(tmp_path / "t.csv", [row | {name: f(row.get(name)) for name, f in change.items()} for row in true])
-    result = saga_fg("evaluate", "file", moved, "--truth", gt, "--units", "angle=deg")
-    assert (result.exit_code, result.stderr.startswith("error: ")) == ((2, True) if message else (0, False))
-    assert message is None or message in result.stderr
+    ]:
+        _, true = rows()
+        gt = write(tmp_path / "gt.csv", true)
+        moved = write(
+            tmp_path / "t.csv", [row | {name: f(row.get(name)) for name, f in change.items()} for row in true]
+        )
+        result = saga_fg("evaluate", "file", moved, "--truth", gt, "--units", "angle=deg")
+        assert (result.exit_code, result.stderr.startswith("error: ")) == ((2, True) if message else (0, False))
+        assert message is None or message in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("theirs", "alone", "classes"),
-    [
+def test_each_class_without_a_counterpart_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for theirs, alone, classes in [
         ({"v0": "X"}, "tracks of X and true objects of BUS", "BUS=X"),
         ({"v0": "coach", "v1": "VEHICLE"}, "tracks of coach and true objects of BUS", "BUS=coach"),
         ({"v0": "VEHICLE"}, "true objects of BUS", None),
         ({"v0": "coach", "v2": "Y"}, "tracks of Y, coach and true objects of BUS", "BUS=coach"),
-    ],
-)
-def test_each_class_without_a_counterpart_is_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, theirs: dict[str, str], alone: str, classes: str | None
-) -> None:
-    true = [row | ({"category": "BUS"} if row["object_id"] == "v0" else {}) for row in rows()[1]]
-    gt = write(tmp_path / "gt.csv", true)
-    other = write(tmp_path / "t.csv", [row | {"category": theirs.get(row["object_id"], "VEHICLE")} for row in true])
-    judge = ["evaluate", "file", other, "--truth", gt]
-    assert saga_fg(*judge, "--units", "angle=deg").exit_code == 0
-    assert f"{alone} have no counterpart of their class" in caplog.text
-    assert ("name them alike" in caplog.text) == (classes is not None)
-    if classes is not None:
-        mend = caplog.records[-1].getMessage().rpartition("name them alike: ")[2]
-        assert mend == f"--classes {classes} --units angle=deg"
+    ]:
+        true = [row | ({"category": "BUS"} if row["object_id"] == "v0" else {}) for row in rows()[1]]
+        gt = write(tmp_path / "gt.csv", true)
+        other = write(tmp_path / "t.csv", [row | {"category": theirs.get(row["object_id"], "VEHICLE")} for row in true])
         caplog.clear()
-        assert saga_fg(*judge, *shlex.split(mend)).exit_code == 0
-        assert "BUS" not in caplog.text
+        judge = ["evaluate", "file", other, "--truth", gt]
+        assert saga_fg(*judge, "--units", "angle=deg").exit_code == 0
+        assert f"{alone} have no counterpart of their class" in caplog.text
+        assert ("name them alike" in caplog.text) == (classes is not None)
+        if classes is not None:
+            mend = caplog.records[-1].getMessage().rpartition("name them alike: ")[2]
+            assert mend == f"--classes {classes} --units angle=deg"
+            caplog.clear()
+            assert saga_fg(*judge, *shlex.split(mend)).exit_code == 0
+            assert "BUS" not in caplog.text
 
 
 def test_decimal_commas_and_other_encodings_are_told_in_one_line(tmp_path: Path) -> None:

@@ -34,7 +34,6 @@ from pipelines.report.page import record_path, write_run_record
 from pipelines.report.scenes import edges_of_frames, scene_data
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import Boxes, InputError
-from tests.pipelines.page_in_browser import tried_in_browser
 
 SHORT = SimulatorSettings(duration=4.0, warm_up=5.0)
 CONFIG = load_config("simulated")
@@ -194,37 +193,3 @@ def test_a_table_of_tracks_becomes_a_page(tmp_path: Path):
     wrong = run(app, ["report", "file", str(tracks), "--detections", str(other), "--output", str(output)])
     assert wrong.exit_code == 2
     assert "expected the times of the detections" in wrong.stderr
-
-
-TRY = """
-  const view = document.getElementById("view"), time = document.getElementById("time");
-  const pixels = () => view.toDataURL();
-  Object.assign(found, {clock: [], charts: document.querySelectorAll("#charts svg").length});
-  const before = pixels();
-  time.value = 25; time.oninput();
-  found.clock.push(document.getElementById("clock").value);
-  found.moved = pixels() !== before;
-  found.panel = document.getElementById("panel").textContent;
-  const click = (type, x, y) => {
-    const box = view.getBoundingClientRect();
-    view.dispatchEvent(new PointerEvent(type, {clientX: box.x + x, clientY: box.y + y, pointerId: 1, bubbles: true}));
-  };
-  view.setPointerCapture = () => {};
-  for (let x = 60; x < view.clientWidth && !found.panel; x += 12)
-    for (let y = 20; y < view.clientHeight && !found.panel; y += 12) {
-      click("pointerdown", x, y); click("pointerup", x, y);
-      found.panel = document.getElementById("panel").textContent;
-    }
-  document.getElementById("show-tracks").click();
-  document.dispatchEvent(new KeyboardEvent("keydown", {key: "ArrowRight", bubbles: true}));
-  found.clock.push(document.getElementById("clock").value);
-"""
-
-
-def test_the_page_works_in_a_browser(runs, tmp_path: Path):
-    found = tried_in_browser(page_of(runs, charts=[latency_chart(np.arange(100.0))]), TRY, tmp_path)
-    assert found["faults"] == []
-    assert found["clock"] == ["2.5 s", "2.6 s"]
-    assert found["moved"]
-    assert found["panel"].startswith("track ")
-    assert found["charts"] == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipelines.config import TrackConfig
 from pipelines.tracking import track_dataset, track_scene
-from saga_fg import Detections, Frame, InputError, Scene, Tracks
+from saga_fg import Detections, Frame, Scene, Tracks
 from saga_fg.types.boxes import Boxes
 
 
@@ -21,6 +22,7 @@ class Recorder:
     def __init__(self) -> None:
         self.seen: list[float] = []
         self.predicted: list[float] = []
+        self.sensor_times: dict[str, Any] = {}
 
     def step(self, frame: Frame) -> Tracks:
         self.seen.append(frame.timestamp)
@@ -102,14 +104,3 @@ def test_kf_is_the_tracker_without_edges() -> None:
     config = TrackConfig()
     assert config.new_tracker("saga").settings.edges  # type: ignore[attr-defined]
     assert config.new_tracker("kf").settings.edges == ()  # type: ignore[attr-defined]
-
-
-def test_a_scene_that_cannot_be_read_is_an_error_not_a_shorter_result() -> None:
-    class Broken:
-        scenes = ("a",)
-
-        def scene(self, name: str) -> Scene:
-            raise InputError(f"scene {name}: broken")
-
-    with pytest.raises(InputError, match="scene a: broken"):
-        list(track_dataset(Broken(), Recorder))

@@ -140,7 +140,7 @@ class RawTable:
         return faults
 
     def doubts(self) -> list[Doubt]:
-        """Checks about columns as they are given, which cannot be seen in frames."""
+        """Doubts about columns as they are given, which cannot be seen in frames."""
         doubts = [headings_in_degrees(self.numbers("yaw"))]
         if self.clock.unit == ISO:
             doubts.append(days_taken_for_times(self.numbers("timestamp")))
