@@ -20,18 +20,13 @@ from data_tools.plausibility import (
     settings_without_data,
 )
 from pipelines.config import TrackConfig
-from saga_fg.errors import InputError
+from saga_fg import Curvilinear, Dataset, Frame, InputError, Scene, TrackerSettings, Tracks
 from saga_fg.model.edge_rules import acting_classes
-from saga_fg.model.motion import Curvilinear
 from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking import TrackerSettings
 from saga_fg.tracking.by_name import estimator_parameters
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import LANE, MAP_CLASSES, STOP_LINE
-from saga_fg.types.track import Tracks
 
 log = logging.getLogger(__name__)
 

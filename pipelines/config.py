@@ -11,21 +11,11 @@ from typing import Literal, get_args
 
 from data_tools.files.input_files import unknown_name
 from pipelines.configuration import load_settings, read_settings
-from saga_fg.errors import InputError
+from saga_fg import ConstantVelocity, Curvilinear, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.motion import ConstantVelocity, Curvilinear
-from saga_fg.model.sensor import Sensor
 from saga_fg.model.stability import LearnedInteractions
 from saga_fg.settings import settings_group
-from saga_fg.tracking import (
-    AssociationName,
-    ClassSettings,
-    GreedySettings,
-    GreedyTracker,
-    Observer,
-    Tracker,
-    TrackerSettings,
-)
+from saga_fg.tracking import AssociationName, ClassSettings, GreedySettings, Observer
 from saga_fg.types.by_class import DEFAULT, class_settings
 
 Method = Literal["saga", "kf", "centerpoint"]

@@ -20,9 +20,8 @@ from pipelines.configuration import write_settings
 from pipelines.report import Report, ReportScene, report_page, scene_of_run
 from pipelines.tracking import Progress, TrackedScene, track_scene
 from pipelines.view import SceneView, draw_scene, picture
-from saga_fg.errors import InputError
+from saga_fg import Dataset, InputError, Scene
 from saga_fg.numerics.arrays import IntArray
-from saga_fg.types.dataset import Dataset, Scene
 
 __all__ = [
     "DemoResult",

@@ -33,12 +33,10 @@ from pipelines.report.figures import accuracy_charts
 from pipelines.report.page import RunRecord, write_run_record
 from pipelines.smoothing import SmoothConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg.errors import InputError
+from saga_fg import Boxes, Dataset, InputError, Scene
 from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.smoothing import gather_evidence
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation

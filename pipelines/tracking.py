@@ -24,11 +24,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from data_tools.datasets.detection_files import prediction_writer, predictions_path
-from saga_fg.errors import InputError
+from saga_fg import Dataset, GreedyTracker, InputError, PredictedTracks, Scene, Tracker, Tracks
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking import GreedyTracker, SensorTime, Stage, Tracker, TrackerView
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.track import LONGEST_PREDICTION, PredictedTracks, Tracks
+from saga_fg.tracking import SensorTime, Stage, TrackerView
+from saga_fg.types.track import LONGEST_PREDICTION
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc
 LARGE = 2**18  # bytes

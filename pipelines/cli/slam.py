@@ -26,11 +26,10 @@ from pipelines.slam.joint import run_joint, street
 from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.pose_graph_baselines import FromStart, from_same_starts
 from pipelines.slam.results import write_joint, write_laser_slam, write_pose_graph
-from saga_fg.errors import InputError
+from saga_fg import Frame, InputError
 from saga_fg.numerics.arrays import IntArray
 from saga_fg.slam.joint import Observations
 from saga_fg.slam.pose_graph import consensus, graph_error, optimise_poses
-from saga_fg.types.frame import Frame
 
 _ROUNDING = 1e-9  # an error that counts as none: all measurements agree
 Loss = Literal["consensus", "huber", "cauchy", "geman-mcclure", "tukey"]

@@ -45,15 +45,12 @@ from data_tools.files.isolated_reading import isolated
 from data_tools.metrics import SceneBoxes
 from pipelines.report.figures import unseen_for
 from pipelines.tracking import TrackedScene
+from saga_fg import Boxes, ConstantVelocity, Frame, NodeType, Scene, Sensor
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.motion import ConstantVelocity, NodeType
-from saga_fg.model.sensor import Sensor, sensor_model
+from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_of
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Scene
-from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import COLOUR_LABELS, MAX_LIGHT_DISTANCE, Lane, StopLine, TrafficLight
 
 Thumbnails = Mapping[str, list[str | None]]

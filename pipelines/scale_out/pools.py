@@ -35,9 +35,8 @@ from typing import Any, Literal, Protocol
 
 from data_tools.datasets.source import Part
 from pipelines.tracking import one_thread
-from saga_fg.errors import InputError, MissingExtraError, SagaError
+from saga_fg import Dataset, InputError, MissingExtraError, SagaError
 from saga_fg.kernels.compilation import load_kernels
-from saga_fg.types.dataset import Dataset
 
 Status = Literal["done", "unchanged", "failed"]
 

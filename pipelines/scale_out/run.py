@@ -23,10 +23,9 @@ from pipelines.scale_out.pools import Job, Outcome, SceneTask
 from pipelines.scale_out.results import Manifest, OutputFolder, Record, file_name, sha256
 from pipelines.smoothing import SmoothConfig, smooth_dataset
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
-from saga_fg.errors import InputError
+from saga_fg import Dataset, InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.smoothing import LabelCounts
-from saga_fg.types.dataset import Dataset
 
 log = logging.getLogger(__name__)
 

@@ -28,12 +28,11 @@ from typing import Any, NoReturn, get_args
 import numpy as np
 
 from pipelines.serving.settings import StreamSettings
-from saga_fg.errors import InputError
+from saga_fg import Boxes, Detections, Frame, InputError, PredictedTracks, Tracks
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.frame import Coordinates, Detections, Frame
-from saga_fg.types.track import PredictedTracks, Tracks, checked_horizons
+from saga_fg.types.frame import Coordinates
+from saga_fg.types.track import checked_horizons
 
 MAX_HORIZON = 10.0  # furthest time of a prediction, s
 MAX_HORIZONS = 20  # largest number of times of a prediction

@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -30,9 +30,6 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import GreedyTracker, SensorTime
 
-if TYPE_CHECKING:
-    from pipelines.serving.state import StateKeeper
-
 log = logging.getLogger(__name__)
 
 Client = TypeVar("Client")
@@ -45,6 +42,18 @@ COUNTED = (
 )
 
 MAX_HELD = 256  # largest number of frames held back; beyond it the oldest is tracked
+
+
+class StateSaver(Protocol):
+    """Keeper of the stream's state on the disk, `pipelines.serving.state.StateKeeper`."""
+
+    def save(self) -> bool:
+        """Write the state; return True if it is on the disk now."""
+        ...
+
+    def status(self) -> dict[str, Any]:
+        """Return the age of the file and the latest error."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +87,7 @@ class StreamTracker(Generic[Client]):
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # ms
-        self.keeper: StateKeeper | None = None
+        self.keeper: StateSaver | None = None
         self.version = 0  # grows whenever there is something new to keep
         self._new_tracker = new_tracker
         self._tracker = new_tracker()

@@ -63,9 +63,8 @@ from pipelines.view.drawing import (
     in_order,
     one_colour,
 )
-from saga_fg.errors import InputError
+from saga_fg import Boxes, InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
-from saga_fg.types.boxes import Boxes
 
 HISTORY = 4.0  # s, of trajectories
 FLAT = 0.04  # m, height of an ellipse
