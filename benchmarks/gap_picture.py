@@ -18,8 +18,7 @@ import numpy as np
 from benchmarks.gap_runs import LivedRun, judged_run, judgement
 from benchmarks.recording_sets import RecordingSet
 from data_tools.files.atomic_files import write_bytes
-from data_tools.plots import png
-from data_tools.plots.birds_eye import COLOURS, ellipse
+from data_tools.plots import COLOURS, ellipse, png
 from pipelines.learning.gaps import CAP, Contender, JudgedRun
 from saga_fg.errors import InputError
 from saga_fg.learning.gaps import Gap, colours_at

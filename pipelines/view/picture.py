@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.plots import new_figure
 from pipelines.view.drawing import Arrows, Drawing, Lines, Pose, Solids
 from pipelines.view.scenes import EDGE
 from saga_fg.numerics.arrays import FloatArray
@@ -35,11 +36,9 @@ def picture(panels: Mapping[str, Iterable[Drawing]], frame: str, extent: Extent 
     frame   the moving one, such as the vehicle's, about which the picture is drawn, its x to the right
     extent  in that frame: rear, front, right, left, m
     """
-    from matplotlib.figure import Figure
-
     rear, front, right, left = extent
     height = 12.0 * (left - right) / (front - rear)
-    figure = Figure(figsize=(12.0, (height + 0.45) * len(panels) + 0.5), layout="constrained")
+    figure = new_figure(12.0, (height + 0.45) * len(panels) + 0.5)
     axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True, sharey=True))
     for ax, (title, drawings) in zip(axes, panels.items(), strict=True):
         ax.set(xlim=(rear, front), ylim=(right, left), aspect="equal", ylabel="left, m")
