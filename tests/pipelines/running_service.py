@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,8 +11,7 @@ from typing import Any
 
 from pipelines.serving import Address, StreamClient, parse_address
 from pipelines.serving.messages import encode
-
-COMMAND = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
+from tests.pipelines.command import COMMAND
 
 
 def frame(seq: int, sensor: str = "sensor") -> bytes:

@@ -9,16 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from pipelines.cli import app
+from tests.pipelines.command import saga_fg
 
 RNG = np.random.default_rng(11)
 T0 = 1_700_000_000_000_000_000
-
-
-def saga_fg(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def run_line(line: str) -> Result:

@@ -8,18 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
-from pipelines.cli import app
 from pipelines.scale_out import TrackTask
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 from tests.data_tools.kitti_example import write_sequence
+from tests.pipelines.command import saga_fg
 from tests.pipelines.scale_out_example import InThisProcess
-
-
-def saga_fg(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(autouse=True)

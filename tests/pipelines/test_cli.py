@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,19 +15,13 @@ import pytest
 import yaml
 from click import Context
 from typer.main import get_command
-from typer.testing import CliRunner, Result
 
 from data_tools.datasets.nuscenes.source import sensor_locations
 from data_tools.datasets.source import names
 from pipelines.cli import app
 from pipelines.cli.start import FIRST
 from saga_fg import InputError
-
-SAGA_FG = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
-
-
-def saga_fg(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+from tests.pipelines.command import COMMAND, saga_fg
 
 
 def commands(group: Any, path: str = "") -> Iterator[str]:
@@ -197,7 +190,7 @@ def test_names_are_split_at_commas() -> None:
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
 def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
     """Interrupted while it works: exit code 130, one line, no file and no temporary."""
-    command = [*SAGA_FG, "demo", "--output", str(tmp_path / "out"), "--scenes", "50"]
+    command = [*COMMAND, "demo", "--output", str(tmp_path / "out"), "--scenes", "50"]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=tmp_path,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells let background jobs ignore it
@@ -238,6 +231,6 @@ def test_an_output_that_cannot_be_written_is_noticed_before_any_work(
 
 def test_the_installed_command_runs_on_its_own(tmp_path: Path) -> None:
     """A separate process: a clean stdout, no progress bar where stderr is no terminal."""
-    run = subprocess.run([*SAGA_FG, "config", "--full"], capture_output=True, text=True, check=True, cwd=tmp_path)
+    run = subprocess.run([*COMMAND, "config", "--full"], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert run.stderr == ""
     assert json.dumps(yaml.safe_load(run.stdout)["tracker"]["max_delay"]) == "0.5"

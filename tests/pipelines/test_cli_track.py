@@ -8,16 +8,11 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
 from data_tools.datasets.nuscenes import NuScenes, read_tracking_results
-from pipelines.cli import app
+from tests.pipelines.command import saga_fg
 
 METHODS = ("saga", "kf", "centerpoint")
-
-
-def saga_fg(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")

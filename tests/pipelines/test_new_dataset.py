@@ -11,18 +11,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
 from data_tools.datasets import source
 from data_tools.datasets.source import DatasetSource
-from pipelines.cli import app
 from saga_fg.errors import InputError
+from tests.pipelines.command import saga_fg
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "add-a-dataset.md"
-
-
-def saga_fg(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def install(folder: Path, package: str, **datasets: str) -> None:

@@ -6,16 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from data_tools.datasets.detection_files import PREDICTION_COLUMNS, PredictionRows, predictions_path, read_predictions
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.report import Report, report_page, scene_of_run
 from pipelines.report.scenes import scene_data
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import InputError
+from tests.pipelines.command import saga_fg
 from tests.pipelines.page_in_browser import tried_in_browser
 
 HORIZONS = np.array([0.5, 2.0])
@@ -26,10 +25,6 @@ CONFIG = load_config("simulated")
 def run() -> TrackedScene:
     scene = SimulatedTraffic(SimulatorSettings(duration=2.0, warm_up=5.0), scenes=1, seed=1).scene("scene-0001")
     return track_scene(scene, CONFIG.new_tracker("saga"), horizons=HORIZONS)
-
-
-def saga_fg(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")

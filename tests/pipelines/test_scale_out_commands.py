@@ -15,20 +15,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
 
 from data_tools.datasets.nuscenes import read_tracking_results
-from pipelines.cli import app
 from pipelines.scale_out import TrackTask
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
+from tests.pipelines.command import COMMAND, saga_fg
 from tests.pipelines.scale_out_example import InThisProcess, content, write_recordings
-
-COMMAND = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
-
-
-def saga_fg(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.pipelines.command import COMMAND
 from tests.pipelines.scale_out_example import write_recordings
 
-COMMAND = [sys.executable, "-c", "from pipelines.cli.main import main; main()"]
 LINE = "terminated: what was complete is kept\n"
 
 

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from data_tools.datasets.kitti import local_kitti
 from data_tools.datasets.kitti.source import KittiPart, KittiSource
 from data_tools.files.input_files import local_tree
-from pipelines.cli import app
 from saga_fg.errors import InputError
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import VERSION, write_results, write_tables
+from tests.pipelines.command import saga_fg
 
 Put = Callable[[Path, str], str]
-
-
-def saga_fg(*arguments: object) -> Any:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture
