@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -107,18 +106,6 @@ def test_it_runs_in_parallel_and_again_only_what_has_changed(square: Path, tmp_p
         assert rows(tmp_path / f"{verb}-run" / parts) == (tmp_path / serial).read_text()
     again = saga_fg("track", "square", "--folder", square, "-o", tmp_path / "track-run", "--workers", "1")
     assert "2 scenes: 0 done, 2 unchanged, 0 failed" in again.stdout
-
-
-def test_it_runs_on_ray(square: Path, tmp_path: Path) -> None:
-    pytest.importorskip("ray", reason="Ray comes with the extra ray")
-    run = ["track", "square", "--folder", str(square), "-o"]
-    command = [sys.executable, "-c", "from pipelines.cli.main import main; main()", *run, str(tmp_path / "run")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    on_ray = [*command, "--ray", "local", "--workers", "2"]
-    done = subprocess.run(on_ray, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    assert saga_fg(*run, tmp_path / "tracks.csv").exit_code == 0
-    assert rows(tmp_path / "run" / "tracks") == (tmp_path / "tracks.csv").read_text()
 
 
 def test_by_module_and_class_it_need_not_be_installed(square: Path, tmp_path: Path) -> None:

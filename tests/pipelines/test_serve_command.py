@@ -126,15 +126,6 @@ def test_the_status_of_another_service_is_one_line():
         assert len(error.splitlines()) == 1
 
 
-def test_standard_input_to_standard_output(tmp_path: Path):
-    done = subprocess.run(
-        [*COMMAND, "serve", "--reorder", "0.1"], input=b"".join(map(frame, range(4))), capture_output=True, check=True
-    )
-    kinds = [json.loads(line)["type"] for line in done.stdout.splitlines()]
-    assert kinds.count("tracks") == 4
-    assert b"4 frames tracked" in done.stderr
-
-
 def test_a_reader_that_goes_away_ends_the_pipe_in_one_line():
     read, write = os.pipe()
     os.close(read)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import stat
@@ -113,17 +112,3 @@ def test_a_state_file_is_of_one_service(tmp_path: Path):
         server.wait()
     done = subprocess.run(command, input=frame(0), capture_output=True, check=False)  # a killed one holds nothing
     assert done.returncode == 0
-
-
-def test_a_pipe_keeps_its_state_too(tmp_path: Path):
-    command = [*COMMAND, "serve", "--snapshot", str(tmp_path / "state")]
-    subprocess.run(command, input=b"".join(map(frame, range(5))), capture_output=True, check=True)
-    done = subprocess.run(command, input=b"".join(map(frame, range(3, 8))), capture_output=True, check=True)
-    answers = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [(a["type"], a["seq"]) for a in answers] == [
-        *(("repeat", 3), ("repeat", 4)),
-        *(("tracks", 5), ("tracks", 6), ("tracks", 7)),
-    ]
-    assert [track["id"] for track in answers[-1]["tracks"]] == [1]
-    assert answers[0]["durable_seq"] == 4
-    assert b"8 frames tracked" in done.stderr
