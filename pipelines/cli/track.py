@@ -21,7 +21,7 @@ from pipelines.explaining import trackers
 from pipelines.report.page import RunRecord, write_run_record
 from pipelines.scale_out import RunSummary, SceneTask, SmoothTask, TrackTask, file_name, new_pool, run_scenes
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
-from saga_fg import Dataset, InputError
+from saga_fg import InputError
 from saga_fg.smoothing import LabelCounts
 from saga_fg.tracking import SensorTime
 
