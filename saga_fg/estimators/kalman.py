@@ -129,7 +129,7 @@ def asked(
         ask(provider, graph, view)
     new = {key: one for key, one in graph.variables.items() if key not in bare.variables}
     factors = _linear(graph, ids, new)
-    if alone := tuple(key for key in new if not graph.touching(key)):
+    if alone := tuple(key for key in new if not graph.index.touching(key)):
         raise solver_error(graph.variables, graph.groups, SingularSystemError("", alone))
     if new:
         base = graph.base
