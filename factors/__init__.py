@@ -20,7 +20,7 @@ from factors.gaussian import (
     prior_factors,
 )
 from factors.interaction import NonlinearInteraction, interaction_factor, interaction_factors
-from factors.lines_and_planes import HesseLine, lane_keeping_factors, line_factors, plane, plane_factor
+from factors.lines_and_planes import HesseLine, line_factors, plane, plane_factor
 from factors.manifolds import ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
 from factors.measurement import (
     Bearing,
@@ -75,7 +75,6 @@ __all__ = [
     "interaction_factor",
     "interaction_factors",
     "joint_prior_factor",
-    "lane_keeping_factors",
     "line_factors",
     "linearised",
     "marginal_factors",

@@ -1,4 +1,4 @@
-"""Straight lines and planes seen from the vehicle, and objects that keep to the centre line of a lane.
+"""Straight lines and planes seen from the vehicle.
 
 Straight lines on the ground: curbs, borders of lanes. The state is a line in the plane, (theta, rho), in the Hesse
 normal form
@@ -23,9 +23,6 @@ is, in the frame of a pose world_T_pose = (R, t),
 
 by GTSAM's `OrientedPlane3Factor` (Trevor, Rogers and Christensen, "Planar surface SLAM with 3D and 2D sensors", ICRA
 2012), which takes whatever four numbers it is given for a plane.
-
-An object at p keeps to a line whose foot below it is a, with the unit normal n to its left, and which lies c aside of
-where a map has it: r = n . (p - a) - c.
 """
 
 from __future__ import annotations
@@ -38,7 +35,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.manifolds import SpatialPose, Vector, cross_matrix
-from factors.measurement import checked_components
 from factors.nonlinear import ResidualFactors, residual_factors
 from factors.robust import RobustLoss
 from factors.validation import FactorError, FloatArray, checked, checked_keys, whitener
@@ -129,43 +125,3 @@ def plane_factor(pose_key: int, plane_key: int, z: ArrayLike, covariance: ArrayL
     whitener("covariance", covariance, 3)
     noise = gtsam.noiseModel.Gaussian.Covariance(np.asarray(covariance, dtype=np.float64))
     return gtsam.OrientedPlane3Factor(seen, noise, pose_name, plane_name)
-
-
-def lane_keeping_factors(
-    rows: ArrayLike,
-    variances: ArrayLike,
-    feet: ArrayLike,
-    normals: ArrayLike,
-    state_dim: int,
-    position: tuple[int, int] = (0, 1),
-    robust: RobustLoss | None = None,
-) -> ResidualFactors:
-    """Return n factors of objects that keep to a line.
-
-    rows: (n, 2) keys of the object (a vector of `state_dim`) and of how far aside the line lies (a vector of 1, m);
-    variances: (n,) m^2: how far objects stray; feet: (n, 2), m; normals: (n, 2); position: where the world position, m,
-    sits in the object's state. Raises `FactorError`.
-    """
-    checked_components("position", position, state_dim, least=2)
-    spread = checked("variances", variances, (None,))
-    shape = (len(spread), 2)
-    function = _Keeping(checked("feet", feet, shape), checked("normals", normals, shape), state_dim, tuple(position))
-    name = "objects keeping to a lane"
-    return residual_factors(function, rows, (state_dim, 1), spread[:, None, None], 1, name, robust)
-
-
-@dataclass(frozen=True, eq=False)
-class _Keeping:
-    feet: FloatArray
-    normals: FloatArray
-    state_dim: int
-    position: tuple[int, ...]
-
-    def residual(self, state: FloatArray, c: FloatArray) -> FloatArray:
-        offset = np.einsum("ni,ni->n", state[:, list(self.position)] - self.feet, self.normals)
-        return np.asarray(offset[:, None] - c)
-
-    def jacobians(self, state: FloatArray, c: FloatArray) -> Sequence[FloatArray]:
-        J_state = np.zeros((len(state), 1, self.state_dim))
-        J_state[:, 0, list(self.position)] = self.normals
-        return [J_state, np.full((len(state), 1, 1), -1.0)]

@@ -1,14 +1,4 @@
-"""Providers of what is around the vehicle: landmarks, lanes, detections seen from it, objects at rest.
-
-Attraction to lanes: vehicles that go along a lane keep to its centre line, r = e - c, r ~ N(0, deviation^2 / dt).
-
-e is the offset from the line at the foot of where an object is, c how far the line lies aside of where the map has it,
-a variable for all time with a prior (`factors.lane`). The loss is robust: it lets go of objects that change lanes.
-
-Stationary objects: v ~ N(0, deviation^2 / dt), robust, so that it lets an object go that drives off.
-
-The variance shrinks with the length of the interval, so that a second has the same weight at any rate of frames.
-"""
+"""Providers of what is around the vehicle: landmarks, and objects seen from it."""
 
 from __future__ import annotations
 
@@ -17,19 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import ResidualFactors, Robust, lane_keeping_factors, prior_factor, relative_factors
+from factors import relative_factors
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.graph.variables import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, NewVariable
-from saga_fg.model.edge_rules import VEHICLES
+from saga_fg.graph.variables import EGO_POSE, LANDMARK, OBJECT, NewVariable
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import feet, on_it
 from saga_fg.providers.odometry import NO_POSE
-from saga_fg.settings import Positive, Settings, setting, settings_group
+from saga_fg.settings import Positive, Settings, setting
 from saga_fg.types.landmark import Observation
-from saga_fg.types.road_map import Lane
 
 
 @dataclass(frozen=True)
@@ -79,57 +66,6 @@ class Landmarks(Settings):
                 )
 
 
-_ALONG = 0.9  # cosine of the angle between a course and a lane within which an object goes along it
-_LETS_GO = 3.0  # standard deviations
-MIN_SPEED = 1.0  # ignore vehicles slower than this, m/s
-
-
-@dataclass(frozen=True)
-class LaneKeeping(Settings):
-    """Attracts vehicles that drive along a lane to its centre line."""
-
-    lanes: tuple[Lane, ...] = settings_group(tuple, "lanes in world coordinates")
-    deviation: Positive = setting(
-        0.5, "standard deviation of the offset left after one second in the lane, m; lower: stronger"
-    )
-    map_deviation: Positive = setting(0.3, "standard deviation of the lanes in the map, m")
-    classes: tuple[str, ...] = setting(VEHICLES, "classes that keep to lanes")
-    name = "lanes"
-
-    def factors(self, view: GraphView) -> Additions:
-        if not self.lanes:
-            raise InputError("lanes: expected one at least")
-        objects = [one for one in view.now(OBJECT).values() if one.label in self.classes and one.dim >= 4]
-        if not objects or view.dt == 0:
-            return Additions()
-        states = np.array([view.state(one.key)[:4] for one in objects])  # (x, y, vx, vy, ...)
-        known, new, factors = view.static(MAP_NODE), list[NewVariable](), list[Factor]()
-        for number, lane in enumerate(self.lanes):
-            mine, feet_there, normals = self._in_lane(lane, states, view.origin)
-            if len(mine) == 0:
-                continue
-            key = view.key(MAP_NODE, number, static=True)
-            if number not in known:
-                new.append(NewVariable(MAP_NODE, number, np.zeros(1), static=True, label=f"lane {lane.name}"))
-                factors.append(prior_factor(key, np.zeros(1), [[self.map_deviation**2]]))
-            for row, foot, normal in zip(mine.tolist(), feet_there, normals, strict=True):
-                one = objects[row]
-                rows, variances = np.array([[one.key, key]], dtype=np.uint64), [self.deviation**2 / view.dt]
-                loss = Robust("cauchy", _LETS_GO)
-                factors.append(lane_keeping_factors(rows, variances, foot[None], normal[None], one.dim, robust=loss))
-        return Additions(new, factors)
-
-    def _in_lane(self, lane: Lane, states: FloatArray, origin: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Rows (k,) of the states that go along a lane, their feet (k, 2) on it, and the normals (k, 2) there."""
-        centre, speed = np.array(lane.centre) - origin, np.hypot(*states[:, 2:].T)
-        at = feet(centre, states[:, :2])
-        along = np.einsum("ni,ni->n", at.direction, states[:, 2:])
-        inside = on_it(centre, at.s) & (np.abs(at.e) < lane.width / 2)
-        mine = np.flatnonzero(inside & (speed >= MIN_SPEED) & (along >= _ALONG * speed))
-        x, y = at.direction[mine].T
-        return mine, at.point[mine], np.stack([-y, x], axis=1)
-
-
 @dataclass(frozen=True, eq=False)
 class RelativeDetections:
     """Measurements of objects with known ids at this epoch.
@@ -154,46 +90,3 @@ class RelativeDetections:
         rows = np.array([[pose.key, view.key(OBJECT, node)] for node in self.nodes.tolist()], dtype=np.uint64)
         z = self.z[:, : 2 if pose.dim == 3 else 3]
         return Additions(factors=[relative_factors(rows, z, self.R, self.dim, self.position)])
-
-
-_SURELY_MOVING = 4.0  # residual from which the loss lets a moving object go, standard deviations
-
-
-@dataclass(frozen=True)
-class StationaryObjects(Settings):
-    """Holds objects of some classes near velocity zero."""
-
-    classes: tuple[str, ...] = setting(("traffic_cone", "barrier"), "classes of stationary objects")
-    deviation: Positive = setting(0.1, "standard deviation of the velocity left after one second, m/s; lower: stronger")
-    name = "stationary"
-
-    def factors(self, view: GraphView) -> Additions:
-        dims: dict[int, list[list[int]]] = {}
-        for one in view.now(OBJECT).values():
-            if one.label in self.classes and one.dim >= 4:  # (x, y, vx, vy, ...)
-                dims.setdefault(one.dim, []).append([one.key])
-        if view.dt == 0:
-            return Additions()
-        R, robust = self.deviation**2 / view.dt * np.eye(2), Robust("geman-mcclure", _SURELY_MOVING)
-        return Additions(
-            factors=[
-                ResidualFactors(
-                    np.array(rows, dtype=np.uint64),
-                    (dim,),
-                    _velocity,
-                    R,
-                    _by_velocity,
-                    robust,
-                    name="stationary object",
-                )
-                for dim, rows in dims.items()
-            ]
-        )
-
-
-def _velocity(x: FloatArray) -> FloatArray:
-    return x[:, 2:4]
-
-
-def _by_velocity(x: FloatArray) -> list[FloatArray]:
-    return [np.tile(np.eye(2, x.shape[1], 2), (len(x), 1, 1))]

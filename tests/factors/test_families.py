@@ -15,7 +15,6 @@ from factors import (
     RangeRate,
     Robust,
     detection_factors,
-    lane_keeping_factors,
     line_factors,
     linearised,
     nonlinear_graph,
@@ -96,12 +95,6 @@ def plane(rng, keys, covariance):
     return made, [poses, held]
 
 
-def keeping(rng, keys, covariance):
-    normals = rng.normal(size=(N, 2))
-    factors = lane_keeping_factors(keys, [0.3, 0.1, 1.0], rng.normal(0, 5, (N, 2)), normals, 5, (3, 1))
-    return [factors], [rng.normal(0, 5, (N, 5)), rng.normal(0, 1, (N, 1))]
-
-
 def edge(rng, keys, covariance):
     factors = line_factors(keys, rng.normal(0, 5, (N, 2, 3)), np.stack([covariance(rng, 2) for _ in range(N)]))
     return [factors], [[some_pose(rng) for _ in range(N)], rng.uniform(-3, 3, (N, 2))]
@@ -116,7 +109,7 @@ def odometry(rng, keys, covariance):
 
 CASES = {
     "point in the plane": seen(2), "point in space": seen(3), "object in the plane": seen(2, 5, (3, 1)),
-    "object from a pose in space": seen(3, 5, (3, 1)), "plane": plane, "lane keeping": keeping, "edge": edge,
+    "object from a pose in space": seen(3, 5, (3, 1)), "plane": plane, "edge": edge,
     "range and bearing from a pose": seen(2, 5, (3, 1), RangeBearing(2)), "odometry": odometry,
     **{f"detection, {name}": detection(model) for name, model in POLAR.items()},
 }  # fmt: skip
@@ -159,13 +152,11 @@ def test_jacobians_are_those_of_central_differences(name, seed, covariance):
 def test_a_perfect_measurement_costs_nothing(seed):
     rng = np.random.default_rng(seed)
     pose, place, wall = some_pose(rng), rng.normal(0, 5, 3), some_plane(rng)
-    values, here = values_of([1, 2, 3, 4], [pose, place, wall, np.array([0.3])]), pose.transformTo(place)
-    normal = np.array([0.6, -0.8])
+    values, here = values_of([1, 2, 3], [pose, place, wall]), pose.transformTo(place)
     errors = [
         relative_factors([[1, 2]], [here], np.eye(3), 3, (0, 1, 2)).error(values),
         relative_factors([[1, 2]], [here], np.eye(2), 3).error(values),
         plane_factor(1, 3, wall.transform(pose).planeCoefficients(), np.eye(3)).error(values),
-        lane_keeping_factors([[2, 4]], [1.0], [place[:2] - 0.3 * normal], [normal], 3).error(values),
     ]
     np.testing.assert_allclose(errors, 0, atol=1e-18)
 
@@ -334,7 +325,6 @@ def test_what_does_not_fit_is_refused(subtests):
         (lambda: relative_factors([[0, 1]], [[1, 2]], np.eye(2), 4, (1, 1)), "distinct"),
         (lambda: relative_factors([[0, 1]], [[0, 0.1]], np.eye(2), 4, model=RangeBearing(2)), "expected ranges > 0"),
         (lambda: relative_factors([[0, 1]], [[1.0]], np.eye(1), 4, model=Range(4)), "in the plane or in space"),
-        (lambda: lane_keeping_factors([[1, 2]], [1.0, 2.0], [[0, 0]], [[0, 1]], 4), "feet: expected shape"),
         (lambda: odometry_factors([[0, 1, 2, 3]], np.eye(4)[None], [-1.0], np.eye(9)), "expected seconds >= 0"),
         (lambda: Polar(4, ("range",), (0, 1, 2)), "two components"),
         (lambda: RangeBearing(4, sensor_pose=(0.0, 0.0)), "sensor_pose"),

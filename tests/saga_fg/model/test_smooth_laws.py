@@ -28,7 +28,6 @@ from factors import (
     RangeBearing,
     RangeRate,
     Vector,
-    lane_keeping_factors,
     relative_factors,
 )
 from factors.manifolds import central_differences, wrap_angles
@@ -169,7 +168,6 @@ CASES = {
     **MEASUREMENTS,
     "range of an object": factor_case(relative_factors([[0, 1]], [[1.0]], [[1.0]], 4, model=Range(2)), 4, [POSE], 1),
     "object from a pose": factor_case(relative_factors([[0, 1]], [[1.0, 0.1]], np.eye(2), 4), 4, [POSE], 1),
-    "lane": factor_case(lane_keeping_factors([[0, 1]], [0.3], [[0, 0]], [[0, 1]], 4), 4, [np.array([0.1])], 0),
 }
 
 
