@@ -26,6 +26,7 @@ import typer
 from benchmarks.filters import Filter, GtsamWindow, Ours, OurWindow, Read, Textbook, blocks, dense
 from benchmarks.flocks import DT, Flock, FlockFrame, Kind, flock
 from benchmarks.runner import Row, Rows, Seed, counts, each, growth, in_turn, timed
+from benchmarks.sampled_traffic import Interaction
 from factors import gaussian_factors, prior_factors
 from pipelines.tracking import one_thread, resident_memory
 from saga_fg.estimators import (
@@ -39,7 +40,7 @@ from saga_fg.estimators import (
     rts_smooth,
 )
 from saga_fg.graph import OBJECT, Additions, GraphView, NewVariable
-from saga_fg.model.nonlinear_interactions import SmoothDriver, interaction
+from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.tracking import TrackerSettings
 
@@ -260,11 +261,9 @@ class Vehicles:
             if self.linear:
                 factors += _linear(now, last, behind, [OWN, LEADER])
             elif len(behind):
-                motion = interaction(SmoothDriver())
+                motion = Interaction(SmoothDriver())
                 there[behind] = motion.predict(x[behind], [x[behind - 1]], DT)
-                factors.append(
-                    motion.factors(now[behind], np.stack([last[behind], last[behind - 1]], axis=1), 4, DT, Q)
-                )
+                factors.append(motion.factors(np.stack([now[behind], last[behind], last[behind - 1]], axis=1), DT, Q))
         return Additions([NewVariable(OBJECT, i, x) for i, x in zip(self.slots.tolist(), there, strict=True)], factors)
 
 

@@ -15,8 +15,8 @@ import gtsam
 import numpy as np
 
 from factors import (
-    NonlinearInteraction,
     RangeBearing,
+    ResidualFactors,
     Robust,
     between_factor,
     pose_prior_factor,
@@ -24,15 +24,54 @@ from factors import (
     relative_factors,
 )
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, FactorProvider, GraphView, NewVariable
-from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, interaction
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, held
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 INITIAL_POSE_COVARIANCE = np.diag([0.05, 0.05, 0.01]) ** 2
 ODOMETRY_COVARIANCE = np.diag([0.05, 0.03, 0.01]) ** 2
 RANGE_BEARING_COVARIANCE = np.diag([0.15, 0.01]) ** 2
 INITIAL_STATE_COVARIANCE = np.diag([1.0, 1.0, 0.5, 0.5]) ** 2
 NOISE = 0.3  # spectral density of accelerations, m^2/s^3
-_FOLLOWING, _REPULSION = interaction(SmoothDriver()), interaction(SocialForce())
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """A law of the package as factors || x' - f(x, others) ||_Q of states (p, v), with any number of neighbours."""
+
+    law: SmoothDriver | SocialForce
+
+    def predict(self, x: FloatArray, others: Sequence[FloatArray], dt: float) -> FloatArray:
+        """Return f (..., 4) of states x (..., 4) and of the neighbours' (..., 4)."""
+        moved = x + dt * np.concatenate([x[..., 2:], np.zeros_like(x[..., 2:])], axis=-1)
+        for other in others:
+            moved = moved + held(self.law.accelerations(x, other, self.law.alone).value[..., None], dt)[..., 0]
+        return moved
+
+    def jacobians(self, x: FloatArray, others: Sequence[FloatArray], dt: float) -> tuple[FloatArray, list[FloatArray]]:
+        """Return the derivatives (..., 4, 4) of f by x, and by each neighbour's state."""
+        own = np.broadcast_to(np.eye(4) + dt * np.eye(4, k=2), (*x.shape, 4))
+        by_others = []
+        for other in others:
+            _, by_own, by_other = self.law.accelerations(x, other, self.law.alone)
+            own = own + held(by_own, dt)
+            by_others.append(held(by_other, dt))
+        return own, by_others
+
+    def factors(self, rows: IntArray, dt: float, Q: FloatArray) -> ResidualFactors:
+        """Return the factors of nodes: rows (n, 2 + k) of the keys after the interval, before, and of neighbours."""
+
+        def residual(later: FloatArray, x: FloatArray, *others: FloatArray) -> FloatArray:
+            return later - self.predict(x, others, dt)
+
+        def jacobians(later: FloatArray, x: FloatArray, *others: FloatArray) -> list[FloatArray]:
+            own, by_others = self.jacobians(x, others, dt)
+            return [np.broadcast_to(np.eye(4), own.shape), -own, *(-J for J in by_others)]
+
+        name = f"{type(self.law).__name__} interactions"
+        return ResidualFactors(rows, (4,) * rows.shape[1], residual, Q, jacobians, name=name)
+
+
+_FOLLOWING, _REPULSION = Interaction(SmoothDriver()), Interaction(SocialForce())
 States = dict[int, FloatArray]
 
 
@@ -79,7 +118,7 @@ class SampledTraffic:
             return [self.leaders[node]] if self.leaders.get(node) in present else []
         return [other for other in sorted(present) if other != node and self.kinds[other] == "pedestrian"]
 
-    def interaction(self, node: int, near: Sequence[int]) -> NonlinearInteraction:
+    def interaction(self, node: int, near: Sequence[int]) -> Interaction:
         """Return the interaction function of a node with these neighbours; without any it keeps its velocity."""
         if self.kinds[node] == "car" and near:
             return _FOLLOWING
@@ -168,7 +207,7 @@ class ObjectProvider:
         """Return variables, priors and interactions of all present objects."""
         frame, before = self.scene.frames[view.epoch], view.before(OBJECT)
         new: list[NewVariable] = []
-        batches: dict[tuple[NonlinearInteraction, int], list[list[int]]] = {}
+        batches: dict[tuple[Interaction, int], list[list[int]]] = {}
         for node in frame.states:
             label = self.scene.kinds[node]
             if node in frame.new:
@@ -184,10 +223,8 @@ class ObjectProvider:
             keys, states = [view.key(OBJECT, i) for i in initial], [frame.new[i] for i in initial]
             factors.append(prior_factors(keys, states, INITIAL_STATE_COVARIANCE))
         for (motion, _), rows in batches.items():
-            earlier = np.array([[before[i].key for i in row] for row in rows], dtype=np.uint64)
-            now = [view.key(OBJECT, row[0]) for row in rows]
-            Q = process_noise(frame.dt)
-            factors.append(motion.factors(now, earlier, 4, frame.dt, Q))
+            keys = [[view.key(OBJECT, row[0]), *(before[i].key for i in row)] for row in rows]
+            factors.append(motion.factors(np.array(keys), frame.dt, process_noise(frame.dt)))
         return Additions(new, factors)
 
 

@@ -19,7 +19,7 @@ from factors.gaussian import (
     prior_factor,
     prior_factors,
 )
-from factors.interaction import NonlinearInteraction, interaction_factor, interaction_factors
+from factors.interaction import interaction_factor, interaction_factors
 from factors.lines_and_planes import HesseLine, line_factors, plane, plane_factor
 from factors.manifolds import ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
 from factors.measurement import (
@@ -48,7 +48,6 @@ __all__ = [
     "Linearisable",
     "MeasurementModel",
     "Mixture",
-    "NonlinearInteraction",
     "OrientedPlane",
     "PlanarPose",
     "Polar",

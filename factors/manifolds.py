@@ -150,15 +150,11 @@ def cross_matrix(vector: FloatArray) -> FloatArray:
 
 def rotation_log(rotation: FloatArray) -> FloatArray:
     """Rotation vectors (N, 3), rad, of rotation matrices (N, 3, 3)."""
-    if len(rotation) == 0:
-        return np.empty((0, 3))
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
 def rotation_exp(vector: FloatArray) -> FloatArray:
     """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), rad."""
-    if len(vector) == 0:
-        return np.empty((0, 3, 3))
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 

@@ -47,13 +47,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache, partial
 from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.special import expit, softmax
 
-from factors import NonlinearInteraction
 from factors.measurement import soft_distance
 from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -320,31 +318,6 @@ def smooth_acceleration(driver: IntelligentDriver, v: FloatArray, s: FloatArray,
     )
 
 
-@cache
-def interaction(law: AccelerationLaw) -> NonlinearInteraction:
-    """The law for factors with keys (next, own, neighbours), states (p, v); stacks too."""
-    return NonlinearInteraction(partial(_predict, law), partial(_jacobians, law), name=type(law).__name__)
-
-
 def held(by_state: FloatArray, dt: float) -> FloatArray:
     """Change (..., 4, n) of positions and velocities by accelerations (..., 2, n) held over dt."""
     return np.concatenate([0.5 * dt * dt * by_state, dt * by_state], axis=-2)
-
-
-def _predict(law: AccelerationLaw, x: FloatArray, others: list[FloatArray], dt: float) -> FloatArray:
-    moved = x + dt * np.concatenate([x[..., 2:], np.zeros_like(x[..., 2:])], axis=-1)
-    for other in others:
-        moved = moved + held(law.accelerations(x, other, law.alone).value[..., None], dt)[..., 0]
-    return moved
-
-
-def _jacobians(
-    law: AccelerationLaw, x: FloatArray, others: list[FloatArray], dt: float
-) -> tuple[FloatArray, list[FloatArray]]:
-    own = np.broadcast_to(np.eye(4) + dt * np.eye(4, k=2), (*x.shape, 4))
-    by_others = []
-    for other in others:
-        _, by_own, by_other = law.accelerations(x, other, law.alone)
-        own = own + held(by_own, dt)
-        by_others.append(held(by_other, dt))
-    return own, by_others

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.sampled_traffic import Interaction
 from factors import Vector
 from factors.manifolds import central_differences
 from saga_fg.model import nonlinear_interactions
@@ -11,7 +12,6 @@ from saga_fg.model.nonlinear_interactions import (
     IntelligentDriver,
     SmoothDriver,
     SocialForce,
-    interaction,
     smooth_acceleration,
 )
 
@@ -24,7 +24,7 @@ def test_the_round_corners_are_close_to_the_model_away_from_them():
 
 
 def test_nobody_drives_backwards_however_close_the_leader_stands():
-    law, x = interaction(SmoothDriver()), np.array([0.0, 0.0, 3.0, 0.0])
+    law, x = Interaction(SmoothDriver()), np.array([0.0, 0.0, 3.0, 0.0])
     for _ in range(100):
         x = law.predict(x, [np.array([5.5, 0.0, 0.0, 0.0])], 0.1)
     assert 0.0 < x[0] < 2.0
@@ -32,7 +32,7 @@ def test_nobody_drives_backwards_however_close_the_leader_stands():
 
 
 def test_a_follower_closes_up_to_the_gap_he_wants_and_no_farther():
-    law, leader = interaction(SmoothDriver()), np.array([100.0, 0.0, 8.0, 0.0])
+    law, leader = Interaction(SmoothDriver()), np.array([100.0, 0.0, 8.0, 0.0])
     x = np.array([20.0, 0.0, 8.0, 0.0])
     for _ in range(1200):
         x, leader = law.predict(x, [leader], 0.1), leader + np.array([0.8, 0.0, 0.0, 0.0])
@@ -41,7 +41,7 @@ def test_a_follower_closes_up_to_the_gap_he_wants_and_no_farther():
 
 
 def test_pedestrians_push_each_other_away_and_stacks_are_the_same():
-    law, rng = interaction(SocialForce()), np.random.default_rng(0)
+    law, rng = Interaction(SocialForce()), np.random.default_rng(0)
     x, others = rng.normal(size=(5, 4)), [rng.normal(size=(5, 4)) for _ in range(2)]
     together = law.predict(x, others, 0.2)
     for k in range(5):
