@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -23,9 +24,10 @@ from factors import (
     prior_factors,
     relative_factors,
 )
+from factors.validation import KeyArray
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, FactorProvider, GraphView, NewVariable
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, held
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.arrays import FloatArray
 
 INITIAL_POSE_COVARIANCE = np.diag([0.05, 0.05, 0.01]) ** 2
 ODOMETRY_COVARIANCE = np.diag([0.05, 0.03, 0.01]) ** 2
@@ -57,18 +59,18 @@ class Interaction:
             by_others.append(held(by_other, dt))
         return own, by_others
 
-    def factors(self, rows: IntArray, dt: float, Q: FloatArray) -> ResidualFactors:
+    def factors(self, rows: KeyArray, dt: float, Q: FloatArray) -> ResidualFactors:
         """Return the factors of nodes: rows (n, 2 + k) of the keys after the interval, before, and of neighbours."""
-
-        def residual(later: FloatArray, x: FloatArray, *others: FloatArray) -> FloatArray:
-            return later - self.predict(x, others, dt)
-
-        def jacobians(later: FloatArray, x: FloatArray, *others: FloatArray) -> list[FloatArray]:
-            own, by_others = self.jacobians(x, others, dt)
-            return [np.broadcast_to(np.eye(4), own.shape), -own, *(-J for J in by_others)]
-
+        residual, jacobians = partial(self._residual, dt), partial(self._residual_jacobians, dt)
         name = f"{type(self.law).__name__} interactions"
         return ResidualFactors(rows, (4,) * rows.shape[1], residual, Q, jacobians, name=name)
+
+    def _residual(self, dt: float, later: FloatArray, x: FloatArray, *others: FloatArray) -> FloatArray:
+        return later - self.predict(x, others, dt)
+
+    def _residual_jacobians(self, dt: float, later: FloatArray, x: FloatArray, *others: FloatArray) -> list[FloatArray]:
+        own, by_others = self.jacobians(x, others, dt)
+        return [np.broadcast_to(np.eye(4), own.shape), -own, *(-J for J in by_others)]
 
 
 _FOLLOWING, _REPULSION = Interaction(SmoothDriver()), Interaction(SocialForce())
@@ -223,8 +225,8 @@ class ObjectProvider:
             keys, states = [view.key(OBJECT, i) for i in initial], [frame.new[i] for i in initial]
             factors.append(prior_factors(keys, states, INITIAL_STATE_COVARIANCE))
         for (motion, _), rows in batches.items():
-            keys = [[view.key(OBJECT, row[0]), *(before[i].key for i in row)] for row in rows]
-            factors.append(motion.factors(np.array(keys), frame.dt, process_noise(frame.dt)))
+            names = [[view.key(OBJECT, row[0]), *(before[i].key for i in row)] for row in rows]
+            factors.append(motion.factors(np.array(names, dtype=np.uint64), frame.dt, process_noise(frame.dt)))
         return Additions(new, factors)
 
 

@@ -46,7 +46,6 @@ class BatchSolver:
         self._settings = settings or SolverSettings()
         self._graph = SceneFactorGraph()
         self._solution: GraphSolution | None = None
-        self._shared = False  # a caller may hold the graph, so that its values are copied before a change
         if graph is not None:
             self.restore(graph)
 
@@ -61,14 +60,13 @@ class BatchSolver:
         frame: the input of the epoch
         """
         asked = self.providers if providers is None else providers
-        unchanged, begun = (self._graph, self._solution, self._shared), predictors(asked)
+        unchanged, begun = (self._graph, self._solution), predictors(asked)
         self._ask(time, begun or asked, frame)
         if begun:
             try:
                 self._ask(None, asked, frame)
             except GraphError:
-                self._graph, self._solution, self._shared = unchanged
-                self._graph.erase_unknown_values()
+                self._graph, self._solution = unchanged
                 raise
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
@@ -85,7 +83,6 @@ class BatchSolver:
         """Minimise, unless nothing has changed; raises `UndeterminedError` naming the variables that are not."""
         if self._solution is None:
             graph = self._graph.copy()
-            graph.erase_unknown_values()  # when a provider asks, others have added some already
             self._solution = _minimise(graph, self._settings)
             self._graph = graph
         return self._solution
@@ -93,7 +90,6 @@ class BatchSolver:
     def graph(self) -> SceneFactorGraph:
         """The graph itself, solved: its variables, factors and values. To be read, not changed."""
         self.solve()
-        self._shared = True
         return self._graph
 
     def state(self, key: int) -> object:
@@ -121,21 +117,16 @@ class BatchSolver:
         self._replace_graph(graph.copy())
 
     def _ask(self, time: float | None, providers: Sequence[FactorProvider], frame: Frame | None = None) -> None:
-        known = self._graph
-        graph = known.copy(share_values=not self._shared)
+        graph = self._graph.copy()
         view = GraphView(graph, self.covariance, self.origin, frame)
-        try:
-            if time is not None:
-                graph.advance(time)
-            for provider in providers:
-                ask(provider, graph, view)
-        except GraphError:
-            known.erase_unknown_values()
-            raise
+        if time is not None:
+            graph.advance(time)
+        for provider in providers:
+            ask(provider, graph, view)
         self._replace_graph(graph)
 
     def _replace_graph(self, graph: SceneFactorGraph) -> None:
-        self._graph, self._solution, self._shared = graph, None, False
+        self._graph, self._solution = graph, None
 
 
 def _minimise(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolution:

@@ -100,7 +100,6 @@ class SceneFactorGraph:
     def __init__(self, elimination: Elimination = "qr") -> None:
         self._variables: dict[int, GraphVariable] = {}
         self._base, self._values = gtsam.Values(), gtsam.Values()
-        self._shared = False  # with a copy, until one of them changes
         self.index = FactorIndex()
         self.elimination: Elimination = elimination
         self._angles_checked: dict[tuple[str, str], int] = {}
@@ -197,7 +196,6 @@ class SceneFactorGraph:
         self._added += 1
         self.births |= dict.fromkeys(added, self._added)
         self._newest += tuple(key for key, one in added.items() if one.epoch == self.epoch)
-        self._separate()
         self._values.insert(values)
         self._base.insert(values)
         self.index.add_variables(added)
@@ -275,7 +273,6 @@ class SceneFactorGraph:
         for number, mine in rows.items():
             self.index.deactivate(number, mine)
         added = [self.index.add(HeldGroup(_MARGINALS, None, prior, np.ones(1, dtype=bool))) for prior in priors]
-        self._separate()
         for key in leaving:
             del self._variables[key], self.births[key]
             self.index.remove_variable(key)
@@ -359,31 +356,13 @@ class SceneFactorGraph:
                 graph.add(factor)
         return graph
 
-    def copy(self, share_values: bool = False) -> SceneFactorGraph:
-        """A graph of its own with the same variables and factors, which are shared.
-
-        share_values: what is added to the copy comes into these values, too, which costs less than copying them; only
-        one of the two can go on, this one with `erase_unknown_values`
-        """
+    def copy(self) -> SceneFactorGraph:
+        """A graph of its own with the same variables and factors, which are shared."""
         other = SceneFactorGraph()
-        if share_values:
-            self._separate()  # from a third
-        self._shared = not share_values
         other.__dict__ |= self.__dict__
         other._variables, other.index, other.births = dict(self._variables), self.index.copy(), dict(self.births)
+        other._base, other._values = self.base, self.values
         return other
-
-    def _separate(self) -> None:
-        """Go on with values of its own."""
-        if self._shared:
-            self._base, self._values, self._shared = self.base, self.values, False
-
-    def erase_unknown_values(self) -> None:
-        """Erase values of variables that are not in the graph."""
-        self._separate()
-        for values in (self._base, self._values):
-            for key in set(values.keys()) - self._variables.keys():
-                values.erase(key)
 
     def _eliminated(
         self, touched: gtsam.GaussianFactorGraph, keys: list[int], elimination: Elimination
