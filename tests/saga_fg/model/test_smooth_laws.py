@@ -174,7 +174,7 @@ CASES = {
 def test_laws_motions_and_models_are_found():
     assert {"SmoothDriver", "SocialForce", "CoordinatedTurn"} <= CASES.keys()
     found = set(shipped(factors, "predict", "jacobian")) - {type(case.model) for case in MEASUREMENTS.values()}
-    assert [one.__name__ for one in found] == ["Components"], "a model without a case in MEASUREMENTS"
+    assert not found, "a model without a case in MEASUREMENTS"
 
 
 @pytest.mark.parametrize("name", CASES)
