@@ -32,6 +32,7 @@ from saga_fg.estimators import Estimator
 from saga_fg.model.discretisation import Transition
 from saga_fg.model.edge_rules import EdgeRule, Pairs
 from saga_fg.model.interactions import Interaction, NodeTable
+from saga_fg.model.modes import Mixture
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
@@ -256,10 +257,12 @@ class HiddenObjects(Columns):
     def predict(self, settings: TrackerSettings, rules: Sequence[EdgeRule]) -> GapPrediction:
         """Predict all hidden tracks by a tracker's settings and these rules.
 
-        Raises `InputError` for classes that move nonlinearly, and for rules that act on accelerations nonlinearly.
+        Raises `InputError` for classes that move nonlinearly or by a mixture, and for rules that act on accelerations
+        nonlinearly.
         """
-        if settings.nonlinear(rules):
-            raise InputError("expected linear motions and interactions to learn with, got nonlinear ones")
+        mixed = any(isinstance(one.motion, Mixture) for one in settings.classes.values())
+        if mixed or settings.nonlinear(rules):
+            raise InputError("expected linear motions and interactions to learn with, got nonlinear ones or mixtures")
         W, S = self.place.shape[:2]
         found = GapPrediction(np.full((W, S, 2), np.nan), np.full((W, S, 2, 2), np.nan))
         last = S - self.known[:, ::-1].argmax(axis=1)

@@ -188,8 +188,8 @@ def discretise(graph: SceneGraph, dt: float) -> Transition:
         for edges in graph.edges:
             if edges.A_other.shape[1] == d and edges.rate.any():
                 F.append(_coupling_blocks(edges, dt, M, phi, position, kinds, kind))
-    if graph.courses:
-        _move_along_courses(graph, dt, F, b, Q, offsets, coupled)
+    if graph.motions:
+        _move_as_recorded(graph, dt, F, b, Q, offsets, coupled)
     made = unchecked(Transition, graph=graph, dt=dt, F=_merged(F, len(graph)), b=b, Q=tuple(Q), offsets=offsets)
     made.check_finite()
     return made
@@ -219,7 +219,7 @@ def linear_motions(
     return F, Q
 
 
-def _move_along_courses(
+def _move_as_recorded(
     graph: SceneGraph,
     dt: float,
     F: list[Blocks],
@@ -230,7 +230,7 @@ def _move_along_courses(
 ) -> None:
     """Put the recorded motions in place of those of their types: G_i = F_ii exp(-A_i dt) acts on them, I if alone."""
     own_blocks = [number for number, blocks in enumerate(F) if blocks.target is blocks.source]  # in the order of Q
-    for record in graph.courses:
+    for record in graph.motions:
         rows = graph.rows(record.ids)
         if len(rows) == 0:
             continue

@@ -56,7 +56,7 @@ from saga_fg.model.nonlinear_interactions import (
     SocialForce,
     nearest_offset,
 )
-from saga_fg.model.scene_graph import Courses, Edges, NonlinearEdges, SceneGraph
+from saga_fg.model.scene_graph import Edges, NonlinearEdges, RecordedMotions, SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, of_classes, unchecked
 from saga_fg.numerics.gating import near_pairs
 from saga_fg.settings import (
@@ -387,7 +387,7 @@ def build_graph(
     rules: Sequence[EdgeRule],
     explained_noise: float = 0.0,
     noise_scale: FloatArray | None = None,
-    courses: tuple[Courses, ...] = (),
+    motions: tuple[RecordedMotions, ...] = (),
     interacting: BoolArray | None = None,
     min_rate: float = 1e-3,
 ) -> SceneGraph:
@@ -396,7 +396,7 @@ def build_graph(
     Edges weaker than `min_rate` (1/s) are left out.
 
     A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
-    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it. `courses` are those
+    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it. `motions` are those
     of the graph. Rules see, and tie, the nodes that are `interacting` (n,), None: all.
 
     Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
@@ -436,7 +436,7 @@ def build_graph(
     scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
     if noise_scale is not None:
         scale = scale * noise_scale
-    parts = {"edges": tuple(groups), "diffusion_scale": scale, "nonlinear": tuple(nonlinear), "courses": courses}
+    parts = {"edges": tuple(groups), "diffusion_scale": scale, "nonlinear": tuple(nonlinear), "motions": motions}
     return unchecked(SceneGraph, nodes=graph_nodes.id, types=graph_nodes.types, kinds=types, **parts)
 
 

@@ -61,15 +61,15 @@ class OwnMotions(NamedTuple):
     Q: FloatArray
 
 
-class Courses(Protocol):
-    """Courses of some nodes at the start of an interval; see `saga_fg.model.turning.KnownCourses`."""
+class RecordedMotions(Protocol):
+    """Known courses (`saga_fg.model.turning`) or mixtures of motion (`saga_fg.model.modes`) of some nodes."""
 
     @property
     def ids(self) -> IntArray: ...
 
-    def select(self, rows: IntArray) -> Courses: ...
+    def select(self, rows: IntArray) -> RecordedMotions: ...
 
-    def predicted(self, dt: float, scale: FloatArray) -> tuple[Courses, OwnMotions]:
+    def predicted(self, dt: float, scale: FloatArray) -> tuple[RecordedMotions, OwnMotions]:
         """dt seconds later, and the motions until then; scale (n,) of the process noise."""
 
 
@@ -142,7 +142,7 @@ class SceneGraph:
     nonlinear  one or more groups of nonlinear edges, likewise
     diffusion_scale  (n,) > 0, factors on the diffusion of the nodes' own motion, 1 if not given: what an interaction
                      explains of a node's motion is noise no more
-    courses  known ones of nodes, whose motion along these takes the place of that of their types
+    motions  of some nodes in place of those of their types, as they are at the start of the interval
 
     Raises `InputError` for edges that name a row the graph has not, triples whose sizes don't fit the nodes,
     or edges of the other kind.
@@ -153,7 +153,7 @@ class SceneGraph:
     edges: tuple[Edges, ...] = ()
     diffusion_scale: FloatArray = None  # type: ignore[assignment]  # an array from construction on
     nonlinear: tuple[NonlinearEdges, ...] = ()
-    courses: tuple[Courses, ...] = ()
+    motions: tuple[RecordedMotions, ...] = ()
 
     def __post_init__(self) -> None:
         nodes = checked_ids("nodes", self.nodes)
@@ -207,12 +207,12 @@ class SceneGraph:
         return sum(len(group) for group in self._groups)
 
     def after(self, dt: float) -> SceneGraph:
-        """The graph for the rest of an interval of which dt seconds have passed: the same edges, later courses."""
-        if not self.courses:
+        """The graph for the rest of an interval of which dt seconds have passed: the same edges, later motions."""
+        if not self.motions:
             return self
-        scale = (self.diffusion_scale[self.rows(record.ids)] for record in self.courses)
-        later = (record.predicted(dt, s)[0] for record, s in zip(self.courses, scale, strict=True))
-        return replace(self, courses=tuple(later))
+        scale = (self.diffusion_scale[self.rows(record.ids)] for record in self.motions)
+        later = (record.predicted(dt, s)[0] for record, s in zip(self.motions, scale, strict=True))
+        return replace(self, motions=tuple(later))
 
     def rows(self, nodes: IntArray) -> IntArray:
         """Rows of nodes that are in the graph."""
@@ -237,8 +237,8 @@ class SceneGraph:
             triple = (group.A_self[inside], group.A_other[inside], group.b[inside])
             groups.append(Edges(group.interaction, target, source, group.rate[inside], *triple))
         types = tuple(self.types[k] for k in kept.tolist())
-        courses = tuple(c.select(np.flatnonzero(np.isin(c.ids, nodes))) for c in self.courses)
-        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept], tuple(nonlinear), courses)
+        motions = tuple(m.select(np.flatnonzero(np.isin(m.ids, nodes))) for m in self.motions)
+        return SceneGraph(self.nodes[kept], types, tuple(groups), self.diffusion_scale[kept], tuple(nonlinear), motions)
 
     @staticmethod
     def of(nodes: Sequence[int] | IntArray, node_type: NodeType, edges: Sequence[Edges] = ()) -> SceneGraph:

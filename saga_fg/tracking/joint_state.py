@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -24,6 +25,7 @@ from saga_fg.estimators import Estimator, Measurements
 from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
 from saga_fg.model.discretisation import discretise, own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
+from saga_fg.model.modes import Mixture, ModeTable
 from saga_fg.model.motion import Motion, NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct, shallow_copy
@@ -59,6 +61,7 @@ class JointTrackState:
         self._type_of: dict[str, NodeType] = {}
         self._kinds: dict[tuple[tuple[str, ...], bool], tuple[list[NodeType], IntArray]] = {}
         self._initiated: dict[int, float] = {}  # on the estimator's clock
+        self._modes: dict[Mixture, ModeTable] = {}  # of tracks that move by a mixture
         self._kinematics: Kinematics | None = None  # until the state changes
 
     def type_of(self, label: str) -> NodeType:
@@ -105,6 +108,9 @@ class JointTrackState:
             if delay > 0:
                 F, Q = own_motion(node_type, delay)
                 mean, P = mean @ F.T, F @ P @ F.T + Q
+            if isinstance(node_type.motion, Mixture):
+                new, old = ModeTable.new(node_type.motion, ids[rows], mean, P), self._modes.get(node_type.motion)
+                self._modes[node_type.motion] = new if old is None else old.extended(new)
             labels = dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True))
             self._estimator_to_change().add_unchecked(ids[rows], mean, P, labels)
         self._initiated.update(dict.fromkeys(ids.tolist(), self.estimator.time))
@@ -123,12 +129,23 @@ class JointTrackState:
         self._estimator_to_change().marginalise(ids)
         if kept is not None and before is not None and len(before.P) == len(kept) + len(ids):
             self._kinematics = before.select(kept)
+        self._modes = {k: t.select(np.flatnonzero(~np.isin(t.ids, ids))) for k, t in self._modes.items()}
         for track in ids.tolist():
             del self._initiated[track]
 
     def predict(self, graph: SceneGraph, dt: float) -> None:
         """Move all tracks by `dt` s under the graph's dynamics."""
-        self._estimator_to_change().predict(discretise(graph, dt))
+        estimator = self._estimator_to_change()
+        if not self._modes:
+            estimator.predict(discretise(graph, dt))
+            return
+        self._anchor_modes()
+        graph = replace(graph, motions=graph.motions + tuple(self._modes.values()))
+        estimator.predict(discretise(graph, dt))
+        scale = [graph.diffusion_scale[graph.rows(table.ids)] for table in self._modes.values()]
+        later = [t.predicted(dt, s)[0] for t, s in zip(self._modes.values(), scale, strict=True)]
+        self._modes = dict(zip(self._modes, later, strict=True))
+        self._anchor_modes()
 
     def update(
         self,
@@ -216,11 +233,11 @@ class JointTrackState:
 
     def snapshot(self) -> Any:
         """The state as a value."""
-        return self.estimator.snapshot(), dict(self._initiated)
+        return self.estimator.snapshot(), dict(self._initiated), dict(self._modes)
 
     def restore(self, snapshot: Any) -> None:
         """Continue from a snapshot."""
-        state, self._initiated = snapshot
+        state, self._initiated, self._modes = snapshot
         self._estimator_to_change().restore(state)
 
     @property
@@ -235,7 +252,7 @@ class JointTrackState:
         """
         twin = shallow_copy(self)
         twin.estimator = self.estimator.handed_over() if taking_over else copy.copy(self.estimator)
-        twin._initiated = dict(self._initiated)
+        twin._initiated, twin._modes = dict(self._initiated), dict(self._modes)
         return twin
 
     def measure(
@@ -252,6 +269,9 @@ class JointTrackState:
     ) -> Measurements:
         """Measurements as of now; those that a smoother puts at their own time are taken in and left out."""
         estimator = self._estimator_to_change()
+        if isinstance(node_type.motion, Mixture) and delay == 0 and len(ids):
+            self._modes[node_type.motion], z, H = self._modes[node_type.motion].updated(ids, z, H, R)
+            R = np.broadcast_to(np.eye(node_type.dim), H.shape)
         if delay > 0 and estimator.lag > 0:
             then = estimator.time - delay
             known = [self._initiated[track] <= then for track in ids.tolist()]
@@ -267,6 +287,12 @@ class JointTrackState:
         """Correct the estimator, once if it takes several kinds together."""
         self._estimator_to_change().update(kinds)
 
+    def _anchor_modes(self) -> None:
+        estimator = self.estimator
+        for mixture, table in self._modes.items():
+            marginals = estimator.mean(table.ids), estimator.covariance(table.ids)
+            self._modes[mixture] = table.anchored(*marginals) if len(table) else table
+
     def _estimator_to_change(self) -> Estimator:
         self._kinematics = None
         return self.estimator
@@ -274,7 +300,7 @@ class JointTrackState:
     def rows_by_type(self, label: StrArray, moving: bool = False) -> list[tuple[NodeType, IntArray]]:
         """Rows whose states have the same components, with a type of theirs; if `moving`, the same motion too.
 
-        Nonlinear motions are always separate.
+        Nonlinear motions and mixtures are always separate.
         """
         classes, index = distinct(label)
         types, kind = self._kinds.get((classes, moving)) or self._kinds_of(classes, moving)
@@ -287,7 +313,7 @@ class JointTrackState:
         """A type of each kind that `rows_by_type` distinguishes, and the kind (k,) of each class."""
         types = [self.type_of(c) for c in classes]
         number: dict[object, int] = {}
-        apart = [moving or t.flow is not None for t in types]
+        apart = [moving or t.flow is not None or isinstance(t.motion, Mixture) for t in types]
         names = [id(t) if own else t.components for own, t in zip(apart, types, strict=True)]
         kind = [number.setdefault(name, len(number)) for name in names]
         found = [types[kind.index(k)] for k in range(len(number))], np.array(kind, dtype=np.int64)

@@ -11,6 +11,7 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, require_rules, traffic_rules
 from saga_fg.model.lanes import ConeLine, InLane
+from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
@@ -43,10 +44,12 @@ AssociationName = Literal["hungarian", "greedy", "graph"]
 class ClassSettings(Settings):
     """Motion, initiation, association and deletion of the tracks of one class."""
 
-    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn = settings_group(
-        lambda: ConstantVelocity(acceleration_noise=2.0),
-        "motion model of the class; curvilinear for vehicles with measured headings; random_walk for objects that "
-        "never move, such as cones",
+    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn | Mixture = (
+        settings_group(
+            lambda: ConstantVelocity(acceleration_noise=2.0),
+            "motion model of the class; curvilinear for vehicles with measured headings; random_walk for objects that "
+            "never move, such as cones",
+        )
     )
     initial_speed_deviation: Positive = setting(
         5.0, "standard deviation of the velocity of a new track along its heading, m/s; usual 1 (pedestrians) to 8"

@@ -33,11 +33,12 @@ def tracked(tracker, label, path, seen, dt=0.1):
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_a_hidden_car_goes_on_turning(estimator):
+@pytest.mark.parametrize("motion", ["coordinated_turn", "mixture"])
+def test_a_hidden_car_goes_on_turning(estimator, motion):
     angle = 0.5 * np.arange(55) * 0.1
     path = 20.0 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
     straight, there = tracked(tracker(estimator), "car", path, 40)
-    turning, _ = tracked(tracker(estimator, motion="coordinated_turn"), "car", path, 40)
+    turning, _ = tracked(tracker(estimator, motion=motion), "car", path, 40)
     errors = [np.hypot(*(track.position[:2] - there)) for track in (straight, turning)]
     assert errors[1] < 0.5 * errors[0]
     assert errors[0] > 2.0
@@ -102,8 +103,25 @@ def test_pedestrians_who_walk_into_each_other_step_aside():
     assert gaps[1] > gaps[0] + 0.1
 
 
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_modes_know_what_stands_and_do_not_lose_it_when_it_departs(estimator):
+    """A car at a light, which drives off after five seconds."""
+    errors = []
+    for motion in ("constant_velocity", "mixture"):
+        rng, one, x, off = np.random.default_rng(1), tracker(estimator, motion=motion), 0.0, []
+        for k in range(80):
+            speed = 0.0 if k < 50 else min(8.0, 0.3 * (k - 50))
+            x += 0.1 * speed
+            seen = [Detection("car", (x + 0.2 * rng.normal(), 0.2 * rng.normal(), 1.0), score=0.9)]
+            (track,) = one.step(Frame(k / 10, "lidar", Detections.of(seen)))
+            off.append(np.hypot(track.velocity[0] - speed, track.velocity[1]))
+        errors.append([np.mean(off[20:50]), np.mean(off[60:])])
+    assert errors[1][0] < 0.5 * errors[0][0]
+    assert errors[1][1] < 1.3 * errors[0][1]
+
+
 def test_a_tracker_with_nonlinear_edges_is_copied_and_goes_on_alike():
-    one = tracker("fixed-lag", "{kind: repulsion}", motion="coordinated_turn")
+    one = tracker("fixed-lag", "{kind: repulsion}", motion="mixture")
     frames = []
     for k in range(8):
         seen = [Detection("pedestrian", (0.2 * i + 0.01 * k, 0.5, 1.0), score=0.9) for i in range(3)]

@@ -28,7 +28,7 @@ def drawn(rng, motion, count, moments=60):
         for _ in range(moments):
             straight = np.array([heading]), np.zeros(1), np.zeros(1)
             record = KnownCourses.of(car, np.array([0]), *straight, x[None], DT)
-            step = discretise(replace(SceneGraph.of([0], car), courses=(record,)), DT)
+            step = discretise(replace(SceneGraph.of([0], car), motions=(record,)), DT)
             x = step.F_matrix @ x + step.b + rng.multivariate_normal(np.zeros(6), step.Q_matrix.toarray())
             seen.append(x[:2] + NOISE * rng.normal(size=2))
         R = np.tile(NOISE**2 * np.eye(2), (moments, 1, 1))

@@ -10,6 +10,7 @@ from saga_fg.learning import HiddenObjects, hidden_objects
 from saga_fg.learning.hidden_objects import STEP
 from saga_fg.model.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.tracking import ClassSettings, Tracker, TrackerSettings
@@ -129,3 +130,5 @@ def test_nothing_to_learn_from_and_nonlinear_interactions():
     sample = hidden_objects(following_pairs(pairs=1, moments=40), VELOCITY, SENSORS, ONCE)
     with pytest.raises(InputError, match="linear motions and interactions"):
         sample.predict(VELOCITY, (Repulsion(),))
+    with pytest.raises(InputError, match="or mixtures"):
+        sample.predict(settings_of(Mixture()), ())

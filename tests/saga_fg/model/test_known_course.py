@@ -26,7 +26,7 @@ def course(node_type, heading=0.0, rate=0.0, rate_variance=0.0, mean=(0, 0, 8, 0
 
 def along(record, node_type=CAR):
     graph = SceneGraph.of([7], node_type)
-    return replace(graph, courses=(record,))
+    return replace(graph, motions=(record,))
 
 
 def own(record, dt, node_type=CAR):
@@ -129,7 +129,7 @@ def test_edges_act_on_the_velocity_of_turning_nodes():
     nodes = node_table(np.random.default_rng(0), (CAR, CAR), ids=[7, 8])
     one = np.array([0]), np.array([1])
     edges = Edges("shared_velocity", *one, np.array([200.0]), *SharedVelocity().triples(nodes, *one))
-    graph = SceneGraph(np.array([7, 8]), (CAR, CAR), (edges,), courses=(course(CAR, rate=0.5),))
+    graph = SceneGraph(np.array([7, 8]), (CAR, CAR), (edges,), motions=(course(CAR, rate=0.5),))
     F = discretise(graph, 0.5).F_matrix.toarray()
     assert F[V, V] == pytest.approx(np.zeros((2, 2)), abs=1e-9)
     assert F[V, 8:10] == pytest.approx(np.eye(2), abs=1e-9)

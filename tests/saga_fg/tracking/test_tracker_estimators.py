@@ -118,5 +118,5 @@ def test_every_estimator_takes_the_same_turns(estimator, subtests):
                 z, there = place + 0.1 * rng.normal(size=(2, 2)), slice(2 if t < 3 else 1)
                 seen_now = frame(t, z[there], label=LABEL[there], yaw=angle[there])
                 agree(reference.step(seen_now), other.step(seen_now), 1e-8)
-            assert any(reference.graph.courses), "turns were recorded"
+            assert any(reference.graph.motions), "turns were recorded"
             assert np.isclose(np.hypot(*reference.tracks(4.5).boxes.velocity[0]), speed, atol=1.0)

@@ -264,7 +264,7 @@ def test_every_estimator_takes_the_same_paths(estimator, subtests):
         with subtests.test(edges=edges):
             one = replace(ON, edges=edges, tolerance=0.0)
             trackers, _ = driven((one, replace(one, estimator=estimator)), gap=1.0)
-            assert trackers[0].graph.courses[0].settling[1] > 0
+            assert trackers[0].graph.motions[0].settling[1] > 0
             first, second = (tracker.tracks(6.3) for tracker in trackers)
             assert first.id.tolist() == second.id.tolist()
             assert first.boxes.position == pytest.approx(second.boxes.position, abs=1e-7)
