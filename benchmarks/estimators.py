@@ -49,7 +49,8 @@ LAG, WARM_UP = 5, 3  # frames; those that are not counted
 DENSE, WHOLE = 300, 100  # more nodes in one graph are hopeless for the textbook and iSAM2; for windows and the graph
 GROWTH_FROM = 50  # nodes: below, calls cost more than numbers
 ROW = 5  # vehicles
-F, Q = np.eye(4) + DT * np.eye(4, k=2), 0.3 * np.kron([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]], np.eye(2))
+F = np.eye(4) + DT * np.eye(4, k=2)
+Q: FloatArray = 0.3 * np.kron([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]], np.eye(2))
 OWN, LEADER = np.diag([1.0, 1.0, 0.95, 0.95]) @ F, np.diag([0.0, 0.0, 0.05, 0.05])
 COST, GROWTH, ENDURANCE = "cost, and error in standard deviations", "growth of the cost", "endurance"
 
