@@ -50,7 +50,7 @@ DENSE, WHOLE = 300, 100  # more nodes in one graph are hopeless for the textbook
 GROWTH_FROM = 50  # nodes: below, calls cost more than numbers
 ROW = 5  # vehicles
 F = np.eye(4) + DT * np.eye(4, k=2)
-Q: FloatArray = 0.3 * np.kron([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]], np.eye(2))
+Q: FloatArray = np.asarray(0.3 * np.kron([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]], np.eye(2)), dtype=np.float64)
 OWN, LEADER = np.diag([1.0, 1.0, 0.95, 0.95]) @ F, np.diag([0.0, 0.0, 0.05, 0.05])
 COST, GROWTH, ENDURANCE = "cost, and error in standard deviations", "growth of the cost", "endurance"
 
