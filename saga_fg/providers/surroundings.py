@@ -123,7 +123,7 @@ class LaneKeeping(Settings):
                 at = feet(centre, states[mine, :2])
                 normal = np.stack([-at.direction[:, 1], at.direction[:, 0]], axis=1)
                 keys = np.array([[objects[row].key, key] for row in mine.tolist()], dtype=np.uint64)
-                aside, R = _Aside(at.point, normal, dim), [[self.deviation**2 / view.dt]]
+                aside, R = _Aside(at.point, normal, dim), self.deviation**2 / view.dt * np.eye(1)
                 kind = "vehicles in a lane"
                 factors.append(
                     ResidualFactors(keys, (dim, 1), aside.residual, R, aside.jacobians, LANE_LOSS, name=kind)
@@ -148,7 +148,7 @@ class _Aside:
     dim: int
 
     def residual(self, state: FloatArray, offset: FloatArray) -> FloatArray:
-        return np.einsum("ni,ni->n", self.normal, state[:, :2] - self.foot)[:, None] - offset
+        return (self.normal * (state[:, :2] - self.foot)).sum(axis=1, keepdims=True) - offset
 
     def jacobians(self, state: FloatArray, offset: FloatArray) -> list[FloatArray]:
         by_state = np.zeros((len(state), 1, self.dim))
