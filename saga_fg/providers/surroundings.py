@@ -148,7 +148,8 @@ class _Aside:
     dim: int
 
     def residual(self, state: FloatArray, offset: FloatArray) -> FloatArray:
-        return (self.normal * (state[:, :2] - self.foot)).sum(axis=1, keepdims=True) - offset
+        aside: FloatArray = (self.normal * (state[:, :2] - self.foot)).sum(axis=1, keepdims=True)
+        return aside - offset
 
     def jacobians(self, state: FloatArray, offset: FloatArray) -> list[FloatArray]:
         by_state = np.zeros((len(state), 1, self.dim))
