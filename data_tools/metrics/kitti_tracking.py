@@ -11,7 +11,7 @@ among those the largest sum of IoU. Thresholds on the mean score of a track are 
 
 and the CLEAR metrics at the threshold with the highest MOTA. Implemented from the paper, with results equal to its
 authors' evaluation: thresholds are run from few tracks to many, after a run with all, and a found box that matched in
-any of these runs is never exempt (`class_boxes`) in a later one.
+any of these runs is never exempt (`kitti_boxes`) in a later one.
 
 The authors' evaluation averages a track's score anew before each run, so that rounding drops some tracks from the very
 run whose threshold is their score (`track_scores`). One long track can change sAMOTA by many points this way.
@@ -175,7 +175,7 @@ def kitti_tracking_metrics(
     """Metrics of class `label` ("car", "pedestrian", "cyclist") over all sequences; None if no true box counts.
 
     Pairs need a 3D IoU of at least `min_iou`; the benchmark uses 0.25, 0.5 and 0.7. persons: whether `Person` lines are
-    neighbours of pedestrians (`class_boxes`); the reference evaluation leaves them out. Raises `InputError` for objects
+    neighbours of pedestrians (`kitti_boxes`); the reference evaluation leaves them out. Raises `InputError` for objects
     of the class without a 3D box.
     """
     true, found = (boxes(sequences, label.lower(), persons) for boxes in (true_boxes, found_boxes))

@@ -107,7 +107,7 @@ class Setting:
 
 
 def kind_of(cls: type) -> str:
-    """The word that chooses `cls` in a union: its attribute `kind`, or its name: `LaneKernelSettings`: lane_kernel."""
+    """The word that chooses `cls` in a union: its attribute `kind`, or its name: `RandomWalk`: random_walk."""
     kind = getattr(cls, "kind", None)
     if isinstance(kind, str):
         return kind

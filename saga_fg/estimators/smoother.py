@@ -184,7 +184,7 @@ class RecordingSmoother:
         self._prior, self._epochs, self._layout = BlockGaussian.empty(), [_Epoch(0.0)], StateLayout()
         self._means: list[FloatArray] = []  # where what is nonlinear is linearised
         self.bound = 0.0
-        """Largest change that later measurements could make to final epochs; `longest` forces it above `tolerance`."""
+        """Largest change that later measurements could make to final epochs; `LONGEST` forces it above `TOLERANCE`."""
 
     @property
     def time(self) -> float:

@@ -23,7 +23,7 @@ start at its result, the states without the users' factors. `BatchSolver` solves
 
 Stationary objects, recognised from smoothed states and their detections.
 
-A run of moments is a halt if the smoothed speed stays below `stationary_speed` for at least `min_time`, and the
+A run of moments is a halt if the smoothed speed stays below `stationary_speed` for at least `MIN_STATIONARY`, and the
 positions measured meanwhile do not drift: with the weighted regression
 
     z_k = p + u (t_k - t_mean) + e_k,   weights w_k = 2 / tr R_k,   u* = sum w (t - t_mean) z / sum w (t - t_mean)^2

@@ -41,7 +41,7 @@ In a queue, cars too far to be seen creeping look parked, and the vehicle's path
 nearer, are seen to creep. So q_0 is one half, and the other half is divided as the traffic moves then, within 10 s:
 maximum likelihood of all detections by expectation maximisation, with a Dirichlet prior worth a few detections.
 
-Online the window ends now, and T is short: q_0 is `online_stationary_share`, q_1 = 0, and the last term of S, errors
+Online the window ends now, and T is short: q_0 is `ONLINE_STATIONARY_SHARE`, q_1 = 0, and the last term of S, errors
 of the heading, counts across the line of sight only.
 """
 

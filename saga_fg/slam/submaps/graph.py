@@ -13,7 +13,7 @@ that of all anchors, which is solved when a submap is closed, and when loops com
 submap by another prior; what the running submap says of those before comes when it is closed. So a keyframe costs as
 much at the end of a drive as at its beginning.
 
-The measurements themselves are kept. `finish` chooses the loops that agree (`loop_selection`), and solves everything
+The measurements themselves are kept. `finish` chooses the loops that agree (`select_loops`), and solves everything
 together, nothing condensed, from the running estimate.
 """
 
