@@ -1,6 +1,6 @@
 """A dataset for all verbs of the command, and datasets by name.
 
-A dataset for all verbs of the command: its options, how it opens, how its results are written, read and scored.
+It says its options, how it opens, and how its results are written, read and scored.
 
 A new dataset is a dataclass derived from `DatasetSource`, whose fields are its options:
 

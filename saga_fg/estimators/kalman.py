@@ -1,6 +1,6 @@
 """SAGA-KF itself: one Kalman filter over the joint state, extended by the factors of providers.
 
-SAGA-KF itself: one Kalman filter over the joint state of all nodes of the scene graph (Sani et al., ICPR 2024).
+The joint state is that of all nodes of the scene graph (Sani et al., ICPR 2024).
 
     predict   m <- F m + b              P <- F P F^T + Q                    F block-sparse, Q block-diagonal
     update    S = H P H^T + R = L L^T   W = L^-1 H P    m <- m + W^T L^-1 (z - H m)    P <- P - W^T W

@@ -1,7 +1,5 @@
 """The running graph: variables over time, factors on them, and what marginalised variables leave.
 
-The running graph: variables over time, factors on them, and where the variables are.
-
     minimise over x   sum_i rho_i( || r_i(x) ||_{R_i} )
 
 Objects, the vehicle and landmarks are variables of one graph, interactions, measurements and priors its factors. What

@@ -1,7 +1,5 @@
 """Variables of the running graph: kind, id, time and manifold, their keys, values and errors.
 
-Variables of the running graph: kind, id, time, and the manifold they live on.
-
 A variable x of dimension d moves by increments, x = retract(base, delta), delta = local(base, x) in R^d. Its base is
 where it was first put; while it is in the graph the base stays. For a vector the increment is the difference.
 

@@ -1,7 +1,5 @@
 """Sensor models: noise, score calibration, place on the vehicle, field of view.
 
-Sensor models: measurement noise and score calibration of a sensor, with its place and field of view.
-
     z = H x + v,   v ~ N(0, R)
     R = s(score)^2 ( position^2 I + (range_noise r)^2 u u^T + (bearing_noise r)^2 n n^T )
 

@@ -1,6 +1,6 @@
 """Stability of edge rules, alone and together, and interactions learned from recordings.
 
-Stability of edge rules, alone and together: they must not drive objects apart.
+Edge rules must not drive objects apart.
 
 By Gershgorin's theorem the eigenvalues of couplings whose rates sum to K_i at node i lie in discs about -K_i of radius
 K_i, so within 2 max K_i of zero, and two nodes that act on each other at the rate max K_i reach that bound. Rules are

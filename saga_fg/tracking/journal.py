@@ -1,8 +1,7 @@
 """Observing a tracker at work: stages of a frame, a journal of every track, its running graph.
 
-Observing a tracker at work: the state and the results at the end of each step of a frame.
-
-A tracker without an observer pays nothing for the possibility; a view is made only for an observer that asks for it.
+An observer is told of the end of each step of a frame, and may ask for the state and the results. A tracker without an
+observer pays nothing for the possibility; a view is made only for an observer that asks for it.
 
 A journal of a tracker: an event for every track and frame with the reasons, as values that JSON can hold.
 

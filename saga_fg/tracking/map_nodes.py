@@ -1,7 +1,5 @@
 """Maps as nodes of the joint state: lights, stop lines, lanes, walls; tiles joined, colours inferred.
 
-Lights, stop lines, lanes and walls of a map as nodes of the joint state, with the states of the lights.
-
 Nodes are the elements of those classes that some edge rule reads: others would cost time alone.
 
 Nodes of the map are stationary; their positions start at those of the map, as uncertain as the map, and are corrected

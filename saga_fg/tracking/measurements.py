@@ -1,6 +1,6 @@
 """The measurements of a frame in the world, and the vehicle itself as a measured node.
 
-The measurements of a frame: its usable detections, in the world, with the sensor's model of their noise.
+Measurements are the usable detections, with the sensor's model of their noise.
 
 Duplicates are left out by non-maximum suppression. Of two detections of a class closer than `nms_distance` the
 less probable one is suppressed; within `weak_nms_distance` only where its probability is below `WEAK_RATIO` of the

@@ -1,10 +1,10 @@
 """Predict: the state moves on along motions, courses and edges, to a frame or to times ahead.
 
-Predict: the state moves on along the objects' own motion and the edges of the scene graph, frozen an interval long.
+For an interval the edges of the scene graph are those of its start:
 
 x(t + dt) = F x(t) + b + w,   w ~ N(0, Q)   with F, b and Q of the graph's edges (`saga_fg.model.discretisation`)
 
-Courses of vehicles that are known when the state is predicted: seen in headings, or of the path that they are on.
+Courses of vehicles are known when the state is predicted, from headings or from the path that they are on.
 
 A track that is not detected goes on along its path: that of earlier traffic where there is any
 (`saga_fg.tracking.traffic`), else that of its own heading and turn. On it, it takes on the speed of earlier traffic,

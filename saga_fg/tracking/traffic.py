@@ -4,9 +4,7 @@ A passage is a place of a track with its heading and speed there: where it was l
 outlive their tracks and are forgotten after `memory` s. The passages of those that move make trails, and so do the
 lanes of the road map: they tell where to go, at no speed, and are never forgotten.
 
-Paths are predicted from this memory, and the speeds of new tracks.
-
-Predicted paths along the trails of earlier traffic and the lanes of the map.
+The speeds of new tracks are predicted from this memory, and paths along the trails and the lanes of the map.
 
 A trail is the row of passages of one track, or the centre of a lane. A path is predicted
 from a place and a course h in steps of ds, with u the curvature that the vehicle has itself, which fades along the way.

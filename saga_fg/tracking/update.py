@@ -1,10 +1,10 @@
 """Update: matched measurements correct the state, and existence follows from all that was seen.
 
-Update: the matched measurements correct position and velocity, box and stationarity of their tracks.
+The matched measurements correct position and velocity, box and stationarity of their tracks.
 
 Where they are, and how fast, is remembered for the paths and speeds of others (`saga_fg.tracking.traffic`).
 
-Update of the probability r that a track is a real object, by Bayes' rule, and of the score of its box.
+The probability r that a track is a real object is updated by Bayes' rule, and so is the score of its box.
 
     miss    r <- r (1 - p_D) / (1 - r p_D) exp(-dt / lifetime)
     match   r / (1 - r) <- r / (1 - r)  p / (1 - p)  (1 - c) / c
