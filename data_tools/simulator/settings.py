@@ -1,6 +1,6 @@
 """Settings of the traffic simulator, and named scenarios.
 
-Named scenarios, as settings of the simulator.
+Scenarios:
 
 traffic      the default settings
 red-light    a queue before a traffic light; frames have a map, the camera reports colours
@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from saga_fg.errors import InputError
 from saga_fg.settings import (
@@ -30,7 +30,6 @@ from saga_fg.settings import (
     settings_group,
 )
 
-PositiveSpan = Annotated[tuple[float, float], Range(0, above=True, ascending=True)]
 NonNegativeSpan = Annotated[tuple[float, float], Range(0, ascending=True)]
 Count = Annotated[tuple[int, int], Range(0, ascending=True)]  # fewest and most
 PositiveCount = Annotated[tuple[int, int], Range(0, above=True, ascending=True)]
@@ -53,7 +52,9 @@ class TrafficSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not VAN_SHARE + self.truck_share + self.bus_share <= 1:
-            raise InputError("van_share: expected the shares of vans, trucks and buses to be at most 1 together")
+            raise InputError(
+                f"truck_share and bus_share: expected at most {1 - VAN_SHARE:g} together, the rest are vans and cars"
+            )
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,6 @@ class SimulatorSettings(Settings):
 
 
 ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "cycling", "two-sensors"]
-SCENARIOS: tuple[ScenarioName, ...] = get_args(ScenarioName)
 
 
 _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {

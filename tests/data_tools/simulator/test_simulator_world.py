@@ -191,7 +191,7 @@ def test_settings_no_world_can_have_are_refused(subtests: pytest.Subtests) -> No
         (lambda: SimulatorSettings(duration=0.0), "duration: expected a finite number > 0"),
         (lambda: SimulatorSettings(warm_up=-1.0), "warm_up: expected a finite number >= 0"),
         (lambda: SimulatorSettings(roadworks_probability=-0.1), "roadworks_probability: expected a number from 0 to 1"),
-        (lambda: TrafficSettings(truck_share=0.7), "van_share: expected the shares"),
+        (lambda: TrafficSettings(truck_share=0.7), "truck_share and bus_share: expected at most 0.75 together"),
         (lambda: SensorSettings(field_of_view=7.0), "field_of_view: expected a number above 0 to 6.28"),
         (lambda: SensorSettings(colour_accuracy=2.0), "colour_accuracy: expected a number from 0 to 1"),
     ]:
