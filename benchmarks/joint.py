@@ -53,6 +53,7 @@ NEAR, SETTLED, MOVING = 2.0, 3, 1.0  # m, of a detection from the object that it
 SAME_TIME = 1e-3  # s, between a frame and its truth
 FIGURES = ("world position, m", "world velocity, m/s", "ego position, m", "ego velocity, m/s")
 GAP, OFFSET, SEEN = 25.0, 9.0, 0.8  # m between poles, and from the path, means; chance that one within reach is seen
+REACH, NOISE = 30.0, 0.1  # m: largest distance at which a pole is seen; standard deviation ahead and to the left
 Pair = tuple[int, str]  # frame, object
 State = tuple[IntArray, FloatArray, FloatArray, Assignment]  # ids, states (n, 4), the vehicle's pose, detections
 At = Callable[[int, Frame, Detections], Mapping[str, State]]
@@ -292,25 +293,22 @@ class HeldPath:
         return Additions(factors=[gtsam.PriorFactorPose3(view.key(EGO_POSE, 0), pose, noise)])
 
 
-def poles_at(frames: Sequence[Frame], seed: int, reach: float = 30.0, noise: float = 0.1) -> Observations:
-    """Observe poles beside the driven path, 1.5 m high, at frames with true poses.
-
-    reach: m; noise: standard deviation ahead and to the left, m
-    """
+def poles_at(frames: Sequence[Frame], seed: int) -> Observations:
+    """Observe poles beside the driven path, 1.5 m high, at frames with true poses."""
     poses = np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None])
     rng, places = np.random.default_rng(seed), []
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
     for side in (-1.0, 1.0):
-        along = np.arange(0.0, driven[-1] + reach, GAP)
+        along = np.arange(0.0, driven[-1] + REACH, GAP)
         along = along + rng.uniform(-0.3, 0.3, len(along)) * GAP
         for s in along.tolist():
             row = min(int(np.searchsorted(driven, s)), len(driven) - 1)
             ahead, across = s - driven[row], side * (OFFSET + rng.normal(0, 1.0))
             places.append(transform_points(poses[row], np.array([[ahead, across, 1.5]]))[0])
-    kind, R, result = PoleLandmark(), noise**2 * np.eye(2), []
+    kind, R, result = PoleLandmark(), NOISE**2 * np.eye(2), []
     for pose in poses:
         local = transform_points(inverse_transform(pose), np.stack(places))
-        near = (np.hypot(*local[:, :2].T) <= reach) & (rng.random(len(local)) < SEEN)
-        local[:, :2] += noise * rng.standard_normal((len(local), 2))
+        near = (np.hypot(*local[:, :2].T) <= REACH) & (rng.random(len(local)) < SEEN)
+        local[:, :2] += NOISE * rng.standard_normal((len(local), 2))
         result.append([Observation(kind, point, R) for point in local[near]])
     return result

@@ -44,6 +44,7 @@ _WEAK = 0.3  # ratio of information along and across below which few points tell
 _NEIGHBOURS, _REACH = 8, 0.4  # of a point that determine its line, and m from it
 _COARSE = 0.12  # m: lines are those of means in such cells, so that the noise of dense scans is averaged
 _FEWEST = 4  # of them
+_NEAR = 0.15  # m, largest distance of a pair at the end
 _FLAT = 0.15  # largest ratio of the standard deviations across and along a line
 _ITERATIONS, _STEP = 20, 1e-4
 
@@ -78,15 +79,15 @@ class LineMap:
         normals[better] = wider[better]
         return cls(tree, points, normals, np.minimum(ratio, wider_ratio) <= _FLAT**2)
 
-    def fit(self, scan: FloatArray, pose: FloatArray, prior: FloatArray, reach: float, near: float = 0.15) -> Fit:
+    def fit(self, scan: FloatArray, pose: FloatArray, prior: FloatArray, reach: float) -> Fit:
         """Register points (n, 2) of a scan from a pose (3,), of which odometry knows `prior` (3, 3).
 
-        reach: largest distance of a pair at the start, m; it shrinks to `near`
+        reach: largest distance of a pair at the start, m; it shrinks to `_NEAR`
         """
         start, x = pose, pose.copy()
         H = np.zeros((3, 3))
         for iteration in range(_ITERATIONS):
-            farthest = max(near, reach * 0.7**iteration)
+            farthest = max(_NEAR, reach * 0.7**iteration)
             arm = _turned(scan, x[2])
             at = arm + x[:2]
             distance, rows = self.tree.query(at, distance_upper_bound=farthest)
@@ -105,9 +106,9 @@ class LineMap:
             gradient = J.T @ (w * r) + known @ difference(x, start)
             step = -np.linalg.solve(H + known, gradient)
             x = x + step
-            if farthest == near and np.abs(step).max() < _STEP:
+            if farthest == _NEAR and np.abs(step).max() < _STEP:
                 break
-        distance, _ = self.tree.query(_turned(scan, x[2]) + x[:2], distance_upper_bound=near)
+        distance, _ = self.tree.query(_turned(scan, x[2]) + x[:2], distance_upper_bound=_NEAR)
         return Fit(x, H, float(np.isfinite(distance).mean()) if len(scan) else 0.0)
 
 

@@ -30,6 +30,7 @@ from saga_fg.types.dataset import Annotations, LabelledObjects, Scene
 from saga_fg.types.frame import Detections, Frame
 
 REACH = 2.0  # m, from an object to its detections
+MIN_STEP = 0.05  # s, between two detections of an object
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,18 +223,18 @@ def sample_with_truth(scenes: Iterable[Scene], sensors: Mapping[str, Sensor]) ->
 
 
 def measured_trajectories(
-    scenes: Iterable[Scene], sensors: Mapping[str, Sensor], gate: float = 2.0, step: float = 0.05
+    scenes: Iterable[Scene], sensors: Mapping[str, Sensor]
 ) -> dict[str, list[MeasuredTrajectory]]:
     """Class -> the measured positions and headings of each of its objects, by the nearest detection of the class within
-    `gate` m.
+    `REACH`.
 
-    Of detections of one object closer in time than `step` s only the first is taken. Their covariances are those of the
-    sensors' models. Raises `InputError` for a scene without ground truth.
+    Of detections of one object closer in time than `MIN_STEP` only the first is taken. Their covariances are those of
+    the sensors' models. Raises `InputError` for a scene without ground truth.
     """
     found: dict[str, list[MeasuredTrajectory]] = {}
     for scene in scenes:
         objects: dict[tuple[str, str], list[tuple[float, FloatArray, FloatArray, float, float]]] = {}
-        for matched in match_to_truth(scene, sensors, gate):
+        for matched in match_to_truth(scene, sensors, REACH):
             truth, sensor = matched.annotations, sensor_model(sensors, matched.frame.sensor)
             time = matched.frame.timestamp + sensor.time_offset
             boxes = matched.detections.boxes
@@ -241,7 +242,7 @@ def measured_trajectories(
             (yaw_noise,) = sensor.deviations(boxes.label, "yaw")
             for j, i in zip(matched.detection.tolist(), matched.truth.tolist(), strict=True):
                 rows = objects.setdefault((str(truth.boxes.label[i]), str(truth.id[i])), [])
-                if not rows or time - rows[-1][0] >= step:
+                if not rows or time - rows[-1][0] >= MIN_STEP:
                     rows.append((time, boxes.position[j, :2], R[j], boxes.yaw[j], yaw_noise[j]))
         for (label, _), rows in objects.items():
             found.setdefault(label, []).append(MeasuredTrajectory(*map(np.array, zip(*rows, strict=True))))

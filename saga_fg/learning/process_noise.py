@@ -38,6 +38,7 @@ from saga_fg.types.by_class import DEFAULT
 
 FEWEST_OBJECTS = 10  # a class with fewer has the noise of all objects together
 WRONG_REACH = 4.0  # m
+_NOISE_BOUNDS = (1e-4, 1e2)  # m^2/s^3
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,6 @@ class MeasuredTrajectory:
 def fit_acceleration_noise(
     objects: Sequence[MeasuredTrajectory],
     initial_speed_deviation: float = 10.0,
-    bounds: tuple[float, float] = (1e-4, 1e2),
 ) -> float:
     """The most likely `ConstantVelocity.acceleration_noise`, m^2/s^3, of some objects.
 
@@ -86,10 +86,9 @@ def fit_acceleration_noise(
     useful = [o for o in objects if len(o) >= 3]
     if not useful:
         raise InputError("objects: expected at least one object seen three times or more")
-    low, high = np.log(bounds)
     found = minimize_scalar(
         lambda log_q: -log_likelihood(useful, float(np.exp(log_q)), initial_speed_deviation),
-        bounds=(low, high),
+        bounds=np.log(_NOISE_BOUNDS),
         method="bounded",
     )
     return float(np.exp(found.x))

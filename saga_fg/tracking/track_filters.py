@@ -301,10 +301,10 @@ class Stationarity(Columns):
         return Kinematics(*reported_moments(self.probability, coasting, *moving, self.position, self.P))
 
 
-def after_evidence(probability: FloatArray, evidence: FloatArray, most_log_odds: float = _MOST_LOG_ODDS) -> FloatArray:
+def after_evidence(probability: FloatArray, evidence: FloatArray) -> FloatArray:
     """Probability (k,) after evidence (k,), the log of a ratio of likelihoods."""
     before = np.clip(probability, 1e-9, 1 - 1e-9)
-    odds = np.clip(np.log(before / (1 - before)) + evidence, -most_log_odds, most_log_odds)
+    odds = np.clip(np.log(before / (1 - before)) + evidence, -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
     return np.asarray(1 / (1 + np.exp(-odds)))
 
 

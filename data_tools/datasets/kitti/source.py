@@ -142,7 +142,6 @@ def kitti_result_text(
     scene: Scene,
     moments: Sequence[Tracks],
     calibration: Calibration,
-    image_size: tuple[int, int] = IMAGE_SIZE,
     with_score: bool = True,
 ) -> str:
     """The lines of one sequence; without the score they are those of a label file."""
@@ -151,7 +150,7 @@ def kitti_result_text(
     imu_T_camera = inverse_transform(calibration.camera_T_imu)
     lines: list[str] = []
     for frame, (tracks, world_T_imu) in enumerate(zip(moments, scene.world_T_ego, strict=True)):
-        lines += _lines(frame, tracks, world_T_imu @ imu_T_camera, calibration, image_size, with_score)
+        lines += _lines(frame, tracks, world_T_imu @ imu_T_camera, calibration, with_score)
     return "".join(lines)
 
 
@@ -160,7 +159,6 @@ def _lines(
     tracks: Tracks,
     world_T_camera: FloatArray,
     calibration: Calibration,
-    image_size: tuple[int, int],
     with_score: bool,
 ) -> list[str]:
     types = [_type(frame, label) for label in tracks.boxes.label.tolist()]
@@ -169,7 +167,7 @@ def _lines(
         id_ = int(tracks.id[np.argmax(unmeasured)])
         raise InputError(f"frame {frame}: track {id_}: expected a known size and heading, the format requires them")
     boxes = world_boxes_to_camera(tracks.boxes, world_T_camera)
-    bbox = image_boxes(boxes, calibration.projection, image_size)
+    bbox = image_boxes(boxes, calibration.projection, IMAGE_SIZE)
     columns = [observation_angles(boxes), bbox, boxes.size, boxes.location, boxes.rotation_y]
     numbers = np.column_stack([*columns, tracks.score] if with_score else columns)
     return [
