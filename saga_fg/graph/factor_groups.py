@@ -262,7 +262,9 @@ class HeldGroup:
         """
         group = self.factors
         alone = all(len(keys) == 1 for keys in group.rows)
-        sharpest = float(np.abs(group.factors.augmented[:, :-1]).max()) if isinstance(group, LinearGroup) else 0.0
+        sharpest = (
+            float(np.abs(group.factors.augmented[:, :-1]).max(initial=0.0)) if isinstance(group, LinearGroup) else 0.0
+        )
         return isinstance(group, PriorGroup), alone, -sharpest
 
 

@@ -111,7 +111,7 @@ def test_a_dataset_in_place_of_what_to_learn_is_answered_with_the_command() -> N
 def test_config_prints_the_simulators_settings_and_markdown() -> None:
     assert "warm_up" in yaml.safe_load(saga_fg("config", "--full", "--simulator").stdout)
     assert "## `tracker.existence`" in saga_fg("config", "--markdown").stdout
-    assert "## `road`" in saga_fg("config", "--markdown", "--simulator").stdout
+    assert "| `warm_up` |" in saga_fg("config", "--markdown", "--simulator").stdout
 
 
 def test_an_input_error_is_one_line_on_stderr_and_exit_code_2(tmp_path: Path) -> None:

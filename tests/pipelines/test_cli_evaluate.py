@@ -142,7 +142,8 @@ def test_innovations_need_a_journal(drive: Path) -> None:
 
 def test_who_sits_is_unknown_to_the_usual_evaluation(tmp_path: Path) -> None:
     for option, false_positives in [([], 1), (["--persons", "exempt"], 0)]:
-        root, results, file = write_sequence(tmp_path / "kitti"), tmp_path / "results", tmp_path / "figures.json"
+        folder = tmp_path / str(false_positives)
+        root, results, file = write_sequence(folder / "kitti"), folder / "results", folder / "figures.json"
         results.mkdir()
         labels = root / "training" / "label_02" / "0007.txt"
         sitting = "2 5 Person 0 0 0 700 150 720 250 1.2 0.5 0.6 -3 1.6 8 0"

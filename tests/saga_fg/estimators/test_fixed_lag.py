@@ -217,7 +217,7 @@ def test_what_is_wrong_is_said_and_changes_nothing(subtests):
         (lambda s: s.update(Measurements([9], [[0.0]], np.eye(1, 4), [[1.0]]), time=0.05), UnknownNodeError),
         (lambda s: s.marginalise([1, 1]), InputError),
     ]:
-        with subtests.test(error):
+        with subtests.test(error.__name__):
             smoother, untouched = two_cars(), two_cars()
             with pytest.raises(error):
                 wrong(smoother)
