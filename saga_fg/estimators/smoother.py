@@ -174,7 +174,8 @@ class RecordingSmoother:
     max_component largest number of nodes that are smoothed jointly: where more are connected, the weakest interactions
                   take over the neighbour's mean and variance only; None: any number, exact
 
-    The methods that take something in are those of `saga_fg.estimators.Estimator`.
+    The methods that take something in are those of `saga_fg.estimators.Estimator`; measurements come in the order of
+    time.
     """
 
     def __init__(self, windowed: bool = False, max_component: int | None = None) -> None:
