@@ -12,8 +12,8 @@ import pytest
 
 from pipelines.configuration import read_settings
 from saga_fg import InputError, Tracker, TrackerSettings
-from saga_fg.conformance import CHECKS, check_estimator
-from saga_fg.estimators import JointKalmanFilter
+from saga_fg.conformance import check_estimator
+from saga_fg.estimators import GraphFilter, JointKalmanFilter
 from saga_fg.tracking import EgoNodeSettings
 from saga_fg.tracking.by_name import estimator_parameters
 from tests.saga_fg.traffic_frames import columns, run, seen, straight
@@ -243,9 +243,11 @@ def test_what_an_estimator_does_not_take_is_refused():
         Tracker(settings("my_estimators:Textbook", ego=EgoNodeSettings(estimated=True)))
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_the_suite_is_passed_by_the_toolkits_filter(check):
-    check(JointKalmanFilter)
+@pytest.mark.parametrize(
+    "make", [JointKalmanFilter, GraphFilter, lambda: GraphFilter(lag=1.0)], ids=["kalman", "isam2", "fixed-lag"]
+)
+def test_the_toolkits_estimators_conform(make):
+    check_estimator(make)
 
 
 def test_a_users_estimator_conforms(mine):
