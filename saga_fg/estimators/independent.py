@@ -1,6 +1,6 @@
 """Objects that nothing ties to others: in one batch, in closed form, and as providers see them.
 
-Objects that nothing ties to others, over the epochs of a window: all of them in one batch, in closed form.
+Over the epochs of a window,
 
     x_i' = F_ii x_i + b_i + q_i,    z = H x_i + v        P = blockdiag( P_1, ..., P_n )
 

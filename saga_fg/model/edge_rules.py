@@ -371,7 +371,7 @@ def _acted(nodes: NodeTable, able: BoolArray) -> BoolArray:
 
 
 def _columns(nodes: NodeTable, information: bool) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Of n nodes existence, whether they have moved, and variances of velocities, each (n,); the spread, -1: no gain"""
+    """Existence, share that moves and velocity variance of n nodes; the spread, -1 where information does not count."""
     exists, moved = nodes.existence, np.asarray(nodes.has_moved, dtype=np.float64)
     if not information:
         return exists, moved, np.ones(len(nodes)), -1.0
