@@ -60,7 +60,6 @@ def without(x: Sequence[float], gone: range) -> list[float | None]:
 
 HIDDEN = range(5, 9)  # 2.5 to 4 s: the last detection is at 2 s, the next at 4.5 s
 SEEN = [k not in HIDDEN for k in range(len(TIMES))]
-ALWAYS = [True] * len(TIMES)
 
 
 def labelled(labels: Places, detections: Places) -> LabelledScene:

@@ -67,12 +67,6 @@ class WholeSettings:
     chosen: Rule = settings_group(DistanceRule, "one rule")
 
 
-@dataclass(frozen=True)
-class RequiredSettings:
-    path: str = setting("x", "a path")
-    noise: tuple[ClassSettings, ...] = setting((), "none")
-
-
 finite = st.floats(allow_nan=False)
 words = st.text(st.characters(codec="utf-8"), max_size=20)
 gates = st.builds(GateSettings, st.floats(1e-300, 1.0), st.integers(-(2**63) + 1, 2**63 - 1))

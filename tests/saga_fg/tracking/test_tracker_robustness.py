@@ -120,10 +120,6 @@ class Failing:
         return empty, empty, np.empty(0)
 
 
-def estimator_state(tracker):
-    return columns(tracker.tracks(100.0)), tracker.snapshot().next_id, tracker.time_verdict
-
-
 @pytest.mark.parametrize(
     ("estimator", "stage"),
     [
