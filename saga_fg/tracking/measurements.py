@@ -160,8 +160,7 @@ def suppress_duplicates(
 
 
 EGO_ID = 0  # tracks begin at 1, nodes of the map count down from -1
-EGO_LABEL, EGO_LENGTH = "car", 4.5  # class in edge rules; m
-_ID, _LABEL = np.array([EGO_ID]), np.array([EGO_LABEL])
+_ID = np.array([EGO_ID])
 
 
 @dataclass(eq=False)
@@ -178,7 +177,8 @@ class EgoNode:
     @classmethod
     def of(cls, settings: TrackerSettings) -> EgoNode:
         """A node without a position."""
-        return cls(settings.ego, class_settings(settings.classes, ClassSettings, EGO_LABEL))
+        label = "" if settings.ego is None else settings.ego.label
+        return cls(settings.ego, class_settings(settings.classes, ClassSettings, label))
 
     def __len__(self) -> int:
         return int(self.present)
@@ -207,24 +207,25 @@ class EgoNode:
             return
         pose, R = frame.world_T_ego, np.zeros((1, 4, 4))
         R[0, :2, :2] = self.settings.deviation**2 * np.eye(2)
-        z = np.concatenate([pose[:2, 3] - origin, np.zeros(2)])[None]
+        z, label = np.concatenate([pose[:2, 3] - origin, np.zeros(2)])[None], np.array([self.settings.label])
         relative = RelativePositions(np.zeros((1, 3)), R[:, :2, :2]) if self.settings.estimated else None
         if self.present:
-            joint.update(_ID, _LABEL, z, R, np.zeros(1, dtype=bool), 0.0, relative)
+            joint.update(_ID, label, z, R, np.zeros(1, dtype=bool), 0.0, relative)
         else:
             speed = self.motion.initial_speed_deviation**2 * np.eye(2)[None]
-            joint.add(_ID, _LABEL, Kinematics(z[:, :2], z[:, 2:], R[:, :2, :2], speed), relative=relative)
-        velocity = joint.kinematics_of(_ID, _LABEL).velocity[0]
+            joint.add(_ID, label, Kinematics(z[:, :2], z[:, 2:], R[:, :2, :2], speed), relative=relative)
+        velocity = joint.kinematics_of(_ID, label).velocity[0]
         self.present, self.time, self.yaw = True, time, float(yaw_of(pose[:3, :3]))
         self.has_moved = self.has_moved or bool(np.hypot(*velocity) > MOVING)
 
     def table(self, joint: JointTrackState) -> NodeTable:
         """The vehicle as a node table of one row."""
-        now = joint.kinematics_of(_ID, _LABEL)
-        heading, length, moved = np.array([self.yaw]), np.array([EGO_LENGTH]), np.array([float(self.has_moved)])
+        assert self.settings is not None
+        label, length = np.array([self.settings.label]), np.array([self.settings.length])
+        now, types = joint.kinematics_of(_ID, label), joint.types_of(label)
+        heading, moved = np.array([self.yaw]), np.array([float(self.has_moved)])
         variance = np.trace(now.P_velocity, axis1=1, axis2=2) / 2
-        types = joint.types_of(_LABEL)
-        return NodeTable(_ID, _LABEL, types, now.position, now.velocity, heading, length, variance, moved)
+        return NodeTable(_ID, label, types, now.position, now.velocity, heading, length, variance, moved)
 
 
 def relative_covariances(joint: JointTrackState, ids: IntArray, label: StrArray) -> FloatArray:

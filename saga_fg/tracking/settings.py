@@ -139,6 +139,8 @@ class EgoNodeSettings(Settings):
     estimated: bool = setting(
         False, "true: estimate the ego pose with the objects, by factor providers; false: use that of the frames"
     )
+    label: str = setting("car", "class of the ego vehicle in edge rules")
+    length: Positive = setting(4.5, "length of the ego vehicle, m; usual 4 to 20; higher: others follow farther behind")
     deviation: Positive = setting(
         0.02,
         "standard deviation of the ego position about its pose, m; usual 0.01 to 0.1; higher: smoother",

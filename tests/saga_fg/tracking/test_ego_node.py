@@ -12,10 +12,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from saga_fg import ConstantVelocity, Frame, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg import ConstantAcceleration, ConstantVelocity, Frame, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE
 from saga_fg.model.edge_rules import Following
+from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Odometry, StartSettings
@@ -25,7 +26,7 @@ from tests.saga_fg.traffic_frames import at_pose, frame, seen, straight, turning
 
 PLACE = np.array([4000.0, -7000.0])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
-APART = EgoNodeSettings(estimated=True)
+APART = EgoNodeSettings(estimated=True, label="ego")  # of no class that follows
 
 
 def turning(t: float) -> np.ndarray:
@@ -233,7 +234,24 @@ def test_copies_go_on_alike_and_looking_ahead_changes_nothing(copied: Callable[[
         assert b.boxes.position == pytest.approx(a.boxes.position, abs=1e-3)
 
 
+def test_the_vehicle_is_of_the_class_and_the_length_that_are_set() -> None:
+    cars, filled = straight([(-25.0, 0.0)], [(8.0, 0.0)]), {}
+    for length in (4.5, 16.0):
+        ego, classes = EgoNodeSettings(label="truck", length=length), {"truck": ClassSettings(ConstantAcceleration())}
+        classes["default"] = ClassSettings(ConstantVelocity())
+        tracker = Tracker(TrackerSettings(edges=(Following(SmoothDriver()),), ego=ego, classes=classes))
+        for world in seen(np.random.default_rng(0), cars, np.arange(12) / 10):
+            tracker.step(at_pose(world, yaw_transform(8.0 * world.timestamp), "ego"))
+        (edges,) = tracker.graph.nonlinear
+        assert tracker.graph.nodes[edges.source].tolist() == [0]
+        assert tracker.graph.dims.tolist() == [4, 6]
+        filled[length] = edges.given[0]
+    assert filled[16.0] - filled[4.5] == pytest.approx((16.0 - 4.5) / 2), "who follows a longer vehicle has less room"
+
+
 def test_what_is_refused() -> None:
+    with pytest.raises(InputError, match="length: expected a finite number > 0"):
+        EgoNodeSettings(length=0.0)
     with pytest.raises(InputError, match=r"ego\.estimated: expected the estimator isam2 or fixed-lag, got kalman"):
         Tracker(TrackerSettings(ego=EgoNodeSettings(estimated=True)))
     with pytest.raises(InputError, match=r"ego\.estimated: expected association without pairs"):
