@@ -77,7 +77,7 @@ class OurWindow(Ours):
 
     def step(self, frame: FlockFrame) -> None:
         super().step(frame)
-        self.window = [moment.x.mean for moment in self._smoother.smoothed()]
+        self.window = [mean for _, _, mean in self._smoother.smoothed_means()]
 
 
 class Textbook:

@@ -308,18 +308,29 @@ class GraphFilter(Estimator):
 
         A node is in those epochs only in which the graph has its variable.
         """
-        (graph, every), result = self._whole(), list[SmoothedState]()
-        solution, present = linear_solution(graph), self._layout.nodes.tolist()
-        for epoch, keys in zip(self._window.epochs, every, strict=True):
-            if epoch.time < self.start - SAME_TIME:
-                continue
-            layout = self._layout.select(np.array([keys.get(node) in graph.variables for node in present], dtype=bool))
-            here = [keys[node] for node in layout.nodes.tolist()]
-            mean = np.concatenate([np.empty(0), *(graph.state(key) for key in here)])
+        graph, every = self._whole()
+        solution, result = linear_solution(graph), list[SmoothedState]()
+        for time, layout, here, mean in self._epochs(graph, every):
             joint = Partition(layout, np.zeros(len(layout), dtype=np.int64))
             blocks = (solution.covariance(here)[None],) if here else ()
-            result.append(SmoothedState(epoch.time, BlockGaussian(joint, mean, blocks)))
+            result.append(SmoothedState(time, BlockGaussian(joint, mean, blocks)))
         return tuple(result)
+
+    def smoothed_means(self) -> tuple[tuple[float, StateLayout, FloatArray], ...]:
+        """Time, s, layout and mean of every state of `smoothed`, whose covariances cost an elimination each."""
+        return tuple((time, layout, mean) for time, layout, _, mean in self._epochs(*self._whole()))
+
+    def _epochs(
+        self, graph: SceneFactorGraph, every: Sequence[Mapping[int, int]]
+    ) -> Iterator[tuple[float, StateLayout, list[int], FloatArray]]:
+        """Time, layout, keys and mean of every epoch within the lag; `every`: keys of the nodes by epoch."""
+        present = self._layout.nodes.tolist()
+        for epoch, keys in zip(self._window.epochs, every, strict=True):
+            if epoch.time >= self.start - SAME_TIME:
+                there = np.array([keys.get(node) in graph.variables for node in present], dtype=bool)
+                layout = self._layout.select(there)
+                here = [keys[node] for node in layout.nodes.tolist()]
+                yield epoch.time, layout, here, np.concatenate([np.empty(0), *(graph.state(key) for key in here)])
 
     def snapshot(self) -> GraphState:
         """The whole state as a value, which can be pickled. iSAM2 begins anew from it: both go on to the same bits."""
