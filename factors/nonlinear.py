@@ -220,7 +220,7 @@ class ResidualFactors:
             raise FactorError(f"{self}: {error if isinstance(error, FactorError) else repr(error)}") from error
 
     def _checked(self, name: str, value: ArrayLike, *columns: int) -> FloatArray:
-        """What a function gave, (N, m, *columns)."""
+        """Return the result of a function as an array (N, m, *columns)."""
         m = self._whiteners.shape[1]
         try:
             if self.single:

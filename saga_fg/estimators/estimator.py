@@ -40,9 +40,9 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.frame import Frame
 
 ESSENTIAL = ("time", "add", "predict", "update", "marginalise", "posterior")
-"""What an estimator cannot do without."""
+"""Methods that every estimator has."""
 POSES = ("extend", "covariance_with")
-"""What an estimator needs further where the vehicle's pose is a variable beside the nodes."""
+"""Methods of an estimator that has the vehicle's pose as a variable beside the nodes."""
 
 
 @dataclass(frozen=True, eq=False)

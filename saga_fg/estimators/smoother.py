@@ -82,7 +82,7 @@ class SmoothedState:
 
 @dataclass(eq=False)
 class _Epoch:
-    """What came at a time, s: new nodes with their priors, measurements, nodes that leave; the interval after it."""
+    """The input at a time, s: new nodes with their priors, measurements, nodes that leave; the interval after it."""
 
     time: float
     new: list[tuple[IntArray, FloatArray, FloatArray]] = field(default_factory=list)
@@ -349,7 +349,7 @@ def _smoothed(steps: Iterable[_Step]) -> Iterator[BlockGaussian]:
 
 
 def _influence(steps: Iterable[_Step]) -> Iterator[BlockGaussian]:
-    """What may still be measured moves the smoothed means of every epoch by no more than this, from the last on."""
+    """Bounds on how far later measurements can move the smoothed means of each epoch, from the last on."""
     later: BlockGaussian | None = None
     for step in steps:
         if later is None:

@@ -183,7 +183,7 @@ class NativeGroup:
 
     @property
     def types(self) -> tuple[Variable, ...] | None:
-        """Those of factors on vectors, whose lengths GTSAM does not check."""
+        """Types of the variables of factors on vectors, whose lengths GTSAM does not check; None for others."""
         if isinstance(self.factor, gtsam.PriorFactorVector):
             return (Vector(len(self.factor.prior())),)
         if isinstance(self.factor, gtsam.BetweenFactorVector):

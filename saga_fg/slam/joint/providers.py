@@ -101,7 +101,7 @@ class StationaryPairs:
         self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     def changed(self, record: Record, stationary: Sequence[FloatArray]) -> Given:
-        """Those of a window, with the probabilities (n,) of the objects of each epoch, as a provider."""
+        """Return the provider of a window, with the probabilities (n,) of the objects of each epoch."""
         named: dict[Hashable, Factors] = {}
         given: dict[int, tuple[FloatArray, FloatArray]] = {}
         for pair, rows in zip(pairwise(stationary), pairwise(record), strict=True):
