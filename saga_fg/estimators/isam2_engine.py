@@ -377,7 +377,9 @@ class Engine:
         order: dict[int, int] = dict.fromkeys(last, 1)
         again: Set[int] = held - self._held_at_root - set(new)
         if self.in_time:
-            affected = set(self.isam.predictUpdateInfo(added, values, parameters)[0])
+            affected: Set[int] = graph.variables.keys()
+            if not again:  # else some are to move to the root from wherever they are
+                affected = set(self.isam.predictUpdateInfo(added, values, parameters)[0])
             order, again = self._eliminated_in_time(graph, last, affected, set(new))
         moved, groups = gtsam.KeyList(), gtsam.KeyGroupMap()
         for key in again:
