@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from saga_fg.conformance.programs import BUS, CAR, CONE, TRAM, random_graph
 from saga_fg.estimators import Gaussian, GraphFilter, Measurements, kalman_predict, kalman_update, rts_smooth
 from saga_fg.model.discretisation import discretise
-from tests.saga_fg.random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 EXACT = 1e-9  # standard deviations of means, relative difference of covariances
 INTERVALS = (0.05, 0.1, 0.31, 0.7)  # s

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from saga_fg import ConstantVelocity, NodeType, RandomWalk
+from saga_fg.conformance.programs import Add, Marginalise, Predict, Update
 from saga_fg.estimators import Measurements
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following, build_graph
@@ -12,7 +13,6 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.lanes import ConeLine, InLane
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.stop_lines import GreenLight, RedLight
-from tests.saga_fg.estimator_programs import Add, Marginalise, Predict, Update
 
 CAR = NodeType("vehicle", ConstantVelocity(acceleration_noise=0.5))
 STANDING = NodeType("standing", RandomWalk())

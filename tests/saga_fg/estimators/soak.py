@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from saga_fg import Edges, SceneGraph
+from saga_fg.conformance.programs import CAR, CONE
 from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
-from tests.saga_fg.random_graphs import CAR, CONE
 
 LAGS = (0.0, 0.3, 1.0)
 INTERVALS = (1e-3, 0.05, 0.1, 0.1, 0.1, 0.2, 0.5, 2.0)

@@ -14,25 +14,31 @@ import pytest
 from factors import SolverSettings
 from saga_fg import Edges, SagaError, SceneGraph
 from saga_fg.conformance import TOLERANCE, assert_equal
-from saga_fg.estimators import BatchSolver, JointKalmanFilter, Measurements
-from saga_fg.graph import SceneFactorGraph
-from saga_fg.graph.variables import node_key
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.turning import KnownCourses
-from tests.saga_fg.estimator_programs import (
+from saga_fg.conformance.programs import (
+    BUS,
+    CAR,
+    CONE,
+    POLE,
+    TRAM,
+    VAN,
     Add,
     Marginalise,
     Predict,
     TextbookEstimator,
     Update,
     new_nodes,
+    random_graph,
     random_program,
     run,
 )
+from saga_fg.estimators import BatchSolver, JointKalmanFilter, Measurements
+from saga_fg.graph import SceneFactorGraph
+from saga_fg.graph.variables import node_key
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.turning import KnownCourses
 from tests.saga_fg.estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
 from tests.saga_fg.every_estimator import ESTIMATORS, maker
 from tests.saga_fg.graph_keys import newest_key
-from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE, TRAM, VAN, random_graph
 from tests.saga_fg.road_scenes import road_program
 
 SMOOTHERS = [kind for kind in ESTIMATORS if hasattr(maker(kind.values[0])(), "smoothed")]

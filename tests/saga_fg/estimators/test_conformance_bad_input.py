@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from saga_fg import InputError, UnknownNodeError
+from saga_fg.conformance.programs import BUS, CAR, CONE, TRAM, new_nodes, random_graph
 from saga_fg.estimators import Measurements
 from saga_fg.model.discretisation import Blocks, discretise
-from tests.saga_fg.estimator_programs import new_nodes
 from tests.saga_fg.every_estimator import ESTIMATORS, maker
-from tests.saga_fg.random_graphs import BUS, CAR, CONE, TRAM, random_graph
 
 MIXED = (CAR, BUS, CONE, CAR)
 IDS = [4, 8, 15, 16]

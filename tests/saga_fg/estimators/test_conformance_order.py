@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, SceneGraph
+from saga_fg.conformance.programs import Add, Marginalise, Predict, Update, random_program, run
 from saga_fg.estimators import GraphFilter, Measurements
 from saga_fg.model.discretisation import discretise
-from tests.saga_fg.estimator_programs import Add, Marginalise, Predict, Update, random_program, run
 
 
 def permuted(operation, rng):

@@ -11,10 +11,10 @@ import pytest
 from scipy.stats import chi2
 
 from saga_fg import Edges, SceneGraph
+from saga_fg.conformance.programs import BUS, CAR, interaction_edges, node_table
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
-from tests.saga_fg.random_graphs import BUS, CAR, interaction_edges, node_table
 
 RUNS = 200
 TYPES = (CAR, CAR, BUS, CAR, BUS, CAR)

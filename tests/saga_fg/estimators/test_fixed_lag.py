@@ -8,6 +8,7 @@ import pytest
 
 from factors import RangeBearing
 from saga_fg import Edges, InputError, SceneGraph, UnknownNodeError
+from saga_fg.conformance.programs import BUS, CAR, CONE, POLE
 from saga_fg.estimators import GraphFilter, Measurements, Observations
 from saga_fg.graph import OBJECT, key_of
 from saga_fg.model.discretisation import discretise
@@ -24,7 +25,6 @@ from tests.saga_fg.estimator_scenario import (
     tell,
 )
 from tests.saga_fg.graph_keys import keys_of
-from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.6, 100.0])

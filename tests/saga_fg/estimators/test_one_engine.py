@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, NodeType, SceneGraph
+from saga_fg.conformance.programs import CAR, Predict, TextbookEstimator, random_graph, random_program, run
 from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements, filtering
 from saga_fg.graph import OBJECT
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.motion import ConstantVelocity
-from tests.saga_fg.estimator_programs import Predict, TextbookEstimator, random_program, run
 from tests.saga_fg.estimator_scenario import Textbook, assert_newest, random_covariance, tell
 from tests.saga_fg.estimators.soak import LAGS, drive
-from tests.saga_fg.random_graphs import CAR, random_graph
 
 JOINT_STEPS = (filtering.predict, filtering.corrected)
 

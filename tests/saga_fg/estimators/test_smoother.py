@@ -5,13 +5,12 @@ import pytest
 
 from factors import RangeBearing
 from saga_fg import ConstantVelocity, Edges, InputError, NodeType, SceneGraph, UnknownNodeError
+from saga_fg.conformance.programs import BUS, CAR, CONE, POLE, Update, random_program
 from saga_fg.estimators import GraphFilter, Measurements, Observations, RecordingSmoother, smoother
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.nonlinear_interactions import SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
-from tests.saga_fg.estimator_programs import Update, random_program
 from tests.saga_fg.estimator_scenario import EXACT, Textbook, covariance_error, mean_error, part, random_scenario
-from tests.saga_fg.random_graphs import BUS, CAR, CONE, POLE
 
 NODES = np.arange(12)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, InputError, SceneGraph
+from saga_fg.conformance.programs import CAR
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
-from tests.saga_fg.random_graphs import CAR
 
 
 def chain(rates):

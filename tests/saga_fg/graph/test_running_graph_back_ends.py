@@ -23,11 +23,10 @@ from factors import (
     residual_factor,
 )
 from saga_fg import Tracker, TrackerSettings
+from saga_fg.conformance.programs import CAR, POLE, TRAM, Add, TextbookEstimator, random_program
 from saga_fg.estimators import GraphFilter, JointKalmanFilter
 from saga_fg.graph import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, Additions, GraphError, NewVariable
 from saga_fg.model.edge_rules import Following, Neighbours
-from tests.saga_fg.estimator_programs import Add, TextbookEstimator, random_program
-from tests.saga_fg.random_graphs import CAR, POLE, TRAM
 from tests.saga_fg.tracking.test_tracker_road import SENSORS, queue_frames
 from tests.saga_fg.tracking.test_tracker_road import SETTINGS as ROAD
 from tests.saga_fg.traffic_frames import run, seen, straight

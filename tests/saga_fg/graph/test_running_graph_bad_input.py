@@ -22,10 +22,10 @@ from factors import (
     residual_factor,
 )
 from saga_fg import InputError, SceneGraph
+from saga_fg.conformance.programs import CAR
 from saga_fg.estimators import GraphFilter, IncrementalSmoother, JointKalmanFilter, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, LANDMARK, OBJECT, Additions, GraphError, NewVariable, SceneFactorGraph, key_of
 from saga_fg.model.discretisation import discretise
-from tests.saga_fg.random_graphs import CAR
 
 UNIT = gtsam.noiseModel.Isotropic.Sigma
 

@@ -13,13 +13,12 @@ from benchmarks.sampled_traffic import (
     sample_traffic,
 )
 from factors import ResidualFactors, prior_factor
+from saga_fg.conformance.programs import CAR, CONE, random_program
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver, GraduatedNonConvexity, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, GraphError, NewVariable, UndeterminedError, key_of
-from tests.saga_fg.estimator_programs import random_program
 from tests.saga_fg.graph.test_running_graph_linear import MILLISECONDS, USUAL, largest_errors
 from tests.saga_fg.graph_estimator import GraphEstimator
-from tests.saga_fg.random_graphs import CAR, CONE
 
 
 class Batch(GraphEstimator):

@@ -3,11 +3,19 @@
 import numpy as np
 import pytest
 
+from saga_fg.conformance.programs import (
+    CAR,
+    CONE,
+    Predict,
+    TextbookEstimator,
+    Update,
+    new_nodes,
+    random_graph,
+    random_program,
+)
 from saga_fg.estimators import Measurements
 from saga_fg.model.discretisation import discretise
-from tests.saga_fg.estimator_programs import Predict, TextbookEstimator, Update, new_nodes, random_program
 from tests.saga_fg.graph_estimator import GraphEstimator
-from tests.saga_fg.random_graphs import CAR, CONE, random_graph
 
 LAGS = [pytest.param(0.0, id="filter"), pytest.param(1.0, id="lag"), pytest.param(None, id="all")]
 USUAL = (0.02, 0.1, 0.37, 0.5, 1.2)

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from saga_fg.conformance.programs import CAR
 from saga_fg.model.interactions import NodeTable, Paths
 from saga_fg.numerics.geometry import yaw_transform
-from tests.saga_fg.random_graphs import CAR
 
 
 def table(position, heading, speed=10.0, label="car", types=None):

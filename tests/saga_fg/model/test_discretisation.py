@@ -9,10 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import Edges, InputError, SceneGraph
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
-from saga_fg.model.stability import joint_generator
-from tests.saga_fg.random_graphs import (
+from saga_fg.conformance.programs import (
     BUS,
     CAR,
     CONE,
@@ -24,6 +21,9 @@ from tests.saga_fg.random_graphs import (
     random_graph,
     random_types,
 )
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
+from saga_fg.model.stability import joint_generator
 
 seeds = st.integers(0, 2**32 - 1)
 intervals = st.one_of(st.floats(1e-9, 1e3), st.sampled_from([0.0, 1e-9, 1e-3, 0.1, 1.0, 1e3]))

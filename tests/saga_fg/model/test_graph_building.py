@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import ConstantVelocity, InputError, NodeType
+from saga_fg.conformance.programs import BUS, CAR, CONE
 from saga_fg.model.edge_rules import Following, Neighbours, Pairs, build_graph
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from tests.saga_fg.model.drawn_traffic import random_traffic, straight, table
-from tests.saga_fg.random_graphs import BUS, CAR, CONE
 
 seeds = st.integers(0, 2**32 - 1)
 

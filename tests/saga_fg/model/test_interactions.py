@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from saga_fg.conformance.programs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
 from saga_fg.numerics.geometry import yaw_transform
-from tests.saga_fg.random_graphs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
 
 seeds = st.integers(0, 2**32 - 1)
 pairs_of_types = st.tuples(st.sampled_from(MOVING), st.sampled_from(MOVING))

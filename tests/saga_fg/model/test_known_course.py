@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from saga_fg import ConstantAcceleration, Curvilinear, NodeType, SceneGraph
+from saga_fg.conformance.programs import node_table
 from saga_fg.model.discretisation import discretise, linear_motions
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.scene_graph import Edges
 from saga_fg.model.turning import RATE_CORRELATION, CoordinatedTurn, KnownCourses, Unseen, turning_time
-from tests.saga_fg.random_graphs import node_table
 
 LONG = 1e9  # s, as good as no fading
 MOTION = Curvilinear(turn_time=1.5, fading_time=2.0, jerk_noise=0.7, lateral_acceleration_noise=0.2)

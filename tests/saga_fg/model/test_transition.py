@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from saga_fg import Edges, InputError, SceneGraph
+from saga_fg.conformance.programs import BUS, CAR, CONE
 from saga_fg.model.discretisation import Blocks, Transition, discretise
-from tests.saga_fg.random_graphs import BUS, CAR, CONE
 
 GRAPH = SceneGraph([4, 9, 2], (CAR, BUS, CONE))
 TRANSITION = discretise(GRAPH, 0.5)

@@ -7,6 +7,7 @@ import pytest
 
 from pipelines.config import load_config
 from saga_fg import InputError, Sensor, Tracker
+from saga_fg.conformance.programs import CAR
 from saga_fg.estimators import Measurements
 from saga_fg.estimators.partition import StateLayout
 from saga_fg.model.discretisation import Transition
@@ -18,7 +19,6 @@ from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
-from tests.saga_fg.random_graphs import CAR
 
 
 def frame(number, count=6):

@@ -1,3 +1,0 @@
-"""Programs for estimators and the textbook, as the package has them for users' own tests."""
-
-from saga_fg.conformance.programs import *  # noqa: F403
