@@ -128,7 +128,7 @@ def relinking_pairs(
 
     Of all n tracks: group (n,), N(position, P) if they move, N(place, D) if they are stationary, with the probability
     `stationary` (n,); of m measurements: z (m, 2), R (m, 2, 2), group_z (m,), log_density (m,) of others like them.
-    Left out are pairs whose distance neither density reaches, see `saga_fg.tracking.initiation`; rounding: factor on it
+    Left out are pairs whose distance neither density reaches, see `saga_fg.tracking.relinking`; rounding: factor on it
     """
     largest = -math.inf
     for j in range(len(z)):
@@ -227,7 +227,7 @@ def return_evidence(
     apart: FloatArray,
     D: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Logs of `moving` and `stationary` (e,), as `saga_fg.tracking.initiation` defines them.
+    """Logs of `moving` and `stationary` (e,), as `saga_fg.tracking.relinking` defines them.
 
     mean (e, 4), P (e, 4, 4): position and velocity of the new tracks, and old_... of the old ones; moves (e,): whether
     the state has a velocity; V (e, 2, 2) its prior; p, s, old_s (e,) probabilities of being stationary; apart (e, 2), D

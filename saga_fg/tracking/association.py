@@ -38,16 +38,16 @@ from saga_fg.numerics.assignment import (
     pair_costs,
 )
 from saga_fg.numerics.gating import near_pairs
-from saga_fg.tracking.initiation import over_confirmed, relinked
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
+from saga_fg.tracking.relinking import relinked
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.tracking.update import past_cross_covariances, past_positions
+from saga_fg.tracking.unresolved import over_confirmed
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 
 EXISTENCE_WEIGHT, SCORE_WEIGHT = 0.3, 0.5  # a and b above
-LEAST_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
+MIN_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
 
 
 class CandidatePairs(NamedTuple):
@@ -76,9 +76,9 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
     if len(table) == 0 or len(measurements) == 0:
         return Matching.empty()
     sensor, delay, cross = measurements.sensor, measurements.delay, None
-    position, P = past_positions(state, delay)
+    position, P = state.past_positions(delay)
     if association.method == "graph":
-        cross = past_cross_covariances(state, delay)
+        cross = state.past_cross_covariances(delay)
     if measurements.relative is not None:
         P = relative_covariances(state.joint, table.id, table.label)
     predicted = state.boxes(position, np.full_like(position, np.nan))
@@ -158,7 +158,7 @@ def _unmatched(
     if clutter_area == math.inf:
         dearest = found.gain.max(initial=0.0)
         return np.full(len(found.gain), dearest + 1 + len(found.gain) * (dearest - found.gain.min(initial=dearest)))
-    false = np.maximum(np.bincount(of_detection, weights=1 - probability), LEAST_CLUTTER)
+    false = np.maximum(np.bincount(of_detection, weights=1 - probability), MIN_CLUTTER)
     of_track, by_score = EXISTENCE_WEIGHT * _log_odds(expected), SCORE_WEIGHT * _log_odds(probability)
     by_density = np.log(2 * math.pi * false / clutter_area)[of_detection]
     return np.asarray(2 * (of_track[found.track] + (by_score - by_density)[found.detection]))

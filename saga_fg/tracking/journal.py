@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.graph import EGO_ERROR, MAP_NODE, OBJECT, GraphVariable, SceneFactorGraph
+from saga_fg.model.edge_effects import EdgeEffect, edge_effects
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -45,7 +46,7 @@ from saga_fg.numerics.assignment import Matching, gate, mahalanobis
 from saga_fg.tracking.clock import Clock
 from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.prediction import EdgeEffect, edge_effects, node_table
+from saga_fg.tracking.prediction import node_table
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState

@@ -36,7 +36,7 @@ import numpy as np
 
 from saga_fg.kernels.components import biased_covariances
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
-from saga_fg.tracking.initiation import relinkable
+from saga_fg.tracking.relinking import relinkable
 from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState

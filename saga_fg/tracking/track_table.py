@@ -171,7 +171,7 @@ class TrackTable(Columns):
     confirmed         (n,) whether misses no longer delete it
     has_moved         (n,) whether it was ever clearly in motion
     required_hits     (n,) detections after which it is no longer tentative, if they are of one sensor
-    unresolved        (n,) further frames to tell it from the track that it overlaps, see `saga_fg.tracking.initiation`
+    unresolved        (n,) further frames to tell it from the track that it overlaps, see `saga_fg.tracking.unresolved`
     box               size, height and heading
     stationarity      probability and place of standing still
     turn              turn rate

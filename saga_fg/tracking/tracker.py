@@ -1,7 +1,8 @@
 """The graph-aware tracker: one frame of one sensor at a time, from any sensor at any time.
 
-    predict (prediction, ego_node) -> measure (measurements, map_nodes) -> associate (association) -> update (update)
-    -> existence (existence) -> hand over (handover) -> initiate (initiation) -> delete (deletion) -> report (reporting)
+    predict (prediction, courses) -> measure (measurements, map_nodes) -> associate (association, relinking)
+    -> update, existence (update, unresolved) -> hand over (relinking) -> initiate (initiation)
+    -> delete, report (reporting)
 
 (figure 2 of Sani and Anand, arXiv 2411.03702), in brackets the modules of each stage. Without edge rules this is the
 classical tracker of independent Kalman filters, by the same code.
@@ -29,14 +30,16 @@ from saga_fg.tracking.association import associate
 from saga_fg.tracking.by_name import new_provider
 from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, compared, sensor_times
-from saga_fg.tracking.initiation import hand_over, initiate_tracks, resolve_tracks
+from saga_fg.tracking.initiation import initiate_tracks
 from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.prediction import look_ahead, predict
+from saga_fg.tracking.relinking import hand_over
 from saga_fg.tracking.reporting import delete_tracks, report_tracks
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
+from saga_fg.tracking.unresolved import resolve_tracks
 from saga_fg.tracking.update import infer_signals, update_existence, update_tracks
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
 from saga_fg.types.track import PredictedTracks, Tracks, checked_horizons

@@ -19,20 +19,22 @@ from typing import Any
 import numpy as np
 
 from saga_fg.graph import FactorProvider
+from saga_fg.kernels.components import velocities_along
 from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.interactions import POSITION
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
-from saga_fg.numerics.assignment import Assignment
+from saga_fg.numerics.assignment import Assignment, CrossCovariances
 from saga_fg.tracking.by_name import new_estimator
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
-from saga_fg.tracking.joint_state import JointTrackState
+from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past_position
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.measurements import EgoNode
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.tracking.track_table import TrackTable
-from saga_fg.tracking.traffic import Traffic
+from saga_fg.tracking.traffic import Traffic, speed_prior
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
@@ -137,6 +139,49 @@ class TrackerState:
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""
         return self.table.boxes(position + self.origin, velocity)
+
+    def past_positions(self, delay: float) -> tuple[FloatArray, FloatArray]:
+        """Positions (n, 2) of all tracks `delay` s ago and their covariances (n, 2, 2)."""
+        if delay == 0:
+            now = self.kinematics()
+            return now.position, now.P
+        ids, estimator = self.table.id, self.joint.estimator
+        position, P = np.zeros((len(ids), 2)), np.zeros((len(ids), 2, 2))
+        for node_type, rows in self.joint.rows_by_type(self.table.label, moving=True):
+            H, R = moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
+            position[rows] = estimator.mean(ids[rows]) @ H.T
+            P[rows] = H @ estimator.covariance(ids[rows]) @ H.T + R
+        return position, P
+
+    def past_cross_covariances(self, delay: float) -> CrossCovariances:
+        """Covariances between the positions `delay` s ago of correlated pairs of tracks, by rows."""
+        groups = self.joint.rows_by_type(self.table.label, moving=True)
+        group = np.zeros(len(self), dtype=np.int64)
+        for number, (_, rows) in enumerate(groups):
+            group[rows] = number
+        x = self.joint.estimator.posterior()
+        nodes = x.layout.rows(self.table.id)
+        first, second = x.correlated(nodes)
+        past = [past_position(node_type, delay) for node_type, _ in groups]
+        C = np.zeros((len(first), 2, 2))
+        for a, H_a in enumerate(past):
+            for b, H_b in enumerate(past):
+                pairs = np.flatnonzero((group[first] == a) & (group[second] == b))
+                if len(pairs):
+                    C[pairs] = H_a @ x.between(nodes[first[pairs]], nodes[second[pairs]]) @ H_b.T
+        return CrossCovariances(first, second, C)
+
+    def unmeasured_velocity(
+        self, label: StrArray, place: FloatArray, yaw: FloatArray, prior: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Velocity (k, 2), its covariance (k, 2, 2), and the probability (k,) of being stationary, of unknown objects.
+
+        By their class and the traffic around their place (k, 2), world, m, and heading (k,), rad; prior: of the
+        probability.
+        """
+        speed, drift = self.class_values(label, "initial_speed_deviation", "initial_lateral_speed_deviation")
+        stationary, mean, variance = speed_prior(self.traffic, label, place, yaw, speed**2, prior)
+        return *velocities_along(yaw, mean, variance, speed, drift), stationary
 
     @property
     def world_T_ego(self) -> FloatArray | None:

@@ -25,50 +25,16 @@ from saga_fg.kernels.components import existences
 from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import CrossCovariances, Matching
+from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.gating import chi_square_quantile
-from saga_fg.tracking.joint_state import moved_to_present, past_position
+from saga_fg.tracking.joint_state import moved_to_present
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_filters import MOVING
 from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 from saga_fg.tracking.traffic import Passages
 
-
-def past_positions(state: TrackerState, delay: float) -> tuple[FloatArray, FloatArray]:
-    """Positions (n, 2) of all tracks `delay` s ago and their covariances (n, 2, 2)."""
-    if delay == 0:
-        now = state.kinematics()
-        return now.position, now.P
-    ids, estimator = state.table.id, state.joint.estimator
-    position, P = np.zeros((len(ids), 2)), np.zeros((len(ids), 2, 2))
-    for node_type, rows in state.joint.rows_by_type(state.table.label, moving=True):
-        H, R = moved_to_present(node_type, node_type.selector(POSITION), np.zeros((2, 2)), delay)
-        position[rows] = estimator.mean(ids[rows]) @ H.T
-        P[rows] = H @ estimator.covariance(ids[rows]) @ H.T + R
-    return position, P
-
-
-def past_cross_covariances(state: TrackerState, delay: float) -> CrossCovariances:
-    """Covariances between the positions `delay` s ago of correlated pairs of tracks, by rows."""
-    groups = state.joint.rows_by_type(state.table.label, moving=True)
-    group = np.zeros(len(state), dtype=np.int64)
-    for number, (_, rows) in enumerate(groups):
-        group[rows] = number
-    x = state.joint.estimator.posterior()
-    nodes = x.layout.rows(state.table.id)
-    first, second = x.correlated(nodes)
-    past = [past_position(node_type, delay) for node_type, _ in groups]
-    C = np.zeros((len(first), 2, 2))
-    for a, H_a in enumerate(past):
-        for b, H_b in enumerate(past):
-            pairs = np.flatnonzero((group[first] == a) & (group[second] == b))
-            if len(pairs):
-                C[pairs] = H_a @ x.between(nodes[first[pairs]], nodes[second[pairs]]) @ H_b.T
-    return CrossCovariances(first, second, C)
-
-
-LEAST_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
+MIN_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 
 
 def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> None:
@@ -78,7 +44,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     z = np.concatenate([boxes.position[d, :2] - state.origin, boxes.velocity[d]], axis=1)
     R, with_velocity = measurements.R[d], measurements.with_velocity[d]
     if state.settings.stationary_share > 0:
-        position, P = past_positions(state, delay)
+        position, P = state.past_positions(delay)
         moving = state.kinematics()._replace(position=position, P=P).select(t)
         table.stationarity.update(t, z, R, moving, with_velocity)
     relative = None if measurements.relative is None else measurements.relative.select(d)
@@ -116,7 +82,7 @@ def update_range_rates(
     """Take in the range rates of the measurements `rows` (k,) of tracks `ids` (k,), after their positions.
 
     Every estimator takes the same linear measurement: the range rate linearised at the present estimate, moved back by
-    the delay of the frame along own motion. Left out are tracks within `LEAST_RANGE` of the sensor, and range rates
+    the delay of the frame along own motion. Left out are tracks within `MIN_RANGE` of the sensor, and range rates
     outside the gate of the class.
     """
     measured = np.isfinite(measurements.range_rate[rows])
@@ -133,7 +99,7 @@ def update_range_rates(
         x = joint.estimator.mean(ids[of_type])
         if delay > 0:
             x = x @ np.linalg.inv(own_motion(node_type, delay)[0]).T
-        clear = np.hypot(*(x[:, at_p] - viewpoint).T) >= LEAST_RANGE
+        clear = np.hypot(*(x[:, at_p] - viewpoint).T) >= MIN_RANGE
         chosen, x = of_type[clear], x[clear]
         if len(chosen) == 0:
             continue

@@ -9,13 +9,13 @@ import pytest
 
 from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettings, Tracks
 from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_effects import edge_effects
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.tracking import AssociationSettings, Journal
 from saga_fg.tracking.journal import TrackerView
-from saga_fg.tracking.prediction import edge_effects
 
 SETTINGS = TrackerSettings(edges=())
 

@@ -8,7 +8,7 @@ import pytest
 from saga_fg import ConstantVelocity, InputError, Tracker, TrackerSettings
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings
-from saga_fg.tracking.initiation import relinkable
+from saga_fg.tracking.relinking import relinkable
 from tests.saga_fg.traffic_frames import columns, frame, run
 
 SETTINGS = TrackerSettings(
