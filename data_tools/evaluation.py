@@ -419,19 +419,19 @@ def evaluate_tracks(
     thresholds = dict.fromkeys(pooled, 0.0) if swept is None else best_thresholds(swept)
     whole = {"overall": SceneMetrics.pool(pooled.values()), **pooled}
     return Evaluation(
-        FigureTable(
+        tracking=FigureTable(
             _MOMENT_TITLE, _MOMENT_COLUMNS, tuple((name, *_moment_cells(metrics)) for name, metrics in whole.items())
         ),
-        {
+        programs={
             "scenes": tuple(scene.name for scene, _ in results),
             "tracking": {name: _figures(metrics) for name, metrics in whole.items()},
         },
-        LabelErrors.pool(errors),
-        WholeTracks.concatenate(tracks),
-        hota(pairs, thresholds) if with_hota else (),
-        innovations or {},
-        dict if swept is None else lambda: {"recall": recall_sweep(swept.curves)},
-        swept,
+        errors=LabelErrors.pool(errors),
+        tracks=WholeTracks.concatenate(tracks),
+        hota=hota(pairs, thresholds) if with_hota else (),
+        innovations=innovations or {},
+        draw=dict if swept is None else lambda: {"recall": recall_sweep(swept.curves)},
+        sweep=swept,
     )
 
 

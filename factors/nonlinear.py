@@ -248,7 +248,17 @@ def residual_factor(
     """
     rows = np.array([checked_keys("keys", keys)], dtype=np.uint64)
     noise = checked("covariance", covariance, (None, None))
-    return ResidualFactors(rows, variables, residual, noise, jacobians, robust, tuple(angles), name, single=True)
+    return ResidualFactors(
+        rows=rows,
+        variables=variables,
+        residual=residual,
+        covariances=noise,
+        jacobians=jacobians,
+        robust=robust,
+        angles=tuple(angles),
+        name=name,
+        single=True,
+    )
 
 
 def residual_factors(
@@ -264,7 +274,16 @@ def residual_factors(
     """Return the factors of an object with `residual` and `jacobians`; dim: m, of the residuals; the rest as there."""
     keys = np.asarray(rows)
     noise = checked_covariances("covariances", covariances, len(keys), dim)
-    return ResidualFactors(keys, variables, function.residual, noise, function.jacobians, robust, tuple(angles), name)
+    return ResidualFactors(
+        rows=keys,
+        variables=variables,
+        residual=function.residual,
+        covariances=noise,
+        jacobians=function.jacobians,
+        robust=robust,
+        angles=tuple(angles),
+        name=name,
+    )
 
 
 def _column(values: gtsam.Values, keys_of_rows: KeyArray, variable: Variable) -> FloatArray:

@@ -110,7 +110,17 @@ def _plaza(path: Path, name: str) -> LandmarkLog:
     if "TL" in rows:
         places = dict(zip(tables["TL"].integers(0, "beacon", 0).tolist(), rows["TL"][:, 1:], strict=True))
     beacon, R = tables["TD"].integers(2, "beacon", 0)[order], np.full((len(value), 1, 1), RANGE_NOISE**2)
-    return LandmarkLog(time, steps, noise[:, None] ** 2 * np.eye(3), at, beacon, value, R, truth, places)
+    return LandmarkLog(
+        time=time,
+        a_T_b=steps,
+        odometry_covariance=noise[:, None] ** 2 * np.eye(3),
+        pose=at,
+        landmark=beacon,
+        value=value,
+        covariance=R,
+        truth=truth,
+        places=places,
+    )
 
 
 def _park(file: Path) -> LandmarkLog:

@@ -104,7 +104,16 @@ def on_grid(
     size = np.column_stack([length, width, [HEIGHTS.get(each, HEIGHTS["car"]) for each in label.tolist()]])
     position, velocity, yaw = (values[row] for values in states)
     time = PERIOD * np.arange(K, dtype=np.float64)
-    vehicles = SimulatedTrajectories(names, label, size, time, position, velocity, np.unwrap(yaw, axis=0), present)
+    vehicles = SimulatedTrajectories(
+        id=names,
+        label=label,
+        size=size,
+        time=time,
+        position=position,
+        velocity=velocity,
+        yaw=np.unwrap(yaw, axis=0),
+        present=present,
+    )
     return RecordedTraffic(name, vehicles)
 
 

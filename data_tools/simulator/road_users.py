@@ -102,14 +102,14 @@ def static_objects(id: StrArray, boxes: Boxes, time: FloatArray) -> SimulatedTra
     """Trajectories of objects that never move."""
     shape = (len(time), len(boxes))
     return SimulatedTrajectories(
-        id,
-        boxes.label,
-        boxes.size,
-        time,
-        np.broadcast_to(boxes.position[:, :2], (*shape, 2)),
-        np.zeros((*shape, 2)),
-        np.broadcast_to(boxes.yaw, shape),
-        np.ones(shape, dtype=np.bool_),
+        id=id,
+        label=boxes.label,
+        size=boxes.size,
+        time=time,
+        position=np.broadcast_to(boxes.position[:, :2], (*shape, 2)),
+        velocity=np.zeros((*shape, 2)),
+        yaw=np.broadcast_to(boxes.yaw, shape),
+        present=np.ones(shape, dtype=np.bool_),
     )
 
 
@@ -173,14 +173,14 @@ def simulate_pedestrians(
     normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
     size = np.array(BODY) * np.exp(0.08 * np.clip(rng.standard_normal((len(group), 3)), -2, 2))
     return SimulatedTrajectories(
-        np.array([f"pedestrian-{k:03d}" for k in range(len(group))], dtype=np.str_),
-        np.full(len(group), "pedestrian"),
-        size,
-        time,
-        road.position(s, d),
-        (vs * stretch)[..., None] * tangent + vd[..., None] * normal,
-        heading + np.where(sense[group] > 0, 0.0, np.pi),
-        np.ones(s.shape, dtype=np.bool_),
+        id=np.array([f"pedestrian-{k:03d}" for k in range(len(group))], dtype=np.str_),
+        label=np.full(len(group), "pedestrian"),
+        size=size,
+        time=time,
+        position=road.position(s, d),
+        velocity=(vs * stretch)[..., None] * tangent + vd[..., None] * normal,
+        yaw=heading + np.where(sense[group] > 0, 0.0, np.pi),
+        present=np.ones(s.shape, dtype=np.bool_),
     )
 
 
@@ -228,14 +228,14 @@ def simulate_cyclists(
     return concatenated(
         [
             SimulatedTrajectories(
-                np.array([f"{name}-{k:03d}" for k in range(count)], dtype="<U16"),
-                np.full(count, label),
-                np.tile(np.array(size), (count, 1)),
-                time,
-                road.position(s, offset),
-                velocity,
-                heading,
-                np.ones(s.shape, dtype=np.bool_),
+                id=np.array([f"{name}-{k:03d}" for k in range(count)], dtype="<U16"),
+                label=np.full(count, label),
+                size=np.tile(np.array(size), (count, 1)),
+                time=time,
+                position=road.position(s, offset),
+                velocity=velocity,
+                yaw=heading,
+                present=np.ones(s.shape, dtype=np.bool_),
             )
             for name, label, size, offset in (
                 ("bicycle", "bicycle", BICYCLE, d),

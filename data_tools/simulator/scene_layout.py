@@ -123,7 +123,18 @@ def sample_layout(settings: SimulatorSettings, rng: np.random.Generator) -> Scen
     desired_speed = float(rng.uniform(*DESIRED_SPEED))
     fleet, trailer, lane, s = _sample_vehicles(lanes, desired_speed, settings, rng)
     speed = np.full(len(fleet), _start_speed(desired_speed))
-    return SceneLayout(lanes, focus, hedge, fleet, lane, s, speed, stop_lines, slow_zones, trailer)
+    return SceneLayout(
+        lanes=lanes,
+        focus=focus,
+        hedge=hedge,
+        fleet=fleet,
+        lane=lane,
+        s=s,
+        speed=speed,
+        stop_lines=stop_lines,
+        slow_zones=slow_zones,
+        trailer=trailer,
+    )
 
 
 def _start_speed(desired_speed: float) -> float:

@@ -246,14 +246,14 @@ def split_trailers(
     pose = _shifted(lanes, history, rows, -(whole - behind) / 2)
     trailer_size = np.column_stack([behind, vehicles.size[rows, 1], vehicles.size[rows, 2]])
     trailers = SimulatedTrajectories(
-        np.char.replace(vehicles.id[rows], "vehicle", "trailer"),
-        np.full(len(rows), "trailer"),
-        trailer_size,
-        vehicles.time,
-        pose[0],
-        pose[2],
-        pose[1],
-        vehicles.present[:, rows],
+        id=np.char.replace(vehicles.id[rows], "vehicle", "trailer"),
+        label=np.full(len(rows), "trailer"),
+        size=trailer_size,
+        time=vehicles.time,
+        position=pose[0],
+        velocity=pose[2],
+        yaw=pose[1],
+        present=vehicles.present[:, rows],
     )
     return replace(vehicles, position=position, yaw=yaw, velocity=velocity, size=size), trailers
 

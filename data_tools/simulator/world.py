@@ -105,14 +105,14 @@ def vehicle_trajectories(layout: SceneLayout, history: TrafficHistory) -> Simula
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     fleet = layout.fleet
     return SimulatedTrajectories(
-        _ids("vehicle", len(fleet)),
-        fleet.label,
-        fleet.size,
-        history.time,
-        position,
-        history.speed[..., None] * direction,
-        np.unwrap(heading, axis=0),
-        history.on_road,
+        id=_ids("vehicle", len(fleet)),
+        label=fleet.label,
+        size=fleet.size,
+        time=history.time,
+        position=position,
+        velocity=history.speed[..., None] * direction,
+        yaw=np.unwrap(heading, axis=0),
+        present=history.on_road,
     )
 
 

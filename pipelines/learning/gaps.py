@@ -267,17 +267,17 @@ def _figure(situation: str, length: float, runs: Sequence[Run], base: Sequence[R
     every, squares = (np.concatenate(each) for each in (errors, nees))
     known = every[np.isfinite(every)]
     return SituationFigure(
-        situation,
-        length,
-        runs[0].contender,
-        len(known),
-        len(every) - len(known),
-        interval(errors),
-        changes[0],
-        float(np.median(known)) if len(known) else float("nan"),
-        interval(densities),
-        changes[1],
-        {p: coverage(squares[np.isfinite(squares)], p) for p in PROBABILITIES},
+        situation=situation,
+        length=length,
+        contender=runs[0].contender,
+        gaps=len(known),
+        lost=len(every) - len(known),
+        error=interval(errors),
+        error_change=changes[0],
+        median=float(np.median(known)) if len(known) else float("nan"),
+        nll=interval(densities),
+        nll_change=changes[1],
+        coverage={p: coverage(squares[np.isfinite(squares)], p) for p in PROBABILITIES},
     )
 
 

@@ -304,15 +304,15 @@ def edges_of_frames(table: SceneBoxes, frames: int, rules: Sequence[EdgeRule]) -
         moved.update(ids[np.hypot(*velocity.T) > MOVING].tolist())
         heading = np.where(np.isfinite(boxes.yaw), boxes.yaw, np.arctan2(velocity[:, 1], velocity[:, 0]))
         nodes = NodeTable(
-            np.arange(len(rows)),
-            boxes.label,
-            (node_type,) * len(rows),
-            boxes.position[:, :2],
-            velocity,
-            heading,
-            np.nan_to_num(boxes.size[:, 0]),
-            np.full(len(rows), VELOCITY_VARIANCE),
-            np.array([id_ in moved for id_ in ids.tolist()], dtype=np.bool_),
+            id=np.arange(len(rows)),
+            label=boxes.label,
+            types=(node_type,) * len(rows),
+            position=boxes.position[:, :2],
+            velocity=velocity,
+            heading=heading,
+            length=np.nan_to_num(boxes.size[:, 0]),
+            velocity_variance=np.full(len(rows), VELOCITY_VARIANCE),
+            has_moved=np.array([id_ in moved for id_ in ids.tolist()], dtype=np.bool_),
         )
         pairs = [rule.pairs(nodes) for rule in rules] if len(rows) > 1 else []
         none = np.empty(0, dtype=np.int64)

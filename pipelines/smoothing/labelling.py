@@ -115,19 +115,19 @@ def label_states(
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
     score = objects.score[owner]
     columns = LabelColumns(
-        states.id,
-        label,
-        np.concatenate([states.mean[:, :2] + evidence.origin, z[:, None]], axis=1),
-        size[owner],
-        headings.yaw,
-        headings.variance,
-        states.mean[:, 2:],
-        P,
-        states.covariance[:, 2:, 2:],
-        gap,
-        score,
-        _sources(evidence, objects, wanted),
-        quality_of(score, P),
+        id=states.id,
+        label=label,
+        position=np.concatenate([states.mean[:, :2] + evidence.origin, z[:, None]], axis=1),
+        size=size[owner],
+        yaw=headings.yaw,
+        yaw_variance=headings.variance,
+        velocity=states.mean[:, 2:],
+        position_covariance=P,
+        velocity_covariance=states.covariance[:, 2:, 2:],
+        coasting=gap,
+        score=score,
+        source=_sources(evidence, objects, wanted),
+        quality=quality_of(score, P),
     )
     return LabelledStates(states, headings, columns)
 

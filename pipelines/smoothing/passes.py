@@ -164,14 +164,14 @@ def smooth_objects(
     longer = passes.reaching_back(lifespans.select(kept), object_of, score[kept])
     final = passes.final(longer, object_of, states, stationary)
     return SmoothedObjects(
-        lifespans.select(kept),
-        object_of,
-        track_of,
-        final,
-        score[kept],
-        stationary,
-        len(tracklets) - len(joined),
-        lifespans.select(~kept),
+        lifespans=lifespans.select(kept),
+        object_of=object_of,
+        track_of=track_of,
+        states=final,
+        score=score[kept],
+        stationary=stationary,
+        joined=len(tracklets) - len(joined),
+        dropped=lifespans.select(~kept),
     )
 
 

@@ -147,7 +147,18 @@ class ComponentBounds:
     def components(self, x: BlockGaussian, dynamics: Dynamics) -> Partition:
         """The components that a prediction leaves; blocks of F between them are inputs."""
         parts, at, F = x.uncorrelated(self.tolerance), x.partition.block_places, dynamics.flat
-        strength = tie_strengths(x.flat, at.start, at.size, at.offset, x.layout.dims, parts.label, *F)
+        strength = tie_strengths(
+            flat=x.flat,
+            start=at.start,
+            size=at.size,
+            offset=at.offset,
+            dims=x.layout.dims,
+            part=parts.label,
+            target=F.target,
+            source=F.source,
+            at_F=F.begin,
+            F=F.values,
+        )
         strong = (strength > self.tolerance).nonzero()[0]
         strong = strong[np.argsort(-strength[strong], kind="stable")]
         return parts.joined_up_to(parts.label[F.target[strong]], parts.label[F.source[strong]], self.most)
@@ -161,10 +172,25 @@ def predict(x: BlockGaussian, dynamics: Dynamics, partition: Partition | None = 
     """
     partition = dynamics.joined(x.partition) if partition is None else partition
     x = x.over(partition.packed)  # which keeps what little correlation there is among the nodes of a pack
-    layout, at, Q = x.layout, x.partition.block_places, _flat(dynamics.Q)
-    where = x.partition.label, at.start, at.size, at.offset, layout.dims, layout.offsets
+    at, F, Q = x.partition.block_places, dynamics.flat, _flat(dynamics.Q)
     finite, mean, flat = predicted_state(
-        x.mean, x.flat, *where, partition.label, *dynamics.flat, dynamics.b, Q.target, Q.begin, Q.values
+        mean=x.mean,
+        flat=x.flat,
+        label=x.partition.label,
+        start=at.start,
+        size=at.size,
+        offset=at.offset,
+        dims=x.layout.dims,
+        offsets=x.layout.offsets,
+        part=partition.label,
+        target=F.target,
+        source=F.source,
+        at_F=F.begin,
+        F=F.values,
+        b=dynamics.b,
+        noisy=Q.target,
+        at_Q=Q.begin,
+        Q=Q.values,
     )
     if not finite:
         raise InputError("transition: the prediction is not finite, the dynamics grow beyond all numbers")
@@ -176,9 +202,22 @@ def corrected(x: BlockGaussian, seen: LinearisedMeasurements) -> tuple[BlockGaus
 
     Raises `InputError` where a covariance has grown so large that R no longer counts among its digits.
     """
-    at, offsets = x.partition.block_places, x.layout.offsets
-    where = at.start, at.size, at.offset, offsets, at.first, at.places
-    definite, mean, flat, log_likelihood = corrected_state(x.mean, x.flat, *where, *seen, CANCELLATION)
+    at = x.partition.block_places
+    definite, mean, flat, log_likelihood = corrected_state(
+        mean=x.mean,
+        flat=x.flat,
+        start=at.start,
+        size=at.size,
+        offset=at.offset,
+        offsets=x.layout.offsets,
+        first=at.first,
+        places=at.places,
+        rows=seen.rows,
+        z=seen.z,
+        H=seen.H,
+        R=seen.R,
+        cancellation=CANCELLATION,
+    )
     if not definite:
         raise lost_in_rounding(x.variances().max())
     return BlockGaussian(x.partition, mean, unflattened(flat, x.partition)), log_likelihood

@@ -285,6 +285,18 @@ def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: Int
     if len(new.label) == 0:
         return ()
     here, there, length = old.block_places, new.block_places, sum(p.size * p.shape[1] for p in new.groups)
-    before = flattened(blocks), old.label, here.start, here.size, here.offset, old.layout.dims
-    after = new.label, there.start, there.size, there.offset
-    return unflattened(regrouped_blocks(*before, source, *after, length), new)
+    flat = regrouped_blocks(
+        flat=flattened(blocks),
+        label=old.label,
+        start=here.start,
+        size=here.size,
+        offset=here.offset,
+        dims=old.layout.dims,
+        source=source,
+        new_label=new.label,
+        new_start=there.start,
+        new_size=there.size,
+        new_offset=there.offset,
+        length=length,
+    )
+    return unflattened(flat, new)

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from saga_fg.kernels.compilation import BoolArray, CodeArray, FloatArray, IntArray, kernel
+from saga_fg.kernels.compilation import BoolArray, CodeArray, FloatArray, IntArray, kernel, kernel_part
 
 Tables = tuple[IntArray, IntArray, IntArray, IntArray, IntArray, IntArray, IntArray, IntArray, IntArray]
 
@@ -172,6 +172,15 @@ def planar_marginals(
     return mean_of, covariance
 
 
+@kernel_part
+def root_of(root: IntArray, node: int) -> int:
+    """The root of a node's set; the paths to it are halved on the way."""
+    while root[node] != node:
+        root[node] = root[root[node]]
+        node = root[node]
+    return node
+
+
 @kernel("f1 i1 i1 i1 i1 i1 f")
 def uncorrelated_labels(
     flat: FloatArray,
@@ -194,13 +203,7 @@ def uncorrelated_labels(
         j = latest[label[i]]
         before[i], latest[label[i]] = j, i
         while j >= 0:
-            one, other = i, j
-            while root[one] != one:
-                root[one] = root[root[one]]
-                one = root[one]
-            while root[other] != other:
-                root[other] = root[root[other]]
-                other = root[other]
+            one, other = root_of(root, i), root_of(root, j)
             if one != other:
                 tied = False
                 for a in range(d):
@@ -240,13 +243,7 @@ def united_labels(count: int, nodes: IntArray, a: IntArray, b: IntArray, most: i
     """
     root, size = np.arange(count), nodes.copy()
     for k in range(len(a)):
-        one, other = a[k], b[k]
-        while root[one] != one:
-            root[one] = root[root[one]]
-            one = root[one]
-        while root[other] != other:
-            root[other] = root[root[other]]
-            other = root[other]
+        one, other = root_of(root, a[k]), root_of(root, b[k])
         if one != other and size[one] + size[other] <= most:
             first, second = min(one, other), max(one, other)
             root[second], size[first] = first, size[one] + size[other]

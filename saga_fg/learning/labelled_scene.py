@@ -141,7 +141,18 @@ class SampledDetections(Columns):
     ) -> SampledDetections:
         """Detections whose errors are not known."""
         nan = np.full(len(label), np.nan)
-        return cls(label, logit, distance, azimuth, true, nan, nan, np.column_stack([nan, nan]), nan, nan)
+        return cls(
+            label=label,
+            logit=logit,
+            range=distance,
+            azimuth=azimuth,
+            true=true,
+            along=nan,
+            across=nan,
+            velocity=np.column_stack([nan, nan]),
+            yaw=nan,
+            height=nan,
+        )
 
 
 @dataclass(frozen=True, eq=False)

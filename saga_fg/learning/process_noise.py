@@ -231,7 +231,17 @@ class CurvilinearLikelihood:
         gap_object, gap_start = (np.array([gap[k] for gap in gaps], dtype=np.int64) for k in range(2))
         gap_end = np.array([gap[2] for gap in gaps], dtype=np.int64).reshape(-1, len(HORIZONS))
         count = np.array([len(one) for one in order])
-        return cls(time, position, R, yaw, yaw_noise, count, gap_object, gap_start, gap_end)
+        return cls(
+            time=time,
+            position=position,
+            R=R,
+            yaw=yaw,
+            yaw_noise=yaw_noise,
+            count=count,
+            gap_object=gap_object,
+            gap_start=gap_start,
+            gap_end=gap_end,
+        )
 
     def loss(self, motion: Curvilinear) -> float:
         """Mean of l over innovations, plus its means over the gaps of each horizon."""

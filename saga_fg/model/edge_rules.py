@@ -125,7 +125,7 @@ INFORMATION_GAIN = (
 )
 SPREAD = 0.5  # standard deviation of the difference between the velocities of a pair, m/s
 UNSEEN_ACCELERATION = 2.0  # growth of the velocity deviation of undetected objects, m/s^2
-LEAST = 1e-9  # probability that a certain object does not exist
+MIN_ABSENCE = 1e-9  # probability that a certain object does not exist
 
 
 def pairs_within(
@@ -225,10 +225,24 @@ class Neighbours(Settings):
             return NO_PAIRS
         _, _, variance, spread = _columns(nodes, self.information_gain)
         direction = nodes.along(target, source).direction
-        columns = nodes.position, nodes.velocity, nodes.heading, variance
-        scales = self.rate, self.distance_scale, self.heading_scale, self.speed_scale
-        limits = self.max_distance, self.min_speed, self.max_degree
-        return Pairs(*neighbour_rates(target, source, direction, *columns, *scales, *limits, spread))
+        found = neighbour_rates(
+            target=target,
+            source=source,
+            direction=direction,
+            position=nodes.position,
+            velocity=nodes.velocity,
+            heading=nodes.heading,
+            variance=variance,
+            rate=self.rate,
+            distance_scale=self.distance_scale,
+            heading_scale=self.heading_scale,
+            speed_scale=self.speed_scale,
+            max_distance=self.max_distance,
+            min_speed=self.min_speed,
+            degree=self.max_degree,
+            spread=spread,
+        )
+        return Pairs(*found)
 
 
 @dataclass(frozen=True)
@@ -287,12 +301,33 @@ class Following(Settings):
         if len(target) == 0:
             return NO_PAIRS
         exists, moved, variance, spread = _columns(nodes, self.information_gain)
-        columns = nodes.position, nodes.heading, nodes.length, moved, exists, variance
-        scales = self.rate, self.max_gap, self.gap_scale, self.lateral_scale, self.heading_scale
-        leaders = ("any", "moving", "stationary").index(self.leaders)
-        leading = self.parked, leaders, self.min_separation
-        ends = target, source, *nodes.along(target, source)
-        return Pairs(*leader_rates(*ends, *columns, *scales, *leading, spread, _STEEPEST, LEAST))
+        along = nodes.along(target, source)
+        found = leader_rates(
+            target=target,
+            source=source,
+            ahead=along.ahead,
+            aside=along.aside,
+            direction=along.direction,
+            predicted=along.predicted,
+            position=nodes.position,
+            heading=nodes.heading,
+            length=nodes.length,
+            moved=moved,
+            exists=exists,
+            variance=variance,
+            rate=self.rate,
+            max_gap=self.max_gap,
+            gap_scale=self.gap_scale,
+            lateral_scale=self.lateral_scale,
+            heading_scale=self.heading_scale,
+            parked=self.parked,
+            leaders=("any", "moving", "stationary").index(self.leaders),
+            min_separation=self.min_separation,
+            spread=spread,
+            steepest=_STEEPEST,
+            least=MIN_ABSENCE,
+        )
+        return Pairs(*found)
 
     def _ahead(self, nodes: NodeTable) -> tuple[IntArray, IntArray]:
         """All pairs that may be in a lane: target rows, source rows."""
@@ -304,8 +339,22 @@ class Following(Settings):
         path = np.full(len(nodes), -1)
         path[paths.row] = np.arange(len(paths))
         aside, widening = 3 * self.lateral_scale, math.tan(min(3 * self.heading_scale, 1.5) / 2)
-        lane = self.max_gap, aside, widening, path, paths.position[:, 0], *paths.cones(aside), SHARP
-        return pairs_ahead(nodes.position, nodes.heading, follows, able, *lane)
+        direction, turn, margin = paths.cones(aside)
+        return pairs_ahead(
+            position=nodes.position,
+            heading=nodes.heading,
+            follows=follows,
+            able=able,
+            farthest=self.max_gap,
+            aside=aside,
+            widening=widening,
+            path=path,
+            begin=paths.position[:, 0],
+            direction=direction,
+            turn=turn,
+            margin=margin,
+            sharp=SHARP,
+        )
 
 
 PUSHING_DISTANCE = 4.0  # m; beyond, the force is less than a thousandth of that of a touch

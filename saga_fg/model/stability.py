@@ -138,7 +138,16 @@ def _pairs_of_nodes(rules: Sequence[MovingRule], turns: FloatArray) -> tuple[Sce
     velocity = 5.0 * unit(heading)
     position = np.tile([[0.0, 0.0], [10.0, 0.5]], (len(turns), 1))
     names, types = np.full(n, "node"), (node_type,) * n
-    nodes = NodeTable(np.arange(n), names, types, position, velocity, heading, np.full(n, 4.0), np.ones(n))
+    nodes = NodeTable(
+        id=np.arange(n),
+        label=names,
+        types=types,
+        position=position,
+        velocity=velocity,
+        heading=heading,
+        length=np.full(n, 4.0),
+        velocity_variance=np.ones(n),
+    )
     first, second = np.arange(0, n, 2), np.arange(1, n, 2)
     groups, total = [], 0.0
     for rule in rules:

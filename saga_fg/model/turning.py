@@ -121,8 +121,8 @@ def _rotated(v: FloatArray, c: FloatArray, s: FloatArray) -> FloatArray:
 
 
 RATE_CORRELATION = 1.0  # s
-_LEAST_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
-_LEAST = 1e-9  # time constants, so that nothing is divided by 0
+_MIN_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
+_MIN_RATE = 1e-9  # 1/s, so that nothing is divided by 0
 _P, _V, _A = slice(0, 2), slice(2, 4), slice(4, 6)
 
 
@@ -170,25 +170,36 @@ class KnownCourses(Columns):
         """The courses over the next `dt` s of nodes with states `mean` (n, 6); rate_variance (n,) rad^2/s^2."""
         settling, across, pull = unseen or Unseen(*np.zeros((3, len(ids))))
         noise, brake = course_inputs(heading, rate_variance, mean, settling, across, dt, RATE_CORRELATION)
-        return cls(ids, heading, rate, noise, brake, settling, pull, node_type)
+        return cls(
+            ids=ids,
+            heading=heading,
+            rate=rate,
+            lateral_noise=noise,
+            brake=brake,
+            settling=settling,
+            pull=pull,
+            node_type=node_type,
+        )
 
     def predicted(self, dt: float, scale: FloatArray) -> tuple[KnownCourses, OwnMotions]:
         """dt seconds later, and the motions until then; scale (n,) of the process noise."""
         motion = self.node_type.motion
         assert isinstance(motion, Curvilinear)
-        tau = max(motion.turn_time, _LEAST_TIME)
+        tau = max(motion.turn_time, _MIN_TIME)
         theta = self.rate * turning_time(motion, dt)
+        F_axis, Q_axis = _one_axis(motion, dt)
         F, b, Q = course_motions(
-            self.heading,
-            theta,
-            self.lateral_noise,
-            self.brake,
-            self.settling,
-            self.pull,
-            scale,
-            dt,
-            _LEAST,
-            *_one_axis(motion, dt),
+            heading=self.heading,
+            theta=theta,
+            lateral_noise=self.lateral_noise,
+            brake=self.brake,
+            settling=self.settling,
+            pull=self.pull,
+            scale=scale,
+            dt=dt,
+            least=_MIN_RATE,
+            F_axis=F_axis,
+            Q_axis=Q_axis,
         )
         changed = {"heading": self.heading + theta, "rate": self.rate * np.exp(-dt / tau)}
         later = unchecked(KnownCourses, **self.__dict__ | changed | {"brake": np.zeros_like(self.brake)})
@@ -205,5 +216,5 @@ def _one_axis(motion: Curvilinear, dt: float) -> tuple[FloatArray, FloatArray]:
 
 def turning_time(motion: Curvilinear, dt: float) -> float:
     """The time, s, in which an undiminished rate turns as far as one that fades does within `dt`."""
-    tau = max(motion.turn_time, _LEAST_TIME)
+    tau = max(motion.turn_time, _MIN_TIME)
     return float(tau * -np.expm1(-dt / tau))

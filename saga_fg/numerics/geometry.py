@@ -210,7 +210,19 @@ class Polylines(NamedTuple):
                 column[at] = part
         start, t, low, high, before, middle, angle = columns
         base = np.cumsum(length + 1) - length
-        return cls(start, t, low, high, before, middle, angle, first, pieces, length, base)
+        return cls(
+            start=start,
+            t=t,
+            low=low,
+            high=high,
+            before=before,
+            middle=middle,
+            angle=angle,
+            first=first,
+            pieces=pieces,
+            length=length,
+            base=base,
+        )
 
     def __len__(self) -> int:
         return len(self.length)

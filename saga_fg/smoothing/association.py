@@ -135,17 +135,17 @@ def gather_evidence(
         return np.concatenate([np.empty((0, *shape), dtype), *(getattr(part, name) for part in parts)])
 
     return Evidence(
-        times,
-        tuple(taken),
-        origin,
-        number,
-        replace(boxes, position=boxes.position - [*origin, 0.0]),
-        column("probability"),
-        column("R", 4, 4),
-        column("with_velocity", dtype=bool),
-        column("z_noise"),
-        column("yaw_noise"),
-        np.hypot(*(boxes.position[:, :2] - np.reshape(places, (-1, 2))[number]).T),
+        times=times,
+        frames=tuple(taken),
+        origin=origin,
+        frame=number,
+        boxes=replace(boxes, position=boxes.position - [*origin, 0.0]),
+        probability=column("probability"),
+        R=column("R", 4, 4),
+        with_velocity=column("with_velocity", dtype=bool),
+        z_noise=column("z_noise"),
+        yaw_noise=column("yaw_noise"),
+        distance=np.hypot(*(boxes.position[:, :2] - np.reshape(places, (-1, 2))[number]).T),
     )
 
 

@@ -248,15 +248,15 @@ class SmoothedEdges:
         course = np.arctan2(velocity[:, 1], velocity[:, 0])
         known = np.isfinite(self.yaw[objects[rows]]) & (np.hypot(*velocity.T) < FACING)
         nodes = NodeTable(
-            ids[rows],
-            label,
-            tuple(types[row] for row in rows.tolist()),
-            mean[:, :2],
-            velocity,
-            np.where(known, self.yaw[objects[rows]], course),
-            np.nan_to_num(self.length[objects[rows]]),
-            np.trace(P[:, 2:, 2:], axis1=1, axis2=2) / 2,
-            self.has_moved[objects[rows]],
+            id=ids[rows],
+            label=label,
+            types=tuple(types[row] for row in rows.tolist()),
+            position=mean[:, :2],
+            velocity=velocity,
+            heading=np.where(known, self.yaw[objects[rows]], course),
+            length=np.nan_to_num(self.length[objects[rows]]),
+            velocity_variance=np.trace(P[:, 2:, 2:], axis1=1, axis2=2) / 2,
+            has_moved=self.has_moved[objects[rows]],
         )
         graph = build_graph(nodes, self.rules, explained_noise=self.explained_noise)
         if len(rows) == len(ids):

@@ -138,8 +138,19 @@ def _candidates(
     of_track, of_detection = common_numbers(boxes.label, detected.label)
     reach, share = class_values(settings.classes, ClassSettings, boxes.label, "max_distance", "gate")
     x, z = boxes.position[:, :2], detected.position[:, :2]
-    pairs, gates = near_pairs(x, z, reach), np.array([gate(each) for each in share.tolist()])
-    found = CandidatePairs(*gated_pairs(*pairs, x, tracks.P, gates, of_track, z, measurements.R, of_detection))
+    row, column = near_pairs(x, z, reach)
+    pairs = gated_pairs(
+        row=row,
+        column=column,
+        position=x,
+        P=tracks.P,
+        gate=np.array([gate(each) for each in share.tolist()]),
+        group=of_track,
+        z=z,
+        R=measurements.R,
+        group_z=of_detection,
+    )
+    found = CandidatePairs(*pairs)
     unmatched = _unmatched(found, tracks.chance, measurements.probability, of_detection, clutter_area)
     return found._replace(gain=found.gain - unmatched)
 

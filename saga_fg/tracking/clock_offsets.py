@@ -87,7 +87,17 @@ class SeenObjects:
         """Objects of which nothing is known from earlier frames."""
         k = len(label)
         unknown = np.full((k, 2), np.nan)
-        return cls(sensor, stamp, label, position, variance, unknown, unknown[:, 0], position, np.full(k, stamp))
+        return cls(
+            sensor=sensor,
+            stamp=stamp,
+            label=label,
+            position=position,
+            variance=variance,
+            velocity=unknown,
+            velocity_variance=unknown[:, 0],
+            anchor=position,
+            anchor_stamp=np.full(k, stamp),
+        )
 
     def after(self, before: SeenObjects) -> SeenObjects:
         """With the velocities of objects that are in the frame before as well."""

@@ -83,7 +83,16 @@ class GreedyTracker:
         none = np.empty(0)
         flat = np.empty((0, 2))
         self._memory = _Memory(
-            np.empty(0, dtype=np.int64), empty.label, empty.position, empty.size, none, flat, none, none, flat, none
+            id=np.empty(0, dtype=np.int64),
+            label=empty.label,
+            position=empty.position,
+            size=empty.size,
+            yaw=none,
+            velocity=flat,
+            score=none,
+            last_seen=none,
+            anchor=flat,
+            anchor_time=none,
         )
 
     def step(self, frame: Frame) -> Tracks:
@@ -123,16 +132,16 @@ class GreedyTracker:
         ids[~seen] = np.arange(self._next_id, self._next_id + int((~seen).sum()))
         self._next_id += int((~seen).sum())
         fresh = _Memory(
-            ids,
-            boxes.label,
-            boxes.position,
-            boxes.size,
-            boxes.yaw,
-            velocity,
-            p,
-            np.full(len(boxes), now),
-            anchor,
-            anchor_time,
+            id=ids,
+            label=boxes.label,
+            position=boxes.position,
+            size=boxes.size,
+            yaw=boxes.yaw,
+            velocity=velocity,
+            score=p,
+            last_seen=np.full(len(boxes), now),
+            anchor=anchor,
+            anchor_time=anchor_time,
         )
         unseen = np.ones(len(memory.id), dtype=bool)
         unseen[match[seen]] = False

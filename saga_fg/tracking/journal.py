@@ -106,21 +106,21 @@ class TrackerView:
         table.last_detected += state.start
         table.last_in_view += state.start
         return cls(
-            state.start + state.time,
-            sensor,
-            table,
-            node_table(state),
-            now.P,
-            state.origin,
-            state.graph,
-            measurements,
-            matching,
-            np.empty(0, dtype=np.int64) if initiated is None else initiated,
-            replace(state.boxes(now.position, now.velocity)),
-            state.clock,
-            state.shared,
-            state.joint.settled(table.id),
-            state.joint.estimator.graph() if state.providers else None,
+            timestamp=state.start + state.time,
+            sensor=sensor,
+            table=table,
+            nodes=node_table(state),
+            P=now.P,
+            origin=state.origin,
+            graph=state.graph,
+            measurements=measurements,
+            matching=matching,
+            initiated=np.empty(0, dtype=np.int64) if initiated is None else initiated,
+            boxes=replace(state.boxes(now.position, now.velocity)),
+            clock=state.clock,
+            shared=state.shared,
+            settled=state.joint.settled(table.id),
+            running=state.joint.estimator.graph() if state.providers else None,
         )
 
     @property

@@ -194,7 +194,17 @@ class FirstVehicles(Columns):
     def none(cls) -> FirstVehicles:
         """No vehicle."""
         ids, times, states = np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, len(STATES)))
-        return cls(ids, ids, times, times, np.empty((0, 2)), times, states, times, states)
+        return cls(
+            id=ids,
+            line=ids,
+            time=times,
+            speed=times,
+            direction=np.empty((0, 2)),
+            variance=times,
+            expected=states,
+            weight=times,
+            log_likelihood=states,
+        )
 
     def later(self, nodes: NodeTable, rules: Sequence[EdgeRule], detected: BoolArray, time: float) -> FirstVehicles:
         """First vehicles of a node table: tracks (its first rows) `detected` at `time`, and others seen just before."""
@@ -215,15 +225,15 @@ class FirstVehicles(Columns):
         variance = nodes.velocity_variance[first.target]
         then = np.full(len(v), time)
         now = FirstVehicles(
-            ids,
-            line,
-            then,
-            v,
-            first.approach.direction,
-            variance,
-            expected,
-            nodes.existence[first.target],
-            log_likelihood,
+            id=ids,
+            line=line,
+            time=then,
+            speed=v,
+            direction=first.approach.direction,
+            variance=variance,
+            expected=expected,
+            weight=nodes.existence[first.target],
+            log_likelihood=log_likelihood,
         )
         kept = self.select(~np.isin(self.id, nodes.id[: len(detected)][detected]) & (self.time > time - LONGEST))
         return kept.append(now)
@@ -421,14 +431,14 @@ class MapNodes:
             lanes = self.across.placed(origin, position[lines] + origin - middles, first + lines)
         none = np.zeros(len(self))
         return NodeTable(
-            self.id,
-            self.label,
-            joint.types_of(self.label),
-            position,
-            np.zeros((len(self), 2)),
-            np.array([place.heading for place in self.place]),
-            none,
-            none,
+            id=self.id,
+            label=self.label,
+            types=joint.types_of(self.label),
+            position=position,
+            velocity=np.zeros((len(self), 2)),
+            heading=np.array([place.heading for place in self.place]),
+            length=none,
+            velocity_variance=none,
             has_moved=none,
             closed=closed,
             open=opened,

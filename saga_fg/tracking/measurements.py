@@ -110,14 +110,14 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     limit = MAX_MEASURED_SPEED if sensor.use_velocity else -1.0
     covariance_scale, position_bias = sensor.covariance_calibration(boxes.label, probability)
     return FrameMeasurements(
-        sensor,
-        frame.sensor,
-        frame.world_T_ego,
-        viewpoint,
-        keep,
-        boxes,
-        probability,
-        R,
+        sensor=sensor,
+        name=frame.sensor,
+        world_T_ego=frame.world_T_ego,
+        viewpoint=viewpoint,
+        row=keep,
+        boxes=boxes,
+        probability=probability,
+        R=R,
         with_velocity=np.hypot(*boxes.velocity.T) <= limit,
         z_noise=z_noise,
         yaw_noise=np.where(np.isfinite(boxes.yaw), yaw_noise, UNKNOWN_YAW_NOISE),
@@ -225,7 +225,17 @@ class EgoNode:
         now, types = joint.kinematics_of(_ID, label), joint.types_of(label)
         heading, moved = np.array([self.yaw]), np.array([float(self.has_moved)])
         variance = np.trace(now.P_velocity, axis1=1, axis2=2) / 2
-        return NodeTable(_ID, label, types, now.position, now.velocity, heading, length, variance, moved)
+        return NodeTable(
+            id=_ID,
+            label=label,
+            types=types,
+            position=now.position,
+            velocity=now.velocity,
+            heading=heading,
+            length=length,
+            velocity_variance=variance,
+            has_moved=moved,
+        )
 
 
 def relative_covariances(joint: JointTrackState, ids: IntArray, label: StrArray) -> FloatArray:

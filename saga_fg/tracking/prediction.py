@@ -137,7 +137,18 @@ def look_ahead(state: TrackerState, horizons: FloatArray, joint: bool = False) -
     of_pairs = [(2 * k[:, None] + [0, 1]).ravel() for k in kept]  # the coordinates of the tracks kept
     whole = np.stack([P[np.ix_(k, k)] for P, k in zip(together, of_pairs, strict=True)]) if joint else None
     place = position + state.origin
-    return PredictedTracks(newest, horizons, last.id, last.label, place, velocity, yaw, P, P_velocity, whole)
+    return PredictedTracks(
+        timestamp=newest,
+        horizons=horizons,
+        id=last.id,
+        label=last.label,
+        position=place,
+        velocity=velocity,
+        yaw=yaw,
+        position_covariance=P,
+        velocity_covariance=P_velocity,
+        joint_covariance=whole,
+    )
 
 
 def _predict_to(state: TrackerState, time: float) -> None:

@@ -100,8 +100,22 @@ def _pairs(
     still = state.table.stationarity
     group, of_place = common_numbers(state.table.label, label)
     log_density = np.log(np.bincount(of_place)[of_place] / area(state))
-    objects = position, P, still.position, still.P, still.probability, log_survival(state)
-    return relinking_pairs(tracks, group, *objects, z, R, of_place, log_density, least_log_odds(state), _ROUNDING)
+    return relinking_pairs(
+        tracks=tracks,
+        group=group,
+        position=position,
+        P=P,
+        place=still.position,
+        D=still.P,
+        stationary=still.probability,
+        log_survival=log_survival(state),
+        z=z,
+        R=R,
+        group_z=of_place,
+        log_density=log_density,
+        least=min_log_odds(state),
+        rounding=_ROUNDING,
+    )
 
 
 def relinkable(state: TrackerState) -> BoolArray:
@@ -112,7 +126,7 @@ def relinkable(state: TrackerState) -> BoolArray:
     still = table.stationarity
     peaks = log_peaks(state.kinematics().P, still.P, still.probability, log_survival(state))
     within = table.coasting(state.time) <= state.settings.max_coasting
-    return np.asarray(within & (peaks >= least_log_odds(state) - math.log(area(state))))
+    return np.asarray(within & (peaks >= min_log_odds(state) - math.log(area(state))))
 
 
 def initiating(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> IntArray:
@@ -130,7 +144,7 @@ def area(state: TrackerState) -> float:
     return clutter_area if math.isfinite(clutter_area) else NOMINAL_AREA
 
 
-def least_log_odds(state: TrackerState) -> float:
+def min_log_odds(state: TrackerState) -> float:
     """Log-odds from which a track is re-linked."""
     above = state.settings.association.relink_above
     return math.log(above / (1 - above))
@@ -151,7 +165,7 @@ def hand_over(state: TrackerState, matching: Matching) -> Matching:
     moving, still = _log_evidence(state, new, old)
     evidence = np.logaddexp(moving, still)
     log_odds = log_survival(state)[old] + evidence + math.log(area(state)) - np.log(others)
-    chosen = least_total(new, old, least_log_odds(state) - log_odds)
+    chosen = least_total(new, old, min_log_odds(state) - log_odds)
     if len(chosen) == 0:
         return matching
     new, old = new[chosen], old[chosen]
@@ -173,8 +187,19 @@ def _possible_returns(state: TrackerState, matching: Matching) -> tuple[IntArray
         return new, new, new
     old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
     now, still = state.kinematics(), table.stationarity
-    (group,), places = common_numbers(table.label), (now.position, now.P, still.position, still.P)
-    return returned_pairs(new, old, group, table.initiated, table.last_detected, *places, _FARTHEST)
+    (group,) = common_numbers(table.label)
+    return returned_pairs(
+        new=new,
+        old=old,
+        group=group,
+        initiated=table.initiated,
+        last_detected=table.last_detected,
+        position=now.position,
+        P=now.P,
+        place=still.position,
+        D=still.P,
+        farthest=_FARTHEST,
+    )
 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -186,10 +211,21 @@ def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[Fl
     place = state.kinematics().position[each] + state.origin
     _, V_0, p = state.unmeasured_velocity(table.label[each], place, table.box.yaw[each], prior)
     estimator, still = state.joint.estimator, table.stationarity
-    places, place, D, s = state.joint.places(table.label), still.position, still.P, still.probability
+    places = state.joint.places(table.label)
     (x, P), (x_old, P_old) = (estimator.planar_marginals(table.id[k], places[k]) for k in (new, old))
-    if_still = s[new], s[old], place[new] - place[old], D[new] + D[old]
-    return return_evidence(x, P, x_old, P_old, places[new, 2] >= 0, V_0[of_pair], p[of_pair], *if_still)
+    return return_evidence(
+        mean=x,
+        P=P,
+        old_mean=x_old,
+        old_P=P_old,
+        moves=places[new, 2] >= 0,
+        V=V_0[of_pair],
+        p=p[of_pair],
+        s=still.probability[new],
+        old_s=still.probability[old],
+        apart=still.position[new] - still.position[old],
+        D=still.P[new] + still.P[old],
+    )
 
 
 def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatArray) -> None:

@@ -107,7 +107,7 @@ class Kinematics(NamedTuple):
         Means and standard deviations have to be within `MAX_POSITION` and `MAX_SPEED`, variances of positions above 0,
         of velocities at least 0. NaN never is within.
         """
-        return states_within(*self, origin, MAX_POSITION, MAX_SPEED)
+        return states_within(self.position, self.velocity, self.P, self.P_velocity, origin, MAX_POSITION, MAX_SPEED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +126,8 @@ class RelativePositions(Columns):
 
 HEIGHT_DRIFT = 0.1  # standard deviation after one second, m
 MOVING = 2.0  # speed from which the motion tells front from rear, m/s
-MOST_WEIGHT = 20.0  # limit on the weight of past sizes
-MOST_VOTES = 5.0  # limit on the past votes, so that later ones can outvote them
+MAX_WEIGHT = 20.0  # limit on the weight of past sizes
+MAX_VOTES = 5.0  # limit on the past votes, so that later ones can outvote them
 
 
 @dataclass(eq=False)
@@ -181,14 +181,31 @@ class BoxFilter(Columns):
         yaw_noise: FloatArray,
     ) -> None:
         """Take in one detection each for the tracks `rows` (k,)."""
+        later = updated_boxes(
+            size=self.size,
+            size_weight=self.size_weight,
+            z=self.z,
+            z_variance=self.z_variance,
+            yaw=self.yaw,
+            yaw_variance=self.yaw_variance,
+            votes=self.votes,
+            rows=rows,
+            seen_size=size,
+            weight=weight,
+            seen_z=z,
+            z_noise=z_noise,
+            seen_yaw=yaw,
+            yaw_noise=yaw_noise,
+            most_weight=MAX_WEIGHT,
+            most_votes=MAX_VOTES,
+        )
         now = self.size, self.size_weight, self.z, self.z_variance, self.yaw, self.yaw_variance, self.votes
-        later = updated_boxes(*now, rows, size, weight, z, z_noise, yaw, yaw_noise, MOST_WEIGHT, MOST_VOTES)
         for column, values in zip(now, later, strict=True):
             column[rows] = values
 
     def face_motion(self, velocity: FloatArray) -> None:
         """Reverse headings that point against a clear motion; velocity (n, 2), zero where it is not clear."""
-        self.yaw, self.votes = faced_boxes(self.yaw, self.votes, velocity, MOVING, MOST_VOTES)
+        self.yaw, self.votes = faced_boxes(self.yaw, self.votes, velocity, MOVING, MAX_VOTES)
 
     def turn_with(self, before: FloatArray, after: FloatArray, coasting: BoolArray) -> None:
         """Turn the headings of moving, `coasting` (n,) tracks as their velocities (n, 2) turn in a prediction.
@@ -201,7 +218,7 @@ class BoxFilter(Columns):
 DEVIATION = 0.15  # rad/s, stationary standard deviation of a rate: a bend of 50 m at 7 m/s
 TURNING = 0.3  # rad/s, deviation of their rates: a crossing is a quarter turn in some 5 s
 STRAIGHT = 0.01  # rad/s, deviation of the others' rates: corrections within the lane
-_LEAST_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
+_MIN_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
 OUTLIER = 2.0  # standard deviations of an innovation, which 95 % of good headings don't exceed
 
 
@@ -226,8 +243,9 @@ class TurnRate(Columns):
 
     def predict(self, dt: float, fading_time: FloatArray) -> None:
         """Predict by `dt` s; fading_time (n,), s, 0 where turns are not modelled."""
-        before, scales = (self.heading, self.rate, self.P), (DEVIATION, _LEAST_TIME)
-        self.heading, self.rate, self.P = predicted_turning(*before, dt, fading_time, *scales)
+        self.heading, self.rate, self.P = predicted_turning(
+            self.heading, self.rate, self.P, dt, fading_time, DEVIATION, _MIN_TIME
+        )
 
     def update(self, rows: IntArray, yaw: FloatArray, yaw_noise: FloatArray) -> None:
         """Take in one heading each of the tracks `rows` (k,); NaN is none."""
@@ -241,12 +259,10 @@ class TurnRate(Columns):
 
 
 HALTING_SPEED = 1.0  # m/s, scale of the speeds from which an object comes to rest at once: walking, or the last metre
-_MOST_LOG_ODDS = 12.0  # so that later evidence can still change the probability
+_MAX_LOG_ODDS = 12.0  # so that later evidence can still change the probability
 NOISE_SCALE = 0.05  # factor on the process noise of a stationary object
-START_RATE, STOP_RATE = (
-    0.02,
-    0.05,
-)  # 1/s, of stationary objects that start, of slow ones that halt; to 0.1
+START_RATE = 0.02  # 1/s, of stationary objects that start; to 0.1
+STOP_RATE = 0.05  # 1/s, of slow ones that halt; to 0.1
 DRIFT = 0.02  # m, usual 0 to 0.1, standard deviation of the drift of a stationary position in one second
 
 
@@ -270,9 +286,19 @@ class Stationarity(Columns):
 
     def predict(self, dt: float, moving: Kinematics) -> None:
         """Predict by `dt` s; `moving` is the joint filter's state before."""
-        rates = dt, START_RATE, STOP_RATE, DRIFT, HALTING_SPEED
         self.probability, self.position, self.P = predicted_places(
-            self.probability, self.position, self.P, *moving, *rates
+            s=self.probability,
+            place=self.position,
+            D=self.P,
+            position=moving.position,
+            velocity=moving.velocity,
+            P=moving.P,
+            P_velocity=moving.P_velocity,
+            dt=dt,
+            start=START_RATE,
+            stop=STOP_RATE,
+            drift=DRIFT,
+            halting_speed=HALTING_SPEED,
         )
 
     def update(
@@ -283,9 +309,19 @@ class Stationarity(Columns):
         z (k, 4) position and velocity, R (k, 4, 4); `moving`: the joint filter's prediction of these tracks
         """
         if len(rows):
-            still = self.probability, self.position, self.P, rows
             self.probability[rows], self.position[rows], self.P[rows] = updated_places(
-                *still, z, R, *moving, with_velocity, _MOST_LOG_ODDS
+                s=self.probability,
+                place=self.position,
+                D=self.P,
+                rows=rows,
+                z=z,
+                R=R,
+                position=moving.position,
+                velocity=moving.velocity,
+                P=moving.P,
+                P_velocity=moving.P_velocity,
+                with_velocity=with_velocity,
+                most_log_odds=_MAX_LOG_ODDS,
             )
 
     @property
@@ -298,13 +334,23 @@ class Stationarity(Columns):
 
         moving: the joint filter's state, which has the detected positions
         """
-        return Kinematics(*reported_moments(self.probability, coasting, *moving, self.position, self.P))
+        found = reported_moments(
+            s=self.probability,
+            unseen=coasting,
+            position=moving.position,
+            velocity=moving.velocity,
+            P=moving.P,
+            P_velocity=moving.P_velocity,
+            place=self.position,
+            D=self.P,
+        )
+        return Kinematics(*found)
 
 
 def after_evidence(probability: FloatArray, evidence: FloatArray) -> FloatArray:
     """Probability (k,) after evidence (k,), the log of a ratio of likelihoods."""
     before = np.clip(probability, 1e-9, 1 - 1e-9)
-    odds = np.clip(np.log(before / (1 - before)) + evidence, -_MOST_LOG_ODDS, _MOST_LOG_ODDS)
+    odds = np.clip(np.log(before / (1 - before)) + evidence, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)
     return np.asarray(1 / (1 + np.exp(-odds)))
 
 

@@ -127,20 +127,34 @@ class Passages(Columns):
         """
         heading, speed, variance = speeds_ahead(yaw, moves, now.velocity, now.P_velocity)
         stationary = np.zeros(len(ids)) if stationary is None else stationary
-        found = cls(ids, label, now.position, heading, speed, variance, stationary, np.full(len(ids), time), moves)
+        found = cls(
+            id=ids,
+            label=label,
+            position=now.position,
+            heading=heading,
+            speed=speed,
+            variance=variance,
+            stationary=stationary,
+            time=np.full(len(ids), time),
+            moves=moves,
+        )
         return found if np.isfinite(heading).all() else found.select(np.isfinite(heading))
-
-    def speeds(
-        self, of: IntArray
-    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The columns that the prior of speeds is made of; of (n,): the classes by number."""
-        return self.id, of, self.position, self.heading, self.speed, self.variance, self.stationary
 
     @classmethod
     def empty(cls) -> Self:
         """No passages."""
         ids, none, moves = np.empty(0, dtype=np.int64), np.empty(0), np.empty(0, dtype=np.bool_)
-        return cls(ids, np.empty(0, dtype="U1"), np.empty((0, 2)), none, none, none, none, none, moves)
+        return cls(
+            id=ids,
+            label=np.empty(0, dtype="U1"),
+            position=np.empty((0, 2)),
+            heading=none,
+            speed=none,
+            variance=none,
+            stationary=none,
+            time=none,
+            moves=moves,
+        )
 
 
 def _lane_points(lane: Lane, ids: int) -> Passages:
@@ -151,7 +165,17 @@ def _lane_points(lane: Lane, ids: int) -> Passages:
     place = np.stack([np.interp(at, distance, each) for each in centre.T], axis=-1)
     heading, none = np.arctan2(*np.gradient(place, axis=0)[:, ::-1].T), np.zeros(len(at))
     number, moves = np.full(len(at), ids), np.ones(len(at), dtype=np.bool_)
-    return Passages(number, np.full(len(at), lane.name), place, heading, none, none + np.inf, none, none, moves)
+    return Passages(
+        id=number,
+        label=np.full(len(at), lane.name),
+        position=place,
+        heading=heading,
+        speed=none,
+        variance=none + np.inf,
+        stationary=none,
+        time=none,
+        moves=moves,
+    )
 
 
 @dataclass(eq=False)
@@ -167,17 +191,11 @@ class Trails:
     def __len__(self) -> int:
         return len(self.points)
 
-    def columns(
-        self, cell: float
-    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray, IntArray, IntArray]:
-        """Tracks, places, headings, speeds, whether these are known, and the points by cells of this size, m.
-
-        See `saga_fg.kernels.paths.points_by_cell`.
-        """
-        of = self.points
+    def by_cell(self, cell: float) -> tuple[IntArray, IntArray]:
+        """The points by cells of this size, m, see `saga_fg.kernels.paths.points_by_cell`."""
         if self._cells is None or self._cells[0] != cell:
-            self._cells = cell, *points_by_cell(of.position, cell)
-        return of.id, of.position, of.heading, of.speed, np.isfinite(of.variance), *self._cells[1:]
+            self._cells = cell, *points_by_cell(self.points.position, cell)
+        return self._cells[1:]
 
 
 @dataclass(eq=False)
@@ -271,8 +289,8 @@ PRIOR = 0.2  # weight of going on as before, against that of one trail right her
 TURN = 0.3  # rad, sigma of the kernel on the difference of headings
 AGREEMENT = 0.2  # rad, deviation of the headings of trails from which they say little
 _BEND = 20.0  # m, along which a curvature of one's own fades
-_LEAST = 1e-9
-_NONE = Trails(Passages.empty())
+_MIN_REACH = 1e-9  # m
+_NO_TRAILS = Trails(Passages.empty())
 
 
 def paths(
@@ -282,11 +300,39 @@ def paths(
 
     Their steps are `STEP` m long, their rows 0 to n - 1.
     """
-    reach = max(traffic.settings.reach, _LEAST)
-    found = (traffic.lanes, traffic.trails()) if traffic.settings.reach > 0 else (_NONE, _NONE)
-    lanes, trails = (each.columns(2 * reach) for each in found)
-    tracks, scales = (ids, position, heading, curvature), (reach, STEP, _BEND, TURN, PRIOR, AGREEMENT)
-    return Paths(np.arange(len(ids)), *trail_paths(*lanes, *trails, *tracks, steps, NEAREST, *scales))
+    reach = max(traffic.settings.reach, _MIN_REACH)
+    of_lanes, of_trails = (traffic.lanes, traffic.trails()) if traffic.settings.reach > 0 else (_NO_TRAILS, _NO_TRAILS)
+    lanes, trails = of_lanes.points, of_trails.points
+    (lane_cells, lane_latest), (trail_cells, trail_latest) = of_lanes.by_cell(2 * reach), of_trails.by_cell(2 * reach)
+    found = trail_paths(
+        lane_of=lanes.id,
+        lane_points=lanes.position,
+        lane_headings=lanes.heading,
+        lane_speeds=lanes.speed,
+        lane_timed=np.isfinite(lanes.variance),
+        lane_cells=lane_cells,
+        lane_latest=lane_latest,
+        trail_of=trails.id,
+        trail_points=trails.position,
+        trail_headings=trails.heading,
+        trail_speeds=trails.speed,
+        trail_timed=np.isfinite(trails.variance),
+        trail_cells=trail_cells,
+        trail_latest=trail_latest,
+        ids=ids,
+        position=position,
+        heading=heading,
+        curvature=curvature,
+        steps=steps,
+        most=NEAREST,
+        reach=reach,
+        length=STEP,
+        bend=_BEND,
+        turning=TURN,
+        prior=PRIOR,
+        agreement=AGREEMENT,
+    )
+    return Paths(np.arange(len(ids)), *found)
 
 
 _FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
@@ -314,12 +360,36 @@ def speed_prior(
 
     variance (k,) and probability `stationary` of objects without neighbours
     """
-    settings, sets = traffic.settings.speed_prior, (traffic.left, traffic.latest)
-    if settings.weight == 0 or len(label) == 0 or not any(map(len, sets)):
+    settings, left, latest = traffic.settings.speed_prior, traffic.left, traffic.latest
+    if settings.weight == 0 or len(label) == 0 or len(left) + len(latest) == 0:
         return SpeedPrior(np.full(len(label), stationary), np.zeros(len(label)), variance.copy())
-    of_left, of_latest, of_new = common_numbers(traffic.left.label, traffic.latest.label, label)
-    left, latest = traffic.left.speeds(of_left), traffic.latest.speeds(of_latest)
-    new = of_new, position, heading, variance
-    scales = settings.weight, settings.ahead_scale, settings.lateral_scale, HEADING_SCALE, SPREAD
-    limits = settings.max_speed_deviation**2, _FARTHEST
-    return SpeedPrior(*prior_of_traffic(*left, *latest, *new, stationary, *scales, *limits))
+    left_class, latest_class, new_class = common_numbers(left.label, latest.label, label)
+    found = prior_of_traffic(
+        left=left.id,
+        left_class=left_class,
+        left_position=left.position,
+        left_heading=left.heading,
+        left_speed=left.speed,
+        left_variance=left.variance,
+        left_stationary=left.stationary,
+        latest=latest.id,
+        latest_class=latest_class,
+        latest_position=latest.position,
+        latest_heading=latest.heading,
+        latest_speed=latest.speed,
+        latest_variance=latest.variance,
+        latest_stationary=latest.stationary,
+        new_class=new_class,
+        position=position,
+        heading=heading,
+        variance=variance,
+        stationary=stationary,
+        weight=settings.weight,
+        ahead_scale=settings.ahead_scale,
+        lateral_scale=settings.lateral_scale,
+        heading_scale=HEADING_SCALE,
+        spread=SPREAD,
+        most_variance=settings.max_speed_deviation**2,
+        farthest=_FARTHEST,
+    )
+    return SpeedPrior(*found)

@@ -275,7 +275,18 @@ class LanesAcross:
         width = np.array([lanes[k].width for k in kept.tolist()])
         box = np.array([[each.min(axis=0), each.max(axis=0)] for each in points]).reshape(-1, 2, 2)
         low, high = box[:, 0] - width[:, None], box[:, 1] + width[:, None]
-        return cls(Polylines.of(points), width, low, high, line, lane, at.s, at.e, at.direction, np.zeros(2))
+        return cls(
+            centre=Polylines.of(points),
+            width=width,
+            low=low,
+            high=high,
+            line=line,
+            lane=lane,
+            s=at.s,
+            e=at.e,
+            direction=at.direction,
+            origin=np.zeros(2),
+        )
 
     def placed(self, origin: FloatArray, moved: FloatArray, rows: IntArray) -> LanesAcross:
         """The lanes for vehicles in coordinates about `origin` (2,), with the lines moved by `moved` (lines, 2), m, and

@@ -196,7 +196,17 @@ def _checked(raw: RawTable) -> _Rows:
     ego = EgoColumns.of(raw)
     pose = _pose(raw, coordinates, ego is not None)
     detections = box_columns(raw, empty)
-    return _Rows(raw, scene, timestamp, raw.texts("sensor", "sensor"), coordinates, empty, detections, pose, ego)
+    return _Rows(
+        raw=raw,
+        scene=scene,
+        timestamp=timestamp,
+        sensor=raw.texts("sensor", "sensor"),
+        coordinates=coordinates,
+        empty=empty,
+        detections=detections,
+        pose=pose,
+        ego=ego,
+    )
 
 
 def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
@@ -321,15 +331,15 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
     labels = raw.texts("label", "object")
     detected = raw.present("x") if "x" in raw.columns else np.ones(raw.length, dtype=np.bool_)
     return TableSurvey(
-        raw,
-        replace(how, sort=how.sort or not in_order),
-        in_order or how.sort,
-        {name: _range(raw.numbers(name)) for name in SHOWN if name in raw.columns or _rotated(raw, name)},
-        {name: int((detected & (labels == name)).sum()) for name in np.unique(labels[detected]).tolist()},
-        _sizes(raw, labels, detected),
-        _times(ordered) if "timestamp" in raw.columns else (),
-        tuple(known.values()),
-        tuple(faults),
+        raw=raw,
+        how=replace(how, sort=how.sort or not in_order),
+        sorted=in_order or how.sort,
+        ranges={name: _range(raw.numbers(name)) for name in SHOWN if name in raw.columns or _rotated(raw, name)},
+        classes={name: int((detected & (labels == name)).sum()) for name in np.unique(labels[detected]).tolist()},
+        sizes=_sizes(raw, labels, detected),
+        times=_times(ordered) if "timestamp" in raw.columns else (),
+        doubts=tuple(known.values()),
+        faults=tuple(faults),
     )
 
 
@@ -371,6 +381,15 @@ def _times(raw: RawTable) -> tuple[SensorTimes, ...]:
             pauses = int((steps > GAP * usual).sum()) if len(steps) else 0
             longest = float(steps.max()) if len(steps) else np.nan
             found.append(
-                SensorTimes(name, each, len(moments), float(moments[0]), float(moments[-1]), usual, longest, pauses)
+                SensorTimes(
+                    scene=name,
+                    sensor=each,
+                    frames=len(moments),
+                    first=float(moments[0]),
+                    last=float(moments[-1]),
+                    step=usual,
+                    longest=longest,
+                    pauses=pauses,
+                )
             )
     return tuple(found)

@@ -210,7 +210,19 @@ class TrackRows(Columns):
         unknown, whole = np.full((n, 2, 2), np.nan), np.full(n, np.nan)
         P = unknown if position_covariance is None else position_covariance
         V = unknown if velocity_covariance is None else velocity_covariance
-        return cls(scene, timestamp, id_, boxes, score, P, V, whole, whole, np.full(n, "observed"), np.full(n, "low"))
+        return cls(
+            scene=scene,
+            timestamp=timestamp,
+            id=id_,
+            boxes=boxes,
+            score=score,
+            position_covariance=P,
+            velocity_covariance=V,
+            coasting=whole,
+            yaw_variance=whole,
+            source=np.full(n, "observed"),
+            quality=np.full(n, "low"),
+        )
 
 
 def read_tracks(
@@ -239,18 +251,18 @@ def _track_rows(raw: RawTable) -> TrackRows:
         row = int(np.argmax(np.isnan(timestamp)))
         raise raw.fault(row, f"{raw.title('timestamp')}: expected a number, got none")
     return TrackRows(
-        raw.texts("scene", raw.path.stem)[kept],
-        timestamp[kept],
-        raw.identities("id")[kept],
-        found.boxes.select(kept),
-        found.score[kept],
-        _covariance(raw, ("cov_xx", "cov_xy", "cov_yy"))[kept],
-        _covariance(raw, ("cov_vxvx", "cov_vxvy", "cov_vyvy"))[kept],
-        raw.numbers("coasting")[kept],
-        raw.numbers("yaw_variance")[kept],
-        raw.texts("source", "observed")[kept],
-        raw.texts("quality", "low")[kept],
-        "scene" in raw.columns,
+        scene=raw.texts("scene", raw.path.stem)[kept],
+        timestamp=timestamp[kept],
+        id=raw.identities("id")[kept],
+        boxes=found.boxes.select(kept),
+        score=found.score[kept],
+        position_covariance=_covariance(raw, ("cov_xx", "cov_xy", "cov_yy"))[kept],
+        velocity_covariance=_covariance(raw, ("cov_vxvx", "cov_vxvy", "cov_vyvy"))[kept],
+        coasting=raw.numbers("coasting")[kept],
+        yaw_variance=raw.numbers("yaw_variance")[kept],
+        source=raw.texts("source", "observed")[kept],
+        quality=raw.texts("quality", "low")[kept],
+        named="scene" in raw.columns,
     )
 
 

@@ -255,16 +255,18 @@ def autoware_rows(message: Any) -> ObjectRows:
         number = surest.label if surest is not None else 0
         found.objects.append(
             ObjectRow(
-                str(int.from_bytes(bytes(each.object_id.uuid)[-8:])) if hasattr(each, "object_id") else "",
-                AUTOWARE_CLASSES[number] if number < len(AUTOWARE_CLASSES) else str(number),
-                each.existence_probability,
-                xyz(pose.pose.position),
-                wxyz(pose.pose.orientation),
-                _autoware_size(each.shape),
-                xyz(twist.twist.linear) if getattr(motion, "has_twist", True) else (NAN, NAN, NAN),
-                pose.covariance if getattr(motion, "has_position_covariance", True) else NO_COVARIANCE,
-                twist.covariance if getattr(motion, "has_twist_covariance", True) else NO_COVARIANCE,
-                motion.orientation_availability != _UNAVAILABLE,
+                id=str(int.from_bytes(bytes(each.object_id.uuid)[-8:])) if hasattr(each, "object_id") else "",
+                label=AUTOWARE_CLASSES[number] if number < len(AUTOWARE_CLASSES) else str(number),
+                score=each.existence_probability,
+                position=xyz(pose.pose.position),
+                rotation=wxyz(pose.pose.orientation),
+                size=_autoware_size(each.shape),
+                velocity=xyz(twist.twist.linear) if getattr(motion, "has_twist", True) else (NAN, NAN, NAN),
+                covariance=pose.covariance if getattr(motion, "has_position_covariance", True) else NO_COVARIANCE,
+                velocity_covariance=twist.covariance
+                if getattr(motion, "has_twist_covariance", True)
+                else NO_COVARIANCE,
+                heading=motion.orientation_availability != _UNAVAILABLE,
             )
         )
     return found
@@ -399,15 +401,15 @@ def _scene_rows(message: Any) -> ObjectRows:
         text = each.texts[0].text if len(each.texts) else ""
         found.objects.append(
             ObjectRow(
-                facts.get("id", each.id),
-                next((facts[name] for name in _CLASS if name in facts), text),
-                _number(facts, k, next((name for name in _SCORE if name in facts), ""), 1.0),
-                xyz(solid.pose.position),
-                wxyz(solid.pose.orientation),
-                xyz(solid.size),
-                (_number(facts, k, "vx"), _number(facts, k, "vy"), 0.0),
-                _entries(*(_number(facts, k, name) for name in _POSITION)),
-                _entries(*(_number(facts, k, name) for name in _VELOCITY)),
+                id=facts.get("id", each.id),
+                label=next((facts[name] for name in _CLASS if name in facts), text),
+                score=_number(facts, k, next((name for name in _SCORE if name in facts), ""), 1.0),
+                position=xyz(solid.pose.position),
+                rotation=wxyz(solid.pose.orientation),
+                size=xyz(solid.size),
+                velocity=(_number(facts, k, "vx"), _number(facts, k, "vy"), 0.0),
+                covariance=_entries(*(_number(facts, k, name) for name in _POSITION)),
+                velocity_covariance=_entries(*(_number(facts, k, name) for name in _VELOCITY)),
             )
         )
     return found
