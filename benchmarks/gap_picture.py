@@ -69,7 +69,7 @@ def write_telling_picture(
     life = runs[0].life
     first, second = ([run for run in runs if (run.life, run.contender) == (life, c.name)] for c in contenders)
     recording, gap = telling_gap(second, first, situations)
-    labelled = LabelledScene.of(source.scene(recording), contenders[0].config.sensors)
+    labelled = LabelledScene.from_scene(source.scene(recording), contenders[0].config.sensors)
     together = [one for run in first if run.recording == recording for one in run.gaps if one.run == gap.run]
     drawn = {one.name: judged_run(labelled, together, one, life) for one in contenders}
     write_bytes(path, png(gap_picture(labelled, gap, drawn)))

@@ -180,7 +180,7 @@ def prepared(
     source: SceneSource, recording: str, settings: GapBenchSettings, sensors: Mapping[str, Sensor]
 ) -> tuple[LabelledScene, list[Gap]]:
     """A recording and its gaps."""
-    labelled = LabelledScene.of(source.scene(recording), sensors)
+    labelled = LabelledScene.from_scene(source.scene(recording), sensors)
     real = real_gaps(labelled) if settings.real else []
 
     def wanted(gap: Gap) -> bool:

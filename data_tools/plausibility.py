@@ -2,7 +2,7 @@
 
 Checks of detections, one function for each suspicion, over the arrays of a sample.
 
-Each returns a `Doubt` or None. Shares and numbers are such that none is raised by the recordings that come with tests.
+Each returns a `Finding` or None. Shares and numbers are such that recordings which come with tests raise none.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from saga_fg.types.frame import Frame
 
 __all__ = [
     "FILL_IN",
-    "Doubt",
+    "Finding",
     "Mend",
     "Sample",
     "days_taken_for_times",
-    "doubts_of",
     "ego_taken_for_world",
     "far_too_fast",
+    "findings_of",
     "frames_taken_for_seconds",
     "headings_in_degrees",
     "idle_lanes",
@@ -64,7 +64,7 @@ class Mend:
 
 
 @dataclass(frozen=True)
-class Doubt:
+class Finding:
     """One suspicion.
 
     kind      names it; each is told once
@@ -117,7 +117,7 @@ def usual_classes(names: Iterable[str], known: Collection[str]) -> dict[str, str
     return {name: ours for name, ours in found.items() if ours is not None and ours in known}
 
 
-def idle_rules(acting: Collection[str], classes: Collection[str]) -> Doubt | None:
+def idle_rules(acting: Collection[str], classes: Collection[str]) -> Finding | None:
     """Edge rules that act on classes (`acting`), none of which the objects have."""
     if not acting or not classes or set(acting) & set(classes):
         return None
@@ -127,16 +127,16 @@ def idle_rules(acting: Collection[str], classes: Collection[str]) -> Doubt | Non
         f"{', '.join(sorted(classes))}; objects are tracked one by one"
     )
     expected = "name the classes as the rules do, or the rules' `classes` as the data"
-    return Doubt("edges", what, expected, Mend(classes=meant))
+    return Finding("edges", what, expected, Mend(classes=meant))
 
 
-def idle_lanes() -> Doubt:
+def idle_lanes() -> Finding:
     """Lanes of `tracker.road_map` where neither a class nor an edge rule reads lanes."""
     what = "tracker.road_map.lanes: no class follows them (motion.course_time), and no rule of tracker.edges reads them"
-    return Doubt("lanes", what, "set course_time of a curvilinear motion, or add a rule such as in_lane")
+    return Finding("lanes", what, "set course_time of a curvilinear motion, or add a rule such as in_lane")
 
 
-def settings_without_data(where: str, set_up: Collection[str], there: Collection[str]) -> Doubt | None:
+def settings_without_data(where: str, set_up: Collection[str], there: Collection[str]) -> Finding | None:
     """Settings at `where` for classes or sensors (`set_up`) that the data lack, while they have others without any."""
     idle, plain = sorted(set(set_up) - set(there)), sorted(set(there) - set(set_up))
     if not idle or not plain:
@@ -144,7 +144,7 @@ def settings_without_data(where: str, set_up: Collection[str], there: Collection
     nearest = get_close_matches(idle[0].lower(), [name.lower() for name in plain], n=1, cutoff=0.6)
     hint = next((name for name in plain if name.lower() == nearest[0]), plain[0]) if nearest else plain[0]
     what = f"{where}.{idle[0]} has settings and the data have none of it; {', '.join(plain[:6])} have the default ones"
-    return Doubt(where, what, f"is {where}.{hint} meant?")
+    return Finding(where, what, f"is {where}.{hint} meant?")
 
 
 FEWEST = 20  # values that allow a judgement
@@ -155,17 +155,17 @@ _TRAVELLED = 3.0  # m of the vehicle, from which it shows what moves with it
 _PAIRS = 20  # pairs of frames that are compared
 
 
-def headings_in_degrees(yaw: FloatArray) -> Doubt | None:
+def headings_in_degrees(yaw: FloatArray) -> Finding | None:
     """Headings (n,), as they were given, of which many are beyond a full turn of 2 pi."""
     known = np.abs(yaw[np.isfinite(yaw)])
     share = _share(known > 2 * np.pi + 0.1)
     if len(known) < FEWEST or share < 0.05:
         return None
     what = f"headings look like degrees: {share:.0%} of them are beyond 2 pi, the largest is {known.max():.4g}"
-    return Doubt("degrees", what, "expected rad", Mend(units={"angle": "deg"}))
+    return Finding("degrees", what, "expected rad", Mend(units={"angle": "deg"}))
 
 
-def scores_beyond_one(score: FloatArray) -> Doubt | None:
+def scores_beyond_one(score: FloatArray) -> Finding | None:
     """Scores (n,), which should be shares, beyond 0 to 1: percent where none is negative, else logits."""
     share = _share((score < -1e-6) | (score > 1 + 1e-6))
     if len(score) < FEWEST or share < 0.01:
@@ -173,12 +173,12 @@ def scores_beyond_one(score: FloatArray) -> Doubt | None:
     low, high = float(score.min()), float(score.max())
     what = f"scores are not from 0 to 1: {share:.0%} of them are outside, from {low:.3g} to {high:.3g}; "
     if low >= 0 and 5 < high <= 100.5:
-        return Doubt("scores", what + "they look like percent", "expected 0 to 1", Mend(units={"score": "percent"}))
+        return Finding("scores", what + "they look like percent", "expected 0 to 1", Mend(units={"score": "percent"}))
     setting = "put `sensors: {default: {score: logit}}` into a file for --config"
-    return Doubt("scores", what + "they look like logits", setting)
+    return Finding("scores", what + "they look like logits", setting)
 
 
-def length_below_width(label: StrArray, size: FloatArray) -> Doubt | None:
+def length_below_width(label: StrArray, size: FloatArray) -> Finding | None:
     """Large boxes, sizes (n, 3), that are mostly wider than long; barriers are."""
     large = np.isfinite(size[:, :2]).all(axis=1) & (size[:, :2].max(axis=1) >= 2.5)
     large &= ~np.isin(label, [name for name in np.unique(label).tolist() if usual_class(name) == "barrier"])
@@ -187,10 +187,10 @@ def length_below_width(label: StrArray, size: FloatArray) -> Doubt | None:
         return None
     what = f"{_share(wide):.0%} of the large boxes are wider than long: length and width look exchanged"
     exchanged = Mend(columns={"length": "width", "width": "length"})
-    return Doubt("sides", what, "expected the length along the heading", exchanged)
+    return Finding("sides", what, "expected the length along the heading", exchanged)
 
 
-def unlikely_sizes(label: StrArray, size: FloatArray) -> Doubt | None:
+def unlikely_sizes(label: StrArray, size: FloatArray) -> Finding | None:
     """Lengths (of sizes (n, 3)) that no object has: other units than metres."""
     length, width = size[:, 0], size[:, 1]
     known = np.isfinite(length)
@@ -205,10 +205,10 @@ def unlikely_sizes(label: StrArray, size: FloatArray) -> Doubt | None:
     if not unit:
         return None
     what = f"objects have a usual length of {middle:.3g}: this looks like {unit}"
-    return Doubt("lengths", what, "expected metres", Mend(units={"length": unit}))
+    return Finding("lengths", what, "expected metres", Mend(units={"length": unit}))
 
 
-def within_a_metre(frame: IntArray, position: FloatArray) -> Doubt | None:
+def within_a_metre(frame: IntArray, position: FloatArray) -> Finding | None:
     """Positions (n, 3) of frames (n,) with several objects, all of them within a metre."""
     several = np.flatnonzero(np.bincount(frame, minlength=1) >= 3)
     mine = position[np.isin(frame, several), :2]
@@ -220,11 +220,11 @@ def within_a_metre(frame: IntArray, position: FloatArray) -> Doubt | None:
     what = f"all objects of all frames are within {spread:.2g} m: positions look like "
     middle = np.abs(np.median(mine, axis=0))
     if middle.max() > 5 and middle.min() <= 90 and middle.max() <= 180:
-        return Doubt("places", what + "degrees of latitude and longitude", "expected metres in a plane, such as UTM")
-    return Doubt("places", what + "km", "expected metres", Mend(units={"length": "km"}))
+        return Finding("places", what + "degrees of latitude and longitude", "expected metres in a plane, such as UTM")
+    return Finding("places", what + "km", "expected metres", Mend(units={"length": "km"}))
 
 
-def far_too_fast(label: StrArray, velocity: FloatArray) -> Doubt | None:
+def far_too_fast(label: StrArray, velocity: FloatArray) -> Finding | None:
     """Measured velocities (n, 2), of which many are beyond what the class can do."""
     names, of_row = np.unique(label, return_inverse=True)
     usual = [usual_class(name) for name in names.tolist()]
@@ -235,11 +235,11 @@ def far_too_fast(label: StrArray, velocity: FloatArray) -> Doubt | None:
         share = _share(mine > limits[k])
         if len(mine) >= FEWEST and share > 0.05:
             what = f"{share:.0%} of the velocities of {name} are above {limits[k]:g} m/s, up to {mine.max():.3g}"
-            return Doubt("speeds", f"{what}: they look like km/h", "expected m/s", Mend(units={"speed": "km/h"}))
+            return Finding("speeds", f"{what}: they look like km/h", "expected m/s", Mend(units={"speed": "km/h"}))
     return None
 
 
-def strange_time_steps(time: FloatArray, sensor: StrArray) -> Doubt | None:
+def strange_time_steps(time: FloatArray, sensor: StrArray) -> Finding | None:
     """Times (f,) of the frames of sensors (f,), s, which are mostly a thousand times too far apart, or too near."""
     steps = [np.diff(np.unique(time[sensor == name])) for name in np.unique(sensor).tolist()]
     step = np.concatenate([np.empty(0), *steps])
@@ -249,35 +249,35 @@ def strange_time_steps(time: FloatArray, sensor: StrArray) -> Doubt | None:
     if middle >= 20:
         unit = "ms" if middle < 2e4 else "us" if middle < 2e7 else "ns"
         what = f"frames are usually {middle:.4g} s apart: their times look like {unit}"
-        return Doubt("times", what, "expected seconds", Mend(units={"time": unit}))
+        return Finding("times", what, "expected seconds", Mend(units={"time": unit}))
     if middle <= 1e-4:
         what = f"frames are usually {middle:.1g} s apart: their times look like a coarser unit than seconds"
-        return Doubt("times", what, "expected seconds", Mend(units={"time": "s"}))
+        return Finding("times", what, "expected seconds", Mend(units={"time": "s"}))
     return None
 
 
-def frames_taken_for_seconds(column: str, time: FloatArray) -> Doubt | None:
+def frames_taken_for_seconds(column: str, time: FloatArray) -> Finding | None:
     """Times (n,) read as s from a column whose name is that of a count, and which are whole numbers."""
     words = set(re.findall(r"[a-z]+", column.lower()))
     known = np.unique(time[np.isfinite(time)])
     if not words & _COUNTS or len(known) < 3 or (known % 1).any():
         return None
     what = f"times are whole numbers of the column {column[:40]!r}: they look like frames, such as 10 a second"
-    return Doubt("frames", what, "expected seconds", Mend(units={"time": "10Hz"}))
+    return Finding("frames", what, "expected seconds", Mend(units={"time": "10Hz"}))
 
 
-def days_taken_for_times(time: FloatArray) -> Doubt | None:
+def days_taken_for_times(time: FloatArray) -> Finding | None:
     """Times (n,), s, of dates, all of which are of midnight."""
     known = time[np.isfinite(time)]
     if len(known) < 2 or (known % 86_400).any():
         return None
     what = "dates have no time of day: all rows of a day are one frame"
-    return Doubt("days", what, "expected a date and time for each frame")
+    return Finding("days", what, "expected a date and time for each frame")
 
 
 def ego_taken_for_world(
     frame: IntArray, position: FloatArray, world_T_ego: FloatArray, in_world: BoolArray, sensor: StrArray
-) -> Doubt | None:
+) -> Finding | None:
     """Positions (n, 3) of frames (n,) that are said to be in the world, and move with the vehicle.
 
     Either they lie about the origin and the vehicle is far from it; or objects stay nearer to where they were if they
@@ -285,7 +285,7 @@ def ego_taken_for_world(
     """
     from scipy.spatial import cKDTree
 
-    doubt = Doubt(
+    finding = Finding(
         "frame",
         "positions look like coordinates of the vehicle, but are taken for the world: they move with it",
         "expected world coordinates, or coordinates: ego",
@@ -298,7 +298,7 @@ def ego_taken_for_world(
     ego = world_T_ego[:, :2, 3]
     from_ego = np.hypot(*(position[rows, :2] - ego[frame[rows]]).T)
     if np.median(from_ego) > 300 and np.median(np.hypot(*position[rows, :2].T)) < 150:
-        return doubt
+        return finding
     as_given, as_placed = [], []
     for name in np.unique(sensor[posed]).tolist():
         mine = np.flatnonzero(posed & (sensor == name))
@@ -313,7 +313,7 @@ def ego_taken_for_world(
     if sum(map(len, as_given)) < FEWEST:
         return None
     given, placed_apart = float(np.median(np.concatenate(as_given))), float(np.median(np.concatenate(as_placed)))
-    return doubt if given > 1.0 and placed_apart < 0.5 * given else None
+    return finding if given > 1.0 and placed_apart < 0.5 * given else None
 
 
 def _share(mask: BoolArray) -> float:
@@ -340,7 +340,7 @@ class Sample:
     score: FloatArray
 
     @classmethod
-    def of(cls, frames: Sequence[Frame]) -> Self:
+    def from_frames(cls, frames: Sequence[Frame]) -> Self:
         """The first frames of a recording."""
         first = frames[:MOST_FRAMES]
         unknown = np.full((4, 4), np.nan)
@@ -356,7 +356,7 @@ class Sample:
         )
 
 
-def doubts_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: False) -> list[Doubt]:
+def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: False) -> list[Finding]:
     """All that is doubtful in a sample. `logits` says of which sensors the scores are declared as such."""
     boxes, label = sample.boxes, sample.boxes.label
     declared = {name: logits(name) for name in np.unique(sample.sensor).tolist()}
@@ -370,4 +370,4 @@ def doubts_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: Fal
         far_too_fast(label, boxes.velocity),
         ego_taken_for_world(sample.frame, boxes.position, sample.world_T_ego, sample.in_world, sample.sensor),
     )
-    return [doubt for doubt in found if doubt is not None]
+    return [finding for finding in found if finding is not None]

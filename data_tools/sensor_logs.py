@@ -82,7 +82,7 @@ def read_sensor_log(
     for number, row in rows:
         if len(row) != len(titles):
             raise InputError(f"{path}: line {number}: expected {len(titles)} columns, got {len(row)}")
-    table = TextTable.of(path, [row for _, row in rows], [number for number, _ in rows], len(titles))
+    table = TextTable.from_rows(path, [row for _, row in rows], [number for number, _ in rows], len(titles))
     numbers = table.numbers([found[name][0] for name in wanted], wanted)
     numbers = numbers * [_UNITS[name][found[name][1]] for name in wanted]
     backwards = np.flatnonzero(np.diff(numbers[:, 0]) <= 0)

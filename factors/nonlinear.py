@@ -148,7 +148,7 @@ class ResidualFactors:
     def errors(self, values: gtsam.Values, chosen: IntArray | None = None) -> FloatArray:
         """Return the cost rho(|| r_i ||) of each factor, (N,), or of the rows `chosen` (n,)."""
         distances = self._distances(self.residuals_at(self._filled(values, chosen)))
-        return _of(0.5 * distances**2 if self.robust is None else self.robust.cost(distances), chosen)
+        return _chosen_rows(0.5 * distances**2 if self.robust is None else self.robust.cost(distances), chosen)
 
     def error(self, values: gtsam.Values) -> float:
         """Return the cost of all together."""
@@ -170,7 +170,11 @@ class ResidualFactors:
         W = np.broadcast_to(self._whiteners, (len(self.rows), *self._whiteners.shape[1:]))
         if self.robust is not None:
             W = W * np.sqrt(self.robust.weight(self._distances(residuals)))[:, None, None]
-        return _of(W, chosen), [_of(J, chosen) for J in self.jacobians_at(states)], _of(residuals, chosen)
+        return (
+            _chosen_rows(W, chosen),
+            [_chosen_rows(J, chosen) for J in self.jacobians_at(states)],
+            _chosen_rows(residuals, chosen),
+        )
 
     def custom_factors(self, chosen: Iterable[int] | None = None) -> list[gtsam.CustomFactor]:
         """Return the factors, or some, for a GTSAM graph; each evaluates the whole stack.
@@ -295,7 +299,7 @@ def _column(values: gtsam.Values, keys_of_rows: KeyArray, variable: Variable) ->
     return column
 
 
-def _of(array: FloatArray, chosen: IntArray | None) -> FloatArray:
+def _chosen_rows(array: FloatArray, chosen: IntArray | None) -> FloatArray:
     return array if chosen is None else array[chosen]
 
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from data_tools.datasets.source import DatasetSource
 from data_tools.plausibility import (
-    Doubt,
+    Finding,
     Mend,
     Sample,
-    doubts_of,
+    findings_of,
     headings_in_degrees,
     idle_lanes,
     idle_rules,
@@ -71,11 +71,11 @@ class Checks:
 
     def see(self, scene: Scene) -> None:
         """Warn of what looks wrong in a scene, one of the first."""
-        sample = Sample.of(scene.frames)
+        sample = Sample.from_frames(scene.frames)
         self._note(sample)
         if self._judged < SCENES:
             self._judged += 1
-            self._tell(doubts_of(sample, self._logits))
+            self._tell(findings_of(sample, self._logits))
 
     def see_first(self, source: DatasetSource) -> None:
         """Look at the first part of recordings that are done elsewhere; what cannot be read is said there."""
@@ -83,7 +83,7 @@ class Checks:
             first = next(iter(there.parts))
             with first.opened() as part:
                 dataset = part.read()
-                self._tell(doubts_of(Sample.of(dataset.scene(dataset.scenes[0]).frames), self._logits))
+                self._tell(findings_of(Sample.from_frames(dataset.scene(dataset.scenes[0]).frames), self._logits))
 
     def add(self, classes: Iterable[str]) -> None:
         """Note classes of tracks."""
@@ -97,7 +97,7 @@ class Checks:
             found.append(settings_without_data("tracker.classes", set(classes) - {DEFAULT}, self._detected))
         if self._sensors and self._own_sensors - self._sensors:
             found.append(settings_without_data("sensors", set(sensors) - {DEFAULT}, self._sensors))
-        self._tell([doubt for doubt in found if doubt is not None])
+        self._tell([finding for finding in found if finding is not None])
 
     def watch(self, frame: Frame, yaw: FloatArray, tracks: Tracks) -> None:
         """Note a live frame, its headings (n,) as they were given and the tracks; judge after `FRAMES` with tracks."""
@@ -109,8 +109,8 @@ class Checks:
         self._tracked_frames += bool(len(tracks))
         if self._tracked_frames >= FRAMES or len(self._live) > 10 * FRAMES:
             self._tracked_frames = FRAMES
-            doubt = headings_in_degrees(np.concatenate(self._yaw))
-            self._tell([doubt] if doubt is not None else [])
+            finding = headings_in_degrees(np.concatenate(self._yaw))
+            self._tell([finding] if finding is not None else [])
             times = [frame.timestamp for frame in self._live]
             ordered = [self._live[row] for row in np.argsort(times, kind="stable").tolist()]
             self.see(Scene("live", np.empty(0), np.empty((0, 4, 4)), (), ordered))
@@ -137,14 +137,14 @@ class Checks:
     def _logits(self, sensor: str) -> bool:
         return sensor_model(self._settings.sensors, sensor).score == "logit"
 
-    def _tell(self, doubts: Iterable[Doubt]) -> None:
-        for doubt in doubts:
-            if doubt.kind not in self._told:
-                self._told.add(doubt.kind)
-                log.warning("%s", doubt.text("" if doubt.mend is None else self._option_for(doubt.mend)))
+    def _tell(self, findings: Iterable[Finding]) -> None:
+        for finding in findings:
+            if finding.kind not in self._told:
+                self._told.add(finding.kind)
+                log.warning("%s", finding.text("" if finding.mend is None else self._option_for(finding.mend)))
 
 
-def _without_effect(tracker: TrackerSettings, usual: TrackerSettings) -> Iterator[Doubt]:
+def _without_effect(tracker: TrackerSettings, usual: TrackerSettings) -> Iterator[Finding]:
     """Settings, other than the shipped ones, that the estimator does not have."""
     name, given = tracker.estimator, []
     has = estimator_parameters(name)
@@ -156,7 +156,7 @@ def _without_effect(tracker: TrackerSettings, usual: TrackerSettings) -> Iterato
         given.append(f"max_component: {tracker.max_component}")
     if given:
         what = f"tracker: {', '.join(given)}: without effect with estimator: {name}"
-        yield Doubt("estimator", what, "lag is of fixed-lag, tolerance and max_component are of kalman")
+        yield Finding("estimator", what, "lag is of fixed-lag, tolerance and max_component are of kalman")
 
 
 class CheckedDataset:

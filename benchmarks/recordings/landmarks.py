@@ -137,7 +137,7 @@ def _park(file: Path) -> LandmarkLog:
     empty = [tag for tag in _PARK if not rows[tag]]
     if empty:
         raise InputError(f"{file}: expected {empty[0]} records, there are none")
-    odometry, seen = (TextTable.of(file, list(found.values()), list(found)) for found in rows.values())
+    odometry, seen = (TextTable.from_rows(file, list(found.values()), list(found)) for found in rows.values())
     first, second = (odometry.integers(column, name, 0) for column, name in ((0, "i"), (1, "j")))
     broken = np.flatnonzero(first[1:] != second[:-1])
     if len(broken):

@@ -102,7 +102,7 @@ def _windows(root: Path) -> TextTable:
     if not found:
         raise InputError(f"{path}: expected rows, there are none")
     at = [there.index(name) for name in COLUMNS]
-    table = TextTable.of(path, [[row[k] for k in at] for row in found.values()], list(found))
+    table = TextTable.from_rows(path, [[row[k] for k in at] for row in found.values()], list(found))
     unnamed = (table.values[:, :3] == "").any(axis=1)
     if unnamed.any():
         raise table.fault(int(np.argmax(unnamed)), "scenario, id, type: expected a value")

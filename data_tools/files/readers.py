@@ -40,7 +40,7 @@ class TextTable:
     line: np.ndarray[tuple[int], np.dtype[np.int64]]
 
     @classmethod
-    def of(cls, path: Path, rows: list[list[str]], line: list[int], columns: int = 0) -> TextTable:
+    def from_rows(cls, path: Path, rows: list[list[str]], line: list[int], columns: int = 0) -> TextTable:
         """A table of rows; `columns` is how many there are where there is no row. Raises `InputError` for long values.
 
         NumPy stores all texts of an array with the width of the longest.
@@ -123,7 +123,7 @@ def read_table(
             raise InputError(f"{path}: line {number}: expected {expected} columns ({what}), got {len(row)}")
         rows.append(row)
         numbers.append(number)
-    return TextTable.of(path, rows, numbers, columns[0])
+    return TextTable.from_rows(path, rows, numbers, columns[0])
 
 
 def _number(text: str) -> float:

@@ -156,7 +156,7 @@ class Rows:
     identities: int
 
     @classmethod
-    def of(cls, scenes: Sequence[ScoredBoxes]) -> Rows:
+    def from_scenes(cls, scenes: Sequence[ScoredBoxes]) -> Rows:
         counts = [int(s.identity.max(initial=-1)) + 1 for s in scenes]
         offset = np.cumsum([0, *counts])
         joined = ScoredBoxes.concatenate(

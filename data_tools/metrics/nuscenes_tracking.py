@@ -108,7 +108,7 @@ def nuscenes_tracking_metrics(
     settings = settings or NuScenesTrackingSettings()
     class_range = dict(settings.class_range)
     true, found = (
-        Rows.of(
+        Rows.from_scenes(
             [
                 scored_boxes(getattr(scene, name), scene.ego_position, scene.racks, scene.timestamps, class_range)
                 for scene in scenes

@@ -122,7 +122,7 @@ def read_records(file: Path) -> tuple[dict[str, TextTable], list[int]]:
         rows, lines = found.setdefault(tag, ([], []))
         rows.append(row)
         lines.append(number)
-    return {tag: TextTable.of(file, rows, lines) for tag, (rows, lines) in found.items()}, fixed
+    return {tag: TextTable.from_rows(file, rows, lines) for tag, (rows, lines) in found.items()}, fixed
 
 
 def record_values(table: TextTable, record: Record) -> FloatArray:

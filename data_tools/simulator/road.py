@@ -188,7 +188,7 @@ class LaneOrder:
     vehicle: IntArray
 
     @classmethod
-    def of(cls, s: FloatArray, lanes: IntArray) -> LaneOrder:
+    def by_position(cls, s: FloatArray, lanes: IntArray) -> LaneOrder:
         """Sort vehicles by s (N,), m, in the lanes (N, 2) that each occupies: -1 for none, two during a change."""
         rows, columns = np.nonzero(lanes >= 0)
         key = lanes[rows, columns] * SPAN + s[rows]

@@ -97,7 +97,7 @@ class Traffic:
     def order(self) -> LaneOrder:
         """Lane order of the vehicles still on the road."""
         lanes = np.where(self.on_road[:, None], np.stack([self.lane, self._also_in()], axis=1), -1)
-        return LaneOrder.of(self.s, lanes)
+        return LaneOrder.by_position(self.s, lanes)
 
     def _also_in(self) -> IntArray:
         """Second lane (N,) that each vehicle occupies while it changes or is moved aside by cones, or -1."""

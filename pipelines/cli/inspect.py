@@ -18,7 +18,7 @@ from data_tools.datasets.detection_files.dataset import TableSurvey, survey_tabl
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_file, check_writable
 from data_tools.files.input_files import error_context
-from data_tools.plausibility import FILL_IN, Doubt, Mend, idle_rules, usual_classes
+from data_tools.plausibility import FILL_IN, Finding, Mend, idle_rules, usual_classes
 from pipelines.cli.console import JsonFile, counted
 from pipelines.cli.options import Verbose
 from pipelines.config import load_config
@@ -73,18 +73,18 @@ def inspect_table(
     survey = survey_table(table, given.over(base))
     _show_columns(survey)
     _show_times(survey)
-    doubts = (*survey.doubts, *_show_classes(survey))
-    typer.echo("\nWhat looks wrong:" if survey.faults or doubts or not survey.sorted else "\nNothing looks wrong.")
+    findings = (*survey.findings, *_show_classes(survey))
+    typer.echo("\nWhat looks wrong:" if survey.faults or findings or not survey.sorted else "\nNothing looks wrong.")
     for fault in survey.faults:
         typer.echo(f"  {fault}")
-    for doubt in doubts:
-        typer.echo(f"  {doubt.text(survey.how.option_for(doubt.mend, survey.raw.found.names))}")
+    for finding in findings:
+        typer.echo(f"  {finding.text(survey.how.option_for(finding.mend, survey.raw.found.names))}")
     if not survey.sorted:
         typer.echo("  rows are not in order of time; add --sort")
     if survey.raw.present("ego_x").any() and "coordinates" not in survey.raw.columns and not survey.how.coordinates:
         typer.echo("\nPositions are taken for world coordinates; if the vehicle is their origin: --coordinates ego")
     base_option = "" if import_file is None else f" --import {shlex.quote(str(import_file))}"
-    _show_next(survey, table, base_option + _mended(survey, doubts, given).options())
+    _show_next(survey, table, base_option + _mended(survey, findings, given).options())
 
 
 def _show_columns(survey: TableSurvey) -> None:
@@ -124,7 +124,7 @@ def _show_times(survey: TableSurvey) -> None:
         typer.echo(f"  ... {len(survey.times)} in all")
 
 
-def _show_classes(survey: TableSurvey) -> list[Doubt]:
+def _show_classes(survey: TableSurvey) -> list[Finding]:
     """List the classes; return what is doubtful about those that no edge rule acts on."""
     acting = acting_classes(load_config("file").tracker.edges)
     mapped = {name: survey.how.classes.get(name, name) for name in survey.classes}
@@ -142,12 +142,12 @@ def _show_classes(survey: TableSurvey) -> list[Doubt]:
     if idle is not None:
         return [idle]
     what = f"no edge rule acts on {', '.join(meant)}"
-    return [Doubt("edges", what, "name them as the rules do", Mend(classes=meant))] if meant else []
+    return [Finding("edges", what, "name them as the rules do", Mend(classes=meant))] if meant else []
 
 
-def _mended(survey: TableSurvey, doubts: Sequence[Doubt], given: TableImport) -> TableImport:
+def _mended(survey: TableSurvey, findings: Sequence[Finding], given: TableImport) -> TableImport:
     """The options that were given, with those that mend what looks wrong."""
-    mends = [doubt.mend for doubt in doubts if doubt.mend is not None]
+    mends = [finding.mend for finding in findings if finding.mend is not None]
     if survey.raw.clock.guessed:
         mends.insert(0, Mend(units={"time": survey.raw.clock.unit}))
     names, how, changed = survey.raw.found.names, survey.how, {"sort"}

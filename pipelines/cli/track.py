@@ -105,7 +105,7 @@ class Summary:
     classes: set[str] = field(default_factory=set)
     clocks: dict[str, Mapping[str, SensorTime]] = field(default_factory=dict)  # of the sensors, by scene
 
-    def of(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
+    def counting(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
         """Pass runs on and count them."""
         for run in runs:
             self.scenes += 1
@@ -182,7 +182,7 @@ def _track(
         scenes = dataset.scenes
         with progress_bar(len(scenes)) as progress, trackers(settings, method, scenes, kept) as new_tracker:
             looked_at = CheckedDataset(dataset, checks)
-            runs = summary.of(track_dataset(looked_at, new_tracker, progress=progress, horizons=horizons))
+            runs = summary.counting(track_dataset(looked_at, new_tracker, progress=progress, horizons=horizons))
             with keep_predictions(runs, output, horizons is not None) as kept_runs:
                 source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in kept_runs))
     summary.write_record(method, settings, source.kept())

@@ -174,7 +174,7 @@ def judged_on(
     """Runs of all contenders, whose sensors are the same, on recordings with made gaps, tracks kept alive."""
     runs: list[Run] = []
     for name, scene in scenes.items():
-        labelled = LabelledScene.of(scene, contenders[0].config.sensors)
+        labelled = LabelledScene.from_scene(scene, contenders[0].config.sensors)
         gaps = made_gaps(labelled, passes, seed)
         for contender in contenders:
             outcomes: dict[int, GapOutcome] = {}

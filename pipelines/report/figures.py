@@ -105,7 +105,7 @@ class _TrackSpans:
     boxes: FloatArray
     gaps: FloatArray
 
-    def of(self, label: str) -> _TrackSpans:
+    def of_class(self, label: str) -> _TrackSpans:
         rows = np.flatnonzero((self.label == label) | (label == "all"))
         return _TrackSpans(self.label[rows], self.seconds[rows], self.boxes[rows], self.gaps[rows])
 
@@ -120,7 +120,7 @@ class _Boxes:
     score: FloatArray
     unseen: FloatArray
 
-    def of(self, label: str) -> _Boxes:
+    def of_class(self, label: str) -> _Boxes:
         rows = np.flatnonzero((self.label == label) | (label == "all"))
         return _Boxes(*(column[rows] for column in vars(self).values()))
 
@@ -129,7 +129,10 @@ def track_figures(results: Sequence[SceneResult]) -> FigureTable:
     """Return a table with a row for each class."""
     lives, boxes = _track_spans(results), _boxes(results)
     classes = np.unique(lives.label).tolist()
-    rows = [_row(name, lives.of(name), boxes.of(name)) for name in (["all"] if len(classes) > 1 else []) + classes]
+    rows = [
+        _row(name, lives.of_class(name), boxes.of_class(name))
+        for name in (["all"] if len(classes) > 1 else []) + classes
+    ]
     return FigureTable(TITLE, COLUMNS, tuple(rows))
 
 
@@ -138,9 +141,9 @@ def track_charts(results: Sequence[SceneResult]) -> list[Chart]:
     lives, boxes = _track_spans(results), _boxes(results)
     classes = np.unique(lives.label).tolist()
     charts = [
-        distribution("Life of tracks", "s", "share of tracks below", [(c, lives.of(c).seconds) for c in classes]),
-        distribution("Speed", "m/s", "share of boxes below", [(c, _known(boxes.of(c).speed)) for c in classes]),
-        distribution("Score", "score", "share of boxes below", [(c, _known(boxes.of(c).score)) for c in classes]),
+        distribution("Life of tracks", "s", "share of tracks below", [(c, lives.of_class(c).seconds) for c in classes]),
+        distribution("Speed", "m/s", "share of boxes below", [(c, _known(boxes.of_class(c).speed)) for c in classes]),
+        distribution("Score", "score", "share of boxes below", [(c, _known(boxes.of_class(c).score)) for c in classes]),
     ]
     return [_counts(results), *(chart for chart in charts if chart.series)]
 

@@ -185,7 +185,7 @@ def scene_of_run(
         {name: np.concatenate([np.empty(0), *(t.coasting for t in run.tracks)]) for name, run in runs.items()},
         rules,
         sensors,
-        {name: PredictionRows.of(run.predictions) for name, run in runs.items() if run.predictions},
+        {name: PredictionRows.from_moments(run.predictions) for name, run in runs.items() if run.predictions},
     )
 
 

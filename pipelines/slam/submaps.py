@@ -161,7 +161,7 @@ def read_map(folder: str | Path) -> SlamMap:
     for number, row in lines[1:]:
         if len(row) != len(_COLUMNS):
             raise InputError(f"{path}: line {number}: expected {len(_COLUMNS)} columns, got {len(row)}")
-    table = TextTable.of(path, [row for _, row in lines[1:]], [number for number, _ in lines[1:]], len(_COLUMNS))
+    table = TextTable.from_rows(path, [row for _, row in lines[1:]], [number for number, _ in lines[1:]], len(_COLUMNS))
     numbers = table.numbers(slice(2, 9), _COLUMNS[2:])
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     off = np.abs(np.linalg.norm(numbers[:, 3:], axis=1) - 1)
@@ -183,6 +183,6 @@ def _read_origin(path: Path) -> Origin | None:
     lines = [line.split(",") for line in read_lines(path) if line.strip()]
     if len(lines) != 2 or tuple(lines[0]) != _ORIGIN or len(lines[1]) != len(_ORIGIN):
         raise InputError(f"{path}: expected a line of columns, {','.join(_ORIGIN)}, and a line of numbers")
-    table = TextTable.of(path, lines[1:], [2])
+    table = TextTable.from_rows(path, lines[1:], [2])
     latitude, longitude, altitude = table.numbers(slice(0, 3), _ORIGIN, (85.0, 180.0, 1e5))[0].tolist()
     return latitude, longitude, altitude

@@ -251,7 +251,7 @@ def first_line(road: RoadMap | None, route: FloatArray) -> StopLine | None:
     lines = road.stop_lines if road is not None else ()
     if not lines:
         return None
-    across = LanesAcross.of([Lane("route", tuple((x, y) for x, y in route.tolist()))], lines)
+    across = LanesAcross.from_lanes([Lane("route", tuple((x, y) for x, y in route.tolist()))], lines)
     ahead = np.flatnonzero((across.s >= 0) & (across.s <= LINE_REACH))
     return lines[across.line[ahead[np.argmin(across.s[ahead])]]] if len(ahead) else None
 

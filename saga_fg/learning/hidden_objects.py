@@ -334,7 +334,7 @@ def hidden_objects(
 
     longest  of the gaps, s. Raises `InputError` for a scene without ground truth.
     """
-    labels = LabelledObjects.of(scene)
+    labels = LabelledObjects.from_scene(scene)
     parts, moments, held = recorded_tracks(scene, tracker, sensors, labels)
     if not parts:
         return None
@@ -380,6 +380,6 @@ def _trails(parts: Sequence[RecordedTracks], moments: FloatArray) -> Passages:
     for part, time in zip(parts, moments, strict=True):
         now = Kinematics(part.mean[:, :2], part.mean[:, 2:4], part.P[:, :2, :2], part.P[:, 2:4, 2:4])
         moves = (part.table.last_detected >= -1e-6) & (np.hypot(*now.velocity.T) > MOVING)
-        found = Passages.of(part.table.id, part.table.label, now, part.table.box.yaw, moves, float(time))
+        found = Passages.from_tracks(part.table.id, part.table.label, now, part.table.box.yaw, moves, float(time))
         traffic.update(found.select(found.moves), float(time))
     return traffic.left

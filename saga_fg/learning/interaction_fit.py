@@ -90,7 +90,7 @@ class RuleParameters:
     bounds: tuple[tuple[float, float], ...]
 
     @classmethod
-    def of(cls, rules: Sequence[Rule]) -> Self:
+    def from_rules(cls, rules: Sequence[Rule]) -> Self:
         """All rates, widths and parameters of laws that are finite and above 0, clipped to their bounds."""
         names, values, bounds = [], [], []
         for k, rule in enumerate(rules):
@@ -152,7 +152,7 @@ def fit_interactions(
     if len(sample) == 0:
         raise InputError("sample: expected at least one object that is followed for long enough")
     occurring = set(np.unique(sample.label).tolist())
-    parameters = RuleParameters.of([rule for rule in template if occurring & set(rule.classes)])
+    parameters = RuleParameters.from_rules([rule for rule in template if occurring & set(rule.classes)])
     start = parameters.start
     sample = reached(sample, settings, parameters).sampled(most, seed=0)
     if len(sample) == 0:

@@ -54,13 +54,13 @@ class LabelledScene:
     boxes: tuple[Boxes, ...]
 
     @classmethod
-    def of(cls, scene: Scene, sensors: Mapping[str, Sensor]) -> LabelledScene:
+    def from_scene(cls, scene: Scene, sensors: Mapping[str, Sensor]) -> LabelledScene:
         """Raises `InputError` for a scene without ground truth or detections."""
         if scene.ground_truth is None or not scene.frames:
             missing = "detections" if scene.ground_truth is not None else "ground truth"
             raise InputError(f"scene {scene.name}: expected {missing} to find gaps in, there are none")
         truth = scene.ground_truth
-        objects = LabelledObjects.of(scene)
+        objects = LabelledObjects.from_scene(scene)
         rows = [np.searchsorted(objects.id, moment.id) for moment in truth]
         detected = np.zeros((len(truth), len(objects.id)), dtype=np.bool_)
         owners, found = [], []

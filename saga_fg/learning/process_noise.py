@@ -212,7 +212,7 @@ class CurvilinearLikelihood:
     gap_end: IntArray
 
     @classmethod
-    def of(cls, objects: Sequence[MeasuredTrajectory]) -> CurvilinearLikelihood:
+    def from_trajectories(cls, objects: Sequence[MeasuredTrajectory]) -> CurvilinearLikelihood:
         """Some objects, of which there is one at least."""
         order = sorted(objects, key=len, reverse=True)
         K, N = len(order[0]), len(order)
@@ -302,11 +302,11 @@ def fit_curvilinear(objects: Sequence[MeasuredTrajectory], start: Curvilinear) -
         return start
     pieces = [piece for one in useful for piece in one.pieces(LONGEST) if len(piece) >= 3]
     used = [pieces[k] for k in np.unique(np.linspace(0, len(pieces) - 1, MOST).astype(np.int64)).tolist()]
-    halves = [CurvilinearLikelihood.of(used[k::2]) for k in range(2)]
+    halves = [CurvilinearLikelihood.from_trajectories(used[k::2]) for k in range(2)]
     for learned, held_out in (halves, halves[::-1]):
         if held_out.loss(_most_likely(learned, start)) >= held_out.loss(start):
             return start
-    return _most_likely(CurvilinearLikelihood.of(used), start)
+    return _most_likely(CurvilinearLikelihood.from_trajectories(used), start)
 
 
 def fit_curvilinear_by_class(
@@ -366,7 +366,7 @@ def _predicted(
     turns = np.hypot(*mean[:, 2:4].T) > MOVING
     rate, variance, known = np.where(turns, rate, 0.0), np.where(turns, variance, 0.0), np.isfinite(turn.heading)
     heading = np.where(known, turn.heading, 0.0)
-    course = KnownCourses.of(node_type, rows, heading, rate, variance, mean, dt)
+    course = KnownCourses.from_turn_rates(node_type, rows, heading, rate, variance, mean, dt)
     F, b, Q = course.predicted(dt, np.ones(n))[1]
     F_own, Q_own = own_motion(node_type, dt)
     F, Q, b = (np.where(known.reshape(-1, *(1,) * (x.ndim - 1)), x, y) for x, y in ((F, F_own), (Q, Q_own), (b, 0.0)))

@@ -156,7 +156,7 @@ class KnownCourses(Columns):
     node_type: NodeType
 
     @classmethod
-    def of(
+    def from_turn_rates(
         cls,
         node_type: NodeType,
         ids: IntArray,

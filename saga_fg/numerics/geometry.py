@@ -197,7 +197,7 @@ class Polylines(NamedTuple):
     base: FloatArray
 
     @classmethod
-    def of(cls, lines: Sequence[FloatArray]) -> Self:
+    def from_points(cls, lines: Sequence[FloatArray]) -> Self:
         """Polylines (k, 2) of one piece at least, of points apart."""
         pieces = np.array([len(line) - 1 for line in lines], dtype=np.int64)
         first, total, length = np.cumsum(pieces) - pieces, int(pieces.sum()), np.empty(len(lines))
@@ -259,7 +259,7 @@ class Polylines(NamedTuple):
 
 def feet(polyline: FloatArray, places: FloatArray) -> Feet:
     """The feet on a polyline (k, 2) of places (m, 2); its first and last pieces run on straight."""
-    return Polylines.of([polyline]).feet(np.zeros(len(places), dtype=np.int64), places)
+    return Polylines.from_points([polyline]).feet(np.zeros(len(places), dtype=np.int64), places)
 
 
 def on_it(polyline: FloatArray, s: FloatArray) -> BoolArray:
@@ -269,7 +269,7 @@ def on_it(polyline: FloatArray, s: FloatArray) -> BoolArray:
 
 def direction_at(polyline: FloatArray, s: FloatArray) -> FloatArray:
     """Unit directions (m, 2) at distances s (m,) along a polyline (k, 2), turning evenly from piece to piece."""
-    return Polylines.of([polyline]).direction_at(np.zeros(len(s), dtype=np.int64), s)
+    return Polylines.from_points([polyline]).direction_at(np.zeros(len(s), dtype=np.int64), s)
 
 
 def _pieces(lines: FloatArray) -> tuple[FloatArray, ...]:

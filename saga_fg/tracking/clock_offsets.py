@@ -83,7 +83,9 @@ class SeenObjects:
     compared: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, sensor: str, stamp: float, label: StrArray, position: FloatArray, variance: FloatArray) -> SeenObjects:
+    def first_seen(
+        cls, sensor: str, stamp: float, label: StrArray, position: FloatArray, variance: FloatArray
+    ) -> SeenObjects:
         """Objects of which nothing is known from earlier frames."""
         k = len(label)
         unknown = np.full((k, 2), np.nan)
@@ -385,7 +387,7 @@ def compared(
     d = np.argsort(-measurements.probability, kind="stable")[:MOST_OBJECTS]
     R, boxes = measurements.R[d], measurements.boxes
     variance = (R[:, 0, 0] + R[:, 1, 1]) / 2
-    objects = SeenObjects.of(measurements.name, stamp, boxes.label[d], boxes.position[d, :2], variance)
+    objects = SeenObjects.first_seen(measurements.name, stamp, boxes.label[d], boxes.position[d, :2], variance)
     now = shared.with_frame(objects, clock.elapsed)
     if all(a.estimate is b.estimate for a, b in zip(shared.pairs, now.pairs, strict=False)):
         return clock, now

@@ -87,7 +87,7 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
             rate[led] = turn / turning_time(motion, dt)
         mean = state.joint.estimator.mean(table.id[rows])
         ids, unseen = table.id[rows], Unseen(settling, across, pull)
-        found.append(KnownCourses.of(node_type, ids, heading, rate, variance, mean, dt, unseen))
+        found.append(KnownCourses.from_turn_rates(node_type, ids, heading, rate, variance, mean, dt, unseen))
     if turn_time.any():
         table.turn.predict(dt, turn_time)
     return tuple(found), after

@@ -93,7 +93,7 @@ class TrackerView:
     running: SceneFactorGraph | None
 
     @classmethod
-    def of(
+    def from_state(
         cls,
         state: TrackerState,
         sensor: str,

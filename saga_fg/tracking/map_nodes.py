@@ -285,7 +285,7 @@ class Place:
     width: float
 
     @classmethod
-    def of(cls, element: Element) -> Place:
+    def from_element(cls, element: Element) -> Place:
         """The place of an element; a lane's middle is one of its points."""
         points = _points(element)
         middle = points[len(points) // 2] if isinstance(element, Lane) else points.mean(axis=0)
@@ -345,7 +345,7 @@ class MapNodes:
 
     def _add_nodes(self, new: Sequence[Element], deviation: float, origin: FloatArray, joint: JointTrackState) -> None:
         """Add elements of a map of this deviation, m."""
-        labels, places = [LABELS[type(each)] for each in new], tuple(map(Place.of, new))
+        labels, places = [LABELS[type(each)] for each in new], tuple(map(Place.from_element, new))
         lights = tuple(each.name if isinstance(each, TrafficLight) else getattr(each, "light", "") for each in new)
         ids = -np.arange(len(self) + 1, len(self) + len(new) + 1, dtype=np.int64)
         self.id, self.label = np.concatenate([self.id, ids]), np.concatenate([self.label, np.array(labels)])
@@ -369,7 +369,7 @@ class MapNodes:
         nodes = [known.get(self.name[k]) for k in (self.label == STOP_LINE).nonzero()[0].tolist()]
         lanes = [each for each in known.values() if isinstance(each, Lane)]
         lines = [each for each in nodes if isinstance(each, StopLine)]
-        self.across = LanesAcross.of(lanes, lines) if lines else None
+        self.across = LanesAcross.from_lanes(lanes, lines) if lines else None
 
     def predict(self, dt: float) -> None:
         """Predict the states of the lights by `dt` s."""

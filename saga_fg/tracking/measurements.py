@@ -175,7 +175,7 @@ class EgoNode:
     has_moved: bool = False
 
     @classmethod
-    def of(cls, settings: TrackerSettings) -> EgoNode:
+    def from_settings(cls, settings: TrackerSettings) -> EgoNode:
         """A node without a position."""
         label = "" if settings.ego is None else settings.ego.label
         return cls(settings.ego, class_settings(settings.classes, ClassSettings, label))
@@ -199,7 +199,7 @@ class EgoNode:
         """Measurements in the frame of a vehicle whose pose is estimated; None for measurements in the world."""
         if not self._estimated or frame.coordinates == "world" or frame.world_T_ego is None:
             return None
-        return RelativePositions.of(frame.world_T_ego, measurements.boxes.position, measurements.R[:, :2, :2])
+        return RelativePositions.from_world(frame.world_T_ego, measurements.boxes.position, measurements.R[:, :2, :2])
 
     def update(self, frame: Frame, time: float, origin: FloatArray, joint: JointTrackState) -> None:
         """Take in the vehicle's position at a frame of `time`, s; `origin` (2,) of local positions."""

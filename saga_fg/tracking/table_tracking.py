@@ -19,8 +19,8 @@ MANY = 0.01
 """Share of the values from which they are doubted."""
 
 
-def table_doubts(table: Table, settings: TrackerSettings, sensors: Mapping[str, Sensor]) -> Iterator[str]:
-    """Yield a line for each doubt, with what mends it; `saga_fg.track` has the columns and the arguments."""
+def table_findings(table: Table, settings: TrackerSettings, sensors: Mapping[str, Sensor]) -> Iterator[str]:
+    """Yield a line for each finding, with what mends it; `saga_fg.track` has the columns and the arguments."""
     sensor = texts(checked_table(table), "sensor", "sensor")
     shares = [name for name in np.unique(sensor).tolist() if sensor_model(sensors, name).score != "logit"]
     score = numbers(table, "score")
@@ -58,8 +58,8 @@ def track(
     """
     settings = TrackerSettings(min_hits=2) if settings is None else settings
     tracker = Tracker(settings, sensors)
-    for doubt in table_doubts(detections, settings, sensors or {}):
-        warnings.warn(doubt, stacklevel=2)
+    for finding in table_findings(detections, settings, sensors or {}):
+        warnings.warn(finding, stacklevel=2)
     found = [tracker.step(frame).table_columns() for frame in _frames(detections)]
     return new_table(found or [Tracks.empty(0.0).table_columns()])
 

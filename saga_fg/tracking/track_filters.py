@@ -118,7 +118,7 @@ class RelativePositions(Columns):
     R: FloatArray
 
     @classmethod
-    def of(cls, world_T_ego: FloatArray, position: FloatArray, R: FloatArray) -> RelativePositions:
+    def from_world(cls, world_T_ego: FloatArray, position: FloatArray, R: FloatArray) -> RelativePositions:
         """Transform positions (m, 3) and covariances (m, 2, 2) in the world into the frame of a pose."""
         turn = world_T_ego[:2, :2]
         return cls(transform_points(inverse_transform(world_T_ego), position), turn.T @ R @ turn)

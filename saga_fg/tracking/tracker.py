@@ -191,7 +191,7 @@ class Tracker:
 
     def _notify(self, stage: Stage, state: TrackerState, sensor: str, *results: Any) -> None:
         if self.observer is not None:
-            self.observer.after(stage, lambda: TrackerView.of(state, sensor, *results))
+            self.observer.after(stage, lambda: TrackerView.from_state(state, sensor, *results))
 
     def tracks(self, timestamp: float) -> Tracks:
         """The tracks predicted to `timestamp` (s), without taking anything in; the present ones for an earlier time.

@@ -111,7 +111,7 @@ class TrackerState:
         self.joint = JointTrackState(estimator, lambda label: motion_of(settings, label))
         self.table = TrackTable.empty()
         read = MAP_CLASSES if self.providers else classes_read(self.rules)
-        self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.of(settings)
+        self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.from_settings(settings)
         self.traffic = Traffic(settings.traffic)
 
     def __len__(self) -> int:

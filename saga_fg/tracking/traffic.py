@@ -110,7 +110,7 @@ class Passages(Columns):
     moves: BoolArray
 
     @classmethod
-    def of(
+    def from_tracks(
         cls,
         ids: IntArray,
         label: StrArray,

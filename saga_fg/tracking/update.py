@@ -63,7 +63,9 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
             there = now.select(t)
             there = there._replace(position=there.position + state.origin)
             still = table.stationarity.probability[t]
-            passing = Passages.of(table.id[t], table.label[t], there, table.box.yaw[t], moves[t], state.time, still)
+            passing = Passages.from_tracks(
+                table.id[t], table.label[t], there, table.box.yaw[t], moves[t], state.time, still
+            )
             state.traffic.update(passing, state.time)
 
 

@@ -134,7 +134,7 @@ class LabelledObjects:
     velocity: FloatArray
 
     @classmethod
-    def of(cls, scene: Scene) -> Self:
+    def from_scene(cls, scene: Scene) -> Self:
         """All objects of a scene. Raises `InputError` for one without ground truth."""
         if scene.ground_truth is None:
             raise InputError(f"scene {scene.name}: expected ground truth, there is none")

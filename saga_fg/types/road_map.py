@@ -259,12 +259,12 @@ class LanesAcross:
     origin: FloatArray
 
     @classmethod
-    def of(cls, lanes: Sequence[Lane], lines: Sequence[StopLine]) -> Self:
+    def from_lanes(cls, lanes: Sequence[Lane], lines: Sequence[StopLine]) -> Self:
         """A lane crosses a line in its direction of travel, between its ends; straight on before and after it."""
         ends = np.array([line.ends for line in lines]).reshape(-1, 2, 2)
         heading = np.array([line.heading for line in lines])
         line, lane = np.divmod(np.arange(len(lines) * len(lanes)), max(len(lanes), 1))
-        centre = Polylines.of([np.array(each.centre) for each in lanes])
+        centre = Polylines.from_points([np.array(each.centre) for each in lanes])
         at = centre.feet(lane, ends.mean(axis=1)[line])
         travel = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         half = np.hypot(*(ends[:, 0] - ends[:, 1]).T) / 2
@@ -276,7 +276,7 @@ class LanesAcross:
         box = np.array([[each.min(axis=0), each.max(axis=0)] for each in points]).reshape(-1, 2, 2)
         low, high = box[:, 0] - width[:, None], box[:, 1] + width[:, None]
         return cls(
-            centre=Polylines.of(points),
+            centre=Polylines.from_points(points),
             width=width,
             low=low,
             high=high,

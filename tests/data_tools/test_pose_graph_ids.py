@@ -61,5 +61,5 @@ def test_ids_beyond_are_located(tmp_path: Path) -> None:
 
 
 def test_whole_numbers_may_be_written_as_others() -> None:
-    table = TextTable.of(Path("table"), [["12"], ["12.0"], ["1.2e1"], ["9223372036854775807"]], [1, 2, 3, 4])
+    table = TextTable.from_rows(Path("table"), [["12"], ["12.0"], ["1.2e1"], ["9223372036854775807"]], [1, 2, 3, 4])
     assert table.integers(0, "id", 0, 2**63 - 1).tolist() == [12, 12, 12, 2**63 - 1]

@@ -63,4 +63,4 @@ SEEN = [k not in HIDDEN for k in range(len(TIMES))]
 
 
 def labelled(labels: Places, detections: Places) -> LabelledScene:
-    return LabelledScene.of(scene(labels, detections), {})
+    return LabelledScene.from_scene(scene(labels, detections), {})

@@ -17,7 +17,7 @@ from tests.pipelines.sampled_gaps import SHORT
 
 def test_made_gaps_hide_one_object_among_others() -> None:
     config = load_config("simulated")
-    traffic = LabelledScene.of(simulate_scene(SHORT, seed=4), config.sensors)
+    traffic = LabelledScene.from_scene(simulate_scene(SHORT, seed=4), config.sensors)
     gaps = made_gaps(traffic, passes=2, seed=0)
     assert gaps == made_gaps(traffic, passes=2, seed=0)
     assert {gap.run for gap in gaps} == {1, 2}
@@ -39,7 +39,7 @@ def test_made_gaps_hide_one_object_among_others() -> None:
                 assert np.hypot(*apart) >= SPACING
     frames = hidden(traffic, first)
     assert len(frames) == len(traffic.scene.frames)
-    without_them = LabelledScene.of(replace(traffic.scene, frames=frames), config.sensors)
+    without_them = LabelledScene.from_scene(replace(traffic.scene, frames=frames), config.sensors)
     for gap in first:
         inside = slice(gap.start + 1, gap.stop)
         assert not without_them.detected[inside, gap.row].any()

@@ -135,7 +135,7 @@ def test_predictions_of_ids_with_a_scene_belong_to_its_tracks(run):
     table = report.tracks["saga"]
     named = replace(table, id=np.array([f"scene-0001-{id_}" for id_ in table.id]))
     data = scene_data(replace(report, tracks={"saga": named}))["methods"]["saga"]
-    assert sum(map(len, data["predictions"])) == len(PredictionRows.of(run.predictions))
+    assert sum(map(len, data["predictions"])) == len(PredictionRows.from_moments(run.predictions))
 
 
 TRY = """

@@ -47,7 +47,7 @@ def labelled(
         found = Detections(detected, np.ones(len(detected)))
         frames.append(Frame(time, "lidar", found, road_map=road if k == 0 else None))
     poses = np.tile(np.eye(4), (len(TIMES), 1, 1))
-    return LabelledScene.of(Scene("drawn", TIMES, poses, ("",) * len(TIMES), frames, truth), {})
+    return LabelledScene.from_scene(Scene("drawn", TIMES, poses, ("",) * len(TIMES), frames, truth), {})
 
 
 def found(ways: Mapping[str, FloatArray], gap: Gap = GAP, **how: object) -> Mapping[float, frozenset[str]]:

@@ -130,7 +130,7 @@ def read_feather_tracks(path: Path, scenes: Mapping[str, Scene]) -> TrackRows:
     if all(name in rows for name in _VELOCITY):
         velocity = np.stack([rows[name] for name in _VELOCITY], axis=1).astype(np.float64)
         boxes = replace(boxes, velocity=velocity)
-    return TrackRows.of(log, time, rows["track_id"].astype(np.str_), boxes, rows["score"].astype(np.float64))
+    return TrackRows.from_columns(log, time, rows["track_id"].astype(np.str_), boxes, rows["score"].astype(np.float64))
 
 
 def track_categories(scene: Scene, moments: Sequence[Tracks]) -> dict[int, str]:

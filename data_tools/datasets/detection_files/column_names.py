@@ -93,7 +93,7 @@ class Clock:
         return numbers if self.unit == "s" else numbers / round(1 / FACTORS["time"][self.unit])
 
     @classmethod
-    def of(cls, numbers: FloatArray) -> Clock:
+    def fitting(cls, numbers: FloatArray) -> Clock:
         """The clock that fits times (n,), NaN where there is none: s, unless they are too large for it.
 
         Of the finer units, that of times since 1970, or the first in which frames are not apart by 10 s and more.

@@ -22,7 +22,13 @@ from data_tools.datasets.detection_files.column_names import (
     is_date,
     seconds_of_dates,
 )
-from data_tools.plausibility import FILL_IN, Doubt, days_taken_for_times, frames_taken_for_seconds, headings_in_degrees
+from data_tools.plausibility import (
+    FILL_IN,
+    Finding,
+    days_taken_for_times,
+    frames_taken_for_seconds,
+    headings_in_degrees,
+)
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
@@ -139,18 +145,18 @@ class RawTable:
             faults[tuple(commas)] = f"{self.where(row)}: {', '.join(commas)}: {got}"
         return faults
 
-    def doubts(self) -> list[Doubt]:
-        """Doubts about columns as they are given, which cannot be seen in frames."""
-        doubts = [headings_in_degrees(self.numbers("yaw"))]
+    def findings(self) -> list[Finding]:
+        """Findings about columns as they are given, which cannot be seen in frames."""
+        findings = [headings_in_degrees(self.numbers("yaw"))]
         if self.clock.unit == ISO:
-            doubts.append(days_taken_for_times(self.numbers("timestamp")))
+            findings.append(days_taken_for_times(self.numbers("timestamp")))
         if "timestamp" in self.columns and "time" not in self.how.units and self.clock.unit == "s":
-            doubts.append(frames_taken_for_seconds(self.found.names.get("timestamp", ""), self.numbers("timestamp")))
+            findings.append(frames_taken_for_seconds(self.found.names.get("timestamp", ""), self.numbers("timestamp")))
         command = self.argoverse_command()
         if command:
             what = "these are boxes of Argoverse 2, in the frame of the vehicle, and are taken for the world"
-            doubts.append(Doubt("argoverse2", what, f"read them with the poses of their logs: {command}"))
-        return [doubt for doubt in doubts if doubt is not None]
+            findings.append(Finding("argoverse2", what, f"read them with the poses of their logs: {command}"))
+        return [finding for finding in findings if finding is not None]
 
     def argoverse_command(self) -> str:
         """The command for a file in Argoverse's format without poses, "" for another."""
@@ -163,10 +169,10 @@ class RawTable:
             return f"saga-fg evaluate argoverse2 {name} --dataroot {FILL_IN}"
         return f"saga-fg track argoverse2 --dataroot {FILL_IN} --detections {name} --output tracks.feather"
 
-    def warn_of_doubts(self) -> None:
+    def warn_of_findings(self) -> None:
         """Warn of what is doubtful about columns as they are given."""
-        for doubt in self.doubts():
-            log.warning("%s: %s", self.path, doubt.text(self.how.option_for(doubt.mend, self.found.names)))
+        for finding in self.findings():
+            log.warning("%s: %s", self.path, finding.text(self.how.option_for(finding.mend, self.found.names)))
 
     def texts(self, name: str, default: str) -> StrArray:
         """A column (N,) of names; `default` where left out. A whole number is a name too, but in NumPy archives.
@@ -309,7 +315,7 @@ def clock_of(table: RawTable) -> Clock:
     if "timestamp" in table.found.units:
         return Clock(table.found.units["timestamp"])
     try:
-        return Clock.of(table.plain_numbers("timestamp"))
+        return Clock.fitting(table.plain_numbers("timestamp"))
     except (InputError, KeyError):  # named with its row, when the column is read
         return Clock()
 
@@ -330,7 +336,7 @@ class EgoColumns:
     gps: FloatArray
 
     @classmethod
-    def of(cls, raw: RawTable) -> EgoColumns | None:
+    def from_table(cls, raw: RawTable) -> EgoColumns | None:
         """Read those of a table, None where it has none. Raises `InputError` for a row with a part of them."""
         columns = []
         for names, least in ((ODOMETRY, 4), (GPS, 2)):

@@ -29,7 +29,7 @@ from data_tools.datasets.detection_files.columns import (
 )
 from data_tools.datasets.detection_files.formats import ROWS, Layout, read_raw_parts, read_raw_table, sorted_by_time
 from data_tools.files.input_files import error_context, unknown_name
-from data_tools.plausibility import Doubt, Sample, doubts_of
+from data_tools.plausibility import Finding, Sample, findings_of
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_transform
@@ -137,7 +137,7 @@ def read_detections(path: str | Path, how: TableImport | None = None) -> Detecti
     """
     raw = read_raw_table(Path(path), how=how)
     table = DetectionFile(raw)
-    raw.warn_of_doubts()
+    raw.warn_of_findings()
     return table
 
 
@@ -156,7 +156,7 @@ def read_scenes_in_parts(
     for table in read_raw_parts(Path(path), how=how, rows=rows):
         part = DetectionFile(table)
         if with_poses is None:
-            table.warn_of_doubts()
+            table.warn_of_findings()
         if with_poses not in (None, part.with_poses):
             raise InputError(f"{path}: {table.where(0)}: ego_x, ego_y, ego_yaw: expected in all rows or in none")
         with_poses = part.with_poses
@@ -193,7 +193,7 @@ def _checked(raw: RawTable) -> _Rows:
     if strange.any():
         row = int(np.argmax(strange))
         raise raw.fault(row, f"coordinates: expected world, ego or sensor, got {str(coordinates[row])!r}")
-    ego = EgoColumns.of(raw)
+    ego = EgoColumns.from_table(raw)
     pose = _pose(raw, coordinates, ego is not None)
     detections = box_columns(raw, empty)
     return _Rows(
@@ -287,7 +287,7 @@ class TableSurvey:
     classes   rows of each class, by the name in the file
     sizes     median length, width and height of each class, m
     times     of each sensor in each scene
-    doubts    about the table as it is read now
+    findings    about the table as it is read now
     faults    why it cannot be read as it is, a text each
     """
 
@@ -298,7 +298,7 @@ class TableSurvey:
     classes: Mapping[str, int]
     sizes: Mapping[str, FloatArray]
     times: tuple[SensorTimes, ...]
-    doubts: tuple[Doubt, ...]
+    findings: tuple[Finding, ...]
     faults: tuple[str, ...] = ()
 
     @property
@@ -318,16 +318,16 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
     scattered = raw.length > ROWS and np.count_nonzero(np.diff(of_scene)) > of_scene.max()
     in_order = not backwards.any() and not scattered  # longer tables are read in parts, a scene after the other
     ordered = raw if in_order else sorted_by_time(raw)
-    doubts = raw.doubts()
+    findings = raw.findings()
     if not faults:
         try:
             table = DetectionFile(replace(ordered, columns={k: v for k, v in ordered.columns.items() if k in COLUMNS}))
             for number, name in enumerate(table.scenes):
                 frames = table.scene(name).frames
-                doubts += doubts_of(Sample.of(frames)) if number < 3 else []
+                findings += findings_of(Sample.from_frames(frames)) if number < 3 else []
         except InputError as error:
             faults.append(str(error).removeprefix(f"{path}: "))
-    known = {doubt.kind: doubt for doubt in reversed(doubts)}
+    known = {finding.kind: finding for finding in reversed(findings)}
     labels = raw.texts("label", "object")
     detected = raw.present("x") if "x" in raw.columns else np.ones(raw.length, dtype=np.bool_)
     return TableSurvey(
@@ -338,7 +338,7 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
         classes={name: int((detected & (labels == name)).sum()) for name in np.unique(labels[detected]).tolist()},
         sizes=_sizes(raw, labels, detected),
         times=_times(ordered) if "timestamp" in raw.columns else (),
-        doubts=tuple(known.values()),
+        findings=tuple(known.values()),
         faults=tuple(faults),
     )
 

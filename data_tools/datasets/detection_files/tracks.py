@@ -195,7 +195,7 @@ class TrackRows(Columns):
     named: bool = True
 
     @classmethod
-    def of(
+    def from_columns(
         cls,
         scene: StrArray,
         timestamp: FloatArray,
@@ -245,7 +245,7 @@ def _track_rows(raw: RawTable) -> TrackRows:
     _, left_out = raw.labels()
     kept = np.flatnonzero(~left_out)
     found = box_columns(raw, left_out)
-    raw.warn_of_doubts()
+    raw.warn_of_findings()
     timestamp = raw.numbers("timestamp")
     if np.isnan(timestamp).any():
         row = int(np.argmax(np.isnan(timestamp)))
@@ -383,7 +383,7 @@ class PredictionRows(Columns):
     covariance: FloatArray
 
     @classmethod
-    def of(cls, moments: Sequence[PredictedTracks]) -> Self:
+    def from_moments(cls, moments: Sequence[PredictedTracks]) -> Self:
         """The rows of what was predicted at several moments."""
         none = np.empty(0)
         empty = cls(none, none, np.empty(0, dtype=np.str_), np.empty((0, 2)), np.empty((0, 2, 2)))

@@ -96,7 +96,7 @@ def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, 
             parts.append(found)
     n = [len(each.id) for each in parts]
     none = np.empty((0, 2, 2))
-    return TrackRows.of(
+    return TrackRows.from_columns(
         np.full(sum(n), scene.name),
         np.repeat([each.stamp / 1e9 for each in parts], n),
         np.concatenate([np.empty(0, dtype="<U1"), *(each.id for each in parts)]),

@@ -249,7 +249,7 @@ def test_every_alias_has_one_meaning() -> None:
 @given(st.sampled_from([unit for unit in FACTORS["time"] if unit != "s"]), st.floats(0.02, 2.0))
 def test_times_since_1970_are_known_in_any_unit(unit: str, step: float) -> None:
     times = (T0 + step * np.arange(20)) / FACTORS["time"][unit]
-    assert Clock.of(times).unit == unit
+    assert Clock.fitting(times).unit == unit
 
 
 def test_ways_of_reading_that_do_not_exist(subtests: pytest.Subtests) -> None:

@@ -1,4 +1,4 @@
-"""Each doubt: data that raise it, and data like it that must not."""
+"""Each finding: data that raise it, and data like it that must not."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import pytest
 
 from data_tools.datasets.detection_files import TableImport
 from data_tools.plausibility import (
-    Doubt,
+    Finding,
     Sample,
-    doubts_of,
     ego_taken_for_world,
     far_too_fast,
+    findings_of,
     headings_in_degrees,
     idle_rules,
     length_below_width,
@@ -30,8 +30,8 @@ RNG = np.random.default_rng(5)
 CARS = np.full(60, "car")
 
 
-def option(doubt: Doubt | None) -> str | None:
-    return None if doubt is None else TableImport().option_for(doubt.mend, {"length": "len", "width": "wid"})
+def option(finding: Finding | None) -> str | None:
+    return None if finding is None else TableImport().option_for(finding.mend, {"length": "len", "width": "wid"})
 
 
 def test_headings_in_degrees(subtests: pytest.Subtests) -> None:
@@ -58,9 +58,9 @@ def test_scores_beyond_one(subtests: pytest.Subtests) -> None:
         (np.full(5, 90.0), None),
     ]:
         with subtests.test(what):
-            doubt = scores_beyond_one(score)
-            assert (doubt is None) == (what is None)
-            assert doubt is None or f"look like {what}" in doubt.what
+            finding = scores_beyond_one(score)
+            assert (finding is None) == (what is None)
+            assert finding is None or f"look like {what}" in finding.what
 
 
 def test_length_below_width(subtests: pytest.Subtests) -> None:
@@ -73,8 +73,8 @@ def test_length_below_width(subtests: pytest.Subtests) -> None:
         ("car", (np.nan, np.nan, np.nan), False),
     ]:
         with subtests.test(label=label, size=size, found=found):
-            doubt = length_below_width(np.full(60, label), np.tile(size, (60, 1)))
-            assert option(doubt) == ("--columns length=wid,width=len" if found else None)
+            finding = length_below_width(np.full(60, label), np.tile(size, (60, 1)))
+            assert option(finding) == ("--columns length=wid,width=len" if found else None)
 
 
 def test_unlikely_sizes(subtests: pytest.Subtests) -> None:
@@ -97,9 +97,9 @@ def test_within_a_metre() -> None:
     frame = np.repeat(np.arange(20), 5)
     position = RNG.uniform(0, 100, (100, 3))
     assert within_a_metre(frame, position) is None
-    doubt = within_a_metre(frame, position / 1000)
-    assert doubt is not None
-    assert "look like km" in doubt.what
+    finding = within_a_metre(frame, position / 1000)
+    assert finding is not None
+    assert "look like km" in finding.what
     degrees = within_a_metre(frame, position / 1000 + [48.1, 11.6, 0.0])
     assert degrees is not None
     assert "degrees of latitude" in degrees.what
@@ -135,18 +135,18 @@ def test_strange_time_steps(subtests: pytest.Subtests) -> None:
         (10.0, None),
     ]:
         with subtests.test(step=step, found=found):
-            doubt = strange_time_steps(np.arange(20) * step, np.full(20, "lidar"))
-            assert (doubt is None) == (found is None)
+            finding = strange_time_steps(np.arange(20) * step, np.full(20, "lidar"))
+            assert (finding is None) == (found is None)
             if step != 5e5:
-                assert doubt is None or option(doubt) == f"--units time={found}"
+                assert finding is None or option(finding) == f"--units time={found}"
 
 
 def test_a_long_pause_is_no_strange_step() -> None:
     time = np.r_[np.arange(20) * 0.1, 500 + np.arange(20) * 0.1]
     assert strange_time_steps(time, np.full(40, "lidar")) is None
-    doubt = strange_time_steps(np.arange(20) * 1e-5, np.full(20, "lidar"))
-    assert doubt is not None
-    assert "coarser unit" in doubt.what
+    finding = strange_time_steps(np.arange(20) * 1e-5, np.full(20, "lidar"))
+    assert finding is not None
+    assert "coarser unit" in finding.what
 
 
 def drive(coordinates: str, start: float, speed: float = 10.0, traffic: float = 0.0) -> list[Frame]:
@@ -174,18 +174,18 @@ def test_ego_taken_for_world(subtests: pytest.Subtests) -> None:
         (drive("ego", 0.0, 0.0), False),  # nothing tells
     ]:
         with subtests.test(frames=frames, found=found):
-            s = Sample.of(frames)
-            doubt = ego_taken_for_world(s.frame, s.boxes.position, s.world_T_ego, s.in_world, s.sensor)
-            assert option(doubt) == ("--coordinates ego" if found else None)
+            s = Sample.from_frames(frames)
+            finding = ego_taken_for_world(s.frame, s.boxes.position, s.world_T_ego, s.in_world, s.sensor)
+            assert option(finding) == ("--coordinates ego" if found else None)
 
 
 def test_a_sample_has_all_doubts_and_none_where_scores_are_declared() -> None:
     frames = drive("world", 0.0)
-    assert doubts_of(Sample.of(frames)) == []
+    assert findings_of(Sample.from_frames(frames)) == []
     logits = [Frame(f.timestamp, "lidar", Detections(f.detections.boxes, np.full(30, -2.0))) for f in frames]
-    assert [doubt.kind for doubt in doubts_of(Sample.of(logits))] == ["scores"]
-    assert doubts_of(Sample.of(logits), lambda sensor: sensor == "lidar") == []
-    assert doubts_of(Sample.of([])) == []
+    assert [finding.kind for finding in findings_of(Sample.from_frames(logits))] == ["scores"]
+    assert findings_of(Sample.from_frames(logits), lambda sensor: sensor == "lidar") == []
+    assert findings_of(Sample.from_frames([])) == []
 
 
 def test_names_of_classes(subtests: pytest.Subtests) -> None:
@@ -210,9 +210,9 @@ def test_names_of_classes(subtests: pytest.Subtests) -> None:
 
 
 def test_rules_that_meet_no_class() -> None:
-    doubt = idle_rules({"car", "pedestrian"}, {"REGULAR_VEHICLE", "PERSON", "dog"})
-    assert doubt is not None
-    assert option(doubt) == "--classes PERSON=pedestrian,REGULAR_VEHICLE=car"
+    finding = idle_rules({"car", "pedestrian"}, {"REGULAR_VEHICLE", "PERSON", "dog"})
+    assert finding is not None
+    assert option(finding) == "--classes PERSON=pedestrian,REGULAR_VEHICLE=car"
     numbered = idle_rules({"car", "pedestrian"}, {"0", "1"})  # 1 may be the pedestrians
     assert option(numbered) == "--classes 0=...,1=..."
     assert numbered is not None
@@ -224,9 +224,9 @@ def test_rules_that_meet_no_class() -> None:
 
 
 def test_settings_without_data() -> None:
-    doubt = settings_without_data("tracker.classes", {"Pedestrian", "car"}, {"pedestrian", "car"})
-    assert doubt is not None
-    assert doubt.text() == (
+    finding = settings_without_data("tracker.classes", {"Pedestrian", "car"}, {"pedestrian", "car"})
+    assert finding is not None
+    assert finding.text() == (
         "tracker.classes.Pedestrian has settings and the data have none of it; pedestrian have the default ones; "
         "is tracker.classes.pedestrian meant?"
     )

@@ -87,7 +87,7 @@ def test_neighbours_are_those_of_a_plain_search(data: st.DataObject) -> None:
     lane = np.array(data.draw(st.lists(st.integers(0, 2), min_size=n, max_size=n)), dtype=np.int64)
     also = np.array(data.draw(st.lists(st.integers(-1, 2), min_size=n, max_size=n)), dtype=np.int64)
     also = np.where(also == lane, -1, also)
-    order = LaneOrder.of(s, np.stack([lane, also], axis=1))
+    order = LaneOrder.by_position(s, np.stack([lane, also], axis=1))
     target = np.array(data.draw(st.lists(st.integers(-1, 2), min_size=n, max_size=n)), dtype=np.int64)
     ahead, behind = order.ahead(target, s), order.behind(target, s)
     for i in range(n):

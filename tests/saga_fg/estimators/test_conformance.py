@@ -80,7 +80,7 @@ def with_courses(rng, operation):
     graph, dt = operation.transition.graph, operation.transition.dt
     ids = graph.nodes[[k for k, t in enumerate(graph.types) if t is VAN and rng.random() < 0.7]]
     heading, rate, variance = rng.normal(0, (2.0, 0.4, 0.1), (len(ids), 3)).T
-    record = KnownCourses.of(VAN, ids, heading, rate, variance**2, rng.normal(0, 2, (len(ids), 6)), dt)
+    record = KnownCourses.from_turn_rates(VAN, ids, heading, rate, variance**2, rng.normal(0, 2, (len(ids), 6)), dt)
     return Predict(discretise(dataclasses.replace(graph, motions=(record,)), dt))
 
 

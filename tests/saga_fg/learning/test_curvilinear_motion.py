@@ -27,7 +27,7 @@ def drawn(rng, motion, count, moments=60):
         seen = []
         for _ in range(moments):
             straight = np.array([heading]), np.zeros(1), np.zeros(1)
-            record = KnownCourses.of(car, np.array([0]), *straight, x[None], DT)
+            record = KnownCourses.from_turn_rates(car, np.array([0]), *straight, x[None], DT)
             step = discretise(replace(SceneGraph.of([0], car), motions=(record,)), DT)
             x = step.F_matrix @ x + step.b + rng.multivariate_normal(np.zeros(6), step.Q_matrix.toarray())
             seen.append(x[:2] + NOISE * rng.normal(size=2))
@@ -56,7 +56,7 @@ def test_without_headings_the_loss_is_that_of_one_textbook_filter_an_object(monk
             x = kalman_predict(x, step.F_matrix.toarray(), step.b, step.Q_matrix.toarray())
             x, log_density = kalman_update(x, one.position[k], H, one.R[k])
             densities.append(log_density + np.log(2 * np.pi))
-    assert CurvilinearLikelihood.of(objects).loss(TRUTH) == pytest.approx(-np.mean(densities), rel=1e-6)
+    assert CurvilinearLikelihood.from_trajectories(objects).loss(TRUTH) == pytest.approx(-np.mean(densities), rel=1e-6)
 
 
 def test_what_is_learned_is_near_the_truth_and_better_on_other_objects(monkeypatch):
@@ -64,7 +64,7 @@ def test_what_is_learned_is_near_the_truth_and_better_on_other_objects(monkeypat
     rng = np.random.default_rng(1)
     start = replace(TRUTH, acceleration_noise=3.0, jerk_noise=0.05)
     learned = fit_curvilinear(drawn(rng, TRUTH, 30, moments=40), start)
-    others = CurvilinearLikelihood.of(drawn(rng, TRUTH, 30, moments=40))
+    others = CurvilinearLikelihood.from_trajectories(drawn(rng, TRUTH, 30, moments=40))
     assert others.loss(learned) < (others.loss(start) + others.loss(TRUTH)) / 2
     assert TRUTH.acceleration_noise / 2 < learned.acceleration_noise < start.acceleration_noise / 1.5
 

@@ -93,7 +93,7 @@ def test_all_finite_rates_and_widths_of_rules_are_parameters():
         gap_scale: float = math.inf
         max_gap: float = 50.0
 
-    parameters = RuleParameters.of((FOLLOW, Ahead()))
+    parameters = RuleParameters.from_rules((FOLLOW, Ahead()))
     of_following = [(0, name) for name in ("rate", "gap_scale", "lateral_scale", "heading_scale")]
     assert parameters.names == (*of_following, (1, "rate"), (1, "path_scale"))
     np.testing.assert_allclose(np.exp(parameters.bounds[-1]), (0.2, 20.0))
@@ -115,7 +115,7 @@ def test_learning_from_nothing_is_an_error():
 
 def test_the_law_of_drivers_is_learned():
     driver = IntelligentDriver(headway=1.1, free_speed=20.0)
-    parameters = RuleParameters.of((Following(driver, rate=1.0, gap_scale=math.inf),))
+    parameters = RuleParameters.from_rules((Following(driver, rate=1.0, gap_scale=math.inf),))
     names = [name for _, name in parameters.names]
     laws = {
         f"interaction.{name}" for name in ("headway", "standstill_gap", "acceleration", "deceleration", "free_speed")

@@ -73,7 +73,7 @@ def test_no_place_beside_a_path_is_left_out(seed):
     none = np.zeros((1, len(places)))
     paths = Paths(np.array([0]), places[None], heading[None], none, none, *np.zeros((2, 1)))
     others = rng.uniform(-70, 70, (2000, 2))
-    at = Polylines.of(list(paths.position)).feet(np.zeros(2000, dtype=np.int64), others)
+    at = Polylines.from_points(list(paths.position)).feet(np.zeros(2000, dtype=np.int64), others)
     beside = (at.s > 0) & (np.abs(at.e) < 3.6)
     path, able = np.full(2001, -1), np.ones(2001, dtype=bool)
     path[0], follows, every = 0, ~able, np.concatenate([places[:1], others])

@@ -21,7 +21,9 @@ P, V, A = slice(0, 2), slice(2, 4), slice(4, 6)
 
 def course(node_type, heading=0.0, rate=0.0, rate_variance=0.0, mean=(0, 0, 8, 0, 0, 0), dt=0.4):
     angle, turn, variance = (np.array([float(value)]) for value in (heading, rate, rate_variance))
-    return KnownCourses.of(node_type, np.array([7]), angle, turn, variance, np.array([mean], dtype=float), dt)
+    return KnownCourses.from_turn_rates(
+        node_type, np.array([7]), angle, turn, variance, np.array([mean], dtype=float), dt
+    )
 
 
 def along(record, node_type=CAR):
@@ -138,7 +140,7 @@ def test_edges_act_on_the_velocity_of_turning_nodes():
 
 def test_some_nodes_are_selected():
     heading, rate, variance = np.arange(9.0).reshape(3, 3)
-    record = KnownCourses.of(CAR, np.array([1, 2, 3]), heading, rate, variance, np.zeros((3, 6)), 0.1)
+    record = KnownCourses.from_turn_rates(CAR, np.array([1, 2, 3]), heading, rate, variance, np.zeros((3, 6)), 0.1)
     chosen = record.select(np.array([2, 0]))
     assert chosen.ids.tolist() == [3, 1]
     assert chosen.rate.tolist() == [5.0, 3.0]
@@ -180,7 +182,7 @@ def test_an_uncertain_course_keeps_its_variance_across():
     quiet = NodeType("car", Curvilinear(acceleration_noise=0.0, lateral_acceleration_noise=0.0, jerk_noise=0.0))
     none, mean = np.zeros(1), np.array([[0, 0, speed, 0, 0, 0]])
     unseen = Unseen(np.array([k]), np.array([variance]), none)
-    record = KnownCourses.of(quiet, np.array([7]), none, none, none, mean, dt, unseen)
+    record = KnownCourses.from_turn_rates(quiet, np.array([7]), none, none, none, mean, dt, unseen)
     F, _, Q = own(record, dt, quiet)
     P_across = 0.0
     for _ in range(1000):
@@ -195,7 +197,13 @@ def test_an_acceleration_to_the_speed_of_traffic_acts_along_the_course(rate):
     quiet = NodeType("car", Curvilinear())
     none, mean = np.zeros(1), np.array([[0, 0, 8.0, 0, 0, 0]])
     with_it, without = (
-        own(KnownCourses.of(quiet, np.array([7]), none, none + rate, none, mean, dt, Unseen(none, none, p)), dt, quiet)
+        own(
+            KnownCourses.from_turn_rates(
+                quiet, np.array([7]), none, none + rate, none, mean, dt, Unseen(none, none, p)
+            ),
+            dt,
+            quiet,
+        )
         for p in (pull, none)
     )
     for a, b in ((with_it[0], without[0]), (with_it[2], without[2])):

@@ -191,7 +191,7 @@ def test_where_a_lane_ends_vehicles_go_straight_on_to_the_line():
     short = Lane("short", ((-10.0, 0.0), (5.0, 0.0)))
     before = Lane("before", ((-100.0, 0.2), (-10.0, 0.2)))
     for lanes in ((), (short,), (short, before)):
-        across = replace(LanesAcross.of(lanes, [line]), line=np.ones(len(lanes), dtype=np.int64))
+        across = replace(LanesAcross.from_lanes(lanes, [line]), line=np.ones(len(lanes), dtype=np.int64))
         assert RedLight().pairs(replace(nodes, lanes=across)).target.tolist() == [0]
 
 
@@ -226,7 +226,7 @@ def line_round_the_bend(*others):
     )
     left, right = (tuple(point) for point in with_line.outline[n + 2].tolist())
     mapped = Lane("lane", tuple(map(tuple, lane.tolist()))), StopLine("line", left, right, "light")
-    crossing = LanesAcross.of(mapped[:1], mapped[1:]).placed(np.zeros(2), np.zeros((1, 2)), np.array([n + 2]))
+    crossing = LanesAcross.from_lanes(mapped[:1], mapped[1:]).placed(np.zeros(2), np.zeros((1, 2)), np.array([n + 2]))
     return lane, replace(with_line, lanes=crossing)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, initiation
+from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, unresolved
 from tests.saga_fg.traffic_frames import NAN, run
 
 SIZES = {"motorcycle": (2.1, 0.8, 1.5), "pedestrian": (0.7, 0.7, 1.8)}
@@ -52,7 +52,7 @@ def counted_tracks(label, spacing, seed):
 @pytest.mark.parametrize(("label", "spacing"), [("motorcycle", 1.2), ("pedestrian", 1.3)])
 def test_in_a_crowd_most_second_boxes_make_no_track_that_counts(monkeypatch, label, spacing):
     excess = np.mean([counted_tracks(label, spacing, seed) for seed in range(5)])
-    monkeypatch.setattr(initiation, "OVERLAP", 2.0)
+    monkeypatch.setattr(unresolved, "OVERLAP", 2.0)
     without = np.mean([counted_tracks(label, spacing, seed) for seed in range(5)])
     assert excess < 0.8 * without, (excess, without)
 
@@ -113,8 +113,8 @@ def test_a_miss_counts_against_a_track_where_the_surer_one_is_detected():
     for k, seen in enumerate(([(0.0, 0.0)], [(0.0, 0.0)], [(0.0, 0.0)], [], [(0.0, 0.0), (0.7, 0.0)])):
         tracker.step(crowd_frame(1.1 + 0.1 * k, seen, 0.6))
         left.append(tracker._state.table.unresolved.tolist())
-    alone, most = initiation.ALONE, initiation.MOST_FRAMES
-    expected = [initiation.FRAMES + alone, most, most, most, most - 1]
+    alone, most = unresolved.ALONE, unresolved.MAX_FRAMES
+    expected = [unresolved.FRAMES + alone, most, most, most, most - 1]
     assert left == [[0.0, frames] for frames in expected]
 
 

@@ -21,7 +21,7 @@ def scene(truth: bool = True) -> Scene:
 
 
 def test_the_table_has_all_objects_at_all_moments():
-    objects = LabelledObjects.of(scene())
+    objects = LabelledObjects.from_scene(scene())
     assert objects.id.tolist() == ["a", "b"]
     assert objects.label.tolist() == ["bus", "car"]
     assert objects.length.tolist() == [4, 4]
@@ -31,7 +31,7 @@ def test_the_table_has_all_objects_at_all_moments():
 
 
 def test_places_between_labels_are_on_a_line_where_these_are_near():
-    objects = LabelledObjects.of(scene())
+    objects = LabelledObjects.from_scene(scene())
     np.testing.assert_allclose(objects.at(0.25)[1], [0.5, 0])
     np.testing.assert_allclose(objects.at(0.5)[1], [1, 0])
     np.testing.assert_allclose(objects.at(2.5)[0], [10, 3])
@@ -42,4 +42,4 @@ def test_places_between_labels_are_on_a_line_where_these_are_near():
 
 def test_a_scene_without_ground_truth_is_refused():
     with pytest.raises(InputError, match="scene s: expected ground truth"):
-        LabelledObjects.of(scene(truth=False))
+        LabelledObjects.from_scene(scene(truth=False))

@@ -24,7 +24,7 @@ def test_feet_on_many_polylines_are_those_on_each():
     lines = [np.cumsum(rng.uniform(0.5, 3.0, (k, 2)), axis=0) for k in (2, 7, 3)]
     places = rng.uniform(-3, 15, (60, 2))
     line = rng.integers(0, 3, 60)
-    found = Polylines.of(lines).feet(line, places)
+    found = Polylines.from_points(lines).feet(line, places)
     for k, each in enumerate(lines):
         mine = line == k
         for column, alone in zip(found, feet(each, places[mine]), strict=True):
@@ -47,7 +47,7 @@ def test_a_direction_turns_evenly_from_piece_to_piece():
 
 
 def test_lanes_that_cross_in_the_direction_of_travel_are_found():
-    across = LanesAcross.of((STRAIGHT, BACK, ASIDE), (LINE, FAR, NOWHERE))
+    across = LanesAcross.from_lanes((STRAIGHT, BACK, ASIDE), (LINE, FAR, NOWHERE))
     assert len(across.centre) == 2  # nothing crosses a line against its direction
     pairs = list(zip(across.line.tolist(), across.lane.tolist(), across.s.tolist(), strict=True))
     assert [pair[:2] for pair in pairs] == [(0, 0), (0, 1), (1, 0)]  # a lane runs on straight beyond its end
@@ -56,7 +56,7 @@ def test_lanes_that_cross_in_the_direction_of_travel_are_found():
 
 
 def test_a_line_that_was_moved_is_crossed_elsewhere():
-    across = LanesAcross.of((STRAIGHT,), (LINE, FAR))
+    across = LanesAcross.from_lanes((STRAIGHT,), (LINE, FAR))
     moved = across.placed(np.array([100.0, 0.0]), np.array([[2.0, 0.5], [0.0, 0.0]]), np.array([7, 9]))
     assert moved.line.tolist() == [7, 9]
     assert moved.s == pytest.approx([52, 250])
@@ -74,7 +74,7 @@ def test_a_line_that_was_moved_is_crossed_elsewhere():
 
 def test_there_may_be_nothing():
     for lanes, lines in (((), ()), ((STRAIGHT,), ()), ((), (LINE,))):
-        across = LanesAcross.of(lanes, lines)
+        across = LanesAcross.from_lanes(lanes, lines)
         assert len(across.line) == 0
         assert len(across.inside(np.zeros((3, 2)), np.zeros((3, 2))).vehicle) == 0
         assert len(across.crossings(np.array([0, 0]))[0]) == 0
