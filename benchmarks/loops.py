@@ -206,7 +206,7 @@ def graduated(graph: PoseGraph) -> tuple[FloatArray, BoolArray]:
     return poses, np.asarray(optimizer.getWeights())[1:] > 0.5
 
 
-_LEAST = 4  # poses, of which two are no neighbours, whichever is first
+_MIN_POSES = 4  # poses, of which two are no neighbours, whichever is first
 _REACH = 10.0  # m, largest coordinate of a false measurement
 
 
@@ -218,8 +218,8 @@ def with_false_loops(graph: PoseGraph, share: float, seed: int) -> PoseGraph:
     loops = np.flatnonzero(~trusted(graph))
     if not graph.poses_alone:
         raise InputError("expected a graph of poses alone, without landmarks and priors")
-    if not len(loops) or len(graph) < _LEAST:
-        raise InputError(f"expected {_LEAST} poses and a loop or more, got {len(graph)} and {len(loops)}")
+    if not len(loops) or len(graph) < _MIN_POSES:
+        raise InputError(f"expected {_MIN_POSES} poses and a loop or more, got {len(graph)} and {len(loops)}")
     if not 0 <= share < np.inf:
         raise InputError(f"share: expected a number >= 0, got {share:g}")
     rng = np.random.default_rng(seed)

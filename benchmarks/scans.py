@@ -256,7 +256,7 @@ class SimulatedScans:
 _OUTER, _WIDTH = (30.0, 20.0), 3.0  # m: the building, its corridor
 _PERIOD = 0.2  # s between scans
 _BIAS, _SPREAD = 0.006, 0.01  # rad per m that the wheels turn too far, and rad per root metre at random
-_NOTHING = 81.91  # m, what the laser says where it hits nothing
+_NO_RETURN = 81.91  # m, what the laser says where it hits nothing
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ def laser_drive(seed: int, rounds: float = 1.5, kind: LaserKind | None = None) -
 def write_carmen(path: str | Path, log: LaserLog) -> None:
     """Write a log as FLASER records."""
     lines = ["# message formats defined: PARAM SYNC ODOM FLASER"]
-    for time, ranges, pose in zip(log.time, np.nan_to_num(log.ranges, nan=_NOTHING), log.odometry, strict=True):
+    for time, ranges, pose in zip(log.time, np.nan_to_num(log.ranges, nan=_NO_RETURN), log.odometry, strict=True):
         at = " ".join(f"{value:.6f}" for value in pose)
         readings = " ".join(f"{r:.3f}" for r in ranges)
         lines.append(f"FLASER {len(ranges)} {readings} {at} {at} {time:.6f} nohost {time:.6f}")

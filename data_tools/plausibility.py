@@ -320,7 +320,7 @@ def _share(mask: BoolArray) -> float:
     return float(np.mean(mask)) if len(mask) else 0.0
 
 
-MOST_FRAMES = 200
+MAX_FRAMES = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,7 +342,7 @@ class Sample:
     @classmethod
     def from_frames(cls, frames: Sequence[Frame]) -> Self:
         """The first frames of a recording."""
-        first = frames[:MOST_FRAMES]
+        first = frames[:MAX_FRAMES]
         unknown = np.full((4, 4), np.nan)
         poses = [unknown if frame.world_T_ego is None else frame.world_T_ego for frame in first]
         return cls(

@@ -117,7 +117,7 @@ def _footprint(box: Boxes) -> FloatArray:
     return np.asarray(known.corners()[0])
 
 
-MOST_POINTS = 60_000  # of a map that are drawn, evenly chosen
+MAX_POINTS = 60_000  # of a map that are drawn, evenly chosen
 MARGIN = 30.0  # m around the paths
 
 
@@ -163,7 +163,7 @@ def scan_map_from_above(
     layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
     figure = new_figure(wide + 1.7, max(tall, 3.0) + 0.7, layout=layout)
     ax = figure.subplots()
-    chosen = points[:: max(1, len(points) // MOST_POINTS)]
+    chosen = points[:: max(1, len(points) // MAX_POINTS)]
     low, high = np.percentile(chosen[:, 2], [5, 95]) if len(chosen) else (0.0, 1.0)
     x, y, z = chosen.T
     dots = ax.scatter(x, y, c=z, s=1.2, cmap="viridis", vmin=low, vmax=high, linewidths=0)

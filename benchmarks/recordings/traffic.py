@@ -20,7 +20,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.types.road_map import RoadMap
 
 PERIOD = 0.1  # s between moments
-MOST_STATES = 20_000_000  # moments times vehicles of one recording
+MAX_STATES = 20_000_000  # moments times vehicles of one recording
 TRUCK_LENGTH = 7.0  # m, from which a vehicle recorded as a car is a truck
 HEIGHTS = {"car": 1.5, "truck": 3.2, "bus": 3.2, "motorcycle": 1.6, "bicycle": 1.7, "pedestrian": 1.7}
 """Assumed heights, m: the recordings have none, and what hides what depends on them."""
@@ -89,8 +89,8 @@ def on_grid(
     K, N = int(moment.max(initial=-1)) + 1, len(names)
     if K < 2:
         raise InputError(f"{name}: expected at least two moments, got {K}")
-    if K * N > MOST_STATES:
-        raise InputError(f"{name}: expected at most {MOST_STATES:.0e} moments times vehicles, got {K} times {N}")
+    if K * N > MAX_STATES:
+        raise InputError(f"{name}: expected at most {MAX_STATES:.0e} moments times vehicles, got {K} times {N}")
     cells, count = np.unique(moment * N + column, return_counts=True)
     if (count > 1).any():
         k, n = divmod(int(cells[np.argmax(count > 1)]), N)

@@ -35,7 +35,7 @@ RADAR_RATES = (5.0, 15.0, 20.0)
 NOISE = 0.2  # m
 JUMP = 10.0  # s; largest jump of a clock that jumps every second
 OBSERVATIONS = 200  # after which an offset is judged
-TRACKED, MOST_ERROR, MOST_RATIO, WITHIN = 0.99, 0.01, 1.05, 0.95  # to reach; the second in s
+TRACKED, MAX_ERROR, MAX_RATIO, WITHIN = 0.99, 0.01, 1.05, 0.95  # to reach; the second in s
 OBJECTS, REPETITIONS = 10, 10  # seen by all sensors; recordings of every steady offset
 OFFSETS = (0.05, 0.1, 0.3, 0.5, 1.0, 2.0)  # s, either way
 
@@ -194,7 +194,7 @@ def offset_shortcomings(row: Mapping[str, float]) -> list[str]:
     """One text for each figure that is out of bounds."""
     error, ratio = row["largest error, ms"], row["by that without an offset"]
     checks = {
-        f"estimate off by {error:.1f} ms, expected {1e3 * MOST_ERROR:g} ms": not error <= 1e3 * MOST_ERROR,
-        f"error of positions {ratio:.3f} times that without an offset": ratio > MOST_RATIO,
+        f"estimate off by {error:.1f} ms, expected {1e3 * MAX_ERROR:g} ms": not error <= 1e3 * MAX_ERROR,
+        f"error of positions {ratio:.3f} times that without an offset": ratio > MAX_RATIO,
     }
     return [text for text, wrong in checks.items() if wrong]

@@ -33,7 +33,7 @@ from pipelines.config import TrackConfig
 from pipelines.learning.gaps import Contender, Run, judged_on, situation_figures, situation_tables
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import MOST_GAPS, TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
+from saga_fg.learning import MAX_GAPS, TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
 from saga_fg.learning.gaps import LENGTHS
 from saga_fg.learning.hidden_objects import FOLLOWED, LONGEST
 from saga_fg.model.edge_rules import Following, Neighbours
@@ -62,7 +62,7 @@ class LearningSettings:
 
     passes: int = 2
     longest: float = LONGEST
-    most: int = MOST_GAPS
+    most: int = MAX_GAPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ def held_out_parts(scenes: Mapping[str, Scene]) -> tuple[dict[str, Scene], dict[
         return {name: scenes[name] for name in names[:half]}, {name: scenes[name] for name in names[half:]}
     (only,) = scenes.values()
     middle = len(only) // 2
-    return {only.name: _moments(only, slice(None, middle))}, {only.name: _moments(only, slice(middle, None))}
+    return {only.name: _part_of(only, slice(None, middle))}, {only.name: _part_of(only, slice(middle, None))}
 
 
 def coupled_classes(rules: Sequence[Rule]) -> list[tuple[str, ...]]:
@@ -252,7 +252,7 @@ def _errors(runs: Sequence[Run], group: Sequence[str]) -> list[Mapping[float, fl
     ]
 
 
-def _moments(scene: Scene, kept: slice) -> Scene:
+def _part_of(scene: Scene, kept: slice) -> Scene:
     """The moments of a scene, with the frames of their time."""
     time = scene.timestamps[kept]
     assert scene.ground_truth is not None

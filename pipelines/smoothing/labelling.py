@@ -193,7 +193,7 @@ def _sources(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -
 
 
 RESOLUTION = 5e-4  # m, of the sizes that are kept
-MOST_VALUES = 4096  # kept before equal ones are put together
+MAX_VALUES = 4096  # kept before equal ones are put together
 
 
 @dataclass(slots=True)
@@ -229,7 +229,7 @@ class ObjectSummary:
         known = np.isfinite(size).all(axis=1)
         for axis, values in enumerate(self.sizes):
             more = np.concatenate([values, np.stack([size[known, axis], weight[known]])], axis=1)
-            if more.shape[1] > MOST_VALUES:
+            if more.shape[1] > MAX_VALUES:
                 steps, index = np.unique(np.rint(more[0] / RESOLUTION), return_inverse=True)
                 more = np.stack([steps * RESOLUTION, np.bincount(index, more[1])])
             self.sizes[axis] = more

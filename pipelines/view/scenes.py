@@ -114,10 +114,10 @@ def draw_scene(view: SceneView) -> Iterator[Drawing]:
     if scans is not None:
         yield Drawing(f"{root}/ego", "lidar", Pose(scans.ego_T_lidar))
     points = () if scans is None else _scans(root, scans, start, view.spacing)
-    yield from in_order(_moments(view.report, origin, start), points, _graphs(view, origin, start))
+    yield from in_order(_drawn_moments(view.report, origin, start), points, _graphs(view, origin, start))
 
 
-def _moments(report: ReportScene, origin: FloatArray, start: float) -> Iterator[Drawing]:
+def _drawn_moments(report: ReportScene, origin: FloatArray, start: float) -> Iterator[Drawing]:
     scene, root = report.scene, report.scene.name
     detections, _ = latest_detections(scene, report.sensors)
     methods = {name: _Method(table, origin, report) for name, table in report.tracks.items()}

@@ -342,16 +342,16 @@ def biased_covariances(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: 
 
 @kernel("f1 f1 f1 f1 f1")
 def velocities_along(
-    yaw: FloatArray, speed: FloatArray, variance: FloatArray, any_way: FloatArray, lateral: FloatArray
+    yaw: FloatArray, speed: FloatArray, variance: FloatArray, isotropic: FloatArray, lateral: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Velocities (k, 2) of a `speed` (k,) ahead with its variance (k,), and their covariances (k, 2, 2).
 
-    Deviations (k,): `lateral` across a known yaw (k,), `any_way` where it is NaN, of a velocity that is 0 in the mean
+    Deviations (k,): `lateral` across a known yaw (k,), `isotropic` where it is NaN, of a velocity that is 0 in the mean
     """
     k = len(yaw)
     velocity, P = np.zeros((k, 2)), np.zeros((k, 2, 2))
     for t in range(k):
-        P[t, 0, 0] = P[t, 1, 1] = any_way[t] ** 2
+        P[t, 0, 0] = P[t, 1, 1] = isotropic[t] ** 2
         if math.isfinite(yaw[t]):
             c, s, across = math.cos(yaw[t]), math.sin(yaw[t]), lateral[t] ** 2
             along = variance[t] - across

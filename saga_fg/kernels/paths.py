@@ -59,7 +59,7 @@ def places_along(
         if p != known:
             known = p
             unwrapped(points, p, angle)
-        least, way, x, y, before, at, off = math.inf, 0.0, position[j, 0], position[j, 1], 0.0, 0.0, 0.0
+        least, reached, x, y, before, at, off = math.inf, 0.0, position[j, 0], position[j, 1], 0.0, 0.0, 0.0
         for s in range(m):
             tx, ty = points[p, s + 1, 0] - points[p, s, 0], points[p, s + 1, 1] - points[p, s, 1]
             length = math.sqrt(tx * tx + ty * ty)
@@ -75,8 +75,8 @@ def places_along(
                 least, at, off = dx * dx + dy * dy, before + along, tx * dy - ty * dx
             middle[s] = before + length / 2
             before += length
-        way, a = min(max(at, 0.0), before), -1
-        while a + 1 < m and middle[a + 1] <= way:
+        reached, a = min(max(at, 0.0), before), -1
+        while a + 1 < m and middle[a + 1] <= reached:
             a += 1
         b = min(a + 1, m - 1)
         a = max(a, 0)

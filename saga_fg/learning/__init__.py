@@ -2,7 +2,7 @@
 
 from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects, hidden_objects
 from saga_fg.learning.interaction_fit import (
-    MOST_GAPS,
+    MAX_GAPS,
     TEMPLATE,
     FittedInteractions,
     Rule,
@@ -31,7 +31,7 @@ from saga_fg.learning.trajectory_noise import DetectedTrajectory, fit_trajectory
 
 __all__ = [
     "GATE",
-    "MOST_GAPS",
+    "MAX_GAPS",
     "TEMPLATE",
     "DetectedTrajectory",
     "DetectionSample",

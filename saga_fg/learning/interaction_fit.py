@@ -56,8 +56,8 @@ TAILS = 3.0  # degrees of freedom of the innovations
 PLACE_DEVIATION = 0.1  # m, of labels
 FEWEST = 30  # places of a class; classes with fewer share a scale
 MOVED = 0.01  # m; edges that move a prediction by less do not reach it
-MOST_GAPS = 300  # a random sample to learn from; more only take longer
-LEAST_GAIN = 1e-3  # nats a place, of an iteration; what is left below it, the differences hardly resolve
+MAX_GAPS = 300  # a random sample to learn from; more only take longer
+MIN_GAIN = 1e-3  # nats a place, of an iteration; what is left below it, the differences hardly resolve
 
 ROAD_USERS = (*VEHICLES, "van", "tram", "cyclist")
 _LED = replace(traffic_rules()[0], classes=ROAD_USERS, information_gain=False)
@@ -138,7 +138,7 @@ def fit_interactions(
     template: Sequence[Rule] = TEMPLATE,
     iterations: int = 8,
     prior: float = PRIOR,
-    most: int = MOST_GAPS,
+    most: int = MAX_GAPS,
 ) -> FittedInteractions:
     """The most likely values of the template's rules, from gaps in recordings.
 
@@ -162,7 +162,7 @@ def fit_interactions(
         prediction = sample.predict(settings, parameters.valued(x))
         return negative_log_likelihood(sample, prediction) + prior * float(((x - start) ** 2).sum())
 
-    options = {"maxiter": iterations, "eps": 1e-3, "ftol": LEAST_GAIN}
+    options = {"maxiter": iterations, "eps": 1e-3, "ftol": MIN_GAIN}
     found = minimize(loss, start, method="L-BFGS-B", bounds=parameters.bounds, options=options)
     return FittedInteractions(parameters.valued(found.x), float(found.fun))
 

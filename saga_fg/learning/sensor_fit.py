@@ -36,7 +36,7 @@ PRIOR = NoiseModel(position=0.2, range_noise=0.005, bearing_noise=0.005, low_sco
 PRIOR_WIDTH = 1.0  # of the logarithms
 WRONG = 0.05  # share of wrong matches expected
 POSITION = ("position", "range_noise", "bearing_noise", "low_score_growth")
-LEAST = 1e-4  # smaller parameters count as zero
+MIN_PARAMETER = 1e-4  # smaller parameters count as zero
 NINE_IN_TEN = 1.6448536269514722  # standard deviations of a normal distribution
 FEWEST = 10  # errors, for a standard deviation
 
@@ -55,7 +55,7 @@ def fit_position_noise(
     """
     if len(along) == 0:
         raise InputError("along: expected at least one error")
-    start = np.log([max(getattr(prior, name), LEAST) for name in POSITION])
+    start = np.log([max(getattr(prior, name), MIN_PARAMETER) for name in POSITION])
     spread = 1 - probability
 
     odds = math.log(WRONG / (1 - WRONG))
@@ -73,7 +73,7 @@ def fit_position_noise(
         penalty = 0.5 * (((theta[:4] - start) / PRIOR_WIDTH) ** 2).sum() + 0.5 * (theta[4] - odds) ** 2
         return float(penalty - likelihood.sum()) / len(along)
 
-    bounds = [(math.log(LEAST), math.log(30.0))] * 4 + [(-7.0, 1.0)]
+    bounds = [(math.log(MIN_PARAMETER), math.log(30.0))] * 4 + [(-7.0, 1.0)]
     found = min(
         (
             minimize(cost, np.append(first, odds), method="L-BFGS-B", bounds=bounds)
@@ -102,7 +102,7 @@ def robust_deviation(errors: FloatArray) -> float:
 
 PRIOR_MEAN = np.array([0.0, 1.0])  # offset, slope
 PRIOR_PRECISION = np.array([1 / 1.5**2, 1.0])
-LEAST_SLOPE = 0.05  # a falling calibration is taken for one without information
+MIN_SLOPE = 0.05  # a falling calibration is taken for one without information
 
 
 def fit_score_calibration(
@@ -124,7 +124,7 @@ def fit_score_calibration(
         beta = beta + step * min(1.0, 2.0 / max(float(np.abs(step).max()), 1e-12))
         if np.abs(step).max() < 1e-9:
             break
-    return ScoreCalibration(slope=max(float(beta[1]), LEAST_SLOPE), offset=float(beta[0]))
+    return ScoreCalibration(slope=max(float(beta[1]), MIN_SLOPE), offset=float(beta[0]))
 
 
 FEWEST_CHANCES = 20  # to detect an object of a class, for a detection probability of its own

@@ -30,7 +30,7 @@ from scipy.optimize import minimize
 
 from saga_fg.learning.labelled_scene import DetectionSample, SampledDetections, SampledObjects
 from saga_fg.learning.process_noise import MeasuredTrajectory, innovation_likelihood
-from saga_fg.learning.sensor_fit import FEWEST, LEAST, PRIOR_WIDTH, robust_deviation
+from saga_fg.learning.sensor_fit import FEWEST, MIN_PARAMETER, PRIOR_WIDTH, robust_deviation
 from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Assignment
@@ -240,11 +240,11 @@ def fit_trajectory_noise(
         return R
 
     start = [
-        max(getattr(class_settings(models[name].noise, NoiseModel, label), part), LEAST)
+        max(getattr(class_settings(models[name].noise, NoiseModel, label), part), MIN_PARAMETER)
         for name in fitted
         for part in POSITION
     ]
-    start_logs = np.log([*start, max(acceleration_noise, LEAST)])
+    start_logs = np.log([*start, max(acceleration_noise, MIN_PARAMETER)])
 
     def cost(theta: FloatArray) -> float:
         q = float(np.exp(theta[-1]))
@@ -253,7 +253,7 @@ def fit_trajectory_noise(
         )
         return float(0.5 * (((theta - start_logs) / PRIOR_WIDTH) ** 2).sum() - likelihood) / len(time)
 
-    bounds = [(math.log(LEAST), math.log(30.0))] * (len(start_logs) - 1) + [(math.log(1e-3), math.log(1e2))]
+    bounds = [(math.log(MIN_PARAMETER), math.log(30.0))] * (len(start_logs) - 1) + [(math.log(1e-3), math.log(1e2))]
     first = np.maximum(start_logs, math.log(2e-3))  # a parameter near 0 has no slope to follow
     found = minimize(cost, first, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60}).x
     noise = {}

@@ -427,7 +427,7 @@ def _columns(nodes: NodeTable, information: bool) -> tuple[FloatArray, FloatArra
     return exists, moved, nodes.velocity_variance + (UNSEEN_ACCELERATION * nodes.unseen) ** 2, SPREAD
 
 
-_MOST_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
+_MAX_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
 E = TypeVar("E", Edges, NonlinearEdges)
 
 
@@ -482,7 +482,7 @@ def build_graph(
                     ends["given"] = law.given(nodes, t, s)
                     nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
                 total_rate += np.bincount(row[t], weights=rate[mine], minlength=len(total_rate))
-    scale = np.exp(-np.minimum(explained_noise * total_rate, _MOST_EXPLAINED))
+    scale = np.exp(-np.minimum(explained_noise * total_rate, _MAX_EXPLAINED))
     if noise_scale is not None:
         scale = scale * noise_scale
     parts = {"edges": tuple(groups), "diffusion_scale": scale, "nonlinear": tuple(nonlinear), "motions": motions}

@@ -10,12 +10,12 @@ heading of node i and R_ij the rotation from the heading of j to that of i:
     shared velocity    dv_i/dt += rate ( R_ij v_j - v_i ),  da_i/dt -= rate a_i  where a_i is of the state
     car-following      dv_i/dt += rate u_i ( u_j.v_j - u_i.v_i + ( s_ij - gap_ij - headway u_i.v_i ) / tau )
 
-s_ij is the way along the path of i, linearised at the estimate: it changes by
+s_ij is the distance along the path of i, linearised at the estimate: it changes by
 t_j.dp_j - u_i.dp_i, with t_j the direction of the path at j. On a straight path it is u_i.(p_j - p_i).
 
 Car-following is Helly's linear law (Helly 1959); its gap is that of the present estimate: it keeps the formation.
 
-Predicted paths of nodes: where others are along the way of a vehicle, and beside it.
+Predicted paths of nodes: where others are along the path of a vehicle, and beside it.
 
 A path is a polyline from the node on, and straight beyond both ends. A node without one goes straight along its
 heading.
@@ -243,8 +243,8 @@ class CarFollowing(Settings):
 
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
-        way = nodes.along(target, source)
-        t_j = unit(way.direction)
+        place = nodes.along(target, source)
+        t_j = unit(place.direction)
         along, onward = u_i[:, :, None] * u_i[:, None, :], u_i[:, :, None] * t_j[:, None, :]
         constant = -self.headway * (nodes.velocity[target] * u_i).sum(axis=1)
         constant += ((nodes.position[source] * t_j) - (nodes.position[target] * u_i)).sum(axis=1)

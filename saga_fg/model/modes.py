@@ -49,7 +49,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 
 _UNUSED_DEVIATION = 0.3  # standard deviation of a component, in its unit, while its mode does not use it
-_LEAST = 1e-12  # probability of a mode, and share of a variance that a measurement takes away
+_TINY = 1e-12  # probability of a mode, and share of a variance that a measurement takes away
 STOP_TIME = 0.1  # time constant with which the velocity fades, s
 
 
@@ -212,7 +212,7 @@ class ModeTable:
         distance = (innovation * np.linalg.solve(S, innovation[..., None])[..., 0]).sum(axis=-1)
         log_weight = np.log(self.weight[rows]) - (distance + np.linalg.slogdet(S)[1]) / 2
         weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
-        weight = np.maximum(weight / weight.sum(axis=1, keepdims=True), _LEAST)
+        weight = np.maximum(weight / weight.sum(axis=1, keepdims=True), _TINY)
         weight = weight / weight.sum(axis=1, keepdims=True)
         m = m + (np.swapaxes(gain_T, -1, -2) @ innovation[..., None])[..., 0]
         P = P - np.swapaxes(gain_T, -1, -2) @ S @ gain_T
@@ -279,7 +279,7 @@ def _equivalent(
     share, U = np.linalg.eigh(W @ later_P @ np.swapaxes(W, 1, 2))
     directions, axes = np.swapaxes(U, 1, 2) @ W, L @ U
     y = (directions @ (later - mean)[..., None])[..., 0]
-    informative = share < 1 - _LEAST
+    informative = share < 1 - _TINY
     rest = np.where(informative, 1 - share, 1.0)
     scale = np.where(informative, np.sqrt(rest / np.where(informative, share, 1.0)), 0.0)
     z = scale * (y / rest + (directions @ mean[..., None])[..., 0])

@@ -57,7 +57,7 @@ from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Tri
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 
-LEAST_GAP = 0.5  # m; smaller gaps are below their own noise
+MIN_GAP = 0.5  # m; smaller gaps are below their own noise
 MAX_DECELERATION = 6.0  # m/s^2, usual 4 to 8
 STOP_TIME = 0.4  # t_stop, s, with which the last of the speed fades
 HIDDEN_VEHICLE_GAP = 7.0  # m: a car that no sensor sees fits in, so that nobody speeds up into such a gap
@@ -98,7 +98,7 @@ class IntelligentDriver(Settings):
 
     def alone(self, v: FloatArray, s: FloatArray, w: FloatArray) -> Linearised:
         """f (E,) without an undetected vehicle in the gap; v, w >= 0 m/s, s m."""
-        a, T, s = self.acceleration, self.headway, np.maximum(s, LEAST_GAP)
+        a, T, s = self.acceleration, self.headway, np.maximum(s, MIN_GAP)
         root = 2 * math.sqrt(a * self.deceleration)
         dynamic = v * T + v * (v - w) / root
         share = (self.standstill_gap + np.maximum(dynamic, 0.0)) / s
@@ -139,11 +139,11 @@ class IntelligentDriver(Settings):
     def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
         u_i, u_j = (unit(nodes.heading[rows]) for rows in (target, source))
         v, w = speed_along(nodes, target, u_i), speed_along(nodes, source, u_j)
-        way = nodes.along(target, source)
-        f = self.following(v, way.ahead - (nodes.length[target] + nodes.length[source]) / 2, w)
+        place = nodes.along(target, source)
+        f = self.following(v, place.ahead - (nodes.length[target] + nodes.length[source]) / 2, w)
         at_rest = f._replace(value=f.value - f.by_leader * w)
         from_leader = u_i[:, :, None] * u_j[:, None, :] * f.by_leader[:, None, None]
-        along = Along(u_i, unit(way.direction), v)
+        along = Along(u_i, unit(place.direction), v)
         return accelerated(nodes, target, source, along, at_rest, from_leader)
 
 
@@ -301,7 +301,7 @@ def smooth_acceleration(driver: IntelligentDriver, v: FloatArray, s: FloatArray,
     root = 2 * np.sqrt(a * driver.deceleration)
     approach = v * driver.headway + v * (v - w) / root
     wanted = driver.standstill_gap + np.logaddexp(0.0, approach)
-    gap = LEAST_GAP + np.logaddexp(0.0, s - LEAST_GAP)
+    gap = MIN_GAP + np.logaddexp(0.0, s - MIN_GAP)
     share = wanted / gap
     by_approach = 2 * a * share / gap * expit(approach)
     G = a + MAX_DECELERATION
@@ -313,7 +313,7 @@ def smooth_acceleration(driver: IntelligentDriver, v: FloatArray, s: FloatArray,
     return Linearised(
         np.asarray(_HALT * np.logaddexp(0.0, above) - v / STOP_TIME),
         by_speed + (expit(above) - 1) / STOP_TIME,
-        slope * (-2 * a * share**2 / gap * expit(s - LEAST_GAP)),
+        slope * (-2 * a * share**2 / gap * expit(s - MIN_GAP)),
         slope * by_approach * -v / root,
     )
 

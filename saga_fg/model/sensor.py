@@ -87,7 +87,7 @@ class Extrinsics(Settings):
 
 
 MAX_MEASURED_SPEED = 150.0  # m/s; no road user is faster: measured velocities and range rates above are errors
-LEAST_PROBABILITY = 1e-3  # of a detection, and of its being none
+MIN_PROBABILITY = 1e-3  # of a detection, and of its being none
 _LARGEST_LOGIT = 50.0  # beyond, a probability is 0 or 1 to the last digit
 
 
@@ -179,7 +179,7 @@ class Sensor(Settings):
     def logit(self, score: FloatArray) -> FloatArray:
         """The logits (N,) of the detector's own scores, before calibration; of probabilities in [0.001, 0.999]."""
         if self.score == "probability":
-            p = np.asarray(score, dtype=np.float64).clip(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+            p = np.asarray(score, dtype=np.float64).clip(MIN_PROBABILITY, 1 - MIN_PROBABILITY)
             return np.asarray(np.log(p / (1 - p)))
         return np.asarray(score, dtype=np.float64).clip(-_LARGEST_LOGIT, _LARGEST_LOGIT)
 
@@ -191,7 +191,7 @@ class Sensor(Settings):
         """The probabilities (N,) of scores with these logits (N,) before calibration."""
         slope, offset = class_values(self.calibration, ScoreCalibration, label, "slope", "offset")
         p = 1 / (1 + np.exp(-(offset + slope * logit).clip(-50, 50)))
-        return np.asarray(p.clip(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY))
+        return np.asarray(p.clip(MIN_PROBABILITY, 1 - MIN_PROBABILITY))
 
     def detection_chance(self, label: StrArray) -> FloatArray:
         """(N,) chance that a visible object of each class in the field of view is detected."""

@@ -1,6 +1,6 @@
-"""Stop lines: the way of vehicles to them, stopping where they are closed, starting where they open.
+"""Stop lines: the distance of vehicles to them, stopping where they are closed, starting where they open.
 
-Approaches of vehicles to stop lines: the way along a lane of the map or straight ahead, and the first in each lane.
+Approaches of vehicles to stop lines: distances along a lane of the map or straight ahead, and the first in each lane.
 
 A vehicle approaches a line along a lane of the map that crosses the line, or else straight along its heading, as where
 a lane ends before the line.
@@ -9,8 +9,8 @@ A closed stop line brings the first vehicle to a halt, and through it the queue.
 
     dv_i/dt += rate u ( -v^2 / (2 g) ),    v = u.v_i,    g = u.(p_j - p_i) + bend - length_i / 2 - margin
 
-is the constant deceleration that ends at the line: v the speed along the lane, g the remaining way from the front of
-the vehicle to `margin` before the line, `bend` the extra length of the way along the lane over the straight one.
+is the constant deceleration that ends at the line: v the speed along the lane, g the remaining distance from the front
+of the vehicle to `margin` before the line, `bend` the extra length of the lane over the straight line.
 Linearised at the estimate (v0, g0):
 
     -v^2 / (2 g) ~ -v0^2 / (2 g0) - (v0 / g0) (v - v0) + v0^2 / (2 g0^2) (g - g0)
@@ -43,7 +43,7 @@ import numpy as np
 from saga_fg.model.edge_rules import VEHICLES, Pairs
 from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.model.nonlinear_interactions import (
-    LEAST_GAP,
+    MIN_GAP,
     Along,
     IntelligentDriver,
     Linearised,
@@ -65,18 +65,18 @@ START_RATE = 0.2  # 1/s; by it the first acceleration is 2 m/s^2
 
 
 class Approach(NamedTuple):
-    """E pairs of a vehicle and a stop line: whether it comes to it, the way to it (from the centre, along the lane),
-    m, the direction of the lane at the vehicle (E, 2), and where it will cross the line, m to the left of its middle.
+    """E pairs of a vehicle and a stop line: whether it comes to it, the distance to it from the centre, along the
+    lane, m, the direction of the lane at the vehicle (E, 2), and where it will cross the line, m left of its middle.
     """
 
     comes: BoolArray
-    way: FloatArray
+    distance: FloatArray
     direction: FloatArray
     crossing: FloatArray
 
     def select(self, rows: IntArray | BoolArray) -> Approach:
         """Some of the pairs."""
-        return Approach(self.comes[rows], self.way[rows], self.direction[rows], self.crossing[rows])
+        return Approach(self.comes[rows], self.distance[rows], self.direction[rows], self.crossing[rows])
 
 
 def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
@@ -97,12 +97,12 @@ def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
 def _approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
     offset = nodes.position[source] - nodes.position[target]
     u = unit(nodes.heading[target])
-    way = np.einsum("ei,ei->e", offset, u)
+    distance = np.einsum("ei,ei->e", offset, u)
     ends = _ends(nodes, source)
     aside = u[:, 0] * offset[:, 1] - u[:, 1] * offset[:, 0]  # of the line's middle, to the left of the vehicle's path
     aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4
-    comes = (np.abs(aside) < np.hypot(*(ends[:, 0] - ends[:, 1]).T) / 2) & aligned & (way > 0)
-    found = Approach(comes, way, u, -aside)
+    comes = (np.abs(aside) < np.hypot(*(ends[:, 0] - ends[:, 1]).T) / 2) & aligned & (distance > 0)
+    found = Approach(comes, distance, u, -aside)
     if nodes.lanes is not None:
         _follow_lanes(found, nodes, nodes.lanes, target, source)
     return found
@@ -120,13 +120,13 @@ def _follow_lanes(found: Approach, nodes: NodeTable, lanes: LanesAcross, target:
     order = np.lexsort((np.abs(at.e), row))
     nearest = order[np.unique(row[order], return_index=True)[1]]
     row, crossed, at = row[nearest], crossed[nearest], at.select(nearest)
-    found.way[row], found.crossing[row] = lanes.s[crossed] - at.s, at.e - lanes.e[crossed]
+    found.distance[row], found.crossing[row] = lanes.s[crossed] - at.s, at.e - lanes.e[crossed]
     found.direction[row], found.comes[row] = at.direction, lanes.s[crossed] > at.s
 
 
 class ComingVehicles(NamedTuple):
     """E pairs of a vehicle that comes to a stop line and the line (rows of a `NodeTable`), with the approach, the speed
-    along it, m/s, and the way left to the front of the vehicle, m, negative where it is past the line."""
+    along it, m/s, and the distance left to the front of the vehicle, m, negative where it is past the line."""
 
     target: IntArray
     source: IntArray
@@ -142,9 +142,9 @@ class ComingVehicles(NamedTuple):
 
     def first(self) -> ComingVehicles:
         """The first vehicle of each lane."""
-        crossing, way = self.approach.crossing, self.approach.way
+        crossing, distance = self.approach.crossing, self.approach.distance
         one_lane = (self.source[:, None] == self.source) & (np.abs(crossing[:, None] - crossing) < SIDE_BY_SIDE)
-        return self.select(~(one_lane & (way < way[:, None])).any(axis=1))
+        return self.select(~(one_lane & (distance < distance[:, None])).any(axis=1))
 
 
 def _ends(nodes: NodeTable, source: IntArray) -> FloatArray:
@@ -166,11 +166,11 @@ def coming_vehicles(nodes: NodeTable) -> ComingVehicles:
     """All vehicles that come to a line within `MAX_DISTANCE`; those that wait a little past it among them."""
     if "coming" not in nodes.derived:
         target, source = _near(nodes, MAX_DISTANCE)
-        ways = approach(nodes, target, source)
-        speed = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], ways.direction), 0.0)
-        front = ways.way - nodes.length[target] / 2
-        found = ComingVehicles(target, source, ways, speed, front)
-        nodes.derived["coming"] = found.select(ways.comes & (front > -PAST))
+        near = approach(nodes, target, source)
+        speed = np.maximum(np.einsum("ei,ei->e", nodes.velocity[target], near.direction), 0.0)
+        front = near.distance - nodes.length[target] / 2
+        found = ComingVehicles(target, source, near, speed, front)
+        nodes.derived["coming"] = found.select(near.comes & (front > -PAST))
     coming: ComingVehicles = nodes.derived["coming"]
     return coming
 
@@ -205,12 +205,12 @@ class Stopping(Settings):
         "distance left between the front of a stopped vehicle and the line, m; usual 1 to 5; higher: stops earlier",
     )
 
-    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
-        """g (E,), m, for ways (E,) from the centres to the line."""
-        return np.maximum(way - nodes.length[target] / 2 - self.margin, LEAST_GAP)
+    def gap(self, nodes: NodeTable, target: IntArray, distance: FloatArray) -> FloatArray:
+        """g (E,), m, for distances (E,) from the centres to the line."""
+        return np.maximum(distance - nodes.length[target] / 2 - self.margin, MIN_GAP)
 
     def law(self, v: FloatArray, g: FloatArray) -> Linearised:
-        """The deceleration (E,) at speeds and remaining ways g (E,)."""
+        """The deceleration (E,) at speeds and remaining distances g (E,)."""
         g = np.maximum(g, v**2 / (2 * MAX_DECELERATION))
         none = np.zeros_like(v)
         even = Linearised(-(v**2) / (2 * g), -v / g, v**2 / (2 * g**2), none)
@@ -229,9 +229,9 @@ class DriverStopping:
         IntelligentDriver, "parameters of the driver; its standstill gap is to the line"
     )
 
-    def gap(self, nodes: NodeTable, target: IntArray, way: FloatArray) -> FloatArray:
-        """Gap (E,), m, for ways (E,) from the centres to the line."""
-        return np.maximum(way - nodes.length[target] / 2, LEAST_GAP)
+    def gap(self, nodes: NodeTable, target: IntArray, distance: FloatArray) -> FloatArray:
+        """Gap (E,), m, for distances (E,) from the centres to the line."""
+        return np.maximum(distance - nodes.length[target] / 2, MIN_GAP)
 
     def law(self, v: FloatArray, g: FloatArray) -> Linearised:
         """The acceleration (E,) at speeds and gaps g (E,)."""
@@ -243,10 +243,10 @@ class DriverStopping:
 
 def _stopping(law: Stopping | DriverStopping, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
     """The triples of a law before lines."""
-    ways = approach(nodes, target, source)
-    v = speed_along(nodes, target, ways.direction)
-    f = law.law(v, law.gap(nodes, target, ways.way))
-    return accelerated(nodes, target, source, Along(ways.direction, ways.direction, v), f)
+    near = approach(nodes, target, source)
+    v = speed_along(nodes, target, near.direction)
+    f = law.law(v, law.gap(nodes, target, near.distance))
+    return accelerated(nodes, target, source, Along(near.direction, near.direction, v), f)
 
 
 @dataclass(frozen=True)
@@ -270,7 +270,7 @@ class RedLight(Settings):
 
     def brakes(self, nodes: NodeTable, coming: ComingVehicles) -> tuple[FloatArray, FloatArray]:
         """The probability that each driver brakes for a closed line (E,), and the acceleration then (E,), m/s^2."""
-        g = self.interaction.gap(nodes, coming.target, coming.approach.way)
+        g = self.interaction.gap(nodes, coming.target, coming.approach.distance)
         needed = coming.speed**2 / (2 * g) - self.reaction_deceleration
         ramp = np.clip(needed / max(self.full_deceleration - self.reaction_deceleration, 1e-9), 0.0, 1.0)
         ramp = np.where(halting(coming.speed, coming.front), 1.0, ramp)

@@ -23,7 +23,7 @@ from saga_fg.kernels.compilation import StrArray as StrArray
 from saga_fg.kernels.components import numbered_rows
 
 Values = Literal["finite", "finite-or-nan", "any"]
-_MOST = np.iinfo(np.int64).max
+_MAX_INT64 = np.iinfo(np.int64).max
 T = TypeVar("T")
 
 
@@ -123,7 +123,7 @@ def checked_rows(name: str, value: ArrayLike, length: int | None = None) -> IntA
     array = _listed(value)
     if array.size == 0:
         array = np.empty(0, dtype=np.int64)
-    if array.dtype.kind not in "iu" or array.ndim != 1 or (array.dtype.kind == "u" and (array > _MOST).any()):
+    if array.dtype.kind not in "iu" or array.ndim != 1 or (array.dtype.kind == "u" and (array > _MAX_INT64).any()):
         raise InputError(f"{name}: expected a list of integers, got {_short(value)}")
     if length is not None and len(array) != length:
         raise InputError(f"{name}: expected {length} entries, got {len(array)}")

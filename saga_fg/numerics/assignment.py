@@ -355,7 +355,7 @@ def _incumbent(track: IntArray, detection: IntArray, gain: FloatArray, C: FloatA
 
 
 PARTNERS = 4  # of each track, the most informative
-LEAST_INFORMATION = 1e-4  # nats; tracks with less mutual information are taken for independent
+MIN_INFORMATION = 1e-4  # nats; tracks with less mutual information are taken for independent
 
 
 class CrossCovariances(NamedTuple):
@@ -405,7 +405,7 @@ def tree_edges(track: IntArray, whitening: FloatArray, cross: CrossCovariances) 
     i, j, C = i[there], j[there], C[there]
     U = whitening[row[i]] @ C @ np.swapaxes(whitening[row[j]], 1, 2)
     information = -0.5 * np.log(_determinant(np.eye(2) - U @ np.swapaxes(U, 1, 2)))
-    kept = np.flatnonzero(information > LEAST_INFORMATION)
+    kept = np.flatnonzero(information > MIN_INFORMATION)
     mutual = information[kept]
     strongest = _strongest(np.concatenate([i[kept], j[kept]]), np.concatenate([mutual, mutual]))
     kept = kept[np.unique(strongest % max(len(kept), 1))]

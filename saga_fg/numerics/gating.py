@@ -2,7 +2,7 @@
 
 Pairs of places that are near each other, from a k-d tree where there are many.
 
-Up to `MOST_COMPARED` distances are compared by a kernel, which is faster. Beyond, rows whose reach differs by less than
+Up to `MAX_COMPARED` distances are compared by a kernel, which is faster. Beyond, rows whose reach differs by less than
 a factor of two are searched together, so that a few far-reaching ones do not widen the search of all others.
 
 Quantiles of the chi-square distribution: gates, and ellipses that hold a given share.
@@ -19,8 +19,8 @@ from scipy.special import gammaincinv
 from saga_fg.kernels.pairs import compared_pairs
 from saga_fg.numerics.arrays import FloatArray, IntArray
 
-MOST_COMPARED = 500_000  # distances that the kernel compares
-_LEAST = 1e-9  # m, so that a reach of 0 has a logarithm
+MAX_COMPARED = 500_000  # distances that the kernel compares
+_MIN_REACH = 1e-9  # m, so that a reach of 0 has a logarithm
 
 
 def near_pairs(
@@ -35,7 +35,7 @@ def near_pairs(
 
 
 def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
-    if len(a) * len(b) <= MOST_COMPARED:
+    if len(a) * len(b) <= MAX_COMPARED:
         return compared_pairs(a, b, reach, further)
     i, j = (~np.isnan(reach)).nonzero()[0], (~np.isnan(further)).nonzero()[0]
     if len(i) == 0 or len(j) == 0:
@@ -45,7 +45,7 @@ def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatA
     all_i, all_j = compared_pairs(a[i[~bounded]], b[j], reach[i[~bounded]], further[j])
     found, tree = [i[~bounded][all_i] * len(b) + j[all_j]], cKDTree(b[j])
     i, widest = i[bounded], widest[bounded]
-    octave = np.ceil(np.log2(np.maximum(widest, _LEAST)))
+    octave = np.ceil(np.log2(np.maximum(widest, _MIN_REACH)))
     for level in np.unique(octave).tolist():
         alike = (octave == level).nonzero()[0]
         radius = float(widest[alike].max()) * (1 + 1e-9)

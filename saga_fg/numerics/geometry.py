@@ -179,7 +179,7 @@ class Feet(NamedTuple):
 class Polylines(NamedTuple):
     """L polylines as S pieces, one line after the other.
 
-    start (S, 2), m, and unit direction t (S, 2) of each piece; low, high (S,): bounds of the way along it, m, infinite
+    start (S, 2), m, and unit direction t (S, 2) of each piece; low, high (S,): bounds of the distance along it, m, inf
     at both ends of a line; before (S,): length of the line before it, m; middle (S,): s of its middle; angle (S,), rad,
     without jumps; first (L,), pieces (L,): its pieces; length (L,), m; base (L,) of keys s + base that sort all pieces
     """

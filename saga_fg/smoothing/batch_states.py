@@ -184,9 +184,9 @@ def _drift(evidence: Evidence, rows: IntArray) -> float:
 
 MIN_STATIONARY = 1.0  # shortest stationary interval, s
 LONG_RECORDING = 120.0  # s from which it is smoothed in windows
-MOST_JOINT = 64  # objects that are smoothed jointly: their covariance takes half a megabyte
+MAX_JOINT = 64  # objects that are smoothed jointly: their covariance takes half a megabyte
 UNKNOWN_POSITION = 100.0  # standard deviation of a position at the first moment of an object, m
-LEAST_WEIGHT = 1e-4  # of a detection; at zero its noise would be infinite
+MIN_WEIGHT = 1e-4  # of a detection; at zero its noise would be infinite
 
 GraphOf = Callable[[int, IntArray, tuple[NodeType, ...]], SceneGraph]
 """The graph over an interval: called with its first moment, the ids of the objects there, and their node types."""
@@ -240,7 +240,7 @@ def smooth_states(
     )
     epochs = list(parts) if providers else parts
     long = len(evidence.times) > 0 and evidence.times[-1] - evidence.times[0] > LONG_RECORDING
-    states = _smoothed(epochs, RecordingSmoother(long, MOST_JOINT))
+    states = _smoothed(epochs, RecordingSmoother(long, MAX_JOINT))
     if not providers:
         return states
     labels = dict(zip(lifespans.id.tolist(), lifespans.label.tolist(), strict=True))
@@ -316,7 +316,7 @@ def robust_weights(evidence: Evidence, object_of: IntArray, states: StateTable, 
     rows = np.flatnonzero(at >= 0)
     residual = evidence.boxes.position[rows, :2] - states.mean[at[rows], :2]
     d2 = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(evidence.R[rows, :2, :2]), residual)
-    weight[rows] = np.maximum(loss.weight(np.sqrt(d2)), LEAST_WEIGHT)
+    weight[rows] = np.maximum(loss.weight(np.sqrt(d2)), MIN_WEIGHT)
     return weight
 
 

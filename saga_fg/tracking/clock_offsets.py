@@ -37,22 +37,22 @@ from saga_fg.tracking.measurements import FrameMeasurements
 log = logging.getLogger(__name__)
 
 WINDOW = 2.5  # s; candidates are up to this far apart along their velocity
-LEAST_SPEED = 2.0  # m/s; slower objects tell little, and errors of their velocity matter
+MIN_SPEED = 2.0  # m/s; slower objects tell little, and errors of their velocity matter
 SPEED_RATIO = 9.0  # squared speed by its variance, from which a velocity counts as known
 ACROSS = 9.0  # squared deviations across the velocity
 LONGEST_STEP, FASTEST = 1.0, 40.0  # s, m/s; objects are found again in a sensor's next frame up to these
 BASELINE = 0.8  # s, over which velocities are measured
-MOST_OBJECTS = 24  # of a frame
-MOST_SAMPLES = 400  # of a pair of sensors
-MOST_SENSORS = 12  # whose frames are compared
+MAX_OBJECTS = 24  # of a frame
+MAX_SAMPLES = 400  # of a pair of sensors
+MAX_SENSORS = 12  # whose frames are compared
 TRIM = 3.5  # deviations from the cluster, beyond which a sample is none of it
 FEWEST = 25  # samples of an estimate that is used
 SHORTEST = 2.0  # s of samples of an estimate that is used
 OFTEN = 16  # samples from one estimate to the next
 SUREST, SURE = 0.01, 0.03  # s; standard deviation of a small and a large offset that are used, at most
-LEAST_SHARE = 0.4  # of the samples, that have to agree
+MIN_SHARE = 0.4  # of the samples, that have to agree
 EMPTY: FloatArray = np.empty(0)
-LEAST_OFFSET = 0.03  # s; smaller offsets are left alone, since sensors also differ in where they see an object
+MIN_OFFSET = 0.03  # s; smaller offsets are left alone, since sensors also differ in where they see an object
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class OffsetEstimate:
     @property
     def significant(self) -> bool:
         """Return True for an offset that is to be corrected."""
-        return self.steady and abs(self.offset) > max(LEAST_OFFSET, 4 * self.deviation)
+        return self.steady and abs(self.offset) > max(MIN_OFFSET, 4 * self.deviation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +174,9 @@ class PairSamples:
         n = len(offset)
         new = replace(
             self,
-            time=np.concatenate([self.time, np.full(n, time)])[-MOST_SAMPLES:],
-            offset=np.concatenate([self.offset, offset])[-MOST_SAMPLES:],
-            variance=np.concatenate([self.variance, variance])[-MOST_SAMPLES:],
+            time=np.concatenate([self.time, np.full(n, time)])[-MAX_SAMPLES:],
+            offset=np.concatenate([self.offset, offset])[-MAX_SAMPLES:],
+            variance=np.concatenate([self.variance, variance])[-MAX_SAMPLES:],
             fresh=self.fresh + n,
         )
         return replace(new, estimate=new.estimated(), fresh=0) if new.fresh >= OFTEN else new
@@ -199,7 +199,7 @@ class PairSamples:
         drifts = abs(slope) > 4 * of_slope
         if drifts:
             mean, deviation = mean + slope * (latest - centre), math.hypot(deviation, of_slope * (latest - centre))
-        agreed = n >= LEAST_SHARE * len(self.offset)
+        agreed = n >= MIN_SHARE * len(self.offset)
         sure = deviation <= max(SUREST, min(abs(mean) / 10, SURE))
         steady = agreed and n >= FEWEST and time[-1] - time[0] >= SHORTEST and sure
         return OffsetEstimate(float(mean), float(deviation), float(slope), float(of_slope), n, agreed, bool(steady))
@@ -208,7 +208,7 @@ class PairSamples:
     def settled(self) -> bool:
         """Return True if further samples will not change much: there are enough that agree, or none do."""
         found = self.estimate
-        return found is not None and (found.steady or (not found.agreed and len(self.offset) >= MOST_SAMPLES / 2))
+        return found is not None and (found.steady or (not found.agreed and len(self.offset) >= MAX_SAMPLES / 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +237,7 @@ class SharedObservations:
                 other = replace(other, compared=(*other.compared, frame.sensor))
                 frame = replace(frame, compared=(*frame.compared, other.sensor))
             others.append(other)
-        return SharedObservations((*others, frame)[-MOST_SENSORS:], tuple(pairs.values()))
+        return SharedObservations((*others, frame)[-MAX_SENSORS:], tuple(pairs.values()))
 
     def without(self, sensor: str) -> SharedObservations:
         """Without what is known of a sensor, whose clock has changed."""
@@ -309,7 +309,7 @@ def _candidates(a: SeenObjects, b: SeenObjects, known: PairSamples) -> tuple[Flo
 def _moving(objects: SeenObjects) -> BoolArray:
     """(k,) objects whose velocity is known well enough to tell time by."""
     speed2 = (objects.velocity**2).sum(axis=1)
-    return np.asarray((speed2 >= LEAST_SPEED**2) & (speed2 >= SPEED_RATIO * objects.velocity_variance))
+    return np.asarray((speed2 >= MIN_SPEED**2) & (speed2 >= SPEED_RATIO * objects.velocity_variance))
 
 
 def _cluster(offset: FloatArray, variance: FloatArray) -> BoolArray:
@@ -384,7 +384,7 @@ def compared(
     """
     if len(clock.sensors) < 2 or measurements.relative is not None:
         return clock, shared
-    d = np.argsort(-measurements.probability, kind="stable")[:MOST_OBJECTS]
+    d = np.argsort(-measurements.probability, kind="stable")[:MAX_OBJECTS]
     R, boxes = measurements.R[d], measurements.boxes
     variance = (R[:, 0, 0] + R[:, 1, 1]) / 2
     objects = SeenObjects.first_seen(measurements.name, stamp, boxes.label[d], boxes.position[d, :2], variance)

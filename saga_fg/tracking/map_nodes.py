@@ -161,9 +161,9 @@ def _dense(points: FloatArray) -> FloatArray:
     """Points every metre or so along a line."""
     if len(points) == 1:
         return points
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    at = np.linspace(0.0, way[-1], max(3, round(way[-1]) | 1))
-    return np.stack([np.interp(at, way, each) for each in points.T], axis=-1)
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    at = np.linspace(0.0, distance[-1], max(3, round(distance[-1]) | 1))
+    return np.stack([np.interp(at, distance, each) for each in points.T], axis=-1)
 
 
 LONGEST = 1.0  # s between two detections of a vehicle

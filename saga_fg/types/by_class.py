@@ -12,7 +12,7 @@ from saga_fg.numerics.arrays import FloatArray, StrArray, distinct
 
 DEFAULT = "default"  # key of the settings for every class that has none of its own
 S = TypeVar("S")
-_MOST_KEPT = 512  # tables of numbers; settings that are gone are kept as long
+_MAX_KEPT = 512  # tables of numbers; settings that are gone are kept as long
 _tables: dict[tuple[int, tuple[str, ...], tuple[str, ...]], tuple[Mapping[str, Any], FloatArray]] = {}
 
 
@@ -37,7 +37,7 @@ def class_values(classes: Mapping[str, S], plain: Callable[[], S], label: StrArr
     key = id(classes), occurring, names
     known = _tables.get(key)
     if known is None:
-        if len(_tables) >= _MOST_KEPT:
+        if len(_tables) >= _MAX_KEPT:
             _tables.clear()
         number = attrgetter(*names)
         numbers = [number(class_settings(classes, plain, c)) for c in occurring]

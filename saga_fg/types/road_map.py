@@ -156,7 +156,7 @@ COLOUR_OF_STATE = np.array([0, 1, 2, 2])  # (4,) numbers in COLOURS
 COLOUR_LABELS = tuple(f"traffic_light_{colour}" for colour in COLOURS)  # labels of detections that report a colour
 START_DELAY = 1.5  # s, mean time from green until the first driver starts; usual 1 to 2
 NON_COMPLIANCE = 0.1  # h, share of drivers who turn at red or cannot leave at green; usual 0.05 to 0.3
-LEAST_BELIEF = 1e-6  # no state is ever ruled out
+MIN_BELIEF = 1e-6  # no state is ever ruled out
 MAX_LIGHT_DISTANCE = 4.0  # a reported light belongs to no known light further away than this, m
 
 
@@ -223,7 +223,7 @@ def colour_updated(belief: FloatArray, colour: int, accuracy: float) -> FloatArr
 def updated(belief: FloatArray, log_likelihood: FloatArray) -> FloatArray:
     """The belief (4,) after an observation with these logarithms of its likelihoods (4,)."""
     posterior = belief * np.exp(log_likelihood - log_likelihood.max())
-    posterior = np.maximum(posterior / posterior.sum(), LEAST_BELIEF)
+    posterior = np.maximum(posterior / posterior.sum(), MIN_BELIEF)
     return np.asarray(posterior / posterior.sum())
 
 

@@ -207,7 +207,7 @@ def _points(points: Any) -> FloatArray:
 
 SENSOR = "lidar"
 COLUMNS = ("log_id", "timestamp_ns", "category", "score", *SIZE, *POSE)
-_NONE: StrArray = np.empty(0, dtype=np.str_)
+_NO_LABELS: StrArray = np.empty(0, dtype=np.str_)
 
 
 class AnnotatedLogs:
@@ -227,7 +227,7 @@ class AnnotatedLogs:
         assert scene.ground_truth is not None
         seen = [of[truth.visible] for of, truth in zip(scene.categories, scene.ground_truth, strict=True)]
         by_time = dict(zip(scene.timestamps.tolist(), seen, strict=True))
-        categories = [by_time.get(frame.timestamp, _NONE) for frame in found.frames]
+        categories = [by_time.get(frame.timestamp, _NO_LABELS) for frame in found.frames]
         return replace(scene, frames=found.frames, categories=categories)
 
 

@@ -53,13 +53,13 @@ class _Reading:
     rows: int
     own: Collection[str] | None
 
-    def way(self, names: Collection[str]) -> TableImport:
+    def hint(self, names: Collection[str]) -> TableImport:
         """Hint in an error message: how to read a file with these columns."""
         return TableImport() if self.own is not None and set(self.own) <= set(names) else self.how
 
     def understood(self, names: Collection[str]) -> Columns:
         """The columns of the file by their meaning. Raises `InputError` for all that is wrong with their names."""
-        wanted, layout = self.way(names).columns, self.layout
+        wanted, layout = self.hint(names).columns, self.layout
         found = understood(names, layout.columns, layout.required, wanted, layout.lenient)
         if found.faults and not (layout.faulty and found.names):
             raise InputError(f"{self.path}: {'; '.join(found.faults)}")
@@ -181,7 +181,7 @@ def _read_csv(reading: _Reading) -> Iterator[RawTable]:
             _full_rows(path, numbered, len(header)), reading.rows, lambda row: [row[i].strip() for i in moment]
         ):
             columns: dict[str, Values] = {name: [row[i].strip() or None for row in rows] for name, i in at.items()}
-            yield RawTable(path, columns, len(rows), partial(_line, lines), True, found, reading.way(header))
+            yield RawTable(path, columns, len(rows), partial(_line, lines), True, found, reading.hint(header))
 
 
 def _csv_rows(path: Path, file: TextIO) -> Iterator[tuple[int, list[str]]]:
@@ -229,7 +229,7 @@ def _read_ndjson(reading: _Reading) -> Iterator[RawTable]:
             columns: dict[str, Values] = {
                 ours: [row.get(theirs) for row in rows] for ours, theirs in found.names.items()
             }
-            yield RawTable(path, columns, len(rows), partial(_line, lines), False, found, reading.way(names))
+            yield RawTable(path, columns, len(rows), partial(_line, lines), False, found, reading.hint(names))
 
 
 def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -277,7 +277,7 @@ def _read_columns(reading: _Reading) -> Iterator[RawTable]:
             raise InputError(f"{path}: {ours}: expected shape ({length},) as {first} has, got {np.shape(column)}")
         if ours in NAMED and not archive:
             columns[ours] = _names(column)
-    yield RawTable(path, columns, length, _row, False, found, reading.way(names))
+    yield RawTable(path, columns, length, _row, False, found, reading.hint(names))
 
 
 def _names(values: Values) -> Values:

@@ -133,7 +133,7 @@ class TransformTree:
         return inverse_transform(to_target) @ to_source, a & b
 
     def _below(self, ancestor: str, upwards: list[str], time: IntArray) -> tuple[FloatArray, BoolArray]:
-        """ancestor_T_frame of the frame that the way up begins at."""
+        """ancestor_T_frame of the frame that the chain up begins at."""
         T, known = np.tile(np.eye(4), (len(time), 1, 1)), np.ones(len(time), dtype=bool)
         for child, _ in pairwise(upwards[: upwards.index(ancestor) + 1]):
             parent_T_child, there = self._edges[child].at(time)
@@ -142,12 +142,12 @@ class TransformTree:
 
     def _upwards(self, frame: str) -> list[str]:
         """The frame, its parent, and so on; raises `InputError` for a circle."""
-        way = [frame]
-        while (edge := self._edges.get(way[-1])) is not None:
-            if edge.parent in way:
-                raise InputError(f"transforms: expected a tree of frames, got the circle {' -> '.join(way)}")
-            way.append(edge.parent)
-        return way
+        chain = [frame]
+        while (edge := self._edges.get(chain[-1])) is not None:
+            if edge.parent in chain:
+                raise InputError(f"transforms: expected a tree of frames, got the circle {' -> '.join(chain)}")
+            chain.append(edge.parent)
+        return chain
 
 
 def _edge(rows: list[TransformRecord]) -> _Edge:

@@ -16,7 +16,7 @@ def by_distances(a, b, reach, further):
 
 @pytest.fixture(params=[0, 10**9], ids=["tree", "kernel"])
 def most_compared(request, monkeypatch):
-    monkeypatch.setattr(module, "MOST_COMPARED", request.param)
+    monkeypatch.setattr(module, "MAX_COMPARED", request.param)
 
 
 @pytest.mark.usefixtures("most_compared")

@@ -12,7 +12,7 @@ import pytest
 from pipelines.serving.state import TreeWriter, read_tree
 from saga_fg import Tracker
 from saga_fg.tracking.clock import MANY_SENSORS, MAX_JUMP, Clock, weighted_median
-from saga_fg.tracking.clock_offsets import MOST_SAMPLES, PairSamples
+from saga_fg.tracking.clock_offsets import MAX_SAMPLES, PairSamples
 from tests.saga_fg.traffic_frames import columns, frame
 
 MAX_DELAY, START = 0.5, 5.0
@@ -224,7 +224,7 @@ def test_the_offset_of_a_pair_is_that_of_the_densest_cluster(drift):
         true, false = 0.3 + drift * time + 0.03 * rng.normal(size=3), rng.uniform(-2.5, 2.5, 1)
         pair = pair.added(time, np.concatenate([true, false]), np.full(4, 0.03**2))
     found = pair.estimate
-    assert len(pair.offset) == MOST_SAMPLES
+    assert len(pair.offset) == MAX_SAMPLES
     assert found.steady
     assert found.offset == pytest.approx(0.3 + drift * 11.9, abs=4 * found.deviation)
     assert found.drift == pytest.approx(drift, abs=4 * found.drift_deviation)
