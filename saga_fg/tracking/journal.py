@@ -352,7 +352,7 @@ class Journal:
     def _candidates(
         self, row: int, position: FloatArray, measurements: FrameMeasurements, taken: dict[int, int], chosen: int | None
     ) -> list[Event]:
-        """Detections near a track, of its class, the nearest first."""
+        """Detections near a track, of its class, the nearest first; the chosen one is always among them."""
         assert self._predicted is not None
         label = str(self._predicted.table.label[row])
         settings = class_settings(self._settings.classes, ClassSettings, label)
@@ -360,9 +360,9 @@ class Journal:
         measured = measurements.boxes.position[rows, :2]
         d2, _ = mahalanobis(position[None], self._predicted.P[row][None], measured, measurements.R[rows, :2, :2])
         apart, limit = np.hypot(*(measured - position).T), gate(settings.gate)
-        near = [k for k in np.argsort(d2[0]).tolist() if d2[0, k] < NEAR * limit or rows[k] == chosen][:LISTED]
+        near = [k for k in np.argsort(d2[0]).tolist() if d2[0, k] < NEAR * limit or rows[k] == chosen]
         result = []
-        for k in near:
+        for k in near[:LISTED] + [k for k in near[LISTED:] if rows[k] == chosen]:
             detection = int(rows[k])
             if detection == chosen:
                 outcome = "chosen"

@@ -14,7 +14,7 @@ from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
-from saga_fg.tracking import AssociationSettings, Journal
+from saga_fg.tracking import AssociationSettings, ClassSettings, Journal
 from saga_fg.tracking.journal import TrackerView
 
 SETTINGS = TrackerSettings(edges=())
@@ -59,6 +59,17 @@ def test_matches_name_the_candidates_and_why_they_were_rejected() -> None:
     assert outcomes.get(2) in (None, "outside the gate", "too far", "taken by track 2")
     assert one["existence"][1] >= one["existence"][0]
     assert one["edges"] == []
+
+
+def test_the_chosen_candidate_is_listed_however_many_are_nearer() -> None:
+    classes = {"default": ClassSettings(nms_distance=0.0, weak_nms_distance=0.0, min_score=0.0)}
+    weak = [Detection("car", (0.02 * k, 0.0, 1.0), score=0.01) for k in range(1, 9)]
+    crowd = Frame(0.1, "lidar", Detections.of([*weak, Detection("car", (0.3, 0.0, 1.0), score=0.99)]))
+    settings = TrackerSettings(classes, association=AssociationSettings(clutter_area=5000.0), edges=())
+    events, _ = run(frame(0.0, 0.0), crowd, settings=settings)
+    (matched,) = of_kind(events, "matched")
+    assert [c["outcome"] for c in matched["candidates"]].count("chosen") == 1
+    assert matched["candidates"][-1]["detection"] == 8
 
 
 def test_what_another_track_took_is_named() -> None:
