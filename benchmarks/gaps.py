@@ -7,7 +7,7 @@ Intervals are paired bootstraps over recordings; those that overlap in time coun
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -48,21 +48,14 @@ def _writable_picture(path: Path | None) -> Path | None:
     return writable(path)
 
 
-def gaps(
-    data: Data = None,
-    sets: Annotated[
-        str | None,
-        typer.Option(
-            "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, with made detections.  "
-            "[default: the first five]",
-        ),
-    ] = None,
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
+@dataclass(frozen=True)
+class GapOptions:
+    """Which gaps are made, and who is judged in them after which fit."""
+
     compared_by_name: Annotated[
         str, typer.Option("--contenders", help="Names, with commas; those without effect are left out.")
-    ] = CONTENDERS,
-    against: Annotated[str, typer.Option("--against", help="The contender that all others are compared with.")] = "kf",
+    ] = CONTENDERS
+    against: Annotated[str, typer.Option("--against", help="The contender that all others are compared with.")] = "kf"
     own: Annotated[
         list[str] | None,
         typer.Option(
@@ -70,8 +63,7 @@ def gaps(
             help="One more, from a YAML file over the settings; METHOD is saga if left out; repeatable.",
             metavar="NAME[:METHOD]=FILE",
         ),
-    ] = None,
-    test: Annotated[str | None, typer.Option("--test", help="Take these recordings alone, with commas.")] = None,
+    ] = None
     folds: Annotated[
         str | None,
         typer.Option(
@@ -80,23 +72,40 @@ def gaps(
             "setting of openacc, recording of others.",
             metavar="N|place",
         ),
-    ] = None,
+    ] = None
     fit: Annotated[
         str, typer.Option("--fit", help="To the other folds, with commas: the noise of kf, the edges of saga.")
-    ] = "noise,edges",
+    ] = "noise,edges"
     passes: Annotated[
         int, typer.Option("--passes", min=0, help="Runs over each recording with made gaps; 0: real gaps alone.")
-    ] = 2,
+    ] = 2
     life: Annotated[
         Literal["both", "kept", "shipped"],
         typer.Option("--life", help="Tracks kept alive through all gaps, ended as configured, or both."),
-    ] = "both",
-    by_class: Annotated[bool, typer.Option("--by-class", help="Rows for classes of objects as well.")] = False,
-    situations: Annotated[
-        bool,
-        typer.Option("--situations", help="Tables by situation as well: leaders, halting, turning, at red, ..."),
-    ] = False,
-    lengths: Annotated[str, typer.Option("--lengths", help="Of made gaps, s, with commas.")] = "1,2,3,5",
+    ] = "both"
+    lengths: Annotated[str, typer.Option("--lengths", help="Of made gaps, s, with commas.")] = "1,2,3,5"
+    of: Annotated[
+        str | None,
+        typer.Option(
+            "--of", help="Make gaps of objects in one of these situations alone, with commas.", metavar="SITUATIONS"
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Recordings that are tracked."""
+
+    sets: Annotated[
+        str | None,
+        typer.Option(
+            "--sets",
+            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, with made detections.  "
+            "[default: the first five]",
+        ),
+    ] = None
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10
+    test: Annotated[str | None, typer.Option("--test", help="Take these recordings alone, with commas.")] = None
     viewpoint: Annotated[
         str | None,
         typer.Option(
@@ -104,19 +113,24 @@ def gaps(
             help="Of the sensors in the sets ngsim and openacc: above, where nothing is hidden, mast, vehicle, the id "
             "of one, or X,Y,Z in m.  [default: above]",
         ),
-    ] = None,
+    ] = None
     longest: Annotated[
         float | None,
         typer.Option(
             "--longest", min=1.0, help="Of recordings of ngsim and openacc, s, from the middle of longer ones."
         ),
-    ] = None,
-    of: Annotated[
-        str | None,
-        typer.Option(
-            "--of", help="Make gaps of objects in one of these situations alone, with commas.", metavar="SITUATIONS"
-        ),
-    ] = None,
+    ] = None
+
+
+@dataclass(frozen=True)
+class ShownOptions:
+    """What is shown of the figures."""
+
+    by_class: Annotated[bool, typer.Option("--by-class", help="Rows for classes of objects as well.")] = False
+    situations: Annotated[
+        bool,
+        typer.Option("--situations", help="Tables by situation as well: leaders, halting, turning, at red, ..."),
+    ] = False
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -126,7 +140,15 @@ def gaps(
             metavar="FILE",
             callback=_writable_picture,
         ),
-    ] = None,
+    ] = None
+
+
+def gaps(
+    *,
+    data: Data = None,
+    recorded: RecordingOptions,
+    made: GapOptions,
+    shown: ShownOptions,
     config: Config = None,
 ) -> Rows:
     """Objects that are not detected for some seconds: is their identity kept, and where are they?
@@ -146,27 +168,31 @@ def gaps(
       python -m benchmarks gaps --data data --sets ngsim --life kept --picture gap.png --of 'at red'
       python -m benchmarks gaps --data data --sets openacc --life kept --longest 20 --folds 2
     """
-    found = chosen_sets(sets, data, scenes, test, viewpoint, longest, usual=ABOVE)
-    wanted = chosen("--of", of, SITUATIONS) if of is not None else ()
-    fits = chosen("--fit", fit, FITS)
-    settings = GapBenchSettings(passes, LIVES if life == "both" else (life,), chosen_lengths(lengths), of=wanted)
+    found = chosen_sets(
+        recorded.sets, data, recorded.scenes, recorded.test, recorded.viewpoint, recorded.longest, usual=ABOVE
+    )
+    wanted = chosen("--of", made.of, SITUATIONS) if made.of is not None else ()
+    fits = chosen("--fit", made.fit, FITS)
+    settings = GapBenchSettings(
+        made.passes, LIVES if made.life == "both" else (made.life,), chosen_lengths(made.lengths), of=wanted
+    )
     for recordings in found:
         base, complete = (
             load_config(recordings.family, config),
-            recordings.name in TRAFFIC_SETS and viewpoint in (None, ABOVE),
+            recordings.name in TRAFFIC_SETS and recorded.viewpoint in (None, ABOVE),
         )
-        tried = contenders(recordings.family, base, compared_by_name, own or ())
-        chosen("--against", against, [one.name for one in tried])
+        tried = contenders(recordings.family, base, made.compared_by_name, made.own or ())
+        chosen("--against", made.against, [one.name for one in tried])
         judged = replace(settings, real=not complete)  # from above nothing is hidden, there are no gaps but made ones
         with progress_bar(unit="runs") as progress:
-            runs = split_runs(recordings, folds, fits, tried, base, judged, progress)
+            runs = split_runs(recordings, made.folds, fits, tried, base, judged, progress)
         if not any(run.gaps for run in runs):
             raise InputError(f"set {recordings.name}: expected recordings with gaps: longer ones, or more --passes")
-        yield from rows_of(recordings.name, runs, against, by_class, situations)
-        if picture is not None and recordings is found[0]:
-            better = next((one for one in tried if one.name != against), tried[0])
-            pair = [next(one for one in tried if one.name == against), better]
-            write_telling_picture(picture, recordings, runs, pair, wanted)
+        yield from rows_of(recordings.name, runs, made.against, shown.by_class, shown.situations)
+        if shown.picture is not None and recordings is found[0]:
+            better = next((one for one in tried if one.name != made.against), tried[0])
+            pair = [next(one for one in tried if one.name == made.against), better]
+            write_telling_picture(shown.picture, recordings, runs, pair, wanted)
 
 
 def chosen_lengths(text: str) -> tuple[float, ...]:

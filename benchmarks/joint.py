@@ -59,21 +59,36 @@ State = tuple[IntArray, FloatArray, FloatArray, Assignment]  # ids, states (n, 4
 At = Callable[[int, Frame, Detections], Mapping[str, State]]
 
 
-def joint(
+@dataclass(frozen=True)
+class KittiOptions:
+    """Recordings of KITTI."""
+
     dataroot: Annotated[
         Path | None, typer.Option("--dataroot", help="KITTI tracking; without it, simulated streets.")
-    ] = None,
+    ] = None
     detections: Annotated[
         Path | None, typer.Option("--detections", help="Folder of a detector: Car/, Pedestrian/, Cyclist/.")
-    ] = None,
-    sequences: Annotated[str | None, typer.Option("--sequences", help="KITTI sequences, by commas; all.")] = None,
-    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
-    first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first simulated scene.")] = 0,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
-    poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False,
+    ] = None
+    sequences: Annotated[str | None, typer.Option("--sequences", help="KITTI sequences, by commas; all.")] = None
+
+
+@dataclass(frozen=True)
+class StreetOptions:
+    """Simulated streets."""
+
+    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10
+    first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first simulated scene.")] = 0
+    poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False
     parked: Annotated[
         bool, typer.Option("--parked/--no-parked", help="Simulated: cars parked on both sides, or none.")
-    ] = True,
+    ] = True
+
+
+def joint(
+    *,
+    kitti: KittiOptions,
+    streets: StreetOptions,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
     online: Annotated[bool, typer.Option("--online", help="In a running graph, frame by frame.")] = False,
     lag: Annotated[float, typer.Option("--lag", min=0.0, help="Of the running graph, s.")] = 3.0,
     config: Config = None,
@@ -89,19 +104,24 @@ def joint(
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
     """
-    if (dataroot is None) != (detections is None):
+    if (kitti.dataroot is None) != (kitti.detections is None):
         raise InputError("expected both --dataroot and --detections, or neither")
-    if dataroot is not None and (poles or not parked):
+    if kitti.dataroot is not None and (streets.poles or not streets.parked):
         raise InputError("--poles and --no-parked: expected with simulated streets only")
-    if online and poles:
+    if online and streets.poles:
         raise InputError("--online: expected without --poles")
-    if dataroot is None:
-        many = [simulate_scene(street(parked), seed) for seed in range(first, first + scenes)]
+    if kitti.dataroot is None:
+        many = [
+            simulate_scene(street(streets.parked), seed)
+            for seed in range(streets.first, streets.first + streets.scenes)
+        ]
     else:
-        kitti = KittiTracking(dataroot, detections, None if sequences is None else sequences.split(","), True)
-        many = [kitti.scene(name) for name in kitti.scenes]
-    base = load_config("simulated" if dataroot is None else "kitti", config)
-    run = partial(online_run, lag=lag) if online else partial(batch_run, poles=poles)
+        found = KittiTracking(
+            kitti.dataroot, kitti.detections, None if kitti.sequences is None else kitti.sequences.split(","), True
+        )
+        many = [found.scene(name) for name in found.scenes]
+    base = load_config("simulated" if kitti.dataroot is None else "kitti", config)
+    run = partial(online_run, lag=lag) if online else partial(batch_run, poles=streets.poles)
     yield from joint_rows(many, range(seeds), partial(run, config=base, settings=JointSettings()))
 
 

@@ -30,7 +30,7 @@ from data_tools.figures import FigureTable
 from data_tools.files.input_files import unknown_name
 from data_tools.metrics import Interval
 from pipelines.cli.console import JsonFile, MarkdownFile, error_console, new_group, report
-from pipelines.cli.options import Verbose
+from pipelines.cli.options import Verbose, as_command
 from pipelines.tracking import one_thread
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -78,7 +78,7 @@ def application(benchmarks: Iterable[Callable[..., Rows]]) -> typer.Typer:
     """One command for all benchmarks."""
     app = new_group("Measure: every figure stands beside a baseline of the same run.")
     for run in benchmarks:
-        app.command()(command(run))
+        app.command()(command(as_command(run)))
     return app
 
 

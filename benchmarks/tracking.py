@@ -8,6 +8,7 @@ scenes anew.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -26,16 +27,18 @@ KF, BASELINE = "kf", "centerpoint"
 ERRORS = ("position", "velocity", "heading")
 
 
-def tracking(
-    data: Data = None,
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Recordings that are tracked."""
+
     sets: Annotated[
         str | None,
         typer.Option(
             "--sets",
             help="Of megvii, centerpoint, camera, kitti, simulated, ngsim, openacc.  [default: all but the last two]",
         ),
-    ] = None,
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10,
+    ] = None
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10
     viewpoint: Annotated[
         str | None,
         typer.Option(
@@ -43,10 +46,16 @@ def tracking(
             help="Of the sensors in the sets ngsim and openacc: mast, above, vehicle, the id of one, or X,Y,Z in m.  "
             "[default: mast, vehicle]",
         ),
-    ] = None,
+    ] = None
     test: Annotated[
         str | None, typer.Option("--test", help="Track these recordings alone, with commas.  [default: all]")
-    ] = None,
+    ] = None
+
+
+def tracking(
+    *,
+    data: Data = None,
+    recorded: RecordingOptions,
     compared: Annotated[
         str | None,
         typer.Option("--contenders", help="Methods and components, by name, with commas.  [default: all]"),
@@ -67,7 +76,7 @@ def tracking(
       python -m benchmarks tracking --data data --sets megvii --contenders 'saga,kf,graph matching'
     """
     wanted = compared or ",".join(variant.name for variant in (*SHIPPED, *(COMPONENTS if components else ())))
-    for recordings in chosen_sets(sets, data, scenes, test, viewpoint):
+    for recordings in chosen_sets(recorded.sets, data, recorded.scenes, recorded.test, recorded.viewpoint):
         base = load_config(recordings.family, config)
         yield from set_rows(recordings, contenders(recordings.family, base, wanted, ()), draws)
 

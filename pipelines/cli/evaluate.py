@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -19,8 +20,8 @@ from data_tools.plots import png
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
-from pipelines.cli.options import Source, dataset_commands
-from pipelines.cli.track import RayAddress, Workers, exit_on_failures, run_at_scale
+from pipelines.cli.options import ScaleOptions, Source, TrackerOptions, dataset_commands
+from pipelines.cli.track import exit_on_failures, run_at_scale
 from pipelines.config import Method, TrackConfig
 from pipelines.evaluation import evaluate_labels, judge_run
 from pipelines.explaining import journal_innovations, journal_of
@@ -30,31 +31,34 @@ from pipelines.tracking import InnovationRecorder, track_dataset
 from saga_fg.errors import InputError
 
 
+@dataclass(frozen=True)
+class EvaluationOptions:
+    """Which figures are made, and what they are written to."""
+
+    hota: Annotated[bool, typer.Option("--hota", help="HOTA, CLEAR and Identity too (needs the extra [eval]).")] = False
+    innovations: Annotated[
+        bool,
+        typer.Option("--innovations", help="How well innovations fit (NIS), from the journal beside the result."),
+    ] = False
+    full: Annotated[bool, typer.Option("--full", help="Print all tables, not the summary alone.")] = False
+    json_file: JsonFile = None
+    markdown: MarkdownFile = None
+    plots: Annotated[
+        Path | None,
+        typer.Option("--plots", help="Folder to draw recall sweeps, calibration and errors to.", metavar="DIR"),
+    ] = None
+
+
 def _evaluate(
     source: DatasetSource,
     result: Annotated[
         Path | None,
         typer.Argument(help="Result of any tracker, as `saga-fg track` writes it; left out, one is made and scored."),
     ] = None,
-    method: options.MethodOrNone = None,
-    estimator: options.EstimatorOption = None,
-    lag: options.LagOption = None,
-    association: options.AssociationOption = None,
+    *,
+    tracker: TrackerOptions,
     config: options.Config = None,
-    hota: Annotated[
-        bool, typer.Option("--hota", help="HOTA, CLEAR and Identity too (needs the extra [eval]).")
-    ] = False,
-    innovations: Annotated[
-        bool,
-        typer.Option("--innovations", help="How well innovations fit (NIS), from the journal beside the result."),
-    ] = False,
-    full: Annotated[bool, typer.Option("--full", help="Print all tables, not the summary alone.")] = False,
-    json_file: JsonFile = None,
-    markdown: MarkdownFile = None,
-    plots: Annotated[
-        Path | None,
-        typer.Option("--plots", help="Folder to draw recall sweeps, calibration and errors to.", metavar="DIR"),
-    ] = None,
+    shown: EvaluationOptions,
     verbose: options.Verbose = False,
 ) -> None:
     """Score tracks against the ground truth: by the dataset's official metrics or CLEAR, and by errors at the labels.
@@ -67,26 +71,25 @@ def _evaluate(
         mend = own if source.truth_option else "score a table: saga-fg evaluate file tracks.csv --truth TABLE"
         raise InputError(f"evaluate {source.name}: expected ground truth, there is none; {mend}")
     if result is None:
-        settings = options.configured(source.family, config, method or "saga", estimator, lag, association)
-        found, nis = _tracked(source, settings, method or "saga")
+        found, nis = _tracked(source, tracker.configured(source.family, config), tracker.method)
     else:
-        given = {"--method": method, "--estimator": estimator, "--lag": lag, "--association": association}
-        for name, value in {**given, "--config": config}.items():
-            if value is not None:
-                raise InputError(f"{name} {value}: goes without a result, which is made by it")
+        given = {name: value for name, value in vars(tracker).items() if value != getattr(TrackerOptions, name)}
+        for name, value in (given | ({} if config is None else {"config": config})).items():
+            raise InputError(f"--{name} {value}: goes without a result, which is made by it")
         with working("reading"):
-            found, nis = source.read_results(result), journal_innovations(journal_of(result)) if innovations else {}
+            found = source.read_results(result)
+            nis = journal_innovations(journal_of(result)) if shown.innovations else {}
     with working("scoring"):
-        evaluation = source.evaluate(found, hota, nis)
+        evaluation = source.evaluate(found, shown.hota, nis)
     summary = evaluation.summary()
     if summary is not None:
         show_summary(summary, LEGEND)
     tables = evaluation.tables()
-    report(tables if full or summary is None else (), evaluation.figures(), json_file)
-    if markdown is not None:
-        write_text(markdown, "\n".join(table.markdown() for table in (*([summary] if summary else ()), *tables)))
-    if plots is not None:
-        with atomic_directory(plots, known=("recall.png", "errors.png", "calibration.png")) as folder:
+    report(tables if shown.full or summary is None else (), evaluation.figures(), shown.json_file)
+    if shown.markdown is not None:
+        write_text(shown.markdown, "\n".join(table.markdown() for table in (*([summary] if summary else ()), *tables)))
+    if shown.plots is not None:
+        with atomic_directory(shown.plots, known=("recall.png", "errors.png", "calibration.png")) as folder:
             for name, picture in evaluation.pictures().items():
                 (folder / f"{name}.png").write_bytes(png(picture))
 
@@ -174,16 +177,12 @@ def _benchmark(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder of the run; the same one again continues the run.")
     ],
-    method: options.MethodOption = "saga",
-    estimator: options.EstimatorOption = None,
-    lag: options.LagOption = None,
-    association: options.AssociationOption = None,
+    tracker: TrackerOptions,
+    scale: ScaleOptions,
     hota: Annotated[bool, typer.Option("--hota", help="HOTA too (needs the extra [eval]).")] = False,
     without_truth: Annotated[
         bool, typer.Option("--without-truth", help="The submission alone, as for a test split without ground truth.")
     ] = False,
-    workers: Workers = 0,
-    ray: RayAddress = None,
     config: options.Config = None,
     verbose: options.Verbose = False,
 ) -> None:
@@ -196,16 +195,15 @@ def _benchmark(
     """
     if not source.all_tracks:
         raise InputError(f"benchmark {source.name}: expected a dataset with official results: saga-fg benchmark --help")
-    settings = options.configured(source.family, config, method, estimator, lag, association)
     options.apart(output, *source.input_files())
-    task = TrackTask(settings, method, source)
-    run = run_at_scale(source, task, output, workers, ray)
+    task = TrackTask(tracker.configured(source.family, config), tracker.method, source)
+    run = run_at_scale(source, task, output, scale)
     exit_on_failures(run)
     with working("writing the submission"):
         submission = source.write_submission(output)
     if not without_truth:
         with working("scoring"):
-            evaluation = judge_run(source, output, method, task.configuration, hota)
+            evaluation = judge_run(source, output, tracker.method, task.configuration, hota)
         show_tables(list(evaluation.tables())[:1])
         typer.echo(f"{output / 'figures.json'}: all figures; {output / 'report.html'}: a page of them")
     if submission is not None:
@@ -221,5 +219,6 @@ benchmark_app = dataset_commands(
         "benchmark {recordings} --output baseline --method kf --workers 4",
         "benchmark {recordings} --output test --without-truth",
     ),
+    lambda source: {"workers": "Process scenes in this many processes.  [default: one per core]"},
     listed=lambda source: bool(source.all_tracks),
 )

@@ -6,7 +6,7 @@ import inspect
 import os
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any, get_args, get_type_hints
@@ -18,7 +18,6 @@ from data_tools.files.atomic_files import check_writable, write_text
 from pipelines.cli.console import ReportingGroup, new_command, new_group, set_up_logging
 from pipelines.config import Method, TrackConfig, load_config, load_interactions
 from pipelines.configuration import load_settings
-from pipelines.explaining import journal_of
 from pipelines.learning import offset_fragment
 from pipelines.report.page import as_recorded
 from saga_fg.errors import InputError
@@ -59,28 +58,13 @@ def apart(output: Path, *inputs: Path, option: str = "--output") -> None:
             raise InputError(f"{option} {output}: expected another file than those that are read")
 
 
-_METHOD = typer.Option(
-    "--method",
-    help="saga: graph-aware Kalman filter; kf: without edges, trails and lanes; centerpoint: greedy nearest centre.",
-)
-MethodOption = Annotated[Method, _METHOD]
-MethodOrNone = Annotated[Method | None, _METHOD]
-
-EstimatorOption = Annotated[
-    str | None,
+MethodOption = Annotated[
+    Method,
     typer.Option(
-        "--estimator",
-        help="kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph of "
-        "the last --lag seconds, which puts late frames where they belong; MODULE:NAME, which is imported, or the name "
-        "of an installed entry point: your own. The bounds of kalman (tracker.tolerance, "
-        "tracker.max_component) move tracks by millimetres, a centimetre at most in our recordings.  "
-        "[default: as configured]",
-        metavar="NAME",
+        "--method",
+        help="saga: graph-aware Kalman filter; kf: without edges, trails and lanes; centerpoint: greedy nearest "
+        "centre.",
     ),
-]
-LagOption = Annotated[
-    float | None,
-    typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
 ]
 AssociationOption = Annotated[
     AssociationName | None,
@@ -94,10 +78,73 @@ InteractionsOption = Annotated[
     Path | None,
     typer.Option("--interactions", help="Edge rules from `saga-fg learn interactions`.", metavar="FILE"),
 ]
-ExplainOption = Annotated[
-    bool,
-    typer.Option("--explain", help="Keep a journal beside the output, for `saga-fg explain`: OUTPUT.journal.jsonl."),
-]
+
+
+@dataclass(frozen=True)
+class TrackerOptions:
+    """Which tracker, the options of all commands that track."""
+
+    method: MethodOption = "saga"
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            "--estimator",
+            help="kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph of "
+            "the last --lag seconds, which puts late frames where they belong; MODULE:NAME, which is imported, or the "
+            "name of an installed entry point: your own. The bounds of kalman (tracker.tolerance, "
+            "tracker.max_component) move tracks by millimetres, a centimetre at most in our recordings.  "
+            "[default: as configured]",
+            metavar="NAME",
+        ),
+    ] = None
+    lag: Annotated[
+        float | None,
+        typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
+    ] = None
+    association: AssociationOption = None
+    interactions: InteractionsOption = None
+
+    def configured(self, family: str | Path, config: Path | None) -> TrackConfig:
+        """The settings of a run: the family's, the file's, then these. Raises `InputError` for those without effect."""
+        settings = with_interactions(load_config(family, config), self.method, self.interactions)
+        if self.method == "centerpoint" and (self.estimator is not None or self.lag is not None):
+            raise InputError("--estimator, --lag: the method centerpoint has no estimator")
+        if self.lag is not None and "lag" not in estimator_parameters(self.estimator or settings.tracker.estimator):
+            raise InputError(f"--lag {self.lag:g}: goes with --estimator fixed-lag")
+        association_fits(self.method, self.association)
+        return settings.with_estimator(self.estimator, self.lag).with_association(self.association)
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Scenes in parallel, the options of all commands that can."""
+
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers",
+            min=0,
+            help="Process scenes in parallel, in this many processes (0: one per core); a second run continues where "
+            "the first stopped.",
+            metavar="N",
+        ),
+    ] = None
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            "--ray",
+            help='Process scenes on a Ray cluster: "auto", HOST:PORT, ray://HOST:PORT, or "local" for one of --workers '
+            "CPUs on this machine.",
+            metavar="ADDRESS",
+        ),
+    ] = None
+
+    @property
+    def wanted(self) -> bool:
+        """True if scenes are to be done in parallel."""
+        return self.workers is not None or self.ray is not None
+
+
 LearnOffsetsOption = Annotated[
     Path | None,
     typer.Option(
@@ -107,31 +154,6 @@ LearnOffsetsOption = Annotated[
         metavar="FILE",
     ),
 ]
-PredictOption = Annotated[
-    str | None,
-    typer.Option(
-        "--predict",
-        help="Predict the tracks of every moment to these s after it, and keep that beside the output: "
-        "OUTPUT.predictions.csv, for `saga-fg report`.",
-        metavar="S,S,...",
-    ),
-]
-
-
-def configured(
-    family: str | Path,
-    config: Path | None,
-    method: Method,
-    estimator: str | None,
-    lag: float | None,
-    association: AssociationName | None = None,
-    interactions: Path | None = None,
-) -> TrackConfig:
-    """The settings of a run: the family's, the file's, then the options'."""
-    settings = with_interactions(load_config(family, config), method, interactions)
-    _estimator_fits(method, estimator, lag, settings.tracker.estimator)
-    association_fits(method, association)
-    return settings.with_estimator(estimator, lag).with_association(association)
 
 
 def association_fits(method: str, association: str | None) -> None:
@@ -163,21 +185,6 @@ def horizons(predict: str | None, method: Method) -> FloatArray | None:
         raise InputError(f"--predict: expected seconds with commas between them, got {predict[:40]!r}") from error
 
 
-def _estimator_fits(method: str, estimator: str | None, lag: float | None, configured: str) -> None:
-    """Raise `InputError` where --estimator or --lag would have no effect."""
-    if method == "centerpoint" and (estimator is not None or lag is not None):
-        raise InputError("--estimator, --lag: the method centerpoint has no estimator")
-    if lag is not None and "lag" not in estimator_parameters(estimator or configured):
-        raise InputError(f"--lag {lag:g}: goes with --estimator fixed-lag")
-
-
-def journal(explain: bool, output: Path, at_scale: bool) -> Path | None:
-    """Path of the journal, None if none is wanted. Raises `InputError` where none can be kept."""
-    if explain and at_scale:
-        raise InputError("--explain: goes without --workers and --ray")
-    return journal_of(output) if explain else None
-
-
 def check_learn_offsets(path: Path | None, method: str, at_scale: bool = False) -> None:
     """Raise `InputError` where --learn-offsets would have no effect, or its file is not writable."""
     if path is None:
@@ -195,6 +202,42 @@ def write_offsets(path: Path, scenes: Iterable[Mapping[str, SensorTime]], settin
     write_text(path, text)
     found = ", ".join(f"{name} {offset:+.4f} s" for name, offset in offsets.items())
     typer.echo(f"{path}: {found or 'no two sensors have moving objects in common'}", err=True)
+
+
+def taken_apart(run: Callable[..., Any]) -> tuple[list[inspect.Parameter], Callable[..., Any]]:
+    """The options of a command, the fields of dataclasses in place of these; and the command that is called with them.
+
+    Those of a dataset are left out: it comes first, as an argument by position.
+    """
+    options: list[inspect.Parameter] = []
+    groups: dict[str, Any] = {}
+    for name, kind in get_type_hints(run, include_extras=True).items():
+        if name == "return" or kind is DatasetSource:
+            continue
+        group: Any = kind if is_dataclass(kind) else None
+        groups |= {name: group} if group else {}
+        declared = inspect.signature(group or run).parameters
+        hints = get_type_hints(group, include_extras=True) if group else {name: kind}
+        options += [
+            each.replace(annotation=hints[each.name], kind=inspect.Parameter.KEYWORD_ONLY)
+            for each in declared.values()
+            if each.name in hints
+        ]
+
+    def call(*dataset: DatasetSource, **values: Any) -> Any:
+        for name, kind in groups.items():
+            values[name] = kind(**{each.name: values.pop(each.name) for each in fields(kind) if each.name in values})
+        return run(*dataset, **values)
+
+    return options, call
+
+
+def as_command(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function with its options taken apart, as the command that typer makes of it."""
+    options, call = taken_apart(run)
+    call.__name__, call.__doc__, call.__signature__ = run.__name__, run.__doc__, inspect.Signature(options)  # type: ignore[attr-defined]
+    call.__annotations__ = {each.name: each.annotation for each in options}
+    return call
 
 
 Source = type[DatasetSource]
@@ -264,9 +307,7 @@ def _command(
     texts: Callable[[Source], Mapping[str, str | None]],
 ) -> Any:
     """The command of a verb for one dataset."""
-    _, *of_verb = inspect.signature(run).parameters.values()
-    hints = get_type_hints(run, include_extras=True)
-    of_verb = [each.replace(annotation=hints[each.name]) for each in of_verb]
+    of_verb, call = taken_apart(run)
     reads_result = any(each.name == "result" for each in of_verb)
     different = {"config": _config_text(source), **texts(source)}
     parameters = [
@@ -288,7 +329,7 @@ def _command(
         chosen_source = source(**chosen)
         if values.get("result") is not None:
             chosen_source = as_recorded(chosen_source, values["result"])
-        run(chosen_source, **values)
+        call(chosen_source, **values)
 
     ordered = sorted([*of_dataset, *parameters], key=lambda each: each.name != "result")
     keyword = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in ordered]

@@ -7,7 +7,7 @@ import logging
 import os
 import signal
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,7 +40,10 @@ from saga_fg.kernels.compilation import load_kernels
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 
 
-def serve(
+@dataclass(frozen=True)
+class ServiceOptions:
+    """Where a service listens, what it keeps, and within which limits."""
+
     listen: Annotated[
         str | None,
         typer.Option(
@@ -48,32 +51,32 @@ def serve(
             help="HOST:PORT, or the path of a Unix socket; standard input and output if left out.",
             metavar="ADDRESS",
         ),
-    ] = None,
+    ] = None
     allow_remote: Annotated[
         bool, typer.Option("--allow-remote", help="Listen where other machines can connect. There is no password.")
-    ] = False,
+    ] = False
     reorder: Annotated[
         float | None,
         typer.Option(
             "--reorder", min=0.0, help="Hold frames back by up to this many s, to sort them by time.  [default: 0]"
         ),
-    ] = None,
+    ] = None
     snapshot: Annotated[
         Path | None,
         typer.Option("--snapshot", help="Keep the state in this file, and go on from it at the start.", metavar="FILE"),
-    ] = None,
-    every: Annotated[float, typer.Option("--every", min=0.05, help="How often to write --snapshot, s.")] = 5.0,
+    ] = None
+    every: Annotated[float, typer.Option("--every", min=0.05, help="How often to write --snapshot, s.")] = 5.0
     limits: Annotated[
         Path | None,
         typer.Option(
             "--limits", help="YAML file of limits and times to wait; see `saga-fg config --limits`.", metavar="FILE"
         ),
-    ] = None,
-    method: how.MethodOption = "saga",
-    estimator: how.EstimatorOption = None,
-    lag: how.LagOption = None,
-    association: how.AssociationOption = None,
-    interactions: how.InteractionsOption = None,
+    ] = None
+
+
+def _serve_stream(
+    service: ServiceOptions,
+    tracker: how.TrackerOptions,
     predict: Annotated[
         str | None,
         typer.Option("--predict", help="Answer every frame with its tracks these s later, as well.", metavar="S,S,..."),
@@ -100,19 +103,21 @@ def serve(
     if not verbose:
         for handler in logging.getLogger().handlers:
             handler.addFilter(LogLimitFilter())
+    method = tracker.method
     how.check_learn_offsets(learn_offsets, method)
-    settings = how.configured("file", config, method, estimator, lag, association, interactions)
-    bounds = StreamSettings() if limits is None else load_settings(StreamSettings, limits)
-    if reorder is not None:
-        bounds = replace(bounds, reorder=reorder)
+    settings = tracker.configured("file", config)
+    bounds = StreamSettings() if service.limits is None else load_settings(StreamSettings, service.limits)
+    if service.reorder is not None:
+        bounds = replace(bounds, reorder=service.reorder)
     checks = Checks(settings.of_method(method), load_config("file"))
     horizons = how.horizons(predict, method)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, checks, horizons)
     return_large_blocks()
-    keeper = None if snapshot is None else _restored(stream, snapshot, every, settings, method)
+    kept = service.snapshot
+    keeper = None if kept is None else _restored(stream, kept, service.every, settings, method)
     last_acts = () if keeper is None else (keeper.save, keeper.clear_leftovers)
     with one_thread(), StopRequest(bounds.stop_timeout, *last_acts) as stop:
-        _serve(stream, keeper, listen, allow_remote, stop)
+        _serve(stream, keeper, service.listen, service.allow_remote, stop)
         if keeper is not None:
             keeper.stop()
         typer.echo(_summary(stream.status()), err=True)
@@ -120,6 +125,9 @@ def serve(
             how.write_offsets(learn_offsets, [stream.clocks()], settings, "a stream")
     if stop.number == signal.SIGTERM:
         raise typer.Exit(TERMINATED)
+
+
+serve = how.as_command(_serve_stream)
 
 
 def _restored(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +13,7 @@ from data_tools.datasets.source import dataset_source
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.settings import scenario_settings
 from pipelines.cli.console import counted, progress_bar, show_tables, working
-from pipelines.cli.options import Config, Verbose
+from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.config import load_config
 from pipelines.configuration import load_settings, settings_reference, write_settings
 from pipelines.demo import comparison_table, run_demo, write_simulated_tables
@@ -60,7 +61,18 @@ POINTER = """\
 """
 
 
-def config(
+@dataclass(frozen=True)
+class KindOptions:
+    """Which settings are printed, those of tracking if none is chosen."""
+
+    simulator: Annotated[bool, typer.Option("--simulator", help="The simulator's settings instead.")] = False
+    smoothing: Annotated[bool, typer.Option("--smoothing", help="Those of `saga-fg smooth` instead.")] = False
+    slam: Annotated[bool, typer.Option("--slam", help="Those of `saga-fg slam` instead.")] = False
+    limits: Annotated[bool, typer.Option("--limits", help="Those of `saga-fg serve --limits` instead.")] = False
+
+
+def _config(
+    *,
     kind: Annotated[
         str,
         typer.Option(
@@ -70,10 +82,7 @@ def config(
         ),
     ] = "file",
     full: Annotated[bool, typer.Option("--full", help="All settings, not only the five one changes first.")] = False,
-    simulator: Annotated[bool, typer.Option("--simulator", help="The simulator's settings instead.")] = False,
-    smoothing: Annotated[bool, typer.Option("--smoothing", help="Those of `saga-fg smooth` instead.")] = False,
-    slam: Annotated[bool, typer.Option("--slam", help="Those of `saga-fg slam` instead.")] = False,
-    limits: Annotated[bool, typer.Option("--limits", help="Those of `saga-fg serve --limits` instead.")] = False,
+    kinds: KindOptions,
     file: Annotated[
         Path | None, typer.Option("--config", help="Print the settings this YAML file leads to.", metavar="FILE")
     ] = None,
@@ -94,13 +103,13 @@ def config(
       saga-fg config --slam --for kitti                      # settings of `saga-fg slam`
       saga-fg config --limits                                # limits of `saga-fg serve`
     """
-    chosen = {"simulator": simulator, "smoothing": smoothing, "slam": slam, "limits": limits}
-    if sum(chosen.values()) > 1:
+    chosen = [name for name, wanted in vars(kinds).items() if wanted]
+    if len(chosen) > 1:
         raise InputError("expected one of --simulator, --smoothing, --slam and --limits")
-    name = next((name for name, wanted in chosen.items() if wanted), "tracking")
+    (name,) = chosen or ("tracking",)
     settings: Any
     if name in ("simulator", "limits"):
-        cls: type[Any] = SimulatorSettings if simulator else StreamSettings
+        cls: type[Any] = SimulatorSettings if kinds.simulator else StreamSettings
         settings = load_settings(cls, file) if file else cls()
     else:
         load = {"smoothing": load_smooth_config, "slam": load_slam_config, "tracking": load_config}[name]
@@ -114,6 +123,8 @@ def config(
         text = POINTER + write_settings(settings, selection=FIRST[name])
     typer.echo(text, nl=False)
 
+
+config = as_command(_config)
 
 READING = """\
 MOTA counts missed objects, false boxes and identity switches. kf and saga go on reporting hidden objects, centerpoint

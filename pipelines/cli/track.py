@@ -14,10 +14,10 @@ from pipelines import smoothing
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
 from pipelines.cli.console import counted, progress_bar
-from pipelines.cli.options import Source, dataset_commands
+from pipelines.cli.options import ScaleOptions, Source, TrackerOptions, dataset_commands
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import write_settings
-from pipelines.explaining import trackers
+from pipelines.explaining import journal_of, trackers
 from pipelines.report.page import RunRecord, write_run_record
 from pipelines.scale_out import RunSummary, SceneTask, SmoothTask, TrackTask, file_name, new_pool, run_scenes
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
@@ -27,39 +27,9 @@ from saga_fg.tracking import SensorTime
 
 FAILED_SCENES = 1  # exit code
 
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        "--workers",
-        min=0,
-        help="Process scenes in parallel, in this many processes (0: one per core); a second run continues where the "
-        "first stopped.",
-        metavar="N",
-    ),
-]
-RayAddress = Annotated[
-    str | None,
-    typer.Option(
-        "--ray",
-        help='Process scenes on a Ray cluster: "auto", HOST:PORT, ray://HOST:PORT, or "local" for one of --workers '
-        "CPUs on this machine.",
-        metavar="ADDRESS",
-    ),
-]
-
-
-def at_scale(workers: int | None, ray: str | None) -> bool:
-    """True if scenes are to be done in parallel."""
-    return workers is not None or ray is not None
-
 
 def run_at_scale(
-    source: DatasetSource,
-    task: SceneTask,
-    output: Path,
-    workers: int | None,
-    ray: str | None,
-    labels: bool = False,
+    source: DatasetSource, task: SceneTask, output: Path, scale: ScaleOptions, labels: bool = False
 ) -> RunSummary:
     """Do the task, which makes tracks or labels, with all parts of a dataset; print and return what became of them.
 
@@ -81,7 +51,7 @@ def run_at_scale(
             len(there.names),
             task,
             output,
-            lambda scratch: new_pool(workers or 0, ray, scratch),
+            lambda scratch: new_pool(scale.workers or 0, scale.ray, scratch),
             lambda _, done, of: bar("scenes", done, of),
             finish,
         )
@@ -147,32 +117,49 @@ def exit_on_failures(report: RunSummary) -> None:
         raise typer.Exit(FAILED_SCENES)
 
 
+@dataclass(frozen=True)
+class BesideOptions:
+    """What is kept beside the tracks."""
+
+    predict: Annotated[
+        str | None,
+        typer.Option(
+            "--predict",
+            help="Predict the tracks of every moment to these s after it, and keep that beside the output: "
+            "OUTPUT.predictions.csv, for `saga-fg report`.",
+            metavar="S,S,...",
+        ),
+    ] = None
+    explain: Annotated[
+        bool,
+        typer.Option(
+            "--explain", help="Keep a journal beside the output, for `saga-fg explain`: OUTPUT.journal.jsonl."
+        ),
+    ] = False
+    learn_offsets: options.LearnOffsetsOption = None
+
+
 def _track(
     source: DatasetSource,
     output: Annotated[Path, typer.Option("--output", "-o")],
-    method: options.MethodOption = "saga",
-    estimator: options.EstimatorOption = None,
-    lag: options.LagOption = None,
-    association: options.AssociationOption = None,
-    interactions: options.InteractionsOption = None,
-    predict: options.PredictOption = None,
-    explain: options.ExplainOption = False,
-    learn_offsets: options.LearnOffsetsOption = None,
-    workers: Workers = None,
-    ray: RayAddress = None,
+    tracker: TrackerOptions,
+    beside: BesideOptions,
+    scale: ScaleOptions,
     config: options.Config = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Track the detections of recordings."""
-    settings = options.configured(source.family, config, method, estimator, lag, association, interactions)
+    settings, method = tracker.configured(source.family, config), tracker.method
     options.apart(output, *source.input_files())
-    options.check_learn_offsets(learn_offsets, method, at_scale(workers, ray))
-    kept, horizons = options.journal(explain, output, at_scale(workers, ray)), options.horizons(predict, method)
+    options.check_learn_offsets(beside.learn_offsets, method, scale.wanted)
+    if beside.explain and scale.wanted:
+        raise InputError("--explain: goes without --workers and --ray")
+    kept, horizons = journal_of(output) if beside.explain else None, options.horizons(beside.predict, method)
     checks = Checks(settings.of_method(method), load_config(source.family), source.option_for)
-    if at_scale(workers, ray):
+    if scale.wanted:
         checks.see_first(source)
         task = TrackTask(settings, method, source, horizons)
-        report = run_at_scale(source, task, output, workers, ray)
+        report = run_at_scale(source, task, output, scale)
         checks.add(task.classes(report.counts))
         checks.finish()
         exit_on_failures(report)
@@ -189,10 +176,9 @@ def _track(
     checks.add(summary.classes)
     checks.finish()
     summary.show()
-    if learn_offsets is not None:
-        options.write_offsets(
-            learn_offsets, summary.clocks.values(), settings, f"{counted(summary.scenes, 'scene')}, {source.name}"
-        )
+    if beside.learn_offsets is not None:
+        origin = f"{counted(summary.scenes, 'scene')}, {source.name}"
+        options.write_offsets(beside.learn_offsets, summary.clocks.values(), settings, origin)
 
 
 _TRACK_EXAMPLES = (
@@ -213,18 +199,24 @@ def _texts(source: Source) -> dict[str, str]:
 track_app = dataset_commands("track", "Track recorded detections of a dataset.", _track, _TRACK_EXAMPLES, _texts)
 
 
-def _smooth(
-    source: DatasetSource,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
-    method: options.MethodOption = "saga",
-    association: options.AssociationOption = None,
-    interactions: options.InteractionsOption = None,
+@dataclass(frozen=True)
+class LabelOptions:
+    """How labels are made, and written."""
+
+    method: options.MethodOption = "saga"
+    association: options.AssociationOption = None
+    interactions: options.InteractionsOption = None
     table: Annotated[
         Literal["csv", "ndjson", "parquet"],
         typer.Option("--table", help="Format of the table of boxes; parquet needs the extra [parquet]."),
-    ] = "csv",
-    workers: Workers = None,
-    ray: RayAddress = None,
+    ] = "csv"
+
+
+def _smooth(
+    source: DatasetSource,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    labels: LabelOptions,
+    scale: ScaleOptions,
     config: options.Config = None,
     verbose: options.Verbose = False,
 ) -> None:
@@ -232,16 +224,17 @@ def _smooth(
 
     Tables of detections are smoothed as they are read: memory does not grow with their length.
     """
-    options.association_fits(method, association)
+    method = labels.method
+    options.association_fits(method, labels.association)
     settings = smoothing.load_smooth_config(source.family, config)
-    tracking = options.with_interactions(settings.tracking, method, interactions)
-    settings = replace(settings, tracking=tracking.with_association(association))
+    tracking = options.with_interactions(settings.tracking, method, labels.interactions)
+    settings = replace(settings, tracking=tracking.with_association(labels.association))
     usual = smoothing.load_smooth_config(source.family).tracking
     checks = Checks(settings.tracking.of_method(method), usual, source.option_for)
-    if at_scale(workers, ray):
+    if scale.wanted:
         checks.see_first(source)
-        task = SmoothTask(settings, method, source, f".{table}")
-        report = run_at_scale(source, task, output, workers, ray, labels=True)
+        task = SmoothTask(settings, method, source, f".{labels.table}")
+        report = run_at_scale(source, task, output, scale, labels=True)
         exit_on_failures(report)
         return
     stream = source.stream()
@@ -250,14 +243,14 @@ def _smooth(
             streamed = smoothing.write_streamed_labels(
                 output,
                 lambda folder: smoothing.smooth_stream(checks.over(parts), settings, folder, method, progress=progress),
-                f".{table}",
+                f".{labels.table}",
             )
         _show(output, streamed)
         return
     with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
         runs = smoothing.smooth_dataset(CheckedDataset(dataset, checks), settings, method, progress=progress)
         done = smoothing.write_labels(
-            output, runs, f".{table}", lambda folder, labels: source.write_labels(folder, dataset, labels)
+            output, runs, f".{labels.table}", lambda folder, found: source.write_labels(folder, dataset, found)
         )
     _show(output, done)
 
