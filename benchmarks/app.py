@@ -7,8 +7,9 @@ from importlib import import_module
 from benchmarks.runner import application
 
 NAMES = (
-    *("estimators", "gaps", "joint", "kills", "landmarks", "loops", "metrics", "modes", "scaling"),
-    *("service", "settling", "slam", "smoothing", "speed", "streaming", "tracking"),
+    *("estimators", "gaps", "joint", "kills", "landmarks", "loops", "metrics", "modes"),
+    *("pose_graphs", "scaling", "service", "settling", "slam", "smoothing"),
+    *("speed", "streaming", "tracking"),
 )
 
 app = application(getattr(import_module(f"benchmarks.{name}"), name) for name in NAMES)

@@ -24,14 +24,12 @@ from pipelines.cli.slam_kitti import kitti
 from pipelines.slam.configuration import load_laser_settings, load_slam_config
 from pipelines.slam.joint import run_joint, street
 from pipelines.slam.laser_slam import laser_slam
-from pipelines.slam.pose_graph_baselines import FromStart, from_same_starts
 from pipelines.slam.results import write_joint, write_laser_slam, write_pose_graph
 from saga_fg import Frame, InputError
 from saga_fg.numerics.arrays import IntArray
 from saga_fg.slam.joint import Observations
 from saga_fg.slam.pose_graph import consensus, graph_error, optimise_poses
 
-_ROUNDING = 1e-9  # an error that counts as none: all measurements agree
 Loss = Literal["consensus", "huber", "cauchy", "geman-mcclure", "tukey"]
 Shape = Literal["city", "torus", "sphere", "grid", "cube"]
 
@@ -39,10 +37,6 @@ Shape = Literal["city", "torus", "sphere", "grid", "cube"]
 def g2o(
     file: Annotated[Path, typer.Argument(help="Pose graph in the g2o format, in the plane or in space.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
-    compare: Annotated[
-        bool,
-        typer.Option("--compare", help="Run GTSAM's Levenberg-Marquardt too, with times."),
-    ] = False,
     certify: Annotated[
         bool,
         typer.Option("--certify", help="Find the global minimum of the chordal cost too, start from it, and prove it."),
@@ -73,14 +67,12 @@ def g2o(
     \b
     Examples:
       saga-fg slam g2o sphere2500.g2o --output sphere
-      saga-fg slam g2o MIT.g2o --output MIT --compare
+      saga-fg slam g2o MIT.g2o --output MIT
       saga-fg slam g2o CSAIL.g2o --output CSAIL --certify --covariances last
       saga-fg slam g2o with_false_loops.g2o --robust consensus --output clean
     """
     if robust not in (None, "consensus") and certify:
         raise InputError("--certify: expected without a robust loss, the proof is for squared errors")
-    if robust not in (None, "consensus") and compare:
-        raise InputError("--compare: expected without a robust loss, GTSAM's optimiser is run without one")
     scale = 3.0 if robust_scale is None else robust_scale
     if not 0 < scale < math.inf:
         raise InputError(f"--robust-scale {scale:g}: expected a number > 0")
@@ -88,7 +80,6 @@ def g2o(
         raise InputError("--robust-scale: expected with --robust and the name of a loss only")
     check_writable_folder(output)
     rejected: list[str] = []
-    compared: list[FromStart] = []
     loss = None if robust is None or robust == "consensus" else Robust(robust, scale)
     graph = pose_graphs.read_g2o(file)
     rows = _rows(covariances, graph.ids)
@@ -103,11 +94,6 @@ def g2o(
         optimised = optimise_poses(graph, loss, certify)
         blocks = optimised.covariances(rows)
     errors = {"guess itself": guess, **{f"from the {name}": error for name, error in optimised.errors.items()}}
-    if compare:
-        with working("GTSAM's optimiser"):
-            compared = from_same_starts(graph)
-            for row in compared:
-                errors[f"GTSAM Levenberg-Marquardt from the {row.start}"] = row.gtsam_error
     write_pose_graph(output, graph, optimised, rows, blocks, errors, rejected)
     poses, count = counted(len(graph), "pose"), len(graph.first)
     count += sum(len(one.pose) for one in (graph.priors, graph.places) if one is not None)
@@ -122,18 +108,6 @@ def g2o(
     if (minimum := optimised.chordal) is not None:
         proven = "the global minimum" if minimum.certified else "not proven to be the global minimum"
         typer.echo(f"chordal cost {minimum.cost:.8g}, {proven}: no poses below {minimum.bound:.8g}")
-    for name, error in errors.items():
-        if name.startswith("GTSAM"):
-            least = max(error, optimised.error)  # a graph that all measurements agree on is met but for rounding
-            ours = (
-                "both 0" if least < _ROUNDING else f"ours is {optimised.error / max(error, _ROUNDING):.4f} times that"
-            )
-            typer.echo(f"{name}: error {error:.6g}, {ours}")
-    for row in compared:
-        typer.echo(
-            f"CPU time from the {row.start}: {row.seconds:.2f} s, {row.seconds / row.gtsam_seconds:.2f} times that of "
-            f"GTSAM Levenberg-Marquardt (error {row.error:.6g}, {row.gtsam_error:.6g})"
-        )
 
 
 def _rows(chosen: str, ids: IntArray) -> IntArray:
@@ -163,7 +137,7 @@ def generate(
     \b
     Example:
       saga-fg slam generate city --poses 10000 --output city.g2o
-      saga-fg slam g2o city.g2o --output city --compare
+      saga-fg slam g2o city.g2o --output city
     """
     try:
         graph, _ = getattr(pose_graphs, shape)(poses, seed, noise=noise)

@@ -1,7 +1,4 @@
-"""A baseline for the optimisation of pose graphs: GTSAM's Levenberg-Marquardt on the same factors.
-
-It starts where ours begins, and runs beside ours, with the times of both.
-"""
+"""Optimisation of pose graphs beside GTSAM's Levenberg-Marquardt, from the same starts on the same factors."""
 
 from __future__ import annotations
 
@@ -9,11 +6,16 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from pathlib import Path
+from typing import Annotated, TypeVar
 
 import gtsam
 import numpy as np
+import typer
 
+from benchmarks.runner import Rows, each
+from data_tools.files.input_files import error_context
+from data_tools.pose_graphs import read_g2o
 from factors import PlanarPose, SpatialPose, Vector, residual_factor, solve
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import (
@@ -23,6 +25,25 @@ from saga_fg.slam.pose_graph import (
     factor_graph,
 )
 from saga_fg.slam.pose_graph.optimisation import SOLVER, graph_values, landmark_factors, placed
+
+
+def pose_graphs(files: Annotated[list[Path], typer.Argument(help="Pose graphs in the g2o format.")]) -> Rows:
+    """Solve pose graphs from the guess in the file and from the chordal start, beside GTSAM's optimiser.
+
+    \b
+    Example:
+      python -m benchmarks pose-graphs data/slam/MIT.g2o data/slam/sphere2500.g2o
+    """
+    for file in each(files, "graphs"):
+        with error_context(str(file)):
+            for row in from_same_starts(read_g2o(file)):
+                errors = {"error, saga-fg": row.error, "GTSAM": row.gtsam_error}
+                seconds = {"CPU s, saga-fg": row.seconds, "ratio to GTSAM": row.seconds / row.gtsam_seconds}
+                yield (
+                    "pose graphs: half the sum of squares",
+                    {"graph": file.stem, "start": row.start, **errors, **seconds},
+                )
+
 
 _MOST_RUNS, _LONG = 5, 0.5  # that are timed, and CPU seconds of them all
 _Result = TypeVar("_Result")
