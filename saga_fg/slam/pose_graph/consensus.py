@@ -167,7 +167,10 @@ class _Problem:
                     first, A[:, : self.k], second, A[:, self.k : -1], np.ascontiguousarray(A[:, -1]), unit
                 )
             )
-        return values.retract(linear.optimize())
+        try:
+            return values.retract(linear.optimize())
+        except RuntimeError:  # Cholesky squares the condition number, which odometry that says little makes large
+            return values.retract(linear.optimize(function=gtsam.EliminateQR))
 
     def solved(self, values: gtsam.Values, kept: BoolArray) -> gtsam.Values:
         """The minimum with some of the edges (M,): a loop that returns may bend a long chain far."""

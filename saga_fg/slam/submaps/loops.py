@@ -1,56 +1,44 @@
-"""Loops between submaps: their factors, how they disagree with dead reckoning, and which are true.
-
-What loops say against dead reckoning, as a sparse linear system over the anchors.
-
-d_j, the error of the anchor j in its own frame (d_0 = 0), takes the place of the errors of odometry's steps,
-
-    e_j = d_(j+1) - A_j d_j,  A_j = Ad(T_(j+1)^-1 T_j)        r_k = m_k + d_b - B_k d_a,  B_k = Ad(T_b^-1 T_a)
-
-so that steps and loops are edges of one graph, H = sum G^T W G over both. With e = r = the residuals at its solution
-
-    m^T C^-1 m  = sum e^T Q^-1 e + sum r^T R^-1 r         log |C| = log |H| + log |Q| + log |R|
-
-where C = J Q J^T + R is the covariance of all loops by odometry, which is dense wherever cycles overlap. H is factored
-by sparse LU without pivoting.
-
-Which loops between submaps are true, and how far odometry is off its own noise, once a drive is over.
+"""Loops between submaps: their factors, and which are true and how far odometry is off, once a drive is over.
 
 A loop that passed its proof is false with probability `_FALSE` only. Odometry alone never speaks against it: the
-deviations of odometry's rotation and translation are s_1 and s_2 >= 1 times those stated, as the loops have it. With
-what the loops K say against dead reckoning, m_K, linearised at their solution,
+deviations of odometry's rotation and translation are s_1 and s_2 >= 1 times those stated, as the loops have it. For
+some of the loops, K, with the residuals e of odometry's steps and r of loops at their solution,
 
-    cost(K) = min_s ( m_K^T C_K^-1 m_K + log |C_K| + 2 log s_1 s_2 ),      C = J Q(s) J^T + R
+    cost(K, s) = sum e^T Q(s)^-1 e + sum_K r^T R^-1 r  +  log |H| + log |Q(s)| + log |R_K|  +  2 log s_1 s_2
 
-is -2 log of their likelihood. Q(s): inflated covariance of odometry, J: the loops by odometry's steps, R: their own
-covariance; the prior of s is 1 / s. A false loop has errors of rotation and of translation of its own besides: with
-what K predicts of it, v with covariance V, it costs
+is -2 log of their likelihood: Q(s) inflated covariance of odometry, R their own, H the information of all anchors; the
+prior of s is 1 / s. The first five terms are m^T C^-1 m + log |C| of what loops say against dead reckoning, m, whose
+covariance C = J Q J^T + R is dense wherever cycles overlap. A loop that is left out, predicted with covariance P, has
+errors of rotation and of translation of its own besides, t_1 and t_2, by moments, and costs
 
-    min_t ( v^T V_t^-1 v + log |V_t| ) - 2 log `_FALSE`,      V_t = V + diag(t_1^2 1, t_2^2 1)
+    r^T V^-1 r + log |V| - 2 log `_FALSE`,      V = P + R + diag(t_1^2 1, t_2^2 1)
 
-Loops leave or return while the sum falls, once from all of them, once from the one that fits odometry best; the cheaper
-end is taken. So a loop alone stays, and several that agree at some s.
+With odometry inflated by some s, the loops that agree are those of `saga_fg.slam.pose_graph.consensus`. Each choice
+that some s leads to gets the s that fits it; the cheapest is taken. So a loop alone stays, and several that agree.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, pairwise
-from typing import Any
+from itertools import pairwise
+from typing import Self
 
 import gtsam
 import numpy as np
 from scipy.optimize import minimize
-from scipy.sparse import coo_array, csc_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import coo_array
 
-from factors import Robust, between_factor
+from factors import Robust, Solution, between_factor, solve
 from saga_fg.errors import InputError
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform
 from saga_fg.slam.mapping import pose_key
+from saga_fg.slam.pose_graph import PoseGraph, PosePriors, consensus, factor_graph
+from saga_fg.slam.pose_graph.chordal import factorised
+from saga_fg.slam.pose_graph.consensus import chosen_edges
+from saga_fg.slam.pose_graph.optimisation import SOLVER, graph_values
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,114 +99,15 @@ class Loops:
         return Additions(factors=loop_factors(self._by_epoch.get(view.epoch, ()), self.epochs, None))
 
 
-_AT_ONCE = 64  # loops predicted
-
-
-@dataclass(frozen=True, eq=False)
-class Misfits:
-    """M loops between S + 1 anchors, linearised.
-
-    m       (M, 6) deviations of loops from dead reckoning; ends (M, 2) their anchors
-    turned  (M, 6, 6) B of each loop; moved (S, 6, 6) A of each step
-    parts   (S, 3, 6, 6) covariance of each step by rotations, by translations, and by both together
-    R       (M, 6, 6) covariance of each loop
-    """
-
-    m: FloatArray
-    ends: IntArray
-    turned: FloatArray
-    moved: FloatArray
-    parts: FloatArray
-    R: FloatArray
-
-    def loops(self, kept: BoolArray) -> tuple[csc_array, FloatArray, float]:
-        """What kept loops add to H, its right side (S, 6), and log |R|; the same for every inflation."""
-        W = np.asarray(np.linalg.inv(self.R[kept]))
-        H = _assembled(len(self.moved), self.ends[kept], self.turned[kept], W)
-        side = np.zeros((len(self.moved) + 1, 6))
-        weighted = np.einsum("kij,kj->ki", W, self.m[kept])
-        np.add.at(side, self.ends[kept, 1], -weighted)
-        np.add.at(side, self.ends[kept, 0], np.einsum("kij,ki->kj", self.turned[kept], weighted))
-        return H, side[1:], float(np.linalg.slogdet(self.R[kept])[1].sum())
-
-    def solved(self, kept: BoolArray, inflation: FloatArray, loops: tuple[csc_array, FloatArray, float]) -> Solution:
-        """The errors of anchors by kept loops, of which `loops` says what they add, with inflated odometry."""
-        Q = np.einsum("g,sgij->sij", _scales(inflation), self.parts)
-        inverse = np.linalg.inv(Q)
-        steps = len(self.moved)
-        chain = np.column_stack([np.arange(steps), np.arange(1, steps + 1)])
-        H = _assembled(steps, chain, self.moved, inverse) + loops[0]
-        factor = splu(H.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        d = np.concatenate([np.zeros((1, 6)), factor.solve(loops[1].ravel()).reshape(-1, 6)])
-        e = d[1:] - np.einsum("sij,sj->si", self.moved, d[:-1])
-        r = self.m + d[self.ends[:, 1]] - np.einsum("kij,kj->ki", self.turned, d[self.ends[:, 0]])
-        squares = np.einsum("si,sij,sj->", e, inverse, e)
-        squares += (r[kept] * np.linalg.solve(self.R[kept], r[kept][..., None])[..., 0]).sum()
-        volume = np.log(np.abs(factor.U.diagonal())).sum() + np.linalg.slogdet(Q)[1].sum() + loops[2]
-        return Solution(self, factor, e, r, float(squares + volume))
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """errors (S, 6) of odometry's steps and residuals (M, 6) of all loops; cost: m^T C^-1 m + log |C| of those kept."""
-
-    misfits: Misfits
-    factor: Any
-    errors: FloatArray
-    residuals: FloatArray
-    cost: float
-
-    def predicted(self, rows: IntArray) -> FloatArray:
-        """The covariances (n, 6, 6) with which the solution predicts some loops."""
-        given = self.misfits
-        P, size = np.empty((len(rows), 6, 6)), 6 * len(given.moved)
-        for part in range(0, len(rows), _AT_ONCE):
-            at = rows[part : part + _AT_ONCE]
-            side = np.zeros((len(given.moved) + 1, 6, len(at), 6))
-            each = np.arange(len(at))
-            side[given.ends[at, 1], :, each] = np.eye(6)
-            side[given.ends[at, 0], :, each] = -given.turned[at].swapaxes(1, 2)
-            x = self.factor.solve(side[1:].reshape(size, -1)).reshape(-1, 6, len(at), 6)
-            x = np.concatenate([np.zeros((1, *x.shape[1:])), x])
-            P[part : part + _AT_ONCE] = x[given.ends[at, 1], :, each] - given.turned[at] @ x[given.ends[at, 0], :, each]
-        return (P + P.swapaxes(1, 2)) / 2
-
-    def left_out(self, rows: IntArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Deviations v (n, 6) and covariances V (n, 6, 6) of some loops by the kept ones without them."""
-        P, R, v = self.predicted(rows), self.misfits.R[rows], self.residuals[rows]
-        V, inside = P + R, kept[rows]
-        if inside.any():
-            inverse = np.linalg.inv(R[inside])
-            V[inside] = np.linalg.inv(inverse - inverse @ P[inside] @ inverse)
-            v = v.copy()
-            v[inside] = np.einsum("kij,kjl,kl->ki", V[inside], inverse, v[inside])
-        return v, V
-
-
-def _assembled(steps: int, ends: IntArray, turned: FloatArray, W: FloatArray) -> csc_array:
-    """The sum of G^T W G (6S, 6S) over edges (n, 2), whose residuals are d_b - turned d_a; d_0 is fixed."""
-    across = -W @ turned
-    blocks = np.stack([W, across, across.swapaxes(1, 2), -turned.swapaxes(1, 2) @ across], axis=1)
-    block = ends[:, [1, 1, 0, 0]] - 1, ends[:, [1, 0, 1, 0]] - 1
-    free = (block[0] >= 0) & (block[1] >= 0)
-    row, column = (6 * at[free][:, None, None] for at in block)
-    row, column = np.broadcast_arrays(row + np.arange(6)[:, None], column + np.arange(6))
-    entries = blocks[free].ravel(), (row.ravel(), column.ravel())
-    return coo_array(entries, shape=(6 * steps, 6 * steps)).tocsc()
-
-
-def _scales(inflation: FloatArray) -> FloatArray:
-    a, b = inflation
-    return np.array([a**2, b**2, a * b])
-
-
 _FALSE = 1e-3  # probability that a proven loop is false
 _MOST = np.log(1e3)  # log of the largest inflation
-_STARTS = np.ones(2), np.full(2, 10.0)  # inflations
-_TRIED, _FITTED = 5, 2  # loops whose leaving is tried, the worst first, and choices whose inflation is fitted
-_STEPS, _SETTLED = 10, 1e-4
-_NUDGE, _PRECISION = 1e-3, {"ftol": 1e-7, "gtol": 1e-3}  # of logarithms of inflations, for slopes; of their fit
-_LOG = logging.getLogger(__name__)
+_STARTS = (1.0, 3.0, 10.0, 30.0)  # inflations with which loops are chosen
+_FIRST = PosePriors(np.zeros(1, dtype=np.int64), np.eye(4)[None], np.eye(6)[None])  # of the anchors, anywhere
+_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
+_MOST_CHOICES, _PRECISION = (
+    12,
+    {"xatol": 0.05, "fatol": 0.2, "maxfev": 40},
+)  # of loops, that are fitted; of logarithms of inflations and their cost
 
 Motion = tuple[FloatArray, FloatArray]
 
@@ -242,17 +131,19 @@ def select_loops(motions: Sequence[Motion], anchors: Sequence[int], loops: Seque
         return LoopSelection(np.ones(0, dtype=bool), np.ones(2))
     begin, end = min(loop.first for loop in loops), max(loop.second for loop in loops)
     steps = [_step(motions[a:b]) for a, b in pairwise(anchors[begin : end + 1])]
-    loops = [replace(loop, first=loop.first - begin, second=loop.second - begin) for loop in loops]
-    problem = _Problem(np.array([T for T, _ in steps]), np.array([parts for _, parts in steps]), loops)
-    everyone = _searched(problem, np.ones(len(loops), dtype=bool))
-    if everyone.kept.all() and np.isclose(everyone.inflation, 1.0).all():
-        return LoopSelection(everyone.kept, everyone.inflation)
-    misfits, none = problem.at(np.zeros((len(steps), 6))), np.zeros(len(loops), dtype=bool)
-    dead_reckoning = misfits.solved(none, np.ones(2), misfits.loops(none))
-    alone = _judged(dead_reckoning, none, np.arange(len(loops)))[0]
-    one = _searched(problem, np.arange(len(loops)) == int(np.argmin(alone)))
-    best = min(everyone, one, key=lambda found: found.cost)
-    return LoopSelection(best.kept, best.inflation)
+    drive = _AnchoredLoops.of(
+        steps, [replace(loop, first=loop.first - begin, second=loop.second - begin) for loop in loops]
+    )
+    choices = [(np.ones(len(loops), dtype=bool), np.ones(2))]
+    choices += [(drive.agreeing(start), start) for start in np.outer(_STARTS, np.ones(2))]
+    found: dict[bytes, LoopSelection] = {}
+    costs: dict[bytes, float] = {}
+    for kept, start in choices:
+        if (name := kept.tobytes()) not in found:
+            found[name], costs[name] = drive.fitted(kept, start)
+            if len(choices) < _MOST_CHOICES:
+                choices.append((drive.agreeing(found[name].inflation), found[name].inflation))
+    return found[min(costs, key=costs.__getitem__)]
 
 
 def _step(motions: Sequence[Motion]) -> Motion:
@@ -268,121 +159,79 @@ def _step(motions: Sequence[Motion]) -> Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """Loops (M,), the inflation (2,) with which they fit, their cost, and the solution with them."""
+class _AnchoredLoops:
+    """measured: graph of the anchors, odometry's S steps before the loops; parts (S, 3, 6, 6) of their covariances."""
 
-    kept: BoolArray
-    inflation: FloatArray
-    cost: float
-    solution: Solution
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Steps of odometry (S, 4, 4), the parts of their covariances (S, 3, 6, 6), and the loops."""
-
-    steps: FloatArray
+    measured: PoseGraph
     parts: FloatArray
-    loops: Sequence[LoopClosure]
 
-    def at(self, errors: FloatArray) -> Misfits:
-        """Linearised where odometry's steps are off by errors (S, 6)."""
-        steps = [gtsam.Pose3(T).retract(error) for T, error in zip(self.steps, errors, strict=True)]
-        poses = list(accumulate(steps, lambda pose, step: pose.compose(step), initial=gtsam.Pose3()))
-        ends = np.array([(loop.first, loop.second) for loop in self.loops])
-        between = [poses[a].between(poses[b]) for a, b in ends.tolist()]
-        r = [gtsam.Pose3(loop.first_T_second).localCoordinates(T) for loop, T in zip(self.loops, between, strict=True)]
-        moved, turned = (np.array([T.inverse().AdjointMap() for T in each]) for each in (steps, between))
-        d = np.zeros((len(poses), 6))
-        for j, error in enumerate(errors):
-            d[j + 1] = moved[j] @ d[j] + error
-        m = np.array(r) - d[ends[:, 1]] + np.einsum("kij,kj->ki", turned, d[ends[:, 0]])
-        return Misfits(m, ends, turned, moved, self.parts, np.array([loop.covariance for loop in self.loops]))
+    @classmethod
+    def of(cls, steps: Sequence[Motion], loops: Sequence[LoopClosure]) -> Self:
+        ends = [*pairwise(range(len(steps) + 1)), *((loop.first, loop.second) for loop in loops)]
+        first, second = np.array(ends, dtype=np.int64).T
+        between = np.array([*(T for T, _ in steps), *(loop.first_T_second for loop in loops)])
+        parts = np.array([P for _, P in steps])
+        information = np.linalg.inv([*parts.sum(axis=1), *(loop.covariance for loop in loops)])
+        ids = np.arange(len(steps) + 1, dtype=np.int64)
+        return cls(PoseGraph.of_measurements(ids, first, second, between, _symmetric(information), _FIRST), parts)
 
-    def solved(self, found: _Found) -> tuple[Misfits, _Found]:
-        """Linearised at the solution of some of the loops, with the inflation that fits there."""
-        errors = np.zeros((len(self.steps), 6))
-        misfits = self.at(errors)
-        found = _fitted(misfits, found.kept, [found.inflation])
-        for _ in range(_STEPS):
-            before, errors = errors, found.solution.errors
-            misfits = self.at(errors)
-            found = _fitted(misfits, found.kept, [found.inflation])
-            if np.abs(errors - before).max() < _SETTLED:
-                break
-        return misfits, found
+    def graph(self, inflation: FloatArray) -> PoseGraph:
+        """The graph with odometry's deviations of rotation and of translation (2,) times as large."""
+        a, b = inflation
+        information = self.measured.information.copy()
+        information[: len(self.parts)] = _symmetric(
+            np.linalg.inv(np.einsum("g,sgij->sij", [a**2, b**2, a * b], self.parts))
+        )
+        return replace(self.measured, information=information)
 
+    def agreeing(self, inflation: FloatArray) -> BoolArray:
+        """The loops (M,) that agree with each other and with odometry so inflated."""
+        return consensus(self.graph(inflation)).kept[len(self.parts) :]
 
-def _costed(misfits: Misfits, kept: BoolArray, inflation: FloatArray) -> _Found:
-    """Loops (M,) with some inflation, as it is."""
-    solution = misfits.solved(kept, inflation, misfits.loops(kept))
-    false = _judged(solution, kept, np.flatnonzero(~kept))[1].sum()
-    return _Found(kept, inflation, float(solution.cost + 2 * np.log(inflation).sum() + false), solution)
+    def fitted(self, kept: BoolArray, start: FloatArray) -> tuple[LoopSelection, float]:
+        """The inflation with which some loops (M,) fit, and the cost of that with the others false."""
+        solutions = [self.solved(kept, start, graph_values(self.measured))]
 
+        def cost(logs: FloatArray) -> float:
+            solutions.append(self.solved(kept, np.exp(logs), solutions.pop().values))
+            return self.cost(solutions[0], kept, np.exp(logs))
 
-def _fitted(misfits: Misfits, kept: BoolArray, starts: Sequence[FloatArray]) -> _Found:
-    """The inflation with which loops (M,) fit, from one or several."""
-    loops = misfits.loops(kept)
+        simplex = np.clip(np.log(start) + _SIMPLEX, 0.0, _MOST)
+        options = {**_PRECISION, "initial_simplex": simplex}
+        logs = minimize(cost, simplex[0], method="Nelder-Mead", bounds=[(0.0, _MOST)] * 2, options=options).x
+        total = cost(logs) + self.false_cost(solutions[0], np.flatnonzero(~kept))
+        return LoopSelection(kept, np.exp(logs)), total
 
-    def cost(logs: FloatArray) -> float:
-        return misfits.solved(kept, np.exp(logs), loops).cost + 2 * float(logs.sum())
+    def solved(self, kept: BoolArray, inflation: FloatArray, start: gtsam.Values) -> Solution:
+        """The anchors with some loops (M,)."""
+        chosen = chosen_edges(self.graph(inflation), np.concatenate([np.ones(len(self.parts), dtype=bool), kept]))
+        return solve(factor_graph(chosen), [], start, SOLVER)
 
-    def slopes(logs: FloatArray) -> FloatArray:
-        return np.array([cost(logs + step) - cost(logs - step) for step in _NUDGE * np.eye(2)]) / (2 * _NUDGE)
+    def cost(self, solution: Solution, kept: BoolArray, inflation: FloatArray) -> float:
+        """The cost of the loops (M,) of a solution."""
+        row, column, entry = solution.linear.sparseJacobian_()
+        J = coo_array((entry, (row.astype(np.int64) - 1, column.astype(np.int64) - 1))).tocsc()[:, :-1]
+        volume = float(np.log(np.abs(factorised(J.T @ J).U.diagonal())).sum())
+        rows = np.concatenate([np.ones(len(self.parts), dtype=bool), kept])
+        volume -= float(np.linalg.slogdet(self.graph(inflation).information[rows])[1].sum())
+        return 2 * solution.error + volume + 2 * float(np.log(inflation).sum())
 
-    ends = [
-        minimize(cost, np.log(x), jac=slopes, method="L-BFGS-B", bounds=[(0.0, _MOST)] * 2, options=_PRECISION)
-        for x in starts
-    ]
-    return _costed(misfits, kept, np.exp(min(ends, key=lambda end: float(end.fun)).x))
-
-
-def _judged(solution: Solution, kept: BoolArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Costs (n,) of some loops by the kept ones without them: if they are true, and if they are false."""
-    v, V = solution.left_out(rows, kept)
-    squares = (v**2 - np.diagonal(V, axis1=1, axis2=2)).reshape(-1, 2, 3).mean(axis=2)
-    more = np.repeat(np.maximum(squares, 0.0), 3, axis=1)  # covariance of further errors, by moments
-    return _cost(v, V), _cost(v, V + more[:, None] * np.eye(6)) - 2 * np.log(_FALSE)
-
-
-def _searched(problem: _Problem, kept: BoolArray) -> _Found:
-    """Loops leave and return while the cost falls."""
-    misfits, found = problem.solved(_fitted(problem.at(np.zeros((len(problem.steps), 6))), kept, _STARTS))
-    for _ in range(4 * len(kept)):
-        better = _better(misfits, found)
-        if better is None:
-            return found
-        misfits, found = problem.solved(better)
-    _LOG.warning("the choice among %d loops has not settled: the last one is taken", len(kept))
-    return found
+    def false_cost(self, solution: Solution, rows: IntArray) -> float:
+        """The cost of some loops (n,) besides, false, by a solution without them."""
+        first, second = (ends[len(self.parts) + rows] for ends in (self.measured.first, self.measured.second))
+        keys, total = np.unique([first, second]), 0.0
+        P = solution.covariance(keys.tolist()) if len(rows) else np.empty((0, 0))
+        for row, a, b in zip((len(self.parts) + rows).tolist(), first.tolist(), second.tolist(), strict=True):
+            between = solution.values.atPose3(a).between(solution.values.atPose3(b))
+            v = gtsam.Pose3(self.measured.first_T_second[row]).localCoordinates(between)
+            G = np.hstack([-between.inverse().AdjointMap(), np.eye(6)])
+            at = np.concatenate([6 * np.searchsorted(keys, end) + np.arange(6) for end in (a, b)])
+            V = G @ P[np.ix_(at, at)] @ G.T + np.linalg.inv(self.measured.information[row])
+            more = np.maximum((v**2 - np.diag(V)).reshape(2, 3).mean(axis=1), 0.0)
+            V = V + np.diag(np.repeat(more, 3))
+            total += float(v @ np.linalg.solve(V, v) + np.linalg.slogdet(V)[1]) - 2 * np.log(_FALSE)
+        return total
 
 
-def _better(misfits: Misfits, found: _Found) -> _Found | None:
-    """The cheapest of the choices next to this one, if it is cheaper: those that agree return, or the worst leave."""
-    kept = found.kept
-    true, false = _judged(found.solution, kept, np.arange(len(kept)))
-    score = true - false
-    returning = np.flatnonzero(~kept & (score < 0))
-    returning, tried = returning[np.argsort(score[returning], kind="stable")], []
-    while len(returning) > 1:  # the best half of them, and so on
-        tried.append(kept | np.isin(np.arange(len(kept)), returning))
-        returning = returning[: len(returning) // 2]
-    leaving = kept & (score > max(score[kept].max() / 2, 0.0))
-    tried += [kept & ~leaving] if leaving.sum() > 1 else []
-    for group in (np.flatnonzero(~kept), np.flatnonzero(kept)[::-1]):
-        inside = bool(len(group) and kept[group[0]])
-        order = group[np.argsort(-score[group] if inside else score[group], kind="stable")][:_TRIED]
-        tried += [kept ^ (np.arange(len(score)) == row) for row in order]
-    guesses = [found.inflation**share for share in (1.0, 0.5, 0.0)[: 1 if (found.inflation == 1).all() else 3]]
-    rough = [[_costed(misfits, choice, guess) for guess in guesses] for choice in tried if choice.any()]
-    chosen = sorted((min(costs, key=_by_cost) for costs in rough), key=_by_cost)[:_FITTED]
-    best = min((_fitted(misfits, one.kept, [one.inflation]) for one in chosen), key=_by_cost, default=found)
-    return best if best.cost < found.cost - 1e-3 else None
-
-
-def _by_cost(found: _Found) -> float:
-    return found.cost
-
-
-def _cost(v: FloatArray, V: FloatArray) -> FloatArray:
-    return np.asarray((v * np.linalg.solve(V, v[..., None])[..., 0]).sum(axis=1) + np.linalg.slogdet(V)[1])
+def _symmetric(matrices: FloatArray) -> FloatArray:
+    return np.asarray((matrices + matrices.swapaxes(1, 2)) / 2)

@@ -9,8 +9,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from saga_fg.slam.pose_graph.optimisation import graph_values
 from saga_fg.slam.submaps import LoopClosure
-from saga_fg.slam.submaps.loops import LoopSelection, select_loops
+from saga_fg.slam.submaps.loops import LoopSelection, _AnchoredLoops, select_loops
 
 PER_LAP, STEPS, EVERY = 100, 200, 5
 STATED = np.array([1e-3] * 3 + [0.03] * 3)
@@ -91,3 +92,47 @@ def test_hundreds_of_loops_take_time_by_their_number() -> None:
 
 def test_nothing_is_known_without_loops() -> None:
     np.testing.assert_array_equal(selected(0).inflation, [1.0, 1.0])
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_cost_is_that_of_the_dense_covariance_of_all_loops(seed: int) -> None:
+    """m^T C^-1 m + log |C| + 2 log s_1 s_2 but for a constant, where errors are small."""
+    rng, small = np.random.default_rng(seed), 1e-3
+    true = [gtsam.Pose3.Expmap(rng.normal(size=6)) for _ in range(6)]
+    A = small * rng.normal(size=(7, 6, 8))
+    step, loops, parts = [], [], np.zeros((5, 3, 6, 6))
+    for k in range(5):
+        P = A[k] @ A[k].T
+        parts[k, 0, :3, :3], parts[k, 1, 3:, 3:] = P[:3, :3], P[3:, 3:]
+        parts[k, 2] = P - parts[k, 0] - parts[k, 1]
+        step.append(true[k].between(true[k + 1]).retract(A[k] @ rng.normal(size=8)).matrix())
+    ends, R = [(0, 4), (1, 5)], [A[k] @ A[k].T for k in (5, 6)]
+    for k, (a, b) in enumerate(ends):
+        seen = true[a].between(true[b]).retract(A[5 + k] @ rng.normal(size=8))
+        loops.append(LoopClosure(a, b, seen.matrix(), R[k]))
+    drive = _AnchoredLoops.of(list(zip(step, parts, strict=True)), loops)
+    poses = list(accumulate(map(gtsam.Pose3, step), lambda pose, moved: pose.compose(moved), initial=gtsam.Pose3()))
+    m = np.concatenate(
+        [
+            gtsam.Pose3(loop.first_T_second).localCoordinates(poses[loop.first].between(poses[loop.second]))
+            for loop in loops
+        ]
+    )
+    J = np.zeros((12, 30))
+    for row, (a, b) in enumerate(ends):
+        for k in range(a, b):
+            J[6 * row : 6 * row + 6, 6 * k : 6 * k + 6] = poses[b].between(poses[k + 1]).AdjointMap()
+    off = []
+    for inflation in (np.ones(2), np.array([2.0, 5.0])):
+        s, t = inflation
+        Q = np.zeros((30, 30))
+        for k, P in enumerate(np.einsum("g,sgij->sij", [s**2, t**2, s * t], parts)):
+            Q[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = P
+        C = J @ Q @ J.T
+        for row in range(2):
+            C[6 * row : 6 * row + 6, 6 * row : 6 * row + 6] += R[row]
+        expected = m @ np.linalg.solve(C, m) + np.linalg.slogdet(C)[1] + 2 * np.log(s * t)
+        both = np.ones(2, dtype=bool)
+        solution = drive.solved(both, inflation, graph_values(drive.measured))
+        off.append(drive.cost(solution, both, inflation) - expected)
+    assert off[0] == pytest.approx(off[1], abs=0.02)
