@@ -69,18 +69,8 @@ class Condensation(Protocol):
     @property
     def name(self) -> str: ...
 
-    @property
-    def anchor(self) -> int:
-        """A variable that leaves with the others, but is in the marginal. What a condensation of this name gave for it
-        earlier is handed over apart."""
-
-    def factors(
-        self,
-        marginal: Sequence[gtsam.JacobianFactor],
-        earlier: Sequence[gtsam.JacobianFactor],
-        point: LinearisationPoint,
-    ) -> Sequence[Factor]:
-        """Return factors in place of both, which are on increments from the base, linearised at `point`."""
+    def factors(self, marginal: Sequence[gtsam.JacobianFactor], point: LinearisationPoint) -> Sequence[Factor]:
+        """Return factors in place of the marginal, which is on increments from the base, linearised at `point`."""
 
 
 _MARGINALS = "marginals"
@@ -228,20 +218,16 @@ class SceneFactorGraph:
         if not leaving:
             return
         touched, point, rows = gtsam.GaussianFactorGraph(), self.point(), self.index.rows_on(leaving)
-        earlier: list[gtsam.JacobianFactor] = []
         for number, mine in rows.items():
-            held = self.index.groups[number]
-            apart = into is not None and held.provider == into.name and into.anchor in held.factors.rows[mine[0]]
-            for factor in self.linearised(held, np.array(mine), point):
-                earlier.append(factor) if apart else touched.push_back(factor)
-        involved = set(touched.keyVector())
+            for factor in self.linearised(self.index.groups[number], np.array(mine), point):
+                touched.push_back(factor)
+        eliminated = sorted(leaving.keys() & set(touched.keyVector()))
         if into is not None:
-            eliminated = sorted((leaving.keys() & involved) - {into.anchor})
-            made = into.factors(self._eliminated(touched, eliminated, "qr"), earlier, point)
+            made = into.factors(self._eliminated(touched, eliminated, "qr"), point)
             self._replace(rows, [], leaving)
-            self.add_factors(into.name, made, into.name)
+            self.add_factors(into.name, made)
             return
-        self.replace_rows(rows, self._eliminated(touched, sorted(leaving.keys() & involved), self.elimination), leaving)
+        self.replace_rows(rows, self._eliminated(touched, eliminated, self.elimination), leaving)
 
     def drop(self, keys: Set[int]) -> None:
         """Take out variables with all factors on them, which are on no others: whole components."""

@@ -8,10 +8,8 @@ A submap is anchored at its first keyframe. When it is long enough, the keyframe
 one, and everything in between is eliminated (`condensing`). Landmarks belong to one submap: what is seen on is a
 landmark of the next again, and they are tied through the poses.
 
-There are two graphs: the running one, of the submap at hand alone, whose anchor has a prior from everything before; and
-that of all anchors, which is solved when a submap is closed, and when loops come. These move the anchor of the running
-submap by another prior; what the running submap says of those before comes when it is closed. So a keyframe costs as
-much at the end of a drive as at its beginning.
+So the running graph has the submap at hand and the anchors of all others, and a keyframe costs nearly as much at the
+end of a drive as at its beginning.
 
 The measurements themselves are kept. `finish` chooses the loops that agree (`select_loops`), and solves everything
 together, nothing condensed, from the running estimate.
@@ -27,13 +25,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from factors import Robust, SolverSettings, pose, pose_prior_factor
+from factors import Robust, SolverSettings
 from saga_fg.errors import InputError
 from saga_fg.estimators.batch import BatchSolver
 from saga_fg.estimators.graph_window import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import EGO_POSE, Additions, FactorProvider, GraphView, NewVariable, SceneFactorGraph, ask_all
+from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Positive, Range, Settings, setting
@@ -170,14 +168,13 @@ class SubmapGraph:
     ) -> None:
         self.settings = settings or SubmapSettings()
         self._providers = recorded(providers)
-        self._smoother = self._new_smoother()
+        relinearisation = RelinearisationSettings(self.settings.relinearise_above)
+        self._smoother = IncrementalSmoother(lag=None, settings=relinearisation, elimination="cholesky")
         self._motions: list[Motion] = [(world_T_first, covariance)]
         self._times: list[float] = []
         self._seen: list[Sequence[tuple[int, Observation]]] = []
         self._anchors: list[int] = []
         self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
-        self._by_anchors = self._new_smoother()  # one epoch for each anchor, once a submap was closed
-        self._closed: CondensedSubmap | None = None  # the newest one
         self._loops: list[LoopClosure] = []  # between submaps, by their numbers
         self._landmarks = SubmapLandmarks()
         self._numbers, self._way = 1, 0.0  # of the next landmark; m since the anchor
@@ -239,16 +236,15 @@ class SubmapGraph:
                 raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
         if not loops:
             return
-        factors = loop_factors(loops, range(len(self._anchors)), self.settings.robust_loops)
-        self._by_anchors.extend([Given(Additions(factors=factors), "loops")], settings=_AFTER_LOOPS)
+        factors = loop_factors(loops, self._anchors, self.settings.robust_loops)
+        self._smoother.extend([Given(Additions(factors=factors), "loops")], settings=_AFTER_LOOPS)
         self._loops += loops
-        self._move_running()
 
     def pose(self, k: int) -> FloatArray:
         """The present estimate (4, 4) of a keyframe's pose; in a closed submap it goes along with the anchor."""
         if k < len(self._offsets):
             number = int(np.searchsorted(self._anchors, k, side="right")) - 1
-            return np.asarray(self._anchor(number) @ self._offsets[k])
+            return np.asarray(self._running(self._anchors[number]) @ self._offsets[k])
         return self._running(k)
 
     def covariance(self) -> FloatArray:
@@ -257,7 +253,7 @@ class SubmapGraph:
 
     def world_T_anchor(self) -> FloatArray:
         """The present estimates (n, 4, 4) of all anchors."""
-        return np.array([self._anchor(number) for number in range(len(self._anchors))])
+        return np.array([self._running(anchor) for anchor in self._anchors])
 
     def poses(self) -> FloatArray:
         """The present estimates (N, 4, 4) of all keyframes."""
@@ -298,28 +294,9 @@ class SubmapGraph:
             ask_all([motion, landmarks, loops, *others], graph)
         return graph, landmarks
 
-    def _new_smoother(self) -> IncrementalSmoother:
-        settings = RelinearisationSettings(self.settings.relinearise_above)
-        return IncrementalSmoother(lag=None, settings=settings, elimination="cholesky")
-
     def _running(self, k: int) -> FloatArray:
         state: Any = self._smoother.state(pose_key(k))
         return np.asarray(state.matrix())
-
-    def _anchor(self, number: int) -> FloatArray:
-        if number == len(self._anchors) - 1:
-            return self._running(self._anchors[number])
-        state: Any = self._by_anchors.state(pose_key(number))
-        return np.asarray(state.matrix())
-
-    def _move_running(self) -> None:
-        """Put the anchor of the running submap where the graph of anchors has it."""
-        assert self._closed is not None
-        number = pose_key(len(self._anchors) - 1)
-        state: Any = self._by_anchors.state(number)
-        prior = pose_prior_factor(self._closed.successor, state.matrix(), self._by_anchors.covariance(number))
-        given = Additions(named={self._closed.name: [prior, *self._closed.others]})
-        self._smoother.extend([Given(given, self._closed.name)], settings=_AFTER_LOOPS)
 
     def _begin_submap(self, k: int) -> None:
         """Close the running submap, if any, and make the keyframe k an anchor."""
@@ -327,29 +304,15 @@ class SubmapGraph:
             self._close(self._anchors[-1], k)
         self._anchors.append(k)
         self._way = 0.0
-        if self._loops:
-            self._move_running()
 
     def _close(self, anchor: int, successor: int) -> None:
         mine = {n for now in self._seen[anchor:successor] for n, _ in now}
         world = inverse_transform(self._running(anchor))
         self._offsets += [np.eye(4), *(world @ self._running(k) for k in range(anchor + 1, successor))]
-        begin, moved = self._running(anchor), world @ self._running(successor)
-        variables = self._smoother.graph().variables.values()
+        variables, anchors = self._smoother.graph().variables.values(), set(map(pose_key, self._anchors))
         old = [one.key for one in variables if one.epoch is not None and one.epoch < successor]
-        number = len(self._anchors) - 1
-        keys = (pose_key(anchor), pose_key(successor))
-        self._closed = into = CondensedSubmap(*keys, named=(pose_key(number), pose_key(number + 1)))
-        self._smoother.marginalise([*old, *map(landmark_key, mine)], into)
-        epochs: list[tuple[float, Sequence[FactorProvider]]] = []
-        if number == 0:
-            epochs.append((self._times[anchor], [_anchor_pose(begin)]))
-        else:
-            state: Any = self._by_anchors.state(into.named[0])
-            begin = np.asarray(state.matrix())
-        given = [_anchor_pose(begin @ moved), Given(Additions(factors=into.between), into.name)]
-        epochs.append((self._times[successor], given))
-        self._by_anchors.steps(epochs)
+        leaving = [*(key for key in old if key not in anchors), *map(landmark_key, mine)]
+        self._smoother.marginalise(leaving, CondensedSubmap(pose_key(anchor), pose_key(successor)))
 
     def _confirmed(self) -> dict[int, Sequence[tuple[int, Observation]]]:
         """Observations of landmarks that were seen often enough, by keyframe."""
@@ -368,8 +331,3 @@ class SubmapGraph:
                 elif number not in start:
                     start[number] = self._smoother.state(landmark_key(number))
         return start
-
-
-def _anchor_pose(world_T_anchor: FloatArray) -> Given:
-    variable = NewVariable(EGO_POSE, 0, pose("world_T_anchor", world_T_anchor), label="anchor")
-    return Given(Additions([variable]), "submaps")
