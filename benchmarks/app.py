@@ -7,7 +7,7 @@ from importlib import import_module
 from benchmarks.runner import application
 
 NAMES = (
-    *("estimators", "gaps", "joint", "kills", "landmarks", "loops", "metrics", "modes"),
+    *("estimators", "gaps", "geometry", "joint", "kills", "landmarks", "loops", "metrics", "modes"),
     *("pose_graphs", "scaling", "service", "settling", "slam", "smoothing"),
     *("speed", "streaming", "tracking"),
 )

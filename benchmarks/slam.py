@@ -38,6 +38,7 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
+from pipelines.slam.vehicle_sensors import Vehicle
 from pipelines.tracking import one_thread, peak_memory
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.model.landmarks import PointLandmark
@@ -186,7 +187,7 @@ def all_in_rows(scans: ScanSequence, lap: float | None = None) -> Iterator[Row]:
     The last row compares the end with the beginning (the last lap's keyframes with the first lap's, else the last third
     with the first): of keyframes, of those that close a submap, and of work that never changes.
     """
-    slam = LidarSlam(scans.world_T_ego[0] @ scans.ego_T_lidar, ego_T_lidar=scans.ego_T_lidar)
+    slam = LidarSlam(scans.world_T_ego[0] @ scans.ego_T_lidar, vehicle=Vehicle(scans.ego_T_lidar))
     spent, points, memory = np.zeros(len(scans)), np.zeros(len(scans)), np.zeros(len(scans))
     keyframes, closing = np.zeros((2, len(scans)), dtype=np.bool_)
     load = np.full(len(scans), np.nan)

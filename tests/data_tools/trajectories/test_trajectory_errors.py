@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,6 +19,7 @@ from data_tools.trajectories import (
     rigid_alignment,
     rotation_angle,
     trajectory_errors,
+    write_tum_poses,
 )
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_transform
@@ -40,6 +43,31 @@ def test_absolute_errors_of_a_shifted_drive() -> None:
     np.testing.assert_allclose(absolute_errors(shifted, truth, "none"), 5.0)
     np.testing.assert_allclose(absolute_errors(shifted, truth, "start"), 0.0, atol=1e-12)
     np.testing.assert_allclose(absolute_errors(shifted, truth, "rigid"), 0.0, atol=1e-12)
+
+
+def umeyama_ape(reference: Path, estimate: Path, origin: bool) -> float:
+    """What `evo_ape tum REFERENCE ESTIMATE` gives with --align_origin or with --align: RMSE of the translations, m."""
+    rows = [np.loadtxt(file) for file in (reference, estimate)]
+    (R, t), (Q, x) = ((Rotation.from_quat(table[:, 4:8]).as_matrix(), table[:, 1:4]) for table in rows)
+    turn = R[0] @ Q[0].T
+    if not origin:
+        U, _, Vt = np.linalg.svd((t - t.mean(axis=0)).T @ (x - x.mean(axis=0)))
+        turn = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+    of, onto = (x[0], t[0]) if origin else (x.mean(axis=0), t.mean(axis=0))
+    return float(np.sqrt(np.mean(np.sum((t - onto - (x - of) @ turn.T) ** 2, axis=1))))
+
+
+def test_the_absolute_error_of_written_files_is_that_of_evo(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    truth = Trajectory(np.arange(50.0), np.stack([yaw_transform(k, np.sin(0.2 * k), 0.1, 0.1 * k) for k in range(50)]))
+    off = random_motion(rng) @ truth.world_T_ego
+    off[:, :3, 3] += rng.normal(0, 0.3, (50, 3)).cumsum(axis=0)
+    estimate, files = Trajectory(truth.timestamps, off), (tmp_path / "reference.tum", tmp_path / "trajectory.tum")
+    for file, path in zip(files, (truth, estimate), strict=True):
+        write_tum_poses(file, path)
+    for alignment in ("start", "rigid"):
+        ours = trajectory_errors(estimate, truth, alignment).ate
+        assert ours == pytest.approx(umeyama_ape(*files, origin=alignment == "start"), rel=1e-6)
 
 
 def test_a_scale_error_stays_after_alignment() -> None:
