@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,7 +25,8 @@ from data_tools.datasets.kitti.dataset import read_sensors, world_position
 from data_tools.files.readers import TextTable, read_lines
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.slam.sensors import SensorBuffer, SensorName
+from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings
+from saga_fg.types.frame import EgoMeasurements
 
 _AXES = ("x", "y", "z")
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -98,28 +99,33 @@ def read_sensor_log(
 
 @dataclass(eq=False)
 class SensorLog:
-    """Tables of a drive by sensor, (n, 1 + d) with the time first, fed to a buffer as time goes on."""
+    """Tables of a drive by sensor, (n, 1 + d) with the time first.
+
+    settings: noise and places of the sensors
+    """
 
     tables: Mapping[SensorName, FloatArray]
-    _row: dict[str, int] = field(default_factory=dict, init=False)
+    settings: SensorSettings = field(default_factory=SensorSettings)
 
     def __post_init__(self) -> None:
         for name, table in self.tables.items():
             checked(name, table, (None, 1 + len(_COLUMNS[name])))
 
-    def feed(self, buffer: SensorBuffer, until: float) -> None:
-        """Add what was measured up to a time, s."""
-        for name, table in self.tables.items():
-            first = self._row.get(name, 0)
-            last = int(np.searchsorted(table[:, 0], until, side="right"))
-            for time, *values in table[first:last].tolist():
-                if name == "imu":
-                    buffer.add_imu(time, np.array(values[:3]), np.array(values[3:]))
-                elif name == "wheels":
-                    buffer.add_wheels(time, values[0])
-                else:
-                    buffer.add_gps(time, np.array(values))
-            self._row[name] = last
+    def until(self, times: FloatArray) -> Iterator[tuple[float, EgoMeasurements]]:
+        """Each of some times (K,), s, increasing, with what was measured since the one before."""
+        buffer, first = SensorBuffer(), -math.inf
+        for until in times.tolist():
+            for name, table in self.tables.items():
+                rows = slice(*np.searchsorted(table[:, 0], [first, until], side="right").tolist())
+                for time, *values in table[rows].tolist():
+                    if name == "imu":
+                        buffer.add_imu(time, np.array(values[:3]), np.array(values[3:]))
+                    elif name == "wheels":
+                        buffer.add_wheels(time, values[0])
+                    else:
+                        buffer.add_gps(time, np.array(values))
+            yield until, buffer.take(until)
+            first = until
 
 
 def kitti_sensor_log(

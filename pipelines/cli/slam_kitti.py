@@ -17,16 +17,15 @@ from data_tools.sensor_logs import SensorLog
 from pipelines.cli.console import counted, progress_bar, working
 from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
 from pipelines.slam.configuration import load_slam_config, sensor_log
-from pipelines.slam.joint import SlamWithObjects, path_tracker, with_objects
+from pipelines.slam.joint import path_tracker, with_objects
 from pipelines.slam.lidar_results import write_lidar_slam
-from pipelines.slam.lidar_slam import LidarSlamResult, lidar_slam
+from pipelines.slam.lidar_slam import lidar_slam
 from pipelines.slam.localisation import LocaliserSettings
 from pipelines.slam.localised_drive import localise, write_localised
 from pipelines.slam.submaps import Origin, SlamMap, read_map
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.slam.sensors import SensorSettings
 
 
 def kitti(
@@ -139,9 +138,9 @@ def kitti(
             raise InputError(f"{known_map}: expected a map with origin.csv, its place on Earth, which fixes need")
         return slam_map.origin
 
-    log = sensor_log(records, sensors, sensor_logs or (), seed or 0, recorded.timestamps, origin)
+    log = sensor_log(records, sensors, sensor_logs or (), seed or 0, recorded.timestamps, origin, slam.sensors)
     if slam_map is not None:
-        _localise(recorded, slam_map, guess, slam.localisation, output, log, slam.sensors)
+        _localise(recorded, slam_map, guess, slam.localisation, output, log)
         return
     with progress_bar() as progress:
         lidar = replace(
@@ -158,17 +157,12 @@ def kitti(
             providers=slam.new_providers(),
             detectors=slam.new_detectors(),
             log=log,
-            frames=frames,
-            tracker=tracker,
-            sensors=slam.sensors,
+            objects=None if tracker is None else (frames, tracker),
         )
-    found: LidarSlamResult | SlamWithObjects = result
     if objects:
         with working("objects"):
-            found = with_objects(
-                result, recorded, frames, settings, lidar, window, slam.new_providers, log, slam.sensors
-            )
-    figures = write_lidar_slam(output, found, recorded, settings=lidar, origin=origin())
+            result = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers, log)
+    figures = write_lidar_slam(output, result, recorded, settings=lidar, origin=origin())
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
     counts.append(counted(figures["loops"], "loop"))
@@ -198,11 +192,10 @@ def _localise(
     settings: LocaliserSettings,
     output: Path,
     log: SensorLog | None,
-    sensors: SensorSettings,
 ) -> None:
     with progress_bar() as progress:
         start = None if guess is None else _guess(guess)
-        found = localise(scans, slam_map, start, settings, progress, log, sensors)
+        found = localise(scans, slam_map, start, settings, progress, log)
     figures = write_localised(output, found, scans, slam_map)
     registered = (
         f"{figures['registered']} registered with the map, the first of them scan {figures['first_registered']}"

@@ -86,12 +86,14 @@ def sensor_log(
     seed: int,
     timestamps: FloatArray,
     origin: Callable[[], tuple[float, float, float]] | None = None,
+    settings: SensorSettings | None = None,
 ) -> SensorLog | None:
     """Measurements of the sensors named, like "gps,imu", from KITTI's GPS/IMU records, and of files like "imu=FILE".
 
     timestamps: (K,) s, of the drive; origin: gives latitude, longitude (deg) and altitude (m) of the world's origin,
-    asked for where fixes are so; by default where the records begin. Raises `InputError` for an unknown sensor, for one
-    that is named twice, and for a file without a row within the drive.
+    asked for where fixes are so, by default where the records begin; settings: noise and places of the sensors.
+    Raises `InputError` for an unknown sensor, for one that is named twice, and for a file without a row within the
+    drive.
     """
     named = [one.strip() for one in sensors.split(",") if one.strip()]
     given = [one.partition("=") for one in files]
@@ -119,7 +121,7 @@ def sensor_log(
         table = read_sensor_log(path, cast(SensorName, name), origin or (lambda: read_origin(records)))
         _check_times(path, table[:, 0], timestamps)
         tables[cast(SensorName, name)] = table
-    return SensorLog({name: np.asarray(table) for name, table in tables.items()})
+    return SensorLog({name: np.asarray(table) for name, table in tables.items()}, settings or SensorSettings())
 
 
 def _check_times(path: str, times: FloatArray, timestamps: FloatArray) -> None:

@@ -43,7 +43,7 @@ from saga_fg.slam.joint import (
     estimate_online,
 )
 from saga_fg.slam.joint.record import KEYFRAME_PERIOD
-from saga_fg.slam.sensors import SensorBuffer, SensorSettings, sensor_providers
+from saga_fg.slam.sensors import sensor_providers
 from saga_fg.tracking import Tracker
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
@@ -138,18 +138,6 @@ def keyframes(frames: Sequence[Frame], period: float) -> list[Frame]:
     return [frames[row] for row in _moments((), [frame.timestamp for frame in frames], period)]
 
 
-@dataclass(frozen=True, eq=False)
-class SlamWithObjects:
-    """slam: with the trajectory, landmarks and covariances of the common solution; alone: without the objects.
-
-    estimate: poses of the sensor, errors of the odometry and objects in the world at the moments of the graph.
-    """
-
-    slam: LidarSlamResult
-    alone: LidarSlamResult
-    estimate: JointEstimate
-
-
 def with_objects(
     result: LidarSlamResult,
     scans: ScanSequence,
@@ -159,12 +147,11 @@ def with_objects(
     lag: float | None = None,
     new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
     log: SensorLog | None = None,
-    sensors: SensorSettings | None = None,
-) -> SlamWithObjects:
+) -> LidarSlamResult:
     """Solve again with the objects in `frames`, which cover the times of all scans; config: of the tracker.
 
-    lag: s, to estimate poses, landmarks and objects online as well, in a window so long; `slam.online` is then by that.
-    new_providers: gives fresh providers of other factors; log, sensors: of the vehicle's sensors, as of `lidar_slam`.
+    lag: s, to estimate poses, landmarks and objects online as well, in a window so long; `online` is then by that.
+    new_providers: gives fresh providers of other factors; log: of the vehicle's sensors, as of `lidar_slam`.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
@@ -181,8 +168,7 @@ def with_objects(
     )
     at = np.searchsorted(rows, result.keyframes)
     known = known_providers(result, at.tolist(), s.submaps)
-    named = () if log is None else tuple(log.tables)
-    of_sensors = sensor_providers(sensors or SensorSettings(), named, lidar_T_ego)
+    of_sensors = [] if log is None else sensor_providers(log.settings, tuple(log.tables), lidar_T_ego)
     start = result.drive.poses[0]
     estimate = estimate_jointly(
         seen, odometry, new_tracker, s.objects, start, new_providers=lambda: [*known, *of_sensors, *new_providers()]
@@ -196,6 +182,8 @@ def with_objects(
         landmarks=known[0].landmarks(estimate.solution, s.submaps.confirm_after),
         world_T_submap=np.array([world_T_submap(one, placed[one.anchor]) for one in result.submaps]),
         world_T_lidar=placed,
+        objects=estimate,
+        alone=result.trajectory,
     )
     if lag is not None:
         observed: list[list[Observation]] = [[] for _ in rows]
@@ -205,18 +193,15 @@ def with_objects(
         online = estimate_online(seen, odometry, estimator, observed)
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
         slam = replace(slam, online=Trajectory(scans.timestamps, placed))
-    return SlamWithObjects(slam, result, estimate)
+    return slam
 
 
 def _with_sensors(frames: Sequence[Frame], log: SensorLog | None) -> list[Frame]:
     """The frames, each with what the log has of the time since the one before."""
     if log is None:
         return list(frames)
-    fed, buffer, found = SensorLog(log.tables), SensorBuffer(), list[Frame]()
-    for frame in frames:
-        fed.feed(buffer, frame.timestamp)
-        found.append(replace(frame, ego=buffer.take(frame.timestamp)))
-    return found
+    measured = log.until(np.array([frame.timestamp for frame in frames]))
+    return [replace(frame, ego=ego) for frame, (_, ego) in zip(frames, measured, strict=True)]
 
 
 def _moments(keyframes: Sequence[int], timestamps: Sequence[float], period: float) -> list[int]:

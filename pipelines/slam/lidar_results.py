@@ -34,7 +34,6 @@ from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_cloud
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
-from pipelines.slam.joint import SlamWithObjects
 from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings
 from pipelines.slam.odometry import KeyframeClouds, OdometrySettings
 from pipelines.slam.results import (
@@ -70,7 +69,8 @@ def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySett
     odometry: settings of the run
     """
     truth = Trajectory(scans.timestamps, scans.world_T_ego)
-    kinds = [landmark.kind.name for landmark in result.landmarks]
+    paths = {name: getattr(result, name) for name in ("odometry", "online", "trajectory")}
+    paths["without_objects"], kinds = result.alone, [landmark.kind.name for landmark in result.landmarks]
     return {
         "keyframes": len(result.keyframes),
         "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
@@ -82,10 +82,7 @@ def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySett
         "misfits": dict(result.misfits),
         "unjudged": dict(result.unjudged),
         "scan_to_map_residual": _residual(result, scans, odometry or OdometrySettings()),
-        **{
-            name: asdict(trajectory_errors(getattr(result, name), truth, "start"))
-            for name in ("odometry", "online", "trajectory")
-        },
+        **{name: asdict(trajectory_errors(path, truth, "start")) for name, path in paths.items() if path is not None},
     }
 
 
@@ -111,7 +108,7 @@ def _residual(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySe
 
 def write_lidar_slam(
     output: Path,
-    found: LidarSlamResult | SlamWithObjects,
+    result: LidarSlamResult,
     scans: ScanSequence,
     settings: LidarSlamSettings | None = None,
     origin: Origin | None = None,
@@ -121,13 +118,10 @@ def write_lidar_slam(
     settings: of the run, with the spacing of the map's points; origin: of the world, on Earth
     """
     s = settings or LidarSlamSettings()
-    result, objects = (found, None) if isinstance(found, LidarSlamResult) else (found.slam, found.estimate)
-    points = accumulated_map(result, s.map_spacing)
+    points, objects = accumulated_map(result, s.map_spacing), result.objects
     figures = metrics(result, scans, s.odometry)
-    if isinstance(found, SlamWithObjects):
-        figures["objects"] = len(object_paths(found.estimate))
-        truth = Trajectory(scans.timestamps, scans.world_T_ego)
-        figures["without_objects"] = asdict(trajectory_errors(found.alone.trajectory, truth, "start"))
+    if objects is not None:
+        figures["objects"] = len(object_paths(objects))
     with atomic_directory(output, known=LIDAR_FILES) as folder:
         write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
         for name, trajectory in (

@@ -16,7 +16,7 @@ Odometry is that of the LiDAR, or the recording's own poses, for comparison and 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -40,7 +40,7 @@ from pipelines.slam.odometry import (
 )
 from pipelines.slam.scan_content import MovingObjects, ScanLandmarkSettings, frames_at, observe_landmarks
 from pipelines.slam.submaps import CloudFormat, SubmapBuilder, world_T_submap
-from pipelines.slam.vehicle_sensors import VehicleSensors
+from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -48,9 +48,8 @@ from saga_fg.model.landmarks import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
-from saga_fg.slam.joint import JointSettings, OdometryNoise
+from saga_fg.slam.joint import JointEstimate, JointSettings, OdometryNoise
 from saga_fg.slam.mapping import AssociatedObservation, LandmarkObservations
-from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings
 from saga_fg.slam.submaps import LoopClosure, Loops, LoopSelection, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
@@ -99,6 +98,8 @@ class LidarSlamResult:
     unjudged       sensors that have measured too little to tell, likewise
     submaps        S, and world_T_submap (S, 4, 4) their places
     world_T_lidar  (M, 4, 4) poses of the keyframes
+    objects        poses of the sensor, errors of the odometry and objects in the world, where these are in the graph
+    alone          (K) poses of the vehicle by the graph without the objects
     """
 
     drive: Drive
@@ -118,6 +119,8 @@ class LidarSlamResult:
     submaps: Sequence[Submap]
     world_T_submap: FloatArray
     world_T_lidar: FloatArray
+    objects: JointEstimate | None = None
+    alone: Trajectory | None = None
 
     def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
         """Motions (4, 4) between scans by odometry, as `Drive.motions`, with the covariances of the solution."""
@@ -173,12 +176,11 @@ class LidarSlam:
 
     start       (4, 4) the sensor's first pose in the world, z up
     providers   of other factors, asked at every keyframe
-    sensors     of the vehicle whose measurements `step` gets; sensor_settings: noise and places of these
+    vehicle     whose path the result has, where the LiDAR is on it, and the sensors whose measurements `step` gets
     moving      leaves points on moving objects out of the scans, by the detections that `step` gets
     detectors   of other landmarks in the points of keyframes
     loops       search for loops, by default by place as the settings say
     odometry    by default that of the LiDAR
-    ego_T_lidar (4, 4) pose of the sensor on the vehicle, whose path the result has, and on which its sensors are
 
     A scan that `step` refuses is left out, and the next can follow. If a provider or detector raises, the scan is
     placed by odometry and becomes no keyframe.
@@ -193,15 +195,13 @@ class LidarSlam:
         detectors: Sequence[LandmarkDetector] = (),
         loops: SubmapLoops | None = None,
         odometry: Odometry | None = None,
-        ego_T_lidar: FloatArray | None = None,
-        sensors: Collection[SensorName] = (),
         moving: MovingObjects | None = None,
-        sensor_settings: SensorSettings | None = None,
+        vehicle: Vehicle | None = None,
     ) -> None:
         self.settings = s = settings or LidarSlamSettings()
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._odometry = LidarOdometry(s.odometry) if odometry is None else odometry
-        self._sensors, self._moving = VehicleSensors(sensors, sensor_settings, ego_T_lidar, bool(providers)), moving
+        self._sensors, self._moving = VehicleSensors(vehicle or Vehicle(), bool(providers)), moving
         self._measured = self._sensors.since_keyframe
         both = [*self._sensors.new_providers(), *providers]
         self._new_graph = partial(SubmapGraph, settings=s.submaps, providers=both)
@@ -334,39 +334,32 @@ def lidar_slam(
     providers: Sequence[FactorProvider] = (),
     detectors: Sequence[LandmarkDetector] = (),
     log: SensorLog | None = None,
-    frames: Sequence[Frame] = (),
-    tracker: Tracker | None = None,
-    sensors: SensorSettings | None = None,
+    objects: tuple[Sequence[Frame], Tracker] | None = None,
 ) -> LidarSlamResult:
     """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
     counts is the first, unless the source is "oxts".
 
-    providers, detectors: as of `LidarSlam`; log: of the vehicle's sensors, in the recording's world; sensors: their
-    settings; frames: with detections at the times of all scans, and a new tracker: moving objects leave the scans.
+    providers, detectors: as of `LidarSlam`; log: of the vehicle's sensors, in the recording's world; objects: frames
+    with detections at the times of all scans, and a new tracker: moving objects leave the scans.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
     recorded = RecordedOdometry(scans, s.oxts_rotation, s.oxts_translation, s.odometry) if source == "oxts" else None
     start = scans.world_T_ego[0] @ scans.ego_T_lidar
-    log, buffer = log or SensorLog({}), SensorBuffer()
-    moving = None if tracker is None else MovingObjects(tracker)
+    log = log or SensorLog({})
     seen: Sequence[Frame | None] = [None] * len(scans.timestamps)
-    if tracker is not None:
-        seen = frames_at(frames, scans.timestamps, inverse_transform(scans.ego_T_lidar), tracker)
+    if objects is not None:
+        seen = frames_at(objects[0], scans.timestamps, inverse_transform(scans.ego_T_lidar), objects[1])
     slam = LidarSlam(
         start,
         s,
         providers=providers,
         detectors=detectors,
         odometry=recorded,
-        ego_T_lidar=scans.ego_T_lidar,
-        sensors=tuple(log.tables),
-        moving=moving,
-        sensor_settings=sensors,
+        moving=None if objects is None else MovingObjects(objects[1]),
+        vehicle=Vehicle(scans.ego_T_lidar, tuple(log.tables), log.settings),
     )
-    for k, time in enumerate(scans.timestamps.tolist()):
-        log.feed(buffer, time)
-        ego = buffer.take(time)
+    for k, (time, ego) in enumerate(log.until(scans.timestamps)):
         detections = None if (frame := seen[k]) is None else frame.detections
         slam.step(scans[k], time, imu=ego.imu, gps=ego.gps, detections=detections, wheels=ego.wheels)
         if progress is not None:

@@ -19,7 +19,6 @@ them, those at the start backwards from the first.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,7 +37,7 @@ from factors import Robust, pose_prior_factor
 from pipelines.slam.loop_closures import COMPARED, FEWEST, SURFEL, agreeing, fits_otherwise, registered
 from pipelines.slam.odometry import LOST_TRANSLATION, Drive, LidarOdometry, OdometrySettings, moved_pose
 from pipelines.slam.submaps import SlamMap
-from pipelines.slam.vehicle_sensors import VehicleSensors
+from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, Additions, FactorProvider
@@ -46,7 +45,7 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import Given, MeasuredMotion, pose_key
-from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings
+from saga_fg.slam.sensors import SensorConsistency
 from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 
 _REGISTERED = 6  # places for each search
@@ -212,9 +211,7 @@ class Localiser:
 
     guess       map_T_lidar (4, 4) of the first scan, good to a metre or two and a tenth of a radian; None: it is
                 looked for
-    sensors     of the vehicle whose measurements `step` gets, fixes in the map's frame; sensor_settings: noise and
-                places of these
-    ego_T_lidar (4, 4) pose of the scanner on the vehicle
+    vehicle     where the LiDAR is on it, and the sensors whose measurements `step` gets, fixes in the map's frame
     """
 
     def __init__(
@@ -222,15 +219,13 @@ class Localiser:
         slam_map: SlamMap,
         guess: FloatArray | None = None,
         settings: LocaliserSettings | None = None,
-        sensors: Collection[SensorName] = (),
-        ego_T_lidar: FloatArray | None = None,
-        sensor_settings: SensorSettings | None = None,
+        vehicle: Vehicle | None = None,
     ) -> None:
         require_type("slam_map", slam_map, SlamMap)
         self.settings = settings or LocaliserSettings()
         self._odometry = LidarOdometry(self.settings.odometry)
         self._guess = None if guess is None else checked_transform("guess", guess)
-        self._sensors = VehicleSensors(sensors, sensor_settings, ego_T_lidar)
+        self._sensors = VehicleSensors(vehicle or Vehicle())
         self._measured, self._of_sensors = self._sensors.since_keyframe, self._sensors.new_providers()
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
         self._places = MapPlaces(slam_map, RADIUS, MIN_OVERLAP, SCAN_SPACING)

@@ -28,11 +28,11 @@ from pipelines.slam.lidar_results import LIDAR_FILES
 from pipelines.slam.localisation import Localiser, LocaliserSettings
 from pipelines.slam.results import write_covariances
 from pipelines.slam.submaps import SlamMap
+from pipelines.slam.vehicle_sensors import Vehicle
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.slam.sensors import SensorBuffer, SensorSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,21 +58,18 @@ def localise(
     settings: LocaliserSettings | None = None,
     progress: Progress | None = None,
     log: SensorLog | None = None,
-    sensors: SensorSettings | None = None,
 ) -> LocalisedDrive:
     """Localise a recording in a map.
 
     guess: map_T_ego (4, 4) of the vehicle at the first scan, good to a metre or two and 0.1 rad. None: it is looked
     for, as it is where the scans do not fit the map at the guess. log: of the vehicle's sensors, fixes in the map's
-    frame; sensors: their settings. Of the recording's poses none is used.
+    frame. Of the recording's poses none is used.
     Raises `InputError` where no place of the map was found, or several, and where no scan fits the map.
     """
-    log, buffer = log or SensorLog({}), SensorBuffer()
+    log = log or SensorLog({})
     start = None if guess is None else guess @ scans.ego_T_lidar
-    localiser = Localiser(slam_map, start, settings, tuple(log.tables), scans.ego_T_lidar, sensors)
-    for k, time in enumerate(scans.timestamps.tolist()):
-        log.feed(buffer, time)
-        ego = buffer.take(time)
+    localiser = Localiser(slam_map, start, settings, Vehicle(scans.ego_T_lidar, tuple(log.tables), log.settings))
+    for k, (time, ego) in enumerate(log.until(scans.timestamps)):
         localiser.step(scans[k], time, ego.imu, ego.gps, ego.wheels)
         if progress is not None:
             progress("localising", k + 1, len(scans))

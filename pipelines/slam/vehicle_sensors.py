@@ -11,8 +11,8 @@ left out if k changes too much, or is none that radius or calibration of wheels 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
-from dataclasses import replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -25,7 +25,7 @@ from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.providers import Wheels
 from saga_fg.providers.odometry import mounting
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings, sensor_providers
-from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix, ImuSamples, WheelSpeed
+from saga_fg.types.frame import Detections, EgoMeasurements, Frame, ImuSamples, WheelSpeed
 
 _LOG = logging.getLogger(__name__)
 
@@ -39,9 +39,7 @@ class BetweenKeyframes:
 
     def __init__(self, sensors: Collection[str], others_read: bool, speed_deviation: float) -> None:
         self._sensors, self._others_read, self._speed_deviation = sensors, others_read, speed_deviation
-        self._imu: list[ImuSamples] = []
-        self._wheels: list[WheelSpeed] = []
-        self._fix: tuple[float, GpsFix] | None = None  # the newest, and when it was taken
+        self._since: list[tuple[float, EgoMeasurements]] = []  # by the time of the scan that they came with
         self._warned: set[str] = set()
 
     def check(self, measured: EgoMeasurements) -> None:
@@ -57,39 +55,36 @@ class BetweenKeyframes:
 
     def add(self, time: float, measured: EgoMeasurements) -> None:
         """Add what came with a scan at `time`, s."""
-        self._imu += [] if measured.imu is None else [measured.imu]
-        self._wheels += [] if measured.wheels is None else [measured.wheels]
-        if measured.gps is not None:
-            self._fix = time - measured.gps.age, measured.gps
+        self._since.append((time, measured))
 
     def frame(self, time: float, detections: Detections | None) -> Frame | None:
         """The measurements of a keyframe at `time`, s, besides its scan, for providers; the newest fix has its age."""
-        if not self._imu and not self._wheels and self._fix is None and detections is None:
+        imu = [one.imu for _, one in self._since if one.imu is not None]
+        wheels = [one.wheels for _, one in self._since if one.wheels is not None]
+        fixes = [(then, one.gps) for then, one in self._since if one.gps is not None]
+        if not imu and not wheels and not fixes and detections is None:
             return None
-        samples, speed, fix = None, None, None
-        if self._imu:
-            columns = ("dt", "acceleration", "angular_rate")
-            samples = ImuSamples(*(np.concatenate([getattr(one, name) for one in self._imu]) for name in columns))
-        if self._wheels:
-            speed = self._speed()
-        if self._fix is not None:
-            fix = replace(self._fix[1], age=max(time - self._fix[0], 0.0))
-        ego = EgoMeasurements(gps=fix, imu=samples, wheels=speed)
+        columns = ("dt", "acceleration", "angular_rate")
+        ego = EgoMeasurements(
+            gps=replace(fixes[-1][1], age=max(time - fixes[-1][0] + fixes[-1][1].age, 0.0)) if fixes else None,
+            imu=ImuSamples(*(np.concatenate([getattr(one, name) for one in imu]) for name in columns)) if imu else None,
+            wheels=self._mean_speed(wheels) if wheels else None,
+        )
         return Frame(time, "lidar", Detections.empty() if detections is None else detections, None, "ego", ego=ego)
 
     def clear(self) -> None:
         """Everything was taken."""
-        self._imu, self._wheels, self._fix = [], [], None
+        self._since = []
 
-    def _speed(self) -> WheelSpeed:
+    def _mean_speed(self, wheels: Sequence[WheelSpeed]) -> WheelSpeed:
         """The mean speed; errors of the speeds are independent."""
-        dt = np.array([one.dt for one in self._wheels])
+        dt = np.array([one.dt for one in wheels])
         share = dt / dt.sum() if dt.sum() > 0 else np.full(len(dt), 1 / len(dt))
         deviation = None
-        if any(one.deviation is not None for one in self._wheels):
-            own = [self._speed_deviation if one.deviation is None else one.deviation for one in self._wheels]
+        if any(one.deviation is not None for one in wheels):
+            own = [self._speed_deviation if one.deviation is None else one.deviation for one in wheels]
             deviation = float(np.linalg.norm(share * own))
-        return WheelSpeed(float(share @ [one.speed for one in self._wheels]), float(dt.sum()), deviation)
+        return WheelSpeed(float(share @ [one.speed for one in wheels]), float(dt.sum()), deviation)
 
 
 _WAY, _LEAST = 15.0, 15  # m and scans that are compared
@@ -156,25 +151,32 @@ class WheelComparison:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Vehicle:
+    """What carries the LiDAR.
+
+    ego_T_lidar (4, 4) pose of the LiDAR on it
+    sensors     names of those whose measurements come with the scans; settings: noise and places of all of them
+    """
+
+    ego_T_lidar: FloatArray = field(default_factory=lambda: np.eye(4))
+    sensors: Collection[SensorName] = ()
+    settings: SensorSettings = field(default_factory=SensorSettings)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.sensors, str):
+            raise InputError(f"sensors: expected a list of names, such as [{self.sensors!r}], got a string")
+        checked_transform("ego_T_lidar", self.ego_T_lidar)
+
+
 class VehicleSensors:
     """Sensors of the vehicle in a graph of the poses of its LiDAR.
 
-    names       those that there are; settings: noise and places of all of them
-    ego_T_lidar (4, 4) pose of the LiDAR on the vehicle, the identity by default
-    others_read whether other providers may read what sensors measure that are not among the names
+    others_read: whether other providers may read what sensors measure that are not among the vehicle's
     """
 
-    def __init__(
-        self,
-        names: Collection[SensorName],
-        settings: SensorSettings | None,
-        ego_T_lidar: FloatArray | None,
-        others_read: bool = False,
-    ) -> None:
-        if isinstance(names, str):
-            raise InputError(f"sensors: expected a list of names, such as [{names!r}], got a string")
-        self.names, self._settings = tuple(names), settings or SensorSettings()
-        self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else checked_transform("ego_T_lidar", ego_T_lidar)
+    def __init__(self, vehicle: Vehicle, others_read: bool = False) -> None:
+        self.names, self._settings, self.ego_T_lidar = tuple(vehicle.sensors), vehicle.settings, vehicle.ego_T_lidar
         self.lidar_T_ego = inverse_transform(self.ego_T_lidar)
         self.since_keyframe = BetweenKeyframes(self.names, others_read, self._settings.wheels.deviation)
         self.consistency = SensorConsistency(self.names, self._settings)

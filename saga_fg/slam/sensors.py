@@ -69,8 +69,7 @@ class SensorBuffer:
     """Measurements that no pose has taken yet. Every method raises `InputError` for time that runs backwards."""
 
     def __init__(self) -> None:
-        self._imu: list[_Span] = []
-        self._wheels: list[_Span] = []
+        self._kept: dict[str, list[_Span]] = {"imu": [], "wheels": []}
         self._gps: list[tuple[float, FloatArray, FloatArray | None]] = []
         self._newest: dict[str, float] = {}
         self._taken = -math.inf
@@ -79,15 +78,13 @@ class SensorBuffer:
     def add_imu(self, time: float, acceleration: FloatArray, angular_rate: FloatArray) -> None:
         """Specific force (3,), m/s^2, and turn rate (3,), rad/s, at `time`, s, for the time since the sample before."""
         both = [checked("imu: acceleration", acceleration, (3,)), checked("imu: angular_rate", angular_rate, (3,))]
-        self._in_order("imu", time)
-        _add(self._imu, time, np.concatenate(both))
+        self._add("imu", time, np.concatenate(both))
 
     def add_wheels(self, time: float, speed: float) -> None:
         """Speed ahead, m/s, at `time`, s, for the time since the speed before."""
         if not math.isfinite(speed):
             raise InputError(f"wheels: speed: expected a finite number, got {speed!r}")
-        self._in_order("wheels", time)
-        _add(self._wheels, time, np.array([speed]))
+        self._add("wheels", time, np.array([speed]))
 
     def add_gps(self, time: float, position: FloatArray, covariance: FloatArray | None = None) -> None:
         """A place (2,) or (3,), world, m, at `time`, s; covariance, m^2: by the settings if None."""
@@ -101,14 +98,14 @@ class SensorBuffer:
             raise InputError(f"time: expected one after {self._taken:.6f} s, got {time:.6f} s")
         since, self._taken = self._taken, time
         fixes = [one for one in self._gps if since < one[0] <= time]
-        for name, spans in (("imu", self._imu), ("wheels", self._wheels)):
+        for name, spans in self._kept.items():
             self._notice_gap(name, spans, since, time)
         found = EgoMeasurements(
             gps=GpsFix(fixes[-1][1], fixes[-1][2], time - fixes[-1][0]) if fixes else None,
-            imu=_samples(self._imu, since, time),
-            wheels=_speed(self._wheels, since, time),
+            imu=_samples(*_measured(self._kept["imu"], since, time)),
+            wheels=_speed(*_measured(self._kept["wheels"], since, time)),
         )
-        self._imu, self._wheels = _kept(self._imu, time), _kept(self._wheels, time)
+        self._kept = {name: _kept(spans, time) for name, spans in self._kept.items()}
         self._gps = [one for one in self._gps if one[0] > time]
         return found
 
@@ -122,6 +119,18 @@ class SensorBuffer:
             _LOG.warning("%s: no measurements for %.2f s before %.2f s", sensor, missing, until)
         (self._silent.add if silent else self._silent.discard)(sensor)
 
+    def _add(self, sensor: str, time: float, value: FloatArray) -> None:
+        """Add a measurement; the interval between the first two is that of the first, too."""
+        self._in_order(sensor, time)
+        kept = self._kept[sensor]
+        if not kept:
+            kept.append(_Span(time - _LONGEST, time, value, first=True))
+            return
+        last = kept[-1]
+        kept.append(last.next(time, value))
+        if last.first:
+            kept[-2] = _Span(last.end - (time - kept[-1].start), last.end, last.value)
+
     def _in_order(self, sensor: str, time: float) -> None:
         newest = self._newest.get(sensor, -math.inf)
         if not (math.isfinite(time) and time > newest):
@@ -129,17 +138,6 @@ class SensorBuffer:
         if time <= self._taken:
             raise InputError(f"{sensor}: {time:.6f} s comes too late, the pose at {self._taken:.6f} s is estimated")
         self._newest[sensor] = time
-
-
-def _add(kept: list[_Span], time: float, value: FloatArray) -> None:
-    """Add a measurement; the interval between the first two is that of the first, too."""
-    if not kept:
-        kept.append(_Span(time - _LONGEST, time, value, first=True))
-        return
-    last = kept[-1]
-    kept.append(last.next(time, value))
-    if last.first:
-        kept[-2] = _Span(last.end - (time - kept[-1].start), last.end, last.value)
 
 
 def _kept(spans: list[_Span], time: float) -> list[_Span]:
@@ -157,25 +155,22 @@ def _spans(kept: Sequence[_Span], since: float, until: float) -> FloatArray:
     return np.asarray(np.clip(np.minimum(end, until) - np.maximum(start, since), 0.0, None))
 
 
-def _samples(kept: Sequence[_Span], since: float, until: float) -> ImuSamples | None:
+def _measured(kept: Sequence[_Span], since: float, until: float) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) of an interval, s, that measurements stand for, and these (n, d)."""
     if not kept or not math.isfinite(since):
-        return None
+        return np.empty(0), np.empty((0, 0))
     spans = _spans(kept, since, until)
     used = spans > _NOTHING
-    if not used.any():
-        return None
-    numbers = np.array([one.value for one in kept])[used]
-    return ImuSamples(spans[used], numbers[:, :3], numbers[:, 3:])
+    return spans[used], np.array([one.value for one in kept])[used]
 
 
-def _speed(kept: Sequence[_Span], since: float, until: float) -> WheelSpeed | None:
-    if not kept or not math.isfinite(since):
-        return None
-    spans = _spans(kept, since, until)
+def _samples(spans: FloatArray, values: FloatArray) -> ImuSamples | None:
+    return ImuSamples(spans, values[:, :3], values[:, 3:]) if len(spans) else None
+
+
+def _speed(spans: FloatArray, values: FloatArray) -> WheelSpeed | None:
     total = float(spans.sum())
-    if total <= _NOTHING:
-        return None
-    return WheelSpeed(float(spans @ np.array([one.value[0] for one in kept])) / total, total)
+    return WheelSpeed(float(spans @ values[:, 0]) / total, total) if len(spans) else None
 
 
 SensorName = Literal["gps", "imu", "wheels"]

@@ -10,7 +10,6 @@ import pytest
 from data_tools.datasets.kitti import KittiScans
 from data_tools.sensor_logs import SensorLog, kitti_sensor_log, read_sensor_log
 from saga_fg.errors import InputError
-from saga_fg.slam.sensors import SensorBuffer
 
 
 def written(folder: Path, text: str) -> Path:
@@ -58,12 +57,12 @@ def test_faults_are_named_with_their_line(tmp_path: Path, subtests: pytest.Subte
 
 
 def test_a_log_is_fed_as_time_goes_on() -> None:
-    log, buffer = SensorLog({"wheels": np.array([[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]])}), SensorBuffer()
-    buffer.take(0.0)
-    log.feed(buffer, 0.2)
-    assert buffer.take(0.2).wheels.speed == pytest.approx(1.5)
-    log.feed(buffer, 0.4)
-    assert buffer.take(0.3).wheels.speed == pytest.approx(3.0)
+    log = SensorLog({"wheels": np.array([[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]])})
+    for _ in range(2):  # as often as it is asked
+        given = list(log.until(np.array([0.0, 0.2, 0.3])))
+        assert [time for time, _ in given] == [0.0, 0.2, 0.3]
+        assert given[0][1].wheels is None
+        assert [ego.wheels.speed for _, ego in given[1:]] == pytest.approx([1.5, 3.0])
 
 
 def test_the_records_of_kitti(recordings: Path) -> None:

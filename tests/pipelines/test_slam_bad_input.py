@@ -12,7 +12,7 @@ from benchmarks.scans import SimulatedScans
 from data_tools.lidar import Scan
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep, RecordedOdometry, motion, shared
-from pipelines.slam.vehicle_sensors import BetweenKeyframes
+from pipelines.slam.vehicle_sensors import BetweenKeyframes, Vehicle
 from saga_fg.errors import InputError
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.geometry import yaw_transform
@@ -57,7 +57,7 @@ def scans() -> SimulatedScans:
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_lost_scans_leave_the_drive_as_it_was(scans: SimulatedScans, count: int) -> None:
-    slam, deviations = LidarSlam(scans.world_T_ego[0], PLAIN, ego_T_lidar=scans.ego_T_lidar), list[float]()
+    slam, deviations = LidarSlam(scans.world_T_ego[0], PLAIN, vehicle=Vehicle(scans.ego_T_lidar)), list[float]()
     for k, time in enumerate(scans.timestamps.tolist()):
         step = slam.step(NOTHING if 9 <= k < 9 + count else scans[k], time)
         deviations.append(float(np.sqrt(step.covariance.diagonal()[3:].max())))
@@ -80,7 +80,7 @@ def test_lost_scans_share_the_covariance_of_the_whole_motion() -> None:
 def test_a_speed_that_no_vehicle_can_reach_is_refused(
     scans: SimulatedScans, speed: float, caplog: pytest.LogCaptureFixture
 ) -> None:
-    slam = LidarSlam(scans.world_T_ego[0], PLAIN, ego_T_lidar=scans.ego_T_lidar, sensors=["wheels"])
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN, vehicle=Vehicle(scans.ego_T_lidar, ["wheels"]))
     for k, time in enumerate(scans.timestamps.tolist()):
         slam.step(scans[k], time, wheels=WheelSpeed(speed if k == 10 else 8.0, 0.1))
     assert caplog.text.count("by other sensors is refused") == 1
@@ -93,7 +93,7 @@ def test_wheels_that_are_wrong_from_the_start_are_refused(
     scans: SimulatedScans, factor: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Wrong sign, wrong scale, km/h for m/s: the scans are asked before anything is believed."""
-    slam = LidarSlam(scans.world_T_ego[0], PLAIN, ego_T_lidar=scans.ego_T_lidar, sensors=["wheels"])
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN, vehicle=Vehicle(scans.ego_T_lidar, ["wheels"]))
     for k, time in enumerate(scans.timestamps.tolist()):
         slam.step(scans[k], time, wheels=WheelSpeed(factor * 8.0, 0.1))
     assert caplog.text.count("by other sensors is refused") == 1
@@ -139,7 +139,7 @@ def test_a_vehicle_that_stands_where_the_first_scan_was_refused(scans: Simulated
                 raise ValueError("no")
             return []
 
-    slam = LidarSlam(scans.world_T_ego[0], ego_T_lidar=scans.ego_T_lidar, detectors=[Detector()])
+    slam = LidarSlam(scans.world_T_ego[0], vehicle=Vehicle(scans.ego_T_lidar), detectors=[Detector()])
     with pytest.raises(ValueError, match="no"):
         slam.step(scans[0], 0.0)
     step = slam.step(scans[0], 0.1)
@@ -183,7 +183,7 @@ def test_odometry_of_ones_own_is_checked() -> None:
 def test_a_fix_between_keyframes_waits_for_the_next() -> None:
     heard = Listener()
     steps = [placed(), placed(0.2, keyframe=False), placed(0.4, keyframe=False), placed(0.6)]
-    slam = LidarSlam(settings=PLAIN, providers=[heard], odometry=Given(steps), sensors=["gps"])
+    slam = LidarSlam(settings=PLAIN, providers=[heard], odometry=Given(steps), vehicle=Vehicle(sensors=["gps"]))
     fixes = {1: GpsFix(np.array([0.1, 0, 0]), age=0.02), 2: GpsFix(np.array([0.4, 0, 0]), age=0.03)}
     for k in range(4):
         slam.step(NOTHING, 0.1 * k, gps=fixes.get(k))
@@ -235,7 +235,7 @@ def test_a_turn_on_the_spot_makes_keyframes_of_recorded_poses_too() -> None:
 
 def test_sensors_are_a_list_of_names() -> None:
     with pytest.raises(InputError, match=r"sensors: expected a list of names, such as \['gps'\], got a string"):
-        LidarSlam(sensors="gps")  # type: ignore[arg-type]
+        LidarSlam(vehicle=Vehicle(sensors="gps"))  # type: ignore[arg-type]
 
 
 def test_detections_without_a_scan_are_refused_and_the_drive_goes_on(scans: SimulatedScans) -> None:

@@ -17,6 +17,7 @@ from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.localisation import Localiser, LocaliserSettings
 from pipelines.slam.localised_drive import localise, write_localised
 from pipelines.slam.submaps import SlamMap, read_map, write_map
+from pipelines.slam.vehicle_sensors import Vehicle
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.pose_graph import optimise_poses
@@ -214,7 +215,11 @@ def test_a_sensor_that_does_not_fit_is_named_in_a_map(
 def test_a_fix_counts_as_long_as_the_vehicle_is_near(known: SlamMap, way: int, wait: float, last: list[bool]) -> None:
     """Places are looked for around a fix, then everywhere; an old fix is forgotten, by way or by time."""
     poses = drive(0.0, 0.5, way)
-    scans, localiser, asked = SimulatedScans(8, world_T_lidar=poses), Localiser(known, sensors=["gps"]), []
+    scans, localiser, asked = (
+        SimulatedScans(8, world_T_lidar=poses),
+        Localiser(known, vehicle=Vehicle(sensors=["gps"])),
+        [],
+    )
 
     def recognised(query: np.ndarray, place: np.ndarray | None = None) -> None:
         asked.append(place is not None)

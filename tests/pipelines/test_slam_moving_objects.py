@@ -55,7 +55,7 @@ def test_the_trail_of_a_moving_car_is_not_in_the_map() -> None:
     scans, frames, places = drive_behind_a_car()
     settings = LidarSlamSettings(loop_closures=False, landmarks=False)
     before = lidar_slam(scans, "lidar", settings=settings)
-    after = lidar_slam(scans, "lidar", settings=settings, frames=frames, tracker=path_tracker(load_config("kitti")))
+    after = lidar_slam(scans, "lidar", settings=settings, objects=(frames, path_tracker(load_config("kitti"))))
     clouds = [KeyframeClouds(scans, one.drive, settings.odometry, one.moving) for one in (before, after)]
     assert len(clouds[1][-1]) < len(clouds[0][-1]) - 20
     assert metrics(after, scans)["scan_to_map_residual"] < metrics(before, scans)["scan_to_map_residual"]

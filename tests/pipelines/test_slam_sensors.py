@@ -16,6 +16,7 @@ from pipelines.cli import app
 from pipelines.slam.configuration import sensor_log
 from pipelines.slam.lidar_results import degenerate_spans, metrics
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
+from pipelines.slam.vehicle_sensors import Vehicle
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.frame import WheelSpeed
@@ -62,7 +63,7 @@ def test_wheels_of_another_scale_are_named_at_once_and_corrected(
     factor: float, said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     scans = SimulatedScans(0, world_T_lidar=drive(60, speed=8.0))
-    slam = LidarSlam(scans.world_T_ego[0], PLAIN, sensors=["wheels"])
+    slam = LidarSlam(scans.world_T_ego[0], PLAIN, vehicle=Vehicle(sensors=["wheels"]))
     rng, named = np.random.default_rng(0), []
     for k, time in enumerate(scans.timestamps.tolist()):
         speed = factor * 8.0 + float(rng.normal(0, 0.05))

@@ -51,19 +51,21 @@ def poor_drive(count: int = 24) -> tuple[SimulatedScans, np.ndarray, list[Frame]
 def test_parked_cars_are_landmarks_and_moving_ones_are_tracked(tmp_path: Path) -> None:
     scans, truth, frames = poor_drive()
     settings = LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05)
-    found = with_objects(lidar_slam(scans, "oxts", settings=settings), scans, frames, load_config("kitti"), settings)
+    alone = lidar_slam(scans, "oxts", settings=settings)
+    found = with_objects(alone, scans, frames, load_config("kitti"), settings)
+    assert found.objects is not None
     reference = Trajectory(scans.timestamps, truth)
-    before = trajectory_errors(found.alone.trajectory, reference, "start").ate
-    assert trajectory_errors(found.slam.trajectory, reference, "start").ate < 0.6 * before
-    assert np.trace(found.slam.covariances[-1]) < 0.5 * np.trace(found.alone.covariances[-1])
-    last = found.estimate.objects[-1]
+    before = trajectory_errors(alone.trajectory, reference, "start").ate
+    assert trajectory_errors(found.trajectory, reference, "start").ate < 0.6 * before
+    assert np.trace(found.covariances[-1]) < 0.5 * np.trace(alone.covariances[-1])
+    last = found.objects.objects[-1]
     off = np.linalg.norm(last.position - (MOVER[0] + MOVER[1] * scans.timestamps[-1]), axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(last.velocity[off.argmin()], MOVER[1], atol=1.5)
     figures = write_lidar_slam(tmp_path / "run", found, scans)
-    assert figures["objects"] == len({name for objects in found.estimate.objects for name in objects.id.tolist()})
+    assert figures["objects"] == len({name for objects in found.objects.objects for name in objects.id.tolist()})
     rows = (tmp_path / "run" / "tracks.csv").read_text().splitlines()[1:]
-    assert len(rows) == sum(len(objects.id) for objects in found.estimate.objects)
+    assert len(rows) == sum(len(objects.id) for objects in found.objects.objects)
     assert {row.split(",")[2] for row in rows} == {"car"}
 
 
@@ -72,8 +74,8 @@ def test_landmarks_and_objects_are_in_one_graph() -> None:
     settings = LidarSlamSettings(oxts_rotation=0.003, oxts_translation=0.05)
     alone = lidar_slam(scans, "oxts", settings=settings)
     found = with_objects(alone, scans, frames, load_config("kitti"), settings)
-    assert [mark.number for mark in found.slam.landmarks] == [mark.number for mark in alone.landmarks]
-    for with_, without in zip(found.slam.landmarks, alone.landmarks, strict=True):
+    assert [mark.number for mark in found.landmarks] == [mark.number for mark in alone.landmarks]
+    for with_, without in zip(found.landmarks, alone.landmarks, strict=True):
         assert np.trace(with_.covariance) < 1.05 * np.trace(without.covariance)
         assert np.linalg.norm(with_.kind.variable.local(with_.state, without.state)) < 0.5
 
@@ -91,14 +93,11 @@ def test_the_sensors_of_the_vehicle_are_in_the_same_graph(sensors: tuple[SensorN
         "wheels": np.column_stack([times, speed]),
         "imu": np.column_stack([times, np.gradient(speed, times), rest, rest + 9.81, rest, rest, rest]),
     }
-    log = SensorLog({name: tables[name] for name in sensors})
     gps = replace(SensorSettings().gps, deviation=0.02, height_deviation=0.02)
     settings = LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05)
-    own, config = replace(SensorSettings(), gps=gps), load_config("kitti")
-    alone = lidar_slam(scans, "oxts", settings=settings, log=log, sensors=own)
-    without, found = (
-        with_objects(alone, scans, frames, config, settings, 1.0, log=one, sensors=own).slam for one in (None, log)
-    )
+    log, config = SensorLog({name: tables[name] for name in sensors}, SensorSettings(gps=gps)), load_config("kitti")
+    alone = lidar_slam(scans, "oxts", settings=settings, log=log)
+    without, found = (with_objects(alone, scans, frames, config, settings, 1.0, log=one) for one in (None, log))
 
     def error(path: Trajectory) -> float:
         return float(np.linalg.norm(path.positions - truth[:, :3, 3], axis=1).mean())
