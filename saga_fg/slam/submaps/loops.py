@@ -131,7 +131,7 @@ def select_loops(motions: Sequence[Motion], anchors: Sequence[int], loops: Seque
         return LoopSelection(np.ones(0, dtype=bool), np.ones(2))
     begin, end = min(loop.first for loop in loops), max(loop.second for loop in loops)
     steps = [_step(motions[a:b]) for a, b in pairwise(anchors[begin : end + 1])]
-    drive = _AnchoredLoops.of(
+    drive = _AnchoredLoops.from_steps(
         steps, [replace(loop, first=loop.first - begin, second=loop.second - begin) for loop in loops]
     )
     choices = [(np.ones(len(loops), dtype=bool), np.ones(2))]
@@ -166,7 +166,7 @@ class _AnchoredLoops:
     parts: FloatArray
 
     @classmethod
-    def of(cls, steps: Sequence[Motion], loops: Sequence[LoopClosure]) -> Self:
+    def from_steps(cls, steps: Sequence[Motion], loops: Sequence[LoopClosure]) -> Self:
         ends = [*pairwise(range(len(steps) + 1)), *((loop.first, loop.second) for loop in loops)]
         first, second = np.array(ends, dtype=np.int64).T
         between = np.array([*(T for T, _ in steps), *(loop.first_T_second for loop in loops)])

@@ -110,7 +110,7 @@ def test_the_cost_is_that_of_the_dense_covariance_of_all_loops(seed: int) -> Non
     for k, (a, b) in enumerate(ends):
         seen = true[a].between(true[b]).retract(A[5 + k] @ rng.normal(size=8))
         loops.append(LoopClosure(a, b, seen.matrix(), R[k]))
-    drive = _AnchoredLoops.of(list(zip(step, parts, strict=True)), loops)
+    drive = _AnchoredLoops.from_steps(list(zip(step, parts, strict=True)), loops)
     poses = list(accumulate(map(gtsam.Pose3, step), lambda pose, moved: pose.compose(moved), initial=gtsam.Pose3()))
     m = np.concatenate(
         [
