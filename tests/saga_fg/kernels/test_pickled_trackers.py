@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.config import load_config
-from tests.saga_fg.kernels.test_tracking import random_frames
+from tests.saga_fg.kernels.test_tracks import random_frames
 
 
 @pytest.mark.parametrize("protocol", [4, 5])

@@ -1,1 +1,0 @@
-"""Interactions with the road: stop lines, lanes, cones."""
