@@ -41,7 +41,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 
-from data_tools.files.atomic_files import write_zip
 from data_tools.files.input_files import open_bytes, unknown_name
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -220,6 +219,23 @@ class ChosenScenes:
         return self._dataset.scene(name)
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """LiDAR scans, maps to draw and camera images, by scene, of those that have some; read when they are called."""
+
+    scans: Callable[[], Mapping[str, ScanSequence]] = dict
+    maps: Callable[[], Mapping[str, AreaMap]] = dict
+    images: Callable[[], Mapping[str, Images]] = dict
+
+
+def input_files(source: DatasetSource) -> tuple[Path, ...]:
+    """Files that the options of a dataset name, as FILE or NAME=FILE, which no result may overwrite."""
+    values = [getattr(source, each.name) for each in fields(source)]
+    texts = [text for value in values for text in (value if isinstance(value, list) else [value])]
+    places = [place for text in texts if isinstance(text, str) for place in (text, text.partition("=")[2])]
+    return tuple(Path(place) for place in places if os.path.isfile(place))  # noqa: PTH113 (stands any text)
+
+
 @dataclass(frozen=True, kw_only=True)
 class DatasetSource(ABC):
     """Recordings and how to work with them; the fields are the options that name them. Picklable.
@@ -234,6 +250,7 @@ class DatasetSource(ABC):
     all_tracks      what holds the tracks of all parts of a parallel run, for `benchmark`; "" for none
     submission      pattern of the files that the official server takes, "" for none
     summarised      whether figures have a narrow summary
+    shows           of scans, maps and images, those that `surroundings` may have
     """
 
     name: ClassVar[str]
@@ -247,6 +264,7 @@ class DatasetSource(ABC):
     all_tracks: ClassVar[str] = ""
     submission: ClassVar[str] = ""
     summarised: ClassVar[bool] = False
+    shows: ClassVar[tuple[Literal["scans", "maps", "images"], ...]] = ()
 
     @property
     def title(self) -> str:
@@ -271,13 +289,6 @@ class DatasetSource(ABC):
         chosen: dict[str, Any] = {each.name: ",".join(scenes) for each in fields(self) if each.name == "scenes"}
         return replace(self, **chosen)
 
-    def input_files(self) -> tuple[Path, ...]:
-        """Files that the options name, as FILE or NAME=FILE, which no result may overwrite."""
-        values = [getattr(self, each.name) for each in fields(self)]
-        texts = [text for value in values for text in (value if isinstance(value, list) else [value])]
-        places = [place for text in texts if isinstance(text, str) for place in (text, text.partition("=")[2])]
-        return tuple(Path(place) for place in places if os.path.isfile(place))  # noqa: PTH113 (stands any text)
-
     def option_for(self, mend: Mend) -> str:
         """The options of the command that mend a suspicion about the recordings; "" where it has none."""
         return ""
@@ -300,17 +311,9 @@ class DatasetSource(ABC):
         """Recordings as successive parts of scenes, to smooth them while they are read; None to hold each in memory."""
         return None
 
-    def scans(self, scenes: Collection[str]) -> Mapping[str, ScanSequence]:
-        """LiDAR scans by scene, of those that have some."""
-        return {}
-
-    def maps(self, scenes: Mapping[str, Scene]) -> Mapping[str, AreaMap]:
-        """Maps to draw, by scene, of those that have one."""
-        return {}
-
-    def images(self, scenes: Mapping[str, Scene]) -> Mapping[str, Images]:
-        """Camera images by scene, of those that have some."""
-        return {}
+    def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
+        """What else there is to see of the scenes; its kinds are those in `shows`."""
+        return Surroundings()
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
         """Write the result of tracking; it appears when all is done."""
@@ -332,11 +335,6 @@ class DatasetSource(ABC):
     def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
         """Join the tracks, or labels, of all parts of a parallel run to the file `merged`."""
         return
-
-    def write_submission(self, output: Path) -> Path | None:
-        """Write what the official server takes, beside the tracks of all parts; returns its place, None for none."""
-        files = sorted(output.glob(self.submission)) if self.submission else ()
-        return write_zip(output / "submission.zip", files) if files else None
 
     def read_results(self, result: Path) -> Mapping[str, SceneResult]:
         """The result of any tracker by scene, with ground truth. Raises `InputError` for one missing or broken.

@@ -13,9 +13,9 @@ import typer
 
 from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import SceneResult
-from data_tools.datasets.source import DatasetSource, Innovations
+from data_tools.datasets.source import DatasetSource, Innovations, input_files
 from data_tools.evaluation import LEGEND
-from data_tools.files.atomic_files import atomic_directory, write_text
+from data_tools.files.atomic_files import atomic_directory, write_text, write_zip
 from data_tools.plots import png
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
@@ -195,12 +195,13 @@ def _benchmark(
     """
     if not source.all_tracks:
         raise InputError(f"benchmark {source.name}: expected a dataset with official results: saga-fg benchmark --help")
-    options.apart(output, *source.input_files())
+    options.apart(output, *input_files(source))
     task = TrackTask(tracker.configured(source.family, config), tracker.method, source)
     run = run_at_scale(source, task, output, scale)
     exit_on_failures(run)
     with working("writing the submission"):
-        submission = source.write_submission(output)
+        files = sorted(output.glob(source.submission)) if source.submission else ()
+        submission = write_zip(output / "submission.zip", files) if files else None
     if not without_truth:
         with working("scoring"):
             evaluation = judge_run(source, output, tracker.method, task.configuration, hota)

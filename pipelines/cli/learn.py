@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from data_tools.datasets.source import DatasetSource, dataset_names
+from data_tools.datasets.source import DatasetSource, dataset_names, input_files
 from data_tools.files.atomic_files import check_writable, write_text
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, ReportingGroup, counted, new_group, progress_bar, report
@@ -45,7 +45,7 @@ def _interactions(
     where detections are given, the tracks of a tracker.
     """
     check_writable(output)
-    options.apart(output, *source.input_files(), *(() if start is None else (start,)))
+    options.apart(output, *input_files(source), *(() if start is None else (start,)))
     settings = load_config(source.family, config)
     begin = None if start is None else load_interactions(start)
     with_truth = source.has_truth and getattr(source, "detections", None) is None
@@ -72,7 +72,7 @@ def _noise(
     verbose: options.Verbose = False,
 ) -> None:
     """Learn what sensors are like, and how objects move, from detections and, where there is some, ground truth."""
-    options.apart(output, *source.input_files())
+    options.apart(output, *input_files(source))
     settings = load_config(source.family, config)
     with_truth = source.has_truth and not without_truth
     with source.open(truth=with_truth) as dataset:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from data_tools.datasets.source import DatasetSource
+from data_tools.datasets.source import DatasetSource, input_files
 from data_tools.files.atomic_files import check_writable, write_text
 from pipelines import view
 from pipelines.cli import options
@@ -34,7 +34,7 @@ def _report(
     verbose: options.Verbose = False,
 ) -> None:
     """Make a page of a tracking result: a player, charts, and figures, of errors where there is ground truth."""
-    options.apart(output, result, *([] if beside is None else [beside]), *source.input_files())
+    options.apart(output, result, *([] if beside is None else [beside]), *input_files(source))
     if output.suffix not in (".html", ".htm"):
         raise InputError(f"{output}: expected a file name that ends in .html")
     check_writable(output)
@@ -46,7 +46,7 @@ def _report(
 
 def _report_texts(source: Source) -> dict[str, str | None]:
     """Options of datasets without camera images."""
-    return {"images": None} if source.images is DatasetSource.images else {}
+    return {} if "images" in source.shows else {"images": None}
 
 
 report_app = dataset_commands(
@@ -82,13 +82,13 @@ def _view(
 ) -> None:
     """See a tracking result, with the ground truth, the detections and the LiDAR scans where they are there."""
     if save is not None:
-        options.apart(save, result, *source.input_files(), option="--save")
+        options.apart(save, result, *input_files(source), option="--save")
     _show(result, save, lambda: view.result_views(source, result, spacing), slam)
 
 
 def _view_texts(source: Source) -> dict[str, str | None]:
     """Options of datasets without LiDAR scans."""
-    return {"spacing": None} if source.scans is DatasetSource.scans else {}
+    return {} if "scans" in source.shows else {"spacing": None}
 
 
 view_app = dataset_commands(

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from data_tools.datasets.source import DatasetSource
+from data_tools.datasets.source import DatasetSource, input_files
 from pipelines import smoothing
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
@@ -150,7 +150,7 @@ def _track(
 ) -> None:
     """Track the detections of recordings."""
     settings, method = tracker.configured(source.family, config), tracker.method
-    options.apart(output, *source.input_files())
+    options.apart(output, *input_files(source))
     options.check_learn_offsets(beside.learn_offsets, method, scale.wanted)
     if beside.explain and scale.wanted:
         raise InputError("--explain: goes without --workers and --ray")

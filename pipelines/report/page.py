@@ -275,7 +275,8 @@ def _joined(scene: ReportScene, result: _Result, other: ReportScene | None) -> R
 def _on_the_ground(source: DatasetSource, scenes: Sequence[ReportScene], width: int) -> list[ReportScene]:
     """Add the maps of the places and the images of the cameras."""
     by_name = {each.scene.name: each.scene for each in scenes}
-    maps, images = source.maps(by_name), source.images(by_name) if width else {}
+    around = source.surroundings(by_name)
+    maps, images = around.maps(), around.images() if width else {}
     return [
         replace(each, map=maps.get(name), cameras=thumbnails(images.get(name, {}), width))
         for name, each in zip(by_name, scenes, strict=True)

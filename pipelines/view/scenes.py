@@ -95,7 +95,8 @@ def result_views(source: DatasetSource, result: Path, spacing: float) -> list[Sc
     Raises `InputError` for missing or broken files, and for a result that does not fit the dataset.
     """
     scenes = result_scenes(source, result, source.read_results(result))
-    scans = source.scans([each.scene.name for each in scenes]) if spacing else {}
+    around = source.surroundings({each.scene.name: each.scene for each in scenes})
+    scans = around.scans() if spacing else {}
     return [SceneView(each, scans.get(each.scene.name), spacing) for each in scenes]
 
 

@@ -95,13 +95,13 @@ def scene_of(root: Path):
 
 def test_a_map_is_cut_to_the_surroundings_of_the_path(root: Path) -> None:
     scenes = scene_of(root)
-    known = source_of(root).maps(scenes)["scene-0103"]
+    known = source_of(root).surroundings(scenes).maps()["scene-0103"]
     assert [(kind, len(rings)) for kind, rings in known.areas] == [("drivable", 2), ("crossing", 1)]
     reach = scenes["scene-0103"].world_T_ego[:, 0, 3].max() + 120
     assert known.areas[0][1][0][:, 0].max() == pytest.approx(reach)
     assert len(known.lines) == 1
     shutil.rmtree(root / "maps")
-    assert source_of(root).maps(scenes) == {}
+    assert source_of(root).surroundings(scenes).maps() == {}
 
 
 def test_broken_maps_are_refused(root: Path) -> None:
@@ -110,14 +110,14 @@ def test_broken_maps_are_refused(root: Path) -> None:
     broken["lane_divider"][0]["line_token"] = "none"
     path.write_text(json.dumps(broken))
     with pytest.raises(InputError, match=r"boston-seaport\.json: lane_divider: expected .*none"):
-        source_of(root).maps(scene_of(root))
+        source_of(root).surroundings(scene_of(root)).maps()
     del broken["node"][0]["x"]
     path.write_text(json.dumps(broken))
     with pytest.raises(InputError, match=r"node: expected .*x"):
-        source_of(root).maps(scene_of(root))
+        source_of(root).surroundings(scene_of(root)).maps()
     path.write_text("[]")
     with pytest.raises(InputError, match=r"node: expected a map expansion"):
-        source_of(root).maps(scene_of(root))
+        source_of(root).surroundings(scene_of(root)).maps()
 
 
 def points(*places: tuple[float, float]) -> list[dict[str, float]]:
@@ -127,7 +127,7 @@ def points(*places: tuple[float, float]) -> list[dict[str, float]]:
 def test_maps_of_argoverse_are_found(tmp_path: Path) -> None:
     scene = Scene("log", np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)), ("", ""), ())
     source = ArgoverseSource(dataroot=str(tmp_path))
-    assert source.maps({"log": scene}) == {}
+    assert source.surroundings({"log": scene}).maps() == {}
     content = {
         "drivable_areas": {"1": {"area_boundary": points((-9, -9), (500, -9), (0, 9))}},
         "pedestrian_crossings": {"2": {"edge1": points((0, 0), (0, 4)), "edge2": points((3, 0), (3, 4))}},
@@ -138,7 +138,7 @@ def test_maps_of_argoverse_are_found(tmp_path: Path) -> None:
     path = tmp_path / "log" / "map" / "log_map_archive_log____PAO_city_1.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(content))
-    known = source.maps({"log": scene})["log"]
+    known = source.surroundings({"log": scene}).maps()["log"]
     (_, (area,)), (kind, (crossing,)) = known.areas
     assert area[:, 0].max() == 120
     assert (kind, crossing.tolist()) == ("crossing", [[0, 0], [0, 4], [3, 4], [3, 0]])  # no bow tie
@@ -146,7 +146,7 @@ def test_maps_of_argoverse_are_found(tmp_path: Path) -> None:
     del content["lane_segments"]["3"]["left_lane_boundary"]
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"city_1\.json: expected a map of Argoverse 2: KeyError"):
-        source.maps({"log": scene})
+        source.surroundings({"log": scene}).maps()
 
 
 def test_a_ring_is_clipped_to_a_rectangle() -> None:
@@ -163,9 +163,9 @@ def test_a_ring_is_clipped_to_a_rectangle() -> None:
 
 def test_images_of_nuscenes_are_found_by_moment(root: Path) -> None:
     scenes = scene_of(root)
-    assert source_of(root).images(scenes) == {}
+    assert source_of(root).surroundings(scenes).images() == {}
     image(root / "samples" / "CAM_FRONT" / "a1.jpg", (200, 30, 30))
-    images = source_of(root).images(scenes)
+    images = source_of(root).surroundings(scenes).images()
     assert images == {"scene-0103": {"CAM_FRONT": [None, root / "samples" / "CAM_FRONT" / "a1.jpg", None]}}
     from PIL import Image
 
@@ -182,10 +182,10 @@ def test_images_of_kitti_are_found(tmp_path: Path) -> None:
     source = KittiSource(dataroot=str(root))
     with source.open() as dataset:
         scenes = {"0007": dataset.scene("0007")}
-    assert source.images(scenes) == {}
+    assert source.surroundings(scenes).images() == {}
     file = root / "training" / "image_02" / "0007" / "000001.png"
     image(file, (0, 0, 0))
-    images = source.images(scenes)["0007"]["left"]
+    images = source.surroundings(scenes).images()["0007"]["left"]
     assert images[1] == file
     assert images[0] is None
 
@@ -219,8 +219,8 @@ def test_the_page_draws_the_map_and_shows_the_images(root: Path, tmp_path: Path)
         scenes["scene-0103"],
         {"saga": none},
         {},
-        map=source.maps(scenes)["scene-0103"],
-        cameras=thumbnails(source.images(scenes)["scene-0103"], 32),
+        map=source.surroundings(scenes).maps()["scene-0103"],
+        cameras=thumbnails(source.surroundings(scenes).images()["scene-0103"], 32),
     )
     assert [kind for kind, *_ in scene_data(shown)["map"]["areas"]] == ["drivable", "crossing"]
     found = tried_in_browser(report_page(Report("map", [], [shown])), TRY, tmp_path)

@@ -43,7 +43,7 @@ from data_tools.datasets.argoverse2.logs import (
 )
 from data_tools.datasets.detection_files import TrackRows, read_detections
 from data_tools.datasets.results import SceneResult, scene_result
-from data_tools.datasets.source import AreaMap, ChosenScenes, TrackedScenes, option
+from data_tools.datasets.source import ChosenScenes, Surroundings, TrackedScenes, option
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context, is_url, local_copy, local_tree
 from data_tools.files.readers import arrow_arrays
@@ -226,6 +226,7 @@ class ArgoverseSource(AnnotatedSource):
     tracks_example = "tracks.feather"
     merged = ("tracks.feather", "")
     all_tracks = "tracks.feather"
+    shows = ("maps",)
     dataroot: str = option("Folder of the logs, in each annotations.feather, city_SE3_egovehicle.feather; or its URL.")
     detections: str | None = option(
         "Official detections (.feather) of any number of logs, or a table (.csv, .ndjson, .jsonl, .npz), s from the "
@@ -276,8 +277,9 @@ class ArgoverseSource(AnnotatedSource):
             rows = read_feather_tracks(result, scenes)
         return {name: scene_result(scene, rows, result) for name, scene in scenes.items()}
 
-    def maps(self, scenes: Mapping[str, Scene]) -> Mapping[str, AreaMap]:
-        return {} if is_url(self.dataroot) else argoverse_maps(Path(self.dataroot), scenes)
+    def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
+        root = self.dataroot
+        return Surroundings() if is_url(root) else Surroundings(maps=lambda: argoverse_maps(Path(root), scenes))
 
     def _chosen(self, dataset: Dataset) -> Dataset:
         return dataset if self.scenes is None else ChosenScenes(dataset, self.scenes)

@@ -53,11 +53,11 @@ from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
-    Images,
     Innovations,
     LabelledScenes,
     OpenedPart,
     Parts,
+    Surroundings,
     TrackedScenes,
     file_digest,
     names,
@@ -365,6 +365,7 @@ class KittiSource(DatasetSource):
     tracks_example = "results"
     all_tracks = "tracks"
     submission = "tracks/[0-9]*.txt"
+    shows = ("scans", "images")
     merged = (f"tracks/{TRACK_TABLE}", f"results/{TRACK_TABLE}")
     dataroot: str = option("Folder that holds training/, or oxts/, calib/ and, for scores, label_02/; or its URL.")
     detections: str | None = option(
@@ -400,15 +401,16 @@ class KittiSource(DatasetSource):
             scenes = dataset.scenes
         yield Parts(scenes, (KittiPart(self.restricted([name]), name) for name in scenes))
 
-    def scans(self, scenes: Collection[str]) -> Mapping[str, KittiScans]:
+    def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
         if is_url(self.dataroot):
-            return {}
-        root = self._folder()
-        there = (name for name in scenes if (root / "velodyne" / name).is_dir())
-        return {name: KittiScans(root, name, timed=False) for name in there}
-
-    def images(self, scenes: Mapping[str, Scene]) -> Mapping[str, Images]:
-        return {} if is_url(self.dataroot) else kitti_images(self._folder(), scenes)
+            return Surroundings()
+        root = Path(self.dataroot)
+        root = root / "training" if (root / "training").is_dir() else root
+        there = [name for name in scenes if (root / "velodyne" / name).is_dir()]
+        return Surroundings(
+            scans=lambda: {name: KittiScans(root, name, timed=False) for name in there},
+            images=lambda: kitti_images(root, scenes),
+        )
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
         assert isinstance(dataset, KittiTracking)
@@ -442,10 +444,6 @@ class KittiSource(DatasetSource):
         scored = {name: each for name, each in results.items() if isinstance(each, ScoredSequence)}
         classes, exempt = names("--classes", self.classes), self.persons == "exempt"
         return evaluate_kitti(scored, classes, overlaps(self.iou), hota, innovations, exempt)
-
-    def _folder(self) -> Path:
-        root = Path(self.dataroot)
-        return root / "training" if (root / "training").is_dir() else root
 
     def _chosen(self) -> tuple[str, ...] | None:
         return None if self.sequences is None else names("--sequences", self.sequences)

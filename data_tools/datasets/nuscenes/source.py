@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.datasets.nuscenes.dataset import NuScenes, NuScenesScans, nuscenes_images, nuscenes_maps, nuscenes_scans
+from data_tools.datasets.nuscenes.dataset import NuScenes, nuscenes_images, nuscenes_maps, nuscenes_scans
 from data_tools.datasets.nuscenes.results import (
     MAX_BOXES,
     ResultBoxes,
@@ -25,14 +25,13 @@ from data_tools.datasets.nuscenes.writer import merge_label_parts, write_label_p
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
     TRACKING,
-    AreaMap,
     DatasetSource,
     HeldScene,
-    Images,
     Innovations,
     LabelledScenes,
     OpenedPart,
     Parts,
+    Surroundings,
     TrackedScenes,
     names,
     option,
@@ -191,6 +190,7 @@ class NuScenesSource(DatasetSource):
     tracks_example = "tracks.json"
     merged = ("tracks.json", "tracking.json")
     all_tracks = submission = "tracks.json"
+    shows = ("scans", "maps", "images")
     dataroot: str = option("Folder that holds the folder of tables, or its URL.")
     detections: list[str] | None = option(
         "Detection-result JSON of a sensor, or its URL; repeatable.", None, metavar="NAME=FILE", required=TRACKING
@@ -213,20 +213,15 @@ class NuScenesSource(DatasetSource):
             parts = (NuScenesPart(dataset.scene(name), dataset.meta) for name in dataset.scenes)
             yield Parts(dataset.scenes, parts, dataset)
 
-    def scans(self, scenes: Collection[str]) -> Mapping[str, NuScenesScans]:
+    def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
         if is_url(self.dataroot):
-            return {}
-        return nuscenes_scans(NuScenes(self.dataroot, self.version, {}, scenes), self.dataroot)
-
-    def maps(self, scenes: Mapping[str, Scene]) -> Mapping[str, AreaMap]:
-        if is_url(self.dataroot):
-            return {}
-        return nuscenes_maps(Path(self.dataroot), Path(self.dataroot) / self.version, scenes)
-
-    def images(self, scenes: Mapping[str, Scene]) -> Mapping[str, Images]:
-        if is_url(self.dataroot):
-            return {}
-        return nuscenes_images(Path(self.dataroot), Path(self.dataroot) / self.version, scenes)
+            return Surroundings()
+        root, tables = Path(self.dataroot), Path(self.dataroot) / self.version
+        return Surroundings(
+            lambda: nuscenes_scans(NuScenes(self.dataroot, self.version, {}, scenes), self.dataroot),
+            lambda: nuscenes_maps(root, tables, scenes),
+            lambda: nuscenes_images(root, tables, scenes),
+        )
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
         assert isinstance(dataset, NuScenes | NuScenesPart)

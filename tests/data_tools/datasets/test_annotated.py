@@ -9,6 +9,7 @@ import pytest
 
 from data_tools.datasets.annotated import detected
 from data_tools.datasets.eth_ucy import EthUcySource
+from data_tools.datasets.source import input_files
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
@@ -63,7 +64,7 @@ def test_detections_come_from_a_table_where_one_is_given(recordings: Path) -> No
     table = recordings / "found.csv"
     table.write_text("scene,timestamp,x,y,sensor\nhotel,0.0,0.1,2.0,camera\nhotel,0.4,0.5,2.0,camera\n")
     source = EthUcySource(dataroot=str(recordings), detections=str(table))
-    assert source.input_files() == (table,)
+    assert input_files(source) == (table,)
     with source.open() as dataset:
         scene = dataset.scene("hotel")
         assert scene.sensors == ("camera",)
