@@ -42,6 +42,9 @@ from saga_fg.types.by_class import class_values
 from saga_fg.types.track import Tracks
 
 HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, m
+YAW_DRIFT = (
+    0.2  # standard deviation of the change of heading in one second, rad: detections of both sides in time tell more
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +109,8 @@ def label_states(
     heights = scalar_readings(at, boxes.position[rows, 2], evidence.z_noise[rows] ** 2)
     z, _ = smooth_walks(states, HEIGHT_DRIFT**2 * duration, heights)
     label = lifespans.label[owner]
-    yaw_drift, lasting = class_values(settings.classes, OfflineClass, label, "yaw_drift", "position_bias")
-    turning = yaw_drift**2 * duration
-    turning = np.where(_is_stationary(objects), 1e-6, turning)
+    (lasting,) = class_values(settings.classes, OfflineClass, label, "position_bias")
+    turning = np.where(_is_stationary(objects), 1e-6, YAW_DRIFT**2 * duration)
     (moving,) = class_values(settings.classes, OfflineClass, lifespans.label, "min_heading_speed")
     headings = smooth_headings(states, lifespans, evidence, rows, at, turning, moving)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)

@@ -45,7 +45,7 @@ from pipelines.smoothing.passes import SmoothConfig, SmoothedObjects, smooth_obj
 from pipelines.tracking import OnlineTracker, Progress, one_thread
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.smoothing import (
     Evidence,
     LabelCounts,
@@ -61,6 +61,8 @@ from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame
 
+MIN_LENGTH = 5.0  # s, of a chunk that ends early: below the margins at its ends, which are smoothed again, take over
+
 
 @dataclass(frozen=True)
 class ChunkSettings(Settings):
@@ -69,7 +71,6 @@ class ChunkSettings(Settings):
     length: Positive = setting(30.0, "length of a chunk, s; higher: more memory")
     margin: Positive = setting(7.0, "time smoothed beyond either end of a chunk, s")
     detections: Annotated[int, Range(1, 10**9)] = setting(60_000, "number of detections that ends a chunk early")
-    shortest: NonNegative = setting(5.0, "least length of a chunk that ends early, s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +140,7 @@ class Backlog:
             if tracked.time >= begin:
                 count += len(tracked.track_of)
                 if count >= settings.detections:
-                    return min(max(tracked.time, begin + settings.shortest), begin + settings.length)
+                    return min(max(tracked.time, begin + MIN_LENGTH), begin + settings.length)
         return begin + settings.length
 
     def _oldest(self, otherwise: float) -> float:

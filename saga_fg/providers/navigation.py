@@ -37,10 +37,11 @@ from saga_fg.graph.variables import EGO_BIAS, EGO_CALIBRATION, EGO_POSE, EGO_VEL
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.gating import chi_square_quantile
 from saga_fg.providers.odometry import ANTENNA, INERTIAL, NO_POSE, ON_THE_POSE, Mounting, StartSettings, mounting
-from saga_fg.settings import Fraction, NonNegative, Positive, PositiveOrInf, Settings, setting, settings_group
+from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.types.frame import ImuSamples
 
 _LOG = logging.getLogger(__name__)
+GRAVITY = 9.81  # m/s^2, which differs by 0.3 % at most from place to place, less than a bias
 ANTENNA_DEVIATION = 0.5  # standard deviation of the antenna's position beforehand, by axis, m
 
 
@@ -142,7 +143,6 @@ class Imu(Settings):
     gyroscope_bias: Positive = setting(0.01, "standard deviation of the first bias of the gyroscope, rad/s")
     accelerometer_drift: Positive = setting(1e-3, "random walk of the bias of the accelerometer in one second, m/s^2")
     gyroscope_drift: Positive = setting(1e-4, "random walk of the bias of the gyroscope in one second, rad/s")
-    gravity: NonNegative = setting(9.81, "gravity, m/s^2")
     max_gap: Positive = setting(
         0.05, "longest time of an epoch without samples, s; where they lack more, the epoch is bridged as unknown"
     )
@@ -236,7 +236,7 @@ class Imu(Settings):
         known = samples is not None
         if samples is None:
             turned = pose.rotation() if self.estimate_rotation else pose.compose(self._place).rotation()
-            up = turned.matrix().T @ [[0.0], [0.0], [self.gravity]]
+            up = turned.matrix().T @ [[0.0], [0.0], [GRAVITY]]
             corrected = bias.vector()[None]  # what sensors with these biases would say of straight on
             samples = ImuSamples(np.array([view.dt]), up.T + corrected[:, :3], corrected[:, 3:])
         parameters = self._parameters(known)
@@ -247,7 +247,7 @@ class Imu(Settings):
         return measured
 
     def _parameters(self, known: bool) -> gtsam.PreintegrationCombinedParams:
-        parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(self.gravity)
+        parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY)
         if not self.estimate_rotation:
             parameters.setBodyPSensor(self._place)
         noises = (self.accelerometer_noise, self.gyroscope_noise)

@@ -46,9 +46,6 @@ class OfflineClass(Settings):
     stationary_drift: NonNegative = setting(
         0.5, "largest drift of the measured positions while an object is stationary, m; usual 0.1 to 1"
     )
-    yaw_drift: NonNegative = setting(
-        0.2, "standard deviation of the change of heading in one second, rad; lower: smoother headings"
-    )
 
     @property
     def motion(self) -> ConstantVelocity:

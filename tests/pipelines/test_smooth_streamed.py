@@ -128,7 +128,7 @@ def backlog(detections: int, seconds: int, settings: ChunkSettings) -> Backlog:
 
 @pytest.mark.parametrize(("detections", "ends"), [(1, [20, 40]), (10, [9, 18, 27, 36]), (1000, [5, 10, 15])])
 def test_crowds_are_cut_into_shorter_chunks(detections: int, ends: list[int]) -> None:
-    settings = ChunkSettings(length=20.0, margin=5.0, detections=100, shortest=5.0)
+    settings = ChunkSettings(length=20.0, margin=5.0, detections=100)
     known = backlog(detections, 60, settings)
     spans = []
     for begin, end in known.chunks(until=59.0):

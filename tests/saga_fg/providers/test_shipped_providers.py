@@ -26,6 +26,7 @@ from saga_fg.graph import (
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StartSettings, StationaryObjects
+from saga_fg.providers.navigation import GRAVITY
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, OdometryIncrement
 from saga_fg.types.landmark import Observation
@@ -124,7 +125,7 @@ def test_inertial_samples_find_velocity_and_biases() -> None:
             for i in range(5 if k else 0):
                 a = np.array([np.cos(0.3 * k + i / 20), np.sin(0.2 * k), 0.0])
                 w = np.array([0.0, 0.0, 0.5 * np.cos(0.1 * k)])
-                force = pose.rotation().matrix().T @ (a + np.array([0.0, 0.0, imu.gravity]))
+                force = pose.rotation().matrix().T @ (a + np.array([0.0, 0.0, GRAVITY]))
                 noise = rng.normal(size=6) * np.repeat([imu.accelerometer_noise, imu.gyroscope_noise], 3) / np.sqrt(h)
                 samples.append(np.concatenate([force, w]) + bias + noise)
                 moved = pose.translation() + h * velocity + 0.5 * h * h * a
