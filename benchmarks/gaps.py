@@ -100,7 +100,8 @@ class RecordingOptions:
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, with made detections.  "
+            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, crossings (simulated, without "
+            "signals), with made detections.  "
             "[default: the first five]",
         ),
     ] = None

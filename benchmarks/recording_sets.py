@@ -9,9 +9,10 @@ from functools import partial
 from math import inf
 from pathlib import Path
 
+from benchmarks.recordings.crossings import simulated_crossings
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
-from benchmarks.recordings.sensed import MAST, VEHICLE, sensed_scene
+from benchmarks.recordings.sensed import ABOVE, MAST, VEHICLE, sensed_scene
 from benchmarks.recordings.sources import TrafficScenes
 from benchmarks.recordings.traffic import Recordings, overlapping
 from benchmarks.runner import chosen
@@ -166,6 +167,8 @@ def recording_set(
     """
     if name == "simulated":
         return simulated_set(scenes)
+    if name == "crossings":
+        return _sensed(name, simulated_crossings(scenes), viewpoint or ABOVE)
     if data is None:
         raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
     if name in SETS:
@@ -173,7 +176,13 @@ def recording_set(
     traffic, usual = TRAFFIC_SETS[name]
     recordings = traffic(data / name).middle(longest)
     clusters = overlapping(map(recordings.read, recordings.names)) if name == "ngsim" else {}
-    sensed = partial(sensed_scene, viewpoint=viewpoint or usual, settings=None, seed=0)
+    return _sensed(name, recordings, viewpoint or usual, clusters)
+
+
+def _sensed(
+    name: str, recordings: Recordings, viewpoint: str, clusters: Mapping[str, str] | None = None
+) -> RecordingSet:
+    sensed = partial(sensed_scene, viewpoint=viewpoint, settings=None, seed=0)
     return exact_set(name, "traffic", TrafficScenes(recordings, sensed), clusters)
 
 
@@ -193,13 +202,15 @@ def chosen_sets(
     Raises `InputError` for a recording that no set has, and for options of recorded traffic without it.
     """
     wanted = (
-        chosen("--sets", sets, (*SETS, *TRAFFIC_SETS, "simulated"))
+        chosen("--sets", sets, (*SETS, *TRAFFIC_SETS, "simulated", "crossings"))
         if sets
         else (*(SETS if data is not None else ()), "simulated")
     )
     for option, value in (("--viewpoint", viewpoint), ("--longest", longest)):
-        if value is not None and not set(wanted) & set(TRAFFIC_SETS):
-            raise InputError(f"{option}: expected {' or '.join(TRAFFIC_SETS)} among --sets, others do not use it")
+        if value is not None and not set(wanted) & {*TRAFFIC_SETS, "crossings"}:
+            raise InputError(
+                f"{option}: expected {' or '.join((*TRAFFIC_SETS, 'crossings'))} among --sets, others do not use it"
+            )
     found = [recording_set(name, data, scenes, viewpoint or usual, longest or inf) for name in wanted]
     if test is None:
         return found

@@ -30,7 +30,7 @@ the distance c that drivers keep between cones and the middle of their vehicle,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
@@ -427,6 +427,7 @@ def _columns(nodes: NodeTable, information: bool) -> tuple[FloatArray, FloatArra
     return exists, moved, nodes.velocity_variance + (UNSEEN_ACCELERATION * nodes.unseen) ** 2, SPREAD
 
 
+Governing = Callable[[int, NodeTable, IntArray, IntArray], FloatArray]
 _MAX_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
 E = TypeVar("E", Edges, NonlinearEdges)
 
@@ -438,6 +439,7 @@ def build_graph(
     noise_scale: FloatArray | None = None,
     motions: tuple[RecordedMotions, ...] = (),
     interacting: BoolArray | None = None,
+    governing: Governing | None = None,
     min_rate: float = 1e-3,
 ) -> SceneGraph:
     """The scene graph of `nodes` with the edges `rules` choose, their rates times the existence of their sources.
@@ -446,7 +448,8 @@ def build_graph(
 
     A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
     motion that follows a leader is explained. `noise_scale` (n,) are further factors on it. `motions` are those
-    of the graph. Rules see, and tie, the nodes that are `interacting` (n,), None: all.
+    of the graph. Rules see, and tie, the nodes that are `interacting` (n,), None: all. `governing` gives the
+    probabilities (E,) that edges of a rule, by its number, govern between nodes; they scale its rates.
 
     Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
     """
@@ -460,11 +463,13 @@ def build_graph(
     if len(nodes) > 1:
         first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
         kind = np.array([first.setdefault(t.components, len(first)) for t in types[0]])[types[1][row]]
-        for rule in rules:
+        for number, rule in enumerate(rules):
             target, source, rate = _pairs(rule, nodes)
             if len(target) == 0:
                 continue
             rate = rate * nodes.existence[source]
+            if governing is not None:
+                rate = rate * governing(number, nodes, target, source)
             keep = (rate >= min_rate).nonzero()[0]
             target, source, rate = target[keep], source[keep], rate[keep]
             pair_kind = kind[target] * len(first) + kind[source]

@@ -30,12 +30,14 @@ from saga_fg.model.edge_rules import build_graph
 from saga_fg.model.interactions import NodeTable, Paths
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.tracking.courses import known_courses, predicted_paths
+from saga_fg.tracking.edge_record import answers
 from saga_fg.tracking.reporting import reported_rows, untrackable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types.track import PredictedTracks
 
 log = logging.getLogger(__name__)
 
+SEEN = 0.3  # s since its last detection, for which an object counts as detected
 MIN_EXISTENCE = 0.1  # below, a coasting track that was never confirmed has no edges: most tracks, hardly an object
 MAX_STEPS = 100  # that an interval is predicted in
 LOOKAHEAD_STEP = 0.5  # s, the longest with the same edges; a shorter `max_step` counts
@@ -70,13 +72,24 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
     likely = table.confirmed | (table.existence >= MIN_EXISTENCE) | (table.coasting(state.time) == 0)
     interacting = np.concatenate([likely, np.ones(len(nodes) - len(table), dtype=bool)])
     courses, heading = known_courses(state, dt, paths)
-    state.graph = build_graph(nodes, state.rules, explained, noise, courses, interacting)
+    prior = state.settings.edge_prior
+    governing = state.edge_record.governing(state.rules, state.halting, prior, state.time)
+    state.graph = build_graph(nodes, state.rules, explained, noise, courses, interacting, governing)
     before = state.kinematics().velocity
     state.joint.predict(state.graph, dt)
     table.box.turn_with(before, state.kinematics().velocity, unseen)
     table.box.yaw = np.where(np.isfinite(heading), heading, table.box.yaw)
     state.map_nodes.predict(dt)
     state.remove(untrackable(state))
+
+
+def judge_edges(state: TrackerState) -> None:
+    """Compare what edges said of detected objects with what these did, and let them say it again."""
+    if state.settings.edge_prior == 1 or not any(answers(rule) for rule in state.rules):
+        return
+    nodes, seen, time = node_table(state), state.table.coasting(state.time) <= SEEN, state.time
+    state.halting = state.halting.later(nodes, seen, time)
+    state.edge_record = state.edge_record.later(state.rules, nodes, seen, time)
 
 
 def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:

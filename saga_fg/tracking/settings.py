@@ -170,6 +170,11 @@ class TrackerSettings(Settings):
             "edge rules of the scene graph: who interacts with whom; []: no interactions",
         )
     )
+    edge_prior: Fraction = setting(
+        1.0,
+        "probability that an edge governs, before it is known how well such edges predicted objects in view; higher: "
+        "edges are believed for longer; 1: always",
+    )
     explained_noise: NonNegative = setting(
         0.0, "process noise is scaled by exp(-explained_noise K) at the total rate K of interactions, s; usual 0 to 2"
     )

@@ -34,7 +34,7 @@ from saga_fg.tracking.initiation import initiate_tracks
 from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
-from saga_fg.tracking.prediction import look_ahead, predict
+from saga_fg.tracking.prediction import judge_edges, look_ahead, predict
 from saga_fg.tracking.relinking import hand_over
 from saga_fg.tracking.reporting import delete_tracks, report_tracks
 from saga_fg.tracking.settings import TrackerSettings
@@ -168,6 +168,7 @@ class Tracker:
         update_tracks(state, measurements, matching)
         if delay == 0:
             infer_signals(state, matching)
+            judge_edges(state)
         self._notify("update", state, frame.sensor, measurements, matching)
 
         update_existence(state, measurements, matching, state.time - before)

@@ -28,6 +28,8 @@ from saga_fg.numerics.assignment import Assignment, CrossCovariances
 from saga_fg.tracking.by_name import new_estimator
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
+from saga_fg.tracking.edge_record import EdgeRecord
+from saga_fg.tracking.halting_places import HaltingPlaces
 from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past_position
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.measurements import EgoNode
@@ -54,6 +56,8 @@ class TrackerSnapshot:
     ego           the vehicle as a node
     traffic       where earlier traffic went, and how fast
     graph         scene graph of the latest interval, None before the first
+    edge_record   how well edges have predicted
+    halting       where vehicles halt with nobody before them
     start         time from which all others in here are counted, s
     time          of the state, s
     origin        (2,) of local positions in the world, m
@@ -71,6 +75,8 @@ class TrackerSnapshot:
     ego: EgoNode
     traffic: Traffic
     graph: SceneGraph | None
+    edge_record: EdgeRecord
+    halting: HaltingPlaces
     start: float
     time: float
     origin: FloatArray
@@ -113,6 +119,7 @@ class TrackerState:
         read = MAP_CLASSES if self.providers else classes_read(self.rules)
         self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.from_settings(settings)
         self.traffic = Traffic(settings.traffic)
+        self.edge_record, self.halting = EdgeRecord(), HaltingPlaces()
 
     def __len__(self) -> int:
         return len(self.table)

@@ -1,0 +1,220 @@
+"""Edges that answer for themselves: with what probability a rule governs an object, by what came of its predictions.
+
+While an object and those that act on it are detected, edges make predictions that can be checked. Every `HORIZON` s the
+velocity u of an object is taken from its places now and then, as the estimate has been pulled by the edge already. Over
+the next h s edges change the mean velocity by
+
+    du = a ( 1 - (1 - exp(-K h)) / (K h) ) / K,    a = sum_j K_j law(x_i, x_j),    K = sum_j K_j
+
+and a trial compares that with no change by a log-likelihood ratio,
+
+    l = ( |u' - u|^2 - |u' - u - du|^2 ) / ( 2 s^2 ),    s^2 = 2 variance of v + ( `ACCELERATION` h )^2
+
+which is near 0 where the edge asks for little, and strongly negative where a vehicle waits at a line that its leader
+has crossed. Ratios of the pair of an object and its strongest source are summed, and fade; so are, each worth less,
+those of all pairs of the rule at this place (tiles of `TILE` m, by direction) and everywhere. Sources that are faster
+and slower have records of their own: who waits for a gap does not follow a leader that leaves, but one that brakes. The
+probability that the edge governs,
+
+    p = 1 / ( 1 + exp( -( l_0 + l_pair + l_place + l_rule ) ) ),    l_0 = log( prior / (1 - prior) )
+
+scales its rate, and so does 1 - the probability that the object halts at a line that a faster source has crossed
+(`saga_fg.tracking.halting_places`). Rules that read the map are taken at their word.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from saga_fg.model.edge_rules import EdgeRule, Governing, build_graph
+from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, unit
+from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.tracking.halting_places import HaltingPlaces
+
+HORIZON, MAX_HORIZON = 1.0, 2.0  # s, of a trial
+ACCELERATION = 1.0  # m/s^2, standard deviation of what drivers do without an edge
+MAX_RATIO = 4.0  # of one trial, either way
+TILE = 8.0  # m
+DIRECTIONS = 4
+MIN_PRIOR = 1e-9
+MIN_SUM = 0.05  # a record below is forgotten
+
+Key = tuple[int, ...]
+
+
+class Memory(NamedTuple):
+    """How records add up: share of a trial, bounds of the sum, time in which it fades, s."""
+
+    share: float
+    low: float
+    high: float
+    time: float
+
+
+PAIR = Memory(1.0, -6.0, 2.0, 20.0)
+PLACE = Memory(0.5, -4.0, 2.0, 120.0)
+RULE = Memory(0.1, -4.0, 2.0, 300.0)
+
+
+class Trials(NamedTuple):
+    """n trials, with what was known at their begin: keys of the pairs and places, ids (n,); u (n, 2), m/s, the variance
+    of v (n,), a (n, 2), m/s^2, K (n,), 1/s."""
+
+    pair: tuple[Key, ...]
+    place: tuple[Key, ...]
+    target: IntArray
+    velocity: FloatArray
+    variance: FloatArray
+    acceleration: FloatArray
+    rate: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeRecord:
+    """Sums of log-likelihood ratios, with the time of each, s, by rule, whether the source is
+    faster, and pair, place or nothing else.
+
+    time, places, trials   when the last trials began, where the objects were, and these
+    """
+
+    sums: Mapping[Key, tuple[float, float]] = field(default_factory=dict)
+    time: float = -math.inf
+    places: Mapping[int, FloatArray] = field(default_factory=dict)
+    trials: tuple[Trials, ...] = ()
+
+    def log_odds(self, keys: Iterable[Key], memory: Memory, time: float) -> FloatArray:
+        """What is known of each key now."""
+        found = (self.sums.get(key) for key in keys)
+        return np.array([0.0 if one is None else one[0] * math.exp((one[1] - time) / memory.time) for one in found])
+
+    def governing(
+        self, rules: Sequence[EdgeRule], halting: HaltingPlaces, prior: float, time: float
+    ) -> Governing | None:
+        """The probabilities that edges govern now, for `build_graph`; None where the `prior` is 1."""
+        if prior == 1:
+            return None
+        usual = math.log(max(prior, MIN_PRIOR) / (1 - prior))
+
+        def probabilities(number: int, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
+            if not answers(rules[number]):
+                return np.ones(len(target))
+            rows, back = np.unique(target, return_inverse=True)
+            faster, places = _faster(nodes, target, source).astype(np.int64), _places(nodes, rows)
+            ends = zip(faster.tolist(), nodes.id[target].tolist(), nodes.id[source].tolist(), strict=True)
+            there = zip(faster.tolist(), back.tolist(), strict=True)
+            known = self.log_odds([(number, *pair) for pair in ends], PAIR, time)
+            known = known + self.log_odds([(number, way, *places[row]) for way, row in there], PLACE, time)
+            known = known + self.log_odds([(number, 0), (number, 1)], RULE, time)[faster]
+            own = 1 / (1 + np.exp(-(usual + known)))
+            return np.asarray(own * np.where(faster, 1 - halting.across(nodes, target, source), 1.0))
+
+        return probabilities
+
+    def later(self, rules: Sequence[EdgeRule], nodes: NodeTable, seen: BoolArray, time: float) -> EdgeRecord:
+        """Judge the trials that are over, and begin others; `seen` (n,) are detected, the first rows of `nodes`."""
+        h = time - self.time
+        if h < HORIZON - 1e-6:
+            return self
+        rows = np.flatnonzero(seen)
+        places = dict(zip(nodes.id[rows].tolist(), nodes.position[rows], strict=True))
+        if h > MAX_HORIZON:
+            return EdgeRecord(self.sums, time, places)
+        known = {node: row for node, row in zip(places, rows.tolist(), strict=True) if node in self.places}
+        velocity = nodes.velocity.copy()
+        for node, row in known.items():
+            velocity[row] = (places[node] - self.places[node]) / h
+        nodes = replace(nodes, velocity=velocity)
+        sums = dict(self.sums)
+        for trials in self.trials:
+            _judge(sums, trials, nodes, known, h, time)
+        able = np.isin(np.arange(len(nodes)), list(known.values()))
+        begun = (_trials(number, rule, nodes, able) for number, rule in enumerate(rules) if answers(rule))
+        kept = {key: one for key, one in sums.items() if abs(one[0]) > MIN_SUM}
+        return EdgeRecord(kept, time, places, tuple(one for one in begun if one is not None))
+
+
+def _judge(
+    sums: dict[Key, tuple[float, float]],
+    trials: Trials,
+    nodes: NodeTable,
+    row_of: Mapping[int, int],
+    h: float,
+    time: float,
+) -> None:
+    """Add to the sums what came of trials that began h s ago."""
+    kept = np.array([k for k, node in enumerate(trials.target.tolist()) if node in row_of], dtype=np.int64)
+    rows = np.array([row_of[node] for node in trials.target[kept].tolist()], dtype=np.int64)
+    K = trials.rate[kept, None]
+    change = nodes.velocity[rows] - trials.velocity[kept]
+    asked = trials.acceleration[kept] * (1 + np.expm1(-K * h) / (K * h)) / K
+    variance = trials.variance[kept] + nodes.velocity_variance[rows] + (ACCELERATION * h) ** 2
+    ratio = ((change**2).sum(axis=1) - ((change - asked) ** 2).sum(axis=1)) / (2 * variance)
+    for k, value in zip(kept.tolist(), np.clip(ratio, -MAX_RATIO, MAX_RATIO).tolist(), strict=True):
+        for key, memory in ((trials.pair[k], PAIR), (trials.place[k], PLACE), (trials.pair[k][:2], RULE)):
+            before, then = sums.get(key, (0.0, time))
+            total = before * math.exp((then - time) / memory.time) + memory.share * value
+            sums[key] = min(max(total, memory.low), memory.high), time
+
+
+def answers(rule: EdgeRule) -> bool:
+    """True if a rule is between objects alone."""
+    return not getattr(rule, "map_classes", ())
+
+
+def _faster(nodes: NodeTable, target: IntArray, source: IntArray) -> BoolArray:
+    """(E,) whether sources are faster than targets, each along its heading."""
+    speed = np.einsum("ni,ni->n", nodes.velocity, unit(nodes.heading))
+    return np.asarray(speed[source] > speed[target])
+
+
+def _places(nodes: NodeTable, rows: IntArray) -> list[Key]:
+    """Tile and direction of some nodes."""
+    tiles = np.floor(nodes.position[rows] / TILE).astype(np.int64)
+    direction = np.floor((nodes.heading[rows] / (2 * np.pi / DIRECTIONS) + 0.5) % DIRECTIONS).astype(np.int64)
+    return [(*tile, -1 - way) for tile, way in zip(tiles.tolist(), direction.tolist(), strict=True)]
+
+
+def _trials(number: int, rule: Any, nodes: NodeTable, able: BoolArray) -> Trials | None:
+    """The trials of one rule that begin now; None where it ties none of the `able` (n,)."""
+    if is_dataclass(rule) and not isinstance(rule, type) and getattr(rule, "information_gain", False):
+        rule = replace(rule, information_gain=False)  # as if the objects were hidden
+    graph, n = build_graph(nodes, (rule,)), len(nodes)
+    pulls = list(_pulls(graph, nodes))
+    if not pulls:
+        return None
+    target, source, rate, pull = (np.concatenate(column) for column in zip(*pulls, strict=True))
+    a, strongest = np.zeros((n, 2)), np.full(n, -1)
+    K = np.bincount(target, weights=rate, minlength=n).astype(np.float64)
+    np.add.at(a, target, rate[:, None] * pull)
+    order = np.argsort(rate, kind="stable")
+    strongest[target[order]] = source[order]  # the last one, of the highest rate, stays
+    rows = np.flatnonzero(able & (strongest >= 0) & able[strongest])
+    if len(rows) == 0:
+        return None
+    ids = nodes.id[rows]
+    way = _faster(nodes, rows, strongest[rows]).astype(np.int64).tolist()
+    ends = zip(way, ids.tolist(), nodes.id[strongest[rows]].tolist(), strict=True)
+    places = zip(way, _places(nodes, rows), strict=True)
+    keys = tuple((number, *pair) for pair in ends), tuple((number, one, *place) for one, place in places)
+    return Trials(*keys, ids, nodes.velocity[rows], nodes.velocity_variance[rows], a[rows], K[rows])
+
+
+def _pulls(graph: SceneGraph, nodes: NodeTable) -> Iterator[tuple[IntArray, IntArray, FloatArray, FloatArray]]:
+    """Target, source, rate (E,) and law(x_i, x_j) (E, 2), m/s^2, of the edges of a graph."""
+    states = np.concatenate([nodes.position, nodes.velocity], axis=1)
+    for group in graph.edges:
+        own, other = nodes.types[group.target[0]], nodes.types[group.source[0]]
+        v, at = own.index(VELOCITY), own.index(POSITION + VELOCITY)
+        of = other.index(POSITION + VELOCITY if other.has(VELOCITY) else POSITION)
+        pull = np.einsum("eij,ej->ei", group.A_self[:, v[:, None], at], states[group.target]) + group.b[:, v]
+        pull += np.einsum("eij,ej->ei", group.A_other[:, v[:, None], of], states[group.source, : len(of)])
+        yield group.target, group.source, group.rate, pull
+    for edges in graph.nonlinear:
+        law = edges.law.accelerations(states[edges.target], states[edges.source], edges.given)
+        yield edges.target, edges.source, edges.rate, law.value
