@@ -19,7 +19,7 @@ from data_tools.laser import read_carmen
 from data_tools.simulator import simulate_scene
 from factors import Robust
 from pipelines.cli.console import counted, new_group, progress_bar, working
-from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
+from pipelines.cli.options import Config, Lag, Online, Verbose, as_command, online_window
 from pipelines.cli.slam_kitti import kitti
 from pipelines.slam.configuration import load_laser_settings, load_slam_config
 from pipelines.slam.joint import run_joint, street
@@ -228,4 +228,4 @@ def simulated(
 
 slam_app = new_group("Estimate where the vehicle was and what stands around it, in one factor graph.")
 for run in (g2o, kitti, generate, laser, simulated):
-    slam_app.command()(run)
+    slam_app.command()(as_command(run))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -28,30 +28,37 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 
 
-def kitti(
-    dataroot: Annotated[Path, typer.Option("--dataroot", help="KITTI tracking: training/, or oxts/ and velodyne/.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
-    sequence: Annotated[str, typer.Option("--sequence", help="A sequence with LiDAR scans.")] = "0000",
+@dataclass(frozen=True)
+class DriveOptions:
+    """A sequence, and what of it goes into the graph."""
+
+    sequence: Annotated[str, typer.Option("--sequence", help="A sequence with LiDAR scans.")] = "0000"
     odometry: Annotated[
         Literal["lidar", "oxts"],
         typer.Option("--odometry", help="Motion between scans: by registration, or the recording's GPS/IMU."),
-    ] = "lidar",
+    ] = "lidar"
     deskew: Annotated[
         bool, typer.Option("--deskew/--no-deskew", help="Take the motion within a turn out of the scans.")
-    ] = True,
+    ] = True
     landmarks: Annotated[
         bool, typer.Option("--landmarks/--no-landmarks", help="Walls and poles as nodes of the graph.")
-    ] = True,
+    ] = True
     objects: Annotated[
         bool, typer.Option("--objects", help="The objects of a detector as nodes of the same graph.")
-    ] = False,
+    ] = False
     detections: Annotated[
         Path | None,
         typer.Option(
             "--detections",
             help="Folder of a detector: Car/, Pedestrian/, Cyclist/; DATAROOT/detections/pointrcnn if not given.",
         ),
-    ] = None,
+    ] = None
+
+
+@dataclass(frozen=True)
+class LoggedOptions:
+    """Further sensors of the vehicle."""
+
     sensors: Annotated[
         str,
         typer.Option(
@@ -59,16 +66,22 @@ def kitti(
             help="Some of gps,imu,wheels, from the GPS/IMU records: fixes and speeds with noise added, as the result "
             "is compared with them; inertial samples as recorded, at 10 Hz.",
         ),
-    ] = "",
+    ] = ""
     sensor_logs: Annotated[
         list[str] | None,
         typer.Option("--sensor-log", help="A table of your own in their place: gps=FILE, imu=FILE or wheels=FILE."),
-    ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Of the noise of --sensors; 0 if not given.")] = None,
+    ] = None
+    seed: Annotated[int | None, typer.Option("--seed", help="Of the noise of --sensors; 0 if not given.")] = None
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """The map of an earlier run, to localise in."""
+
     known_map: Annotated[
         Path | None,
         typer.Option("--map", help="Localise in the map of an earlier run, its output folder, in place of SLAM."),
-    ] = None,
+    ] = None
     guess: Annotated[
         str | None,
         typer.Option(
@@ -76,10 +89,26 @@ def kitti(
             help="x,y,z,yaw of the vehicle at the first scan in that map, m and rad, good to a metre or two and "
             "0.1 rad; the place is looked for without it, and where the scans do not fit the map there.",
         ),
-    ] = None,
-    online: Online = False,
-    lag: Lag = None,
-    scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
+    ] = None
+
+
+@dataclass(frozen=True)
+class ExtentOptions:
+    """How much is estimated, and when."""
+
+    online: Online = False
+    lag: Lag = None
+    scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None
+
+
+def kitti(
+    *,
+    dataroot: Annotated[Path, typer.Option("--dataroot", help="KITTI tracking: training/, or oxts/ and velodyne/.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    drive: DriveOptions,
+    logged: LoggedOptions,
+    earlier: MapOptions,
+    extent: ExtentOptions,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -103,30 +132,30 @@ def kitti(
       saga-fg slam kitti --dataroot data/kitti --sequence 0000 --objects --output slam
       saga-fg slam kitti --dataroot data/kitti --sequence 0004 --objects --odometry oxts --output slam
     """
-    if detections is not None and not objects:
+    if drive.detections is not None and not drive.objects:
         raise InputError("--detections: expected with --objects only")
-    if online and not objects:
+    if extent.online and not drive.objects:
         raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
-    if known_map is None and guess is not None:
+    if earlier.known_map is None and earlier.guess is not None:
         raise InputError("--guess: expected with --map only")
-    if known_map is not None and (objects or odometry == "oxts" or not landmarks):
+    if earlier.known_map is not None and (drive.objects or drive.odometry == "oxts" or not drive.landmarks):
         raise InputError("--map: expected without --objects, --no-landmarks and --odometry oxts")
-    if known_map is not None and known_map.resolve() == output.resolve():
+    if earlier.known_map is not None and earlier.known_map.resolve() == output.resolve():
         raise InputError("--output: expected another folder than that of --map, whose run would lose its files")
-    if seed is not None and not sensors:
+    if logged.seed is not None and not logged.sensors:
         raise InputError("--seed: expected with --sensors only")
-    window = online_window(online, lag)
+    window = online_window(extent.online, extent.lag)
     check_writable_folder(output)
     frames, settings = [], load_slam_config("kitti", config)
     slam = settings.slam
-    if objects:
-        detector = detections or dataroot / "detections" / "pointrcnn"
-        frames = list(KittiTracking(dataroot, detector, [sequence]).scene(sequence).frames)
+    if drive.objects:
+        detector = drive.detections or dataroot / "detections" / "pointrcnn"
+        frames = list(KittiTracking(dataroot, detector, [drive.sequence]).scene(drive.sequence).frames)
     training = dataroot / "training" if (dataroot / "training").is_dir() else dataroot
-    blind = objects and odometry == "oxts" and not (training / "velodyne" / sequence).is_dir()
-    recorded = KittiScans(dataroot, sequence, timed=deskew, most=scans, blind=blind)
-    records = training / "oxts" / f"{sequence}.txt"
-    slam_map = None if known_map is None else read_map(known_map)
+    blind = drive.objects and drive.odometry == "oxts" and not (training / "velodyne" / drive.sequence).is_dir()
+    recorded = KittiScans(dataroot, drive.sequence, timed=drive.deskew, most=extent.scans, blind=blind)
+    records = training / "oxts" / f"{drive.sequence}.txt"
+    slam_map = None if earlier.known_map is None else read_map(earlier.known_map)
     if slam_map is not None and (slam.providers or slam.landmarks):
         raise InputError("--config: slam.providers, slam.landmarks: expected without --map, where nothing reads them")
 
@@ -135,23 +164,27 @@ def kitti(
         if slam_map is None:
             return read_origin(records)
         if slam_map.origin is None:
-            raise InputError(f"{known_map}: expected a map with origin.csv, its place on Earth, which fixes need")
+            raise InputError(
+                f"{earlier.known_map}: expected a map with origin.csv, its place on Earth, which fixes need"
+            )
         return slam_map.origin
 
-    log = sensor_log(records, sensors, sensor_logs or (), seed or 0, recorded.timestamps, origin, slam.sensors)
+    log = sensor_log(
+        records, logged.sensors, logged.sensor_logs or (), logged.seed or 0, recorded.timestamps, origin, slam.sensors
+    )
     if slam_map is not None:
-        _localise(recorded, slam_map, guess, slam.localisation, output, log)
+        _localise(recorded, slam_map, earlier.guess, slam.localisation, output, log)
         return
     with progress_bar() as progress:
         lidar = replace(
             slam.lidar,
-            landmarks=slam.lidar.landmarks and landmarks and not blind,
+            landmarks=slam.lidar.landmarks and drive.landmarks and not blind,
             loop_closures=slam.lidar.loop_closures and not blind,
         )
-        tracker = path_tracker(settings) if objects and not blind else None
+        tracker = path_tracker(settings) if drive.objects and not blind else None
         result = lidar_slam(
             recorded,
-            odometry,
+            drive.odometry,
             settings=lidar,
             progress=progress,
             providers=slam.new_providers(),
@@ -159,19 +192,19 @@ def kitti(
             log=log,
             objects=None if tracker is None else (frames, tracker),
         )
-    if objects:
+    if drive.objects:
         with working("objects"):
             result = with_objects(result, recorded, frames, settings, lidar, window, slam.new_providers, log)
     figures = write_lidar_slam(output, result, recorded, settings=lidar, origin=origin())
     counts = [counted(len(recorded), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
     counts.append(counted(figures["loops"], "loop"))
-    if objects:
+    if drive.objects:
         counts.append(counted(figures["objects"], "object"))
     typer.echo(f"{output}: {', '.join(counts)}")
-    compared = ["odometry", "online", *(["without_objects"] if objects else []), "trajectory"]
-    if odometry == "oxts":  # these are the recording itself
-        compared = [*(["online"] if online else []), "trajectory"]
+    compared = ["odometry", "online", *(["without_objects"] if drive.objects else []), "trajectory"]
+    if drive.odometry == "oxts":  # these are the recording itself
+        compared = [*(["online"] if extent.online else []), "trajectory"]
     for name in compared:
         e, what = figures[name], name.replace("_", " ")
         relative = f"no RPE on a path shorter than {e['relative_distance']:g} m"
