@@ -11,12 +11,13 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from itertools import pairwise
 from typing import Literal, Self
 
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.numerics.geometry import transform_points, wrap_angle
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Frame
 
@@ -30,6 +31,7 @@ __all__ = [
     "far_too_fast",
     "findings_of",
     "frames_taken_for_seconds",
+    "headings_against_motion",
     "headings_in_degrees",
     "idle_lanes",
     "idle_rules",
@@ -40,6 +42,7 @@ __all__ = [
     "unlikely_sizes",
     "usual_class",
     "usual_classes",
+    "velocities_between_frames",
     "within_a_metre",
 ]
 
@@ -163,6 +166,58 @@ def headings_in_degrees(yaw: FloatArray) -> Finding | None:
         return None
     what = f"headings look like degrees: {share:.0%} of them are beyond 2 pi, the largest is {known.max():.4g}"
     return Finding("degrees", what, "expected rad", Mend(units={"angle": "deg"}))
+
+
+_MOVES = 2.0  # m/s, from which the direction of motion tells the heading of a vehicle
+_ASTRAY = 0.5  # rad between them
+_CONVENTIONS = {"clockwise": ("clockwise", 0.0), "compass": ("clockwise from north", np.pi / 2)}
+_UNIT_OF = {"rad": {"clockwise": "clockwise", "compass": "compass_rad"}}
+_UNIT_OF["deg"] = {"clockwise": "clockwise_deg", "compass": "compass"}
+
+
+def headings_against_motion(label: StrArray, yaw: FloatArray, velocity: FloatArray, unit: str) -> Finding | None:
+    """Headings (n,), rad, of vehicles that move otherwise, velocities (n, 2), as in another convention.
+
+    unit: in which they were given, rad or deg
+    """
+    usual = {name: usual_class(name) or name for name in np.unique(label).tolist()}
+    walks = np.isin(label, [name for name, ours in usual.items() if ours in ("pedestrian", "barrier")])
+    moves = (np.hypot(*velocity.T) > _MOVES) & np.isfinite(yaw) & ~walks
+    if moves.sum() < 2 * FEWEST or unit not in _UNIT_OF:
+        return None
+    direction, given = np.arctan2(velocity[moves, 1], velocity[moves, 0]), yaw[moves]
+    astray = {name: _share(_apart(offset - given, direction) > _ASTRAY) for name, (_, offset) in _CONVENTIONS.items()}
+    best, now = min(astray, key=lambda name: astray[name]), _share(_apart(given, direction) > _ASTRAY)
+    if now < 0.15 or astray[best] > now / 3:
+        return None
+    what = f"headings look {_CONVENTIONS[best][0]}: {now:.0%} of those of moving vehicles differ from their motion"
+    expected = f"expected counter-clockwise from x; read so, {astray[best]:.0%} differ"
+    return Finding("headings", what, expected, Mend(units={"angle": _UNIT_OF[unit][best]}))
+
+
+def velocities_between_frames(time: FloatArray, label: StrArray, position: FloatArray) -> FloatArray:
+    """Velocities (n, 2) of detections at times (n,), s, and places (n, 2) in the world; NaN where they are not clear.
+
+    That of a detection is to the nearest of its class in the next frame, if it is the nearest of that in turn, and the
+    second nearest is three times as far.
+    """
+    from scipy.spatial import cKDTree
+
+    found = np.full(position.shape, np.nan)
+    for name in np.unique(label).tolist():
+        mine = np.flatnonzero((label == name) & np.isfinite(time))
+        frames = [mine[time[mine] == moment] for moment in np.unique(time[mine])[: MAX_FRAMES + 1]]
+        for now, later in pairwise(frames):
+            distance, nearest = cKDTree(position[later]).query(position[now], k=2)
+            _, back = cKDTree(position[now]).query(position[later])
+            clear = (back[nearest[:, 0]] == np.arange(len(now))) & (distance[:, 1] > 3 * distance[:, 0])
+            rows, to = now[clear], later[nearest[clear, 0]]
+            found[rows] = (position[to] - position[rows]) / (time[to] - time[rows])[:, None]
+    return found
+
+
+def _apart(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.abs(wrap_angle(a - b))
 
 
 def scores_beyond_one(score: FloatArray) -> Finding | None:

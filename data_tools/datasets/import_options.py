@@ -6,7 +6,8 @@ COLUMNS = (
 CLASSES = "Names of classes: REGULAR_VEHICLE=car,PERSON=pedestrian. `SIGN=` leaves a class out."
 UNITS = (
     "Units: time=ns (s, ms, us, ns, iso8601, 10Hz), length=ft (m, cm, mm, km, ft), speed=km/h (m/s, km/h, mph, "
-    "ft/s), angle=deg (rad, deg), score=percent (share, percent)."
+    "ft/s), angle=deg (rad, deg; clockwise, clockwise_deg; compass, compass_rad: clockwise from north), score=percent "
+    "(share, percent)."
 )
 COORDINATES = "Coordinates of rows that say none; ego and sensor need the pose of the vehicle.  [default: world]"
 SORT = "Sort the rows by time, in memory."

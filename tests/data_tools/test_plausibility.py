@@ -12,6 +12,7 @@ from data_tools.plausibility import (
     ego_taken_for_world,
     far_too_fast,
     findings_of,
+    headings_against_motion,
     headings_in_degrees,
     idle_rules,
     length_below_width,
@@ -21,6 +22,7 @@ from data_tools.plausibility import (
     unlikely_sizes,
     usual_class,
     usual_classes,
+    velocities_between_frames,
     within_a_metre,
 )
 from saga_fg import Boxes, Detections, Frame
@@ -47,6 +49,45 @@ def test_headings_in_degrees(subtests: pytest.Subtests) -> None:
     ]:
         with subtests.test(yaw=yaw, found=found):
             assert option(headings_in_degrees(yaw)) == found
+
+
+def test_headings_against_motion(subtests: pytest.Subtests) -> None:
+    direction = RNG.uniform(-np.pi, np.pi, 100)
+    speed = np.where(np.arange(100) < 80, 5.0, 0.0)
+    velocity = speed[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
+    moving = direction + RNG.normal(0, 0.1, 100)
+    turned = np.where(RNG.random(100) < 0.1, moving + np.pi, moving)
+    along_x = np.where(np.arange(100) % 2, 0.0, np.pi) + RNG.normal(0, 0.05, 100)
+    on_x = 5.0 * np.column_stack([np.cos(along_x), np.sin(along_x)])
+    for name, label, yaw, v, unit, found in [
+        ("right", "car", moving, velocity, "rad", None),
+        ("some turned round", "car", turned, velocity, "rad", None),
+        ("mirrored", "car", -moving, velocity, "rad", "--units angle=clockwise"),
+        ("mirrored degrees", "car", -moving, velocity, "deg", "--units angle=clockwise_deg"),
+        ("compass", "truck", np.pi / 2 - moving, velocity, "deg", "--units angle=compass"),
+        ("compass in rad", "car", np.pi / 2 - moving, velocity, "rad", "--units angle=compass_rad"),
+        ("compass on a straight road", "car", np.pi / 2 - along_x, on_x, "deg", "--units angle=compass"),
+        ("mirrored, which makes no difference", "car", -along_x, on_x, "rad", None),
+        ("no convention", "car", RNG.uniform(-3, 3, 100), velocity, "rad", None),
+        ("people look around", "pedestrian", -moving, velocity, "rad", None),
+        ("nothing moves", "car", -moving, 0.1 * velocity, "rad", None),
+        ("no velocities", "car", -moving, np.full((100, 2), np.nan), "rad", None),
+        ("too few", "car", -moving[:30], velocity[:30], "rad", None),
+    ]:
+        with subtests.test(name):
+            assert option(headings_against_motion(np.full(len(yaw), label), yaw, v, unit)) == found
+
+
+def test_velocities_between_frames_are_those_of_objects_that_cannot_be_mistaken() -> None:
+    v = np.array([[8.0, 0.0], [0.0, 5.0], [-3.0, 1.0]])
+    start = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 60.0]])
+    time, label = np.repeat(np.arange(5) * 0.2, 3), np.tile(["car", "car", "truck"], 5)
+    place = np.concatenate([start + t * v for t in np.arange(5) * 0.2])
+    found = velocities_between_frames(time, label, place)
+    np.testing.assert_allclose(found[:12], np.tile(v, (4, 1)), atol=1e-9)
+    assert np.isnan(found[12:]).all()
+    crowd = np.concatenate([0.3 * np.arange(3)[:, None] * [1.0, 0.0] + t for t in np.arange(5) * 0.2])
+    assert np.isnan(velocities_between_frames(time, np.full(15, "car"), crowd)).all()
 
 
 def test_scores_beyond_one(subtests: pytest.Subtests) -> None:

@@ -31,9 +31,12 @@ FACTORS: Mapping[Kind, Mapping[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "length": {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048},
     "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": 0.3048},
-    "angle": {"rad": 1.0, "deg": pi / 180},
+    "angle": {"rad": 1.0, "deg": pi / 180, "clockwise": -1.0, "clockwise_deg": -pi / 180}
+    | {"compass": -pi / 180, "compass_rad": -1.0},
     "score": {"share": 1.0, "percent": 0.01},
 }
+OFFSETS = {"compass": pi / 2, "compass_rad": pi / 2}
+"""What is added: a compass counts clockwise from the y axis, which is north."""
 ISO = "iso8601"
 UNITS: Mapping[str, Mapping[str, str]] = {
     "time": {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "millis": "ms"}
@@ -63,9 +66,9 @@ _ISO_DAY = re.compile(r"\s*\d{4}-\d\d-\d\d\s*$")
 _ISO_DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[T ]\d\d")
 
 
-def factor(name: str, unit: str) -> float:
-    """Factor from a unit to ours, for a column of ours."""
-    return FACTORS[kind_of[name]][unit]
+def in_our_unit(name: str, numbers: FloatArray, unit: str, power: int = 1) -> FloatArray:
+    """Numbers (n,) of a column of ours, in a unit to this power, in ours."""
+    return numbers * FACTORS[kind_of[name]][unit] ** power + OFFSETS.get(unit, 0.0)
 
 
 def unit_of_speed(length: str) -> str:
@@ -312,7 +315,9 @@ class TableImport(Settings):
         dict, "our name of a class, by the file's; an empty text: leave the objects of the class out"
     )
     units: Mapping[str, str] = settings_group(
-        dict, "units of time (s, ms, us, ns, iso8601, 10Hz), length (m, cm, mm, km, ft), speed, angle (rad, deg), score"
+        dict,
+        "units of time (s, ms, us, ns, iso8601, 10Hz), length (m, cm, mm, km, ft), speed, score, "
+        "angle (rad, deg, clockwise, clockwise_deg, compass, compass_rad)",
     )
     coordinates: Literal["", "world", "ego", "sensor"] = setting(
         "", "coordinates of rows that say none: world, ego or sensor; empty: world"

@@ -18,7 +18,7 @@ from data_tools.datasets.detection_files.column_names import (
     Clock,
     Columns,
     TableImport,
-    factor,
+    in_our_unit,
     is_date,
     seconds_of_dates,
 )
@@ -27,7 +27,9 @@ from data_tools.plausibility import (
     Finding,
     days_taken_for_times,
     frames_taken_for_seconds,
+    headings_against_motion,
     headings_in_degrees,
+    velocities_between_frames,
 )
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
@@ -147,7 +149,7 @@ class RawTable:
 
     def findings(self) -> list[Finding]:
         """Findings about columns as they are given, which cannot be seen in frames."""
-        findings = [headings_in_degrees(self.numbers("yaw"))]
+        findings = [headings_in_degrees(self.numbers("yaw")), self._headings_against_motion()]
         if self.clock.unit == ISO:
             findings.append(days_taken_for_times(self.numbers("timestamp")))
         if "timestamp" in self.columns and "time" not in self.how.units and self.clock.unit == "s":
@@ -157,6 +159,17 @@ class RawTable:
             what = "these are boxes of Argoverse 2, in the frame of the vehicle, and are taken for the world"
             findings.append(Finding("argoverse2", what, f"read them with the poses of their logs: {command}"))
         return [finding for finding in findings if finding is not None]
+
+    def _headings_against_motion(self) -> Finding | None:
+        """A finding where headings differ from velocities, given or, in the world, between frames."""
+        columns = {name: self.numbers(name) for name in ("timestamp", "x", "y", "yaw", "vx", "vy")}
+        velocity = np.column_stack([columns["vx"], columns["vy"]])
+        known = self.how.coordinates or ("" if "coordinates" in self.columns else "world")
+        if not np.isfinite(velocity).any() and known == "world" and "timestamp" in self.columns:
+            place = np.column_stack([columns["x"], columns["y"]])
+            velocity = velocities_between_frames(columns["timestamp"], self.labels()[0], place)
+        unit = self.how.unit("yaw", self.found.units.get("yaw")) or "rad"
+        return headings_against_motion(self.labels()[0], columns["yaw"], velocity, unit)
 
     def argoverse_command(self) -> str:
         """The command for a file in Argoverse's format without poses, "" for another."""
@@ -234,7 +247,7 @@ class RawTable:
             else:
                 of, power = _measured(name)
                 unit = self.how.unit(of, self.found.units.get(of))
-                numbers = numbers if unit is None else numbers * factor(of, unit) ** power
+                numbers = numbers if unit is None else in_our_unit(of, numbers, unit, power)
         large = np.abs(numbers) > LIMITS.get(name, sys.float_info.max)
         if large.any():
             row = int(np.argmax(large))
