@@ -5,7 +5,6 @@ from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.estimator import Estimator
 from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_filter import GraphFilter
-from saga_fg.estimators.graph_window import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.estimators.kalman import JointKalmanFilter
@@ -13,6 +12,7 @@ from saga_fg.estimators.measurements import Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
 from saga_fg.estimators.smoother import RecordingSmoother, SmoothedState
+from saga_fg.estimators.solution import GraphSolution
 
 __all__ = [
     "BatchSolver",

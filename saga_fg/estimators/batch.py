@@ -15,7 +15,7 @@ import numpy as np
 from factors import FactorError, SolverSettings, linearised
 from saga_fg.errors import require_type
 from saga_fg.estimators.graduated import solve_graduated
-from saga_fg.estimators.graph_window import GraphSolution
+from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph

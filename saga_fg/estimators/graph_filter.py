@@ -27,7 +27,7 @@ from saga_fg.errors import InputError, UnknownNodeError, require_type
 from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian, not_smaller
 from saga_fg.estimators.estimator import Estimator
 from saga_fg.estimators.filtering import Dynamics, predict
-from saga_fg.estimators.graph_window import SAME_TIME, GraphWindow, WindowEpoch, linear_solution
+from saga_fg.estimators.graph_window import SAME_TIME, GraphWindow, WindowEpoch
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.independent import IndependentObjects, IndependentVariables
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, by_covariance, lossy, merged, replace_by_prior
@@ -35,6 +35,7 @@ from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
 from saga_fg.estimators.partition import Partition, StateLayout, checked_prior
 from saga_fg.estimators.smoother import SmoothedState
+from saga_fg.estimators.solution import linear_solution
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
 from saga_fg.graph.variables import MAP_NODE, OBJECT, node_key, node_kind

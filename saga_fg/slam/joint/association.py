@@ -53,7 +53,7 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.estimators.graph_window import GraphSolution
+from saga_fg.estimators.solution import GraphSolution
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, motion_covariances

@@ -50,7 +50,7 @@ from factors import (
     relative_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.estimators.graph_window import GraphSolution
+from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph import EGO_ERROR, OBJECT, NewVariable, VariableKind, key_of
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.motion import NodeType

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.estimators.graph_window import GraphSolution
+from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform

@@ -16,9 +16,9 @@ import gtsam
 import numpy as np
 
 from factors import ERROR_DIM
-from saga_fg.estimators.graph_window import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
+from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph import EGO_ERROR, EGO_POSE, OBJECT, Additions, FactorProvider, GraphError, GraphView, NewVariable
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Factors

@@ -38,9 +38,9 @@ from factors import (
 )
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.batch import BatchSolver
-from saga_fg.estimators.graph_window import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
+from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable, key_of
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
