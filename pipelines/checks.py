@@ -1,4 +1,4 @@
-"""Warnings of what is probably wrong in data and settings, each once, by the checks of `data_tools.plausibility`."""
+"""Warnings of what is probably wrong in data and settings, each once, by the checks of `saga_fg.types.plausibility`."""
 
 from __future__ import annotations
 
@@ -9,16 +9,6 @@ from contextlib import suppress
 import numpy as np
 
 from data_tools.datasets.source import DatasetSource
-from data_tools.plausibility import (
-    Finding,
-    Mend,
-    Sample,
-    findings_of,
-    headings_in_degrees,
-    idle_lanes,
-    idle_rules,
-    settings_without_data,
-)
 from pipelines.config import TrackConfig
 from saga_fg import Curvilinear, Dataset, Frame, InputError, Scene, TrackerSettings, Tracks
 from saga_fg.model.edge_rules import acting_classes
@@ -26,6 +16,17 @@ from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking.by_name import estimator_parameters
 from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.plausibility import (
+    Finding,
+    Mend,
+    Sample,
+    findings_of,
+    headings_in_degrees,
+    headings_of_frames,
+    idle_lanes,
+    idle_rules,
+    settings_without_data,
+)
 from saga_fg.types.road_map import LANE, MAP_CLASSES, STOP_LINE
 
 log = logging.getLogger(__name__)
@@ -109,8 +110,8 @@ class Checks:
         self._tracked_frames += bool(len(tracks))
         if self._tracked_frames >= FRAMES or len(self._live) > 10 * FRAMES:
             self._tracked_frames = FRAMES
-            finding = headings_in_degrees(np.concatenate(self._yaw))
-            self._tell([finding] if finding is not None else [])
+            found = headings_in_degrees(np.concatenate(self._yaw)), headings_of_frames(self._live)
+            self._tell([finding for finding in found if finding is not None])
             times = [frame.timestamp for frame in self._live]
             ordered = [self._live[row] for row in np.argsort(times, kind="stable").tolist()]
             self.see(Scene("live", np.empty(0), np.empty((0, 4, 4)), (), ordered))

@@ -32,8 +32,8 @@ from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
-    from data_tools.plausibility import Mend
     from saga_fg.numerics.arrays import FloatArray
+    from saga_fg.types.plausibility import Mend
 
 JUDGED: tuple[Verb, ...] = ("evaluate", "report", "view")
 """Verbs that compare with true objects."""

@@ -12,10 +12,10 @@ import numpy as np
 from data_tools.datasets.detection_files import TableImport, TrackRows, read_tracks
 from data_tools.files.input_files import unknown_name
 from data_tools.metrics import SceneBoxes
-from data_tools.plausibility import Mend, usual_class
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.plausibility import Mend, usual_class
 from saga_fg.types.track import known_velocities
 
 log = logging.getLogger(__name__)

@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from data_tools.datasets.results import SceneResult
     from data_tools.evaluation import Evaluation
     from data_tools.lidar.scan import ScanSequence
-    from data_tools.plausibility import Mend
     from saga_fg.smoothing import Labels
+    from saga_fg.types.plausibility import Mend
     from saga_fg.types.track import Tracks
 
 Verb = Literal[

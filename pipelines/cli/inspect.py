@@ -18,7 +18,6 @@ from data_tools.datasets.detection_files.dataset import TableSurvey, survey_tabl
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_file, check_writable
 from data_tools.files.input_files import error_context
-from data_tools.plausibility import FILL_IN, Finding, Mend, idle_rules, usual_classes
 from pipelines.cli.console import JsonFile, counted
 from pipelines.cli.options import Verbose
 from pipelines.config import load_config
@@ -26,6 +25,7 @@ from pipelines.configuration import load_settings
 from pipelines.explaining import clock_lines, graph_picture, journal_of, read_graphs, read_track, story
 from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import acting_classes
+from saga_fg.types.plausibility import FILL_IN, Finding, Mend, idle_rules, usual_classes
 
 MOST = 12  # scenes and classes that are listed
 EPOCH = 1e8  # s, from which times count from 1970

@@ -22,7 +22,7 @@ from saga_fg.numerics.arrays import (
 from saga_fg.numerics.geometry import checked_transform
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.landmark import Observation
-from saga_fg.types.pandas_tables import Table, boxes_of_table, html_table
+from saga_fg.types.pandas_tables import Table, boxes_of_table, html_table, text_table
 from saga_fg.types.road_map import RoadMap
 
 _TANGENT = {3: 3, 4: 6}  # dimension of the motions of so large a transform
@@ -262,7 +262,13 @@ class Detections(Columns):
     def __iter__(self) -> Iterator[Detection]:
         return (self[row] for row in range(len(self)))
 
+    def __str__(self) -> str:
+        return text_table(*self._shown())
+
     def _repr_html_(self) -> str:
+        return html_table(*self._shown())
+
+    def _shown(self) -> tuple[str, tuple[str, ...], list[tuple[str | float, ...]]]:
         columns = (
             self.boxes.label,
             *self.boxes.position[:, :2].T,
@@ -272,7 +278,7 @@ class Detections(Columns):
         )
         rows = list(zip(*(column.tolist() for column in columns), strict=True))
         names = ("class", "x, m", "y, m", "length, m", "width, m", "yaw, rad", "score")
-        return html_table(f"{len(self)} detections", names, rows)
+        return f"{len(self)} detections", names, rows
 
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The detections in target coordinates."""

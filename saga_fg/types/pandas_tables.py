@@ -171,7 +171,20 @@ def html_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str |
     return f"<p>{html.escape(title)}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}"
 
 
-def _cell(value: str | float | int) -> str:
+def text_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | float | int]]) -> str:
+    """Return the same for a terminal."""
+    cells = [columns, *([_text(value) for value in row] for row in rows[:LONGEST])]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = ("  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in cells)
+    more = [f"and {len(rows) - LONGEST} more"] if len(rows) > LONGEST else []
+    return "\n".join([title, *lines, *more])
+
+
+def _text(value: str | float | int) -> str:
     if isinstance(value, float):
         return f"{value:.2f}" if value == value else ""
-    return html.escape(str(value))
+    return str(value)
+
+
+def _cell(value: str | float | int) -> str:
+    return html.escape(_text(value))

@@ -21,7 +21,7 @@ from saga_fg.numerics.arrays import (
     upper_triangle,
 )
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.pandas_tables import Table, html_table, new_table
+from saga_fg.types.pandas_tables import Table, html_table, new_table, text_table
 
 KNOWN_SPEED_DEVIATION = 2.0  # m/s; a velocity of a larger standard deviation counts as unknown
 
@@ -154,7 +154,13 @@ class Tracks(Columns):
         numbers = {name: values[:, k] for names, values in vectors for k, name in enumerate(names)}
         return first | numbers | {"settled": self.settled}
 
+    def __str__(self) -> str:
+        return text_table(*self._shown())
+
     def _repr_html_(self) -> str:
+        return html_table(*self._shown())
+
+    def _shown(self) -> tuple[str, tuple[str, ...], list[tuple[str | float | int, ...]]]:
         deviation = np.sqrt(np.trace(self.position_covariance, axis1=1, axis2=2) / 2)
         speed = np.linalg.norm(self.boxes.velocity, axis=1)
         columns = (
@@ -168,7 +174,7 @@ class Tracks(Columns):
         )
         rows = list(zip(*(column.tolist() for column in columns), strict=True))
         names = ("id", "class", "x, m", "y, m", "position ±, m", "speed, m/s", "score", "unseen for, s")
-        return html_table(f"{len(self)} tracks at {self.timestamp:.3f} s", names, rows)
+        return f"{len(self)} tracks at {self.timestamp:.3f} s", names, rows
 
 
 LONGEST_PREDICTION = 60.0  # s; nobody knows where traffic is a minute later, and time runs out before

@@ -21,10 +21,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from data_tools.plausibility import FILL_IN, Mend
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Settings, setting, settings_group
+from saga_fg.types.plausibility import FILL_IN, Mend
 
 Kind = Literal["time", "length", "speed", "angle", "score"]
 FACTORS: Mapping[Kind, Mapping[str, float]] = {

@@ -22,7 +22,12 @@ from data_tools.datasets.detection_files.column_names import (
     is_date,
     seconds_of_dates,
 )
-from data_tools.plausibility import (
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED
+from saga_fg.types.frame import LATEST, EgoMeasurements, GpsFix, OdometryIncrement
+from saga_fg.types.plausibility import (
     FILL_IN,
     Finding,
     days_taken_for_times,
@@ -31,11 +36,6 @@ from data_tools.plausibility import (
     headings_in_degrees,
     velocities_between_frames,
 )
-from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
-from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED
-from saga_fg.types.frame import LATEST, EgoMeasurements, GpsFix, OdometryIncrement
 
 log = logging.getLogger(__name__)
 

@@ -29,13 +29,13 @@ from data_tools.datasets.detection_files.columns import (
 )
 from data_tools.datasets.detection_files.formats import ROWS, Layout, read_raw_parts, read_raw_table, sorted_by_time
 from data_tools.files.input_files import error_context, unknown_name
-from data_tools.plausibility import Finding, Sample, findings_of
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Coordinates, Detections, Frame
+from saga_fg.types.plausibility import Finding, Sample, findings_of
 
 _COORDINATES = ("world", "ego", "sensor")
 

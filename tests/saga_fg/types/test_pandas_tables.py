@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -112,16 +113,30 @@ def test_a_value_is_named_by_its_column_and_row(subtests: pytest.Subtests) -> No
 
 def test_what_is_probably_wrong_is_warned_of(subtests: pytest.Subtests) -> None:
     for columns, message in [
-        ({"label": "car", "score": 87.0}, r"score: expected 0 to 1, got 87 to 87; divide percent by 100"),
+        ({"label": "car", "score": 87.0}, r"scores are not from 0 to 1: 100% .* look like percent; expected 0 to 1"),
         ({"label": "car", "score": -2.5}, r'Sensor\(score="logit"\)'),
-        ({"label": "car", "yaw": 90.0}, r"yaw: expected rad, got up to 90, which looks like degrees"),
+        ({"label": "car", "yaw": 90.0}, r"headings look like degrees: 100% .* the largest is 90; expected rad"),
+        ({"label": "car", "timestamp": 1e8 * np.arange(24)}, r"frames are usually 1e\+08 s apart: .* look like ns"),
+        ({"label": "car", "length": 180.0, "width": 71.0}, r"objects have a usual length of 180: this looks like cm"),
         (
             {"label": "REGULAR_VEHICLE"},
-            r"label: no edges: the rules act on .*car.*, the detections are of REGULAR_VEHICLE",
+            r"no edges: tracker.edges act on .*car.*, and the tracks are of REGULAR_VEHICLE",
         ),
     ]:
         with subtests.test(message), pytest.warns(UserWarning, match=message):
             saga_fg.track(table(**columns))
+
+
+def test_headings_of_a_compass_are_warned_of_with_and_without_velocities() -> None:
+    angle = np.linspace(0, 6, 60)
+    x, y = 20 * np.sin(angle), -20 * np.cos(angle)
+    turning = pd.DataFrame({"timestamp": angle / 0.5, "label": "car", "x": x, "y": y, "yaw": np.pi / 2 - angle})
+    for rows in (turning, turning.assign(vx=10 * np.cos(angle), vy=10 * np.sin(angle))):
+        with pytest.warns(UserWarning, match="headings look clockwise from north: .* expected counter-clockwise"):
+            saga_fg.track(rows)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            saga_fg.track(rows.assign(yaw=angle))
 
 
 def test_usual_tables_are_not_warned_of() -> None:
@@ -153,6 +168,17 @@ def test_notebooks_show_tables() -> None:
     for k in range(3):
         tracks = tracker.step(Frame(k / 10, "lidar", many))
     assert f"{len(tracks)} tracks at 0.200 s" in tracks._repr_html_()
+
+
+def test_tracks_and_detections_are_printed_as_tables_of_one_width() -> None:
+    detections = Detections.from_pandas(table(label=["car", "pedestrian"] * 12))
+    tracks = saga_fg.Tracker().step(saga_fg.Frame(0.0, "lidar", detections))
+    for shown in (detections, tracks):
+        title, *rows = str(shown).splitlines()
+        assert title.startswith(f"{len(shown)} ")
+        assert len({len(row) for row in rows if not row.startswith("and ")}) == 1
+        assert "pedestrian" in str(shown)
+        assert "nan" not in str(shown)
 
 
 def test_a_tracker_says_what_it_holds() -> None:

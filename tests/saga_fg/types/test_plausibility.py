@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.detection_files import TableImport
-from data_tools.plausibility import (
+from saga_fg import Boxes, Detections, Frame
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.plausibility import (
     Finding,
     Sample,
     ego_taken_for_world,
@@ -25,8 +27,6 @@ from data_tools.plausibility import (
     velocities_between_frames,
     within_a_metre,
 )
-from saga_fg import Boxes, Detections, Frame
-from saga_fg.numerics.geometry import yaw_transform
 
 RNG = np.random.default_rng(5)
 CARS = np.full(60, "car")

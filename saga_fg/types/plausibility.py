@@ -33,6 +33,7 @@ __all__ = [
     "frames_taken_for_seconds",
     "headings_against_motion",
     "headings_in_degrees",
+    "headings_of_frames",
     "idle_lanes",
     "idle_rules",
     "length_below_width",
@@ -206,7 +207,9 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
     found = np.full(position.shape, np.nan)
     for name in np.unique(label).tolist():
         mine = np.flatnonzero((label == name) & np.isfinite(time))
-        frames = [mine[time[mine] == moment] for moment in np.unique(time[mine])[: MAX_FRAMES + 1]]
+        moments = np.unique(time[mine])[: MAX_FRAMES + 1]
+        mine = mine[time[mine] <= moments.max(initial=-np.inf)]
+        frames = [mine[time[mine] == moment] for moment in moments]
         for now, later in pairwise(frames):
             distance, nearest = cKDTree(position[later]).query(position[now], k=2)
             _, back = cKDTree(position[now]).query(position[later])
@@ -214,6 +217,17 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
             rows, to = now[clear], later[nearest[clear, 0]]
             found[rows] = (position[to] - position[rows]) / (time[to] - time[rows])[:, None]
     return found
+
+
+def headings_of_frames(frames: Sequence[Frame]) -> Finding | None:
+    """`headings_against_motion` of the first frames, by the velocities in them, or else, in the world, between them."""
+    first = [frame for frame in frames[:MAX_FRAMES] if len(frame)]
+    boxes = Boxes.concatenate([frame.detections.boxes for frame in first])
+    velocity = boxes.velocity
+    if not np.isfinite(velocity).any() and all(frame.coordinates == "world" for frame in first):
+        time = np.repeat([frame.timestamp for frame in first], [len(frame) for frame in first])
+        velocity = velocities_between_frames(time, boxes.label, boxes.position[:, :2])
+    return headings_against_motion(boxes.label, boxes.yaw, velocity, "rad")
 
 
 def _apart(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -229,8 +243,8 @@ def scores_beyond_one(score: FloatArray) -> Finding | None:
     what = f"scores are not from 0 to 1: {share:.0%} of them are outside, from {low:.3g} to {high:.3g}; "
     if low >= 0 and 5 < high <= 100.5:
         return Finding("scores", what + "they look like percent", "expected 0 to 1", Mend(units={"score": "percent"}))
-    setting = "put `sensors: {default: {score: logit}}` into a file for --config"
-    return Finding("scores", what + "they look like logits", setting)
+    declared = 'put `sensors: {default: {score: logit}}` into a file for --config, or take Sensor(score="logit")'
+    return Finding("scores", what + "they look like logits", declared)
 
 
 def length_below_width(label: StrArray, size: FloatArray) -> Finding | None:
