@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.kitti.dataset import read_sensors, world_position
-from data_tools.files.readers import TextTable, read_lines
+from data_tools.files.readers import LARGEST, TextTable, read_lines
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings
@@ -46,6 +46,7 @@ _COLUMNS: Mapping[SensorName, tuple[str, ...]] = {
     "gps": _AXES,
 }
 _GEODETIC = ("latitude", "longitude", "altitude")
+_MOST = {"latitude": math.radians(85.0), "longitude": math.radians(180.0), "altitude": 1e5}  # rad and m; others: 1e15
 _HEADER = re.compile(r"\s*([A-Za-z_]+)\s*\[\s*([^\]]*?)\s*\]\s*")
 
 
@@ -56,7 +57,7 @@ def read_sensor_log(
 
     origin: gives latitude, longitude (deg) and altitude (m) of the world's origin, asked for where fixes are so; None:
     the first fix. Raises `InputError` naming the file and the line for a column without unit, an unknown unit, a
-    missing column, and time that runs backwards.
+    missing column, time that runs backwards, and a fix beyond 85 degrees north or south.
     """
     path = Path(path)
     lines = [(number, line) for number, line in enumerate(read_lines(path), start=1) if line.strip()]
@@ -84,8 +85,9 @@ def read_sensor_log(
         if len(row) != len(titles):
             raise InputError(f"{path}: line {number}: expected {len(titles)} columns, got {len(row)}")
     table = TextTable.from_rows(path, [row for _, row in rows], [number for number, _ in rows], len(titles))
-    numbers = table.numbers([found[name][0] for name in wanted], wanted)
-    numbers = numbers * [_UNITS[name][found[name][1]] for name in wanted]
+    units = [_UNITS[name][found[name][1]] for name in wanted]
+    most = tuple(_MOST[name] / unit if name in _MOST else LARGEST for name, unit in zip(wanted, units, strict=True))
+    numbers = table.numbers([found[name][0] for name in wanted], wanted, most) * units
     backwards = np.flatnonzero(np.diff(numbers[:, 0]) <= 0)
     if len(backwards):
         at = int(backwards[0]) + 1

@@ -180,30 +180,39 @@ def expanded(locations: Sequence[str], hosts: Collection[str] = ()) -> list[str]
     Raises `InputError` for a pattern or list without files, for a list that is in itself, for another host in a list,
     and for a path in a list that is read from a URL.
     """
-    return _expanded(locations, (), {*hosts, *(_host(each) for each in locations)})
+    return _expanded(locations, (), {*hosts, *(_host(each) for each in locations)}, {})
 
 
-def _expanded(locations: Sequence[str], lists: tuple[str, ...], hosts: set[str]) -> list[str]:
-    """Expand `locations`; `lists` are the lists that contain them."""
+def _expanded(
+    locations: Sequence[str], lists: tuple[str, ...], hosts: set[str], known: dict[str, list[str]]
+) -> list[str]:
+    """Expand `locations`; `lists` are the lists that contain them, `known` what lists hold that were read."""
     found: list[str] = []
     for location in locations:
-        if location in lists:
-            raise InputError(f"{location}: expected a list of files, this one is in itself")
+        if "\0" in location:
+            raise InputError(
+                f"{lists[-1] if lists else 'files'}: expected names without a zero byte, got {location!r:.99}"
+            )
         if lists:
             _check_entry(location, lists[-1], hosts)
         if name_of(location).endswith(".txt"):
-            with local_copy(location, hosts) as path:
-                lines = [line.strip() for line in read_text(path).splitlines()]
-            entries = [line for line in lines if line and not line.startswith("#")]
-            found += _expanded(entries, (*lists, location), hosts)
+            name = location if is_url(location) else os.path.realpath(location)
+            if name in lists:
+                raise InputError(f"{location}: expected a list of files, this one is in itself")
+            if name not in known:
+                with local_copy(location, hosts) as path:
+                    lines = [line.strip() for line in read_text(path).splitlines()]
+                entries = [line for line in lines if line and not line.startswith("#")]
+                known[name] = _expanded(entries, (*lists, name), hosts, known)
+            found += known[name]
         elif is_url(location) and "*" in location:
             found += sorted(_remote(_matching, location, hosts=hosts))
-        elif has_magic(location) and not Path(location).exists():
+        elif has_magic(location) and not os.path.exists(location):  # noqa: PTH110 - false for names too long
             found += sorted(str(Path(path).absolute()) for path in glob(location, recursive=True))  # noqa: PTH207
         else:
             found.append(location if is_url(location) else str(Path(location).absolute()))
     if not found:
-        raise InputError(f"{', '.join(locations)}: expected at least one file, there is none")
+        raise InputError(f"{', '.join((*lists[-1:], *locations))[:500]}: expected at least one file, there is none")
     return list(dict.fromkeys(found))
 
 

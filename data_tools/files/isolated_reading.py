@@ -39,6 +39,7 @@ MEMORY = max(2**30, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 
 DOWNLOAD = 2**36  # bytes of a remote file
 WRITTEN = 2**26  # bytes of a file that a child may write, such as a compiled module
 KEPT, IDLE = 20.0, 60.0  # s without work: the parent uses a child no more, the child ends
+ENDING = 0.02  # s on the clock for the end of the records, where the caller takes no more
 _HEADROOM = 2**31  # bytes of address space of an interpreter and its libraries
 
 
@@ -86,7 +87,7 @@ def isolated(
         raise InputError(f"{location}: {problem}: {reason}") from error
     finally:
         if child is not None:
-            child.keep() if done else child.kill()
+            child.keep() if done or child.has_ended() else child.kill()
 
 
 class _Child:
@@ -111,6 +112,14 @@ class _Child:
     def usable(self) -> bool:
         """True if it can take another file."""
         return time.monotonic() - self._since < KEPT and self._process.poll() is None
+
+    def has_ended(self) -> bool:
+        """True where nothing but the end of the records is left, for a caller that takes no more of them."""
+        with suppress(OSError, EOFError):
+            if self.connection.poll(ENDING):
+                kind, content = ForkingPickler.loads(self.connection.recv_bytes(10**4))
+                return kind is not None or not content
+        return False
 
     def keep(self) -> None:
         """Let it wait for the next file."""

@@ -354,7 +354,7 @@ def arrow_arrays(
         if name not in there:
             raise InputError(f"{path}: {name}: expected this column, the file has {', '.join(there)[:200]}")
     found = {}
-    for name, column, missing in _read(path, [*columns, *(name for name in optional if name in there)], True):
+    for name, column, missing in list(_read(path, [*columns, *(name for name in optional if name in there)], True)):
         if missing and name not in (*gaps, *optional):
             raise InputError(f"{path}: {name}: expected a value in every row")
         allowed = kinds.get(name, NUMBERS)

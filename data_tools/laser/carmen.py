@@ -17,19 +17,21 @@ import bz2
 import gzip
 import logging
 import re
-import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from data_tools.files.input_files import read_text
+from data_tools.files.isolated_reading import isolated
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 
 _RECORDS = ("FLASER", "ROBOTLASER1")
-_UNPACK: dict[str, Callable[[bytes], bytes]] = {".bz2": bz2.decompress, ".gz": gzip.decompress}
+_UNPACK: dict[str, Callable[..., Any]] = {".bz2": bz2.open, ".gz": gzip.open}
+_PIECE = 2**22  # characters
 _TAG = "[A-Z][A-Z0-9_]*"
 _OTHER_LASERS = {"RLASER", "ROBOTLASER2", *(f"{kind}{k}" for kind in ("LASER", "RAWLASER") for k in range(1, 6))}
 _NAMED = 8  # records that are named where none can be read
@@ -173,11 +175,16 @@ def _mounting(robot: FloatArray, laser: FloatArray) -> FloatArray:
     return middle if np.abs(offset - middle).max() < _RIGID else np.zeros(3)
 
 
-def _lines(file: Path) -> list[str]:
-    unpack = _UNPACK.get(file.suffix)
-    if unpack is None:
-        return read_text(file).splitlines()
-    try:
-        return unpack(file.read_bytes()).decode("utf-8", errors="replace").splitlines()
-    except (OSError, ValueError, EOFError, zlib.error) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from error
+def _lines(file: Path) -> Iterator[str]:
+    if file.suffix not in _UNPACK:
+        yield from read_text(file).splitlines()
+        return
+    for lines in isolated("cannot be read", _unpacked, file):
+        yield from lines
+
+
+def _unpacked(file: Path) -> Iterator[list[str]]:
+    """The lines of a compressed log, many at a time."""
+    with _UNPACK[file.suffix](file, "rt", encoding="utf-8", errors="replace") as log:
+        while lines := log.readlines(_PIECE):
+            yield lines

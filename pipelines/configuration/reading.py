@@ -28,6 +28,7 @@ import dataclasses
 import difflib
 import re
 import types
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -340,8 +341,9 @@ class _Loader(yaml.SafeLoader):
     """Refuses equal keys, of which PyYAML keeps the last: a configuration that says two things is a mistake."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        twice = next((key for key, _ in reversed(node.value) if names.count(key.value) > 1), None)
+        keys = [key for key, _ in reversed(node.value) if isinstance(key, yaml.ScalarNode)]
+        count = Counter(key.value for key in keys)
+        twice = next((key for key in keys if count[key.value] > 1), None)
         if twice is not None:
             raise InputError(f"line {twice.start_mark.line + 1}: the key {twice.value!r} occurs twice in a section")
         return super().construct_mapping(node, deep)

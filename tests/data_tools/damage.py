@@ -6,6 +6,7 @@ programs and people do to them, `another` that or a change of structure.
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import json
 import random
@@ -20,18 +21,25 @@ from benchmarks.recordings.landmarks import read_landmark_log
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
 from data_tools.datasets.argoverse2 import ArgoverseLogs
-from data_tools.datasets.detection_files import TruthFile, read_detections, read_tracks
+from data_tools.datasets.detection_files import TruthFile, read_detections, read_predictions, read_tracks
 from data_tools.datasets.eth_ucy import EthUcy
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.source import read_scored_sequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
+from data_tools.files.input_files import expanded
+from data_tools.laser import read_carmen
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o
+from data_tools.sensor_logs import read_sensor_log
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
-from pipelines.config import load_config
+from pipelines.config import OTHER_FILES, TrackConfig, load_config, load_interactions
+from pipelines.configuration import load_settings
 from pipelines.explaining import read_events
 from pipelines.report.page import read_run_record
-from pipelines.serving import StreamTracker
+from pipelines.report.scenes import thumbnails
+from pipelines.serving import StateKeeper, StreamTracker
+from pipelines.slam.configuration import SlamConfig, load_slam_config
+from pipelines.slam.submaps import SlamMap, read_map, write_map
 from saga_fg.types.dataset import Dataset, Scene
 from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.kitti_example import write_sequence
@@ -58,10 +66,13 @@ OTHERS = (
 LABELS = TRACKS.replace("cov_yy\n", "cov_yy,yaw_variance,source,quality\n").replace("0.5\n", "0.5,0.1,observed,high\n")
 G2O_2D = (
     "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0.1\nEDGE_SE2 0 1 1 0 0.1 100 0 0 100 0 400\n"
-    "EDGE_SE2 1 0 -1 0 -0.1 100 0 0 100 0 400\n"
+    "EDGE_SE2 1 0 -1 0 -0.1 100 0 0 100 0 400\nVERTEX_XY 2 1 1\nEDGE_SE2_XY 0 2 1 1 100 0 100\n"
+    "EDGE_BEARING_SE2_XY 1 2 1.5 100\nBR 1 2 1.5 1 0.1 0.1\nEDGE_PRIOR_SE2_XY 1 1 0 4 0 4\nFIX 0\n"
 )
 UNIT = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
 G2O_3D = f"VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\nEDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {UNIT}\n"
+G2O_3D += "PARAMS_SE3OFFSET 0 0 0 1 0 0 0 1\nVERTEX_TRACKXYZ 2 1 1 1\nEDGE_SE3_TRACKXYZ 0 2 0 1 1 0 100 0 0 100 0 100\n"
+G2O_3D += f"EDGE_SE3_PRIOR 0 0 0 0 0 0 0 0 1 {UNIT}\nEDGE_SE3_XYZ_PRIOR 1 0 1 0 0 4 0 0 4 0 4\n"
 POSES = "1 0 0 0 0 1 0 0 0 0 1 0\n0 -1 0 1 1 0 0 2 0 0 1 3\n"
 TUM = "# timestamp tx ty tz qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n"
 CONFIG = "tracker:\n  max_delay: 0.5\n  classes:\n    car: {max_distance: 3.0}\nsensors:\n  default: {score: logit}\n"
@@ -87,6 +98,15 @@ PLAZA = {
     "TL": "7 20 30\n3 -1 -2\n",
 }
 OBSMAT = "780 1 8.0 0 3.0 1.0 0 0.0\n786 1 8.4 0 3.0 1.0 0 0.0\n786 2 1.0 0 2.0 0.0 0 -0.5\n"
+READINGS = " ".join(f"{1 + k / 10:.2f}" for k in range(11))
+FLASER = "".join(f"FLASER 11 {READINGS} {k}.2 2.0 0 {k} 2.0 0 {k}.5 nohost 0.1\n" for k in (1, 2))
+ROBOT = f"ROBOTLASER1 0 -1.57 3.14 0.314 5 0.01 0 11 {READINGS} 0 1.2 2 0.5 1 2 0.5 0 0 0 0 0 17.5 nohost 0.1\n"
+GPS = "time [s],latitude [deg],longitude [deg],altitude [m]\n0,49.0,8.4,110\n1,49.00001,8.4,110.5\n"
+SLAM = "slam:\n  lidar:\n    loops: {drift: 0.05}\n  joint: {}\nsensors:\n  default: {}\n"
+INTERACTIONS = (
+    "format: saga-fg interactions\nedges:\n- {kind: following, classes: [car], rate: 0.5}\nexplained_noise: 0.5\n"
+)
+PREDICTIONS = "scene,timestamp,horizon,id,label,x,y,cov_xx,cov_xy,cov_yy\na,0,1,1,car,1,2,0.5,0.1,0.5\n"
 JOURNAL = '{"event": "initiated", "track": 1, "scene": "a"}\n{"event": "deleted", "track": 1, "scene": "a"}\n'
 
 
@@ -124,7 +144,8 @@ def targets(folder: Path) -> dict[str, Target]:
     np.save(npy, np.ones((3, 4), dtype=np.float32))
     plaza = tuple(table(f"P_{kind}.txt", content) for kind, content in PLAZA.items())
     (folder / "eth").mkdir()
-    config = load_config("file")
+    lasers = (table("a.log", FLASER), table("b.log", ROBOT), table("c.log.gz", gzip.compress(FLASER.encode())))
+    config, slam = load_config("file"), load_slam_config("kitti")
     return {
         **_argoverse(folder / "argoverse"),
         "nuScenes": Target(tuple(sorted((nuscenes / "v1.0-mini").glob("*.json"))), lambda: _read_nuscenes(nuscenes)),
@@ -148,16 +169,68 @@ def targets(folder: Path) -> dict[str, Target]:
         "scan, PCD": one("scan.pcd", PCD, read_scan),
         "scan, PLY": one("scan.ply", PLY, read_scan),
         "scan, NumPy": Target((npy,), lambda: read_scan(npy)),
-        "configuration": one("config.yaml", CONFIG, lambda path: load_config("file", path)),
+        "list of files": one(
+            "list.txt", f"# tables\n{folder}/table.csv\n{folder}/*.npz\n", lambda path: expanded([str(path)])
+        ),
+        "log of a sensor": one("gps.csv", GPS, lambda path: read_sensor_log(path, "gps")),
+        "laser logs": Target(lasers, lambda: [read_carmen(path) for path in lasers]),
+        "map": _map(folder / "map"),
+        "configuration": one("config.yaml", CONFIG, lambda path: load_settings(TrackConfig, path, config, OTHER_FILES)),
+        "configuration of SLAM": one("slam.yaml", SLAM, lambda path: load_settings(SlamConfig, path, slam)),
+        "interactions": one("interactions.yaml", INTERACTIONS, load_interactions),
         "Victoria Park": one("park.txt", PARK, read_landmark_log),
         "Plaza": Target(plaza, lambda: read_landmark_log(plaza[0])),
         "ETH and UCY": one("eth/obsmat.txt", OBSMAT, lambda path: EthUcy(folder).scene("eth")),
+        **_image(folder / "image.png"),
         **_traffic(folder),
         **_recordings(folder),
+        "predictions": one("a.predictions.csv", PREDICTIONS, lambda path: read_predictions(folder / "a")),
+        "state": _state(folder / "state.saga", config),
         "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),
         "run record": Target((table("r.run.json", RECORD),), lambda: read_run_record(folder / "r.json")),
         "stream": one("messages.ndjson", MESSAGES, lambda path: _stream(path, lambda: config.new_tracker("saga"))),
     }
+
+
+def _image(path: Path) -> dict[str, Target]:
+    """An image, where Pillow is installed."""
+    if importlib.util.find_spec("PIL") is None:
+        return {}
+    from PIL import Image
+
+    Image.new("RGB", (40, 30), (200, 100, 50)).save(path)
+    return {"image": Target((path,), lambda: thumbnails({"front": [path]}, 32))}
+
+
+def _map(folder: Path) -> Target:
+    folder.mkdir()
+    points = (np.ones((2, 3), dtype=np.float32),)
+    write_map(folder, SlamMap(points, np.eye(4)[None], (49.0, 8.4, 110.0)), "pcd")
+    return Target((folder / "submaps.csv", folder / "origin.csv"), lambda: read_map(folder))
+
+
+def _state(path: Path, config: TrackConfig) -> Target:
+    """The state of a service; one that is taken goes on with a frame."""
+    header = {"version": "1"}
+
+    def keeper() -> tuple[StreamTracker[None], StateKeeper]:
+        service: StreamTracker[None] = StreamTracker(lambda: config.new_tracker("saga"))
+        return service, StateKeeper(service, path, 1.0, header)
+
+    def read() -> object:
+        service, restored = keeper()
+        try:
+            restored.restore()
+        finally:
+            restored.release()
+        (answer,) = service.handle(b'{"seq": 9, "timestamp": 0.9, "detections": [{"x": 1, "y": 2}]}', None)
+        return json.dumps(answer[1], allow_nan=False)
+
+    service, kept = keeper()
+    for k in range(3):
+        service.handle(json.dumps({"seq": k, "timestamp": k / 10, "detections": [{"x": k, "y": 2}]}).encode(), None)
+    kept.save()
+    return Target((path,), read)
 
 
 def _scenes_of(dataset: Dataset) -> list[Scene]:

@@ -35,7 +35,7 @@ def spins(_: object) -> Iterator[int]:
 
 
 def sleeps(_: object) -> Iterator[int]:
-    yield 1
+    yield os.getpid()
     time.sleep(1000)
 
 

@@ -54,6 +54,9 @@ def test_faults_are_named_with_their_line(tmp_path: Path, subtests: pytest.Subte
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             read_sensor_log(written(tmp_path, text), "wheels")
+    fix = written(tmp_path, "time [s],latitude [rad],longitude [rad],altitude [m]\n0,0.8,0.1,110\n1,1.6,0.1,110\n")
+    with pytest.raises(InputError, match=r"line 3: latitude: expected a number within 1\.48353, got 1\.6"):
+        read_sensor_log(fix, "gps")
 
 
 def test_a_log_is_fed_as_time_goes_on() -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 from collections.abc import Sized
 from contextlib import suppress
@@ -37,6 +38,10 @@ SIZES = {
     "scan, PCD": 2,
     "scan, PLY": 2,
     "scan, NumPy": 3,
+    "list of files": 2,
+    "log of a sensor": 2,
+    "laser logs": 3,
+    "predictions": 1,
     "tracks": 2,
     "labels": 2,
     "journal": 2,
@@ -55,9 +60,11 @@ def test_what_is_whole_is_read(valid: dict[str, Target]) -> None:
     assert len(read.pop("Argoverse", "ab")) == len(read.pop("OpenACC", "ab")) == 2  # need pyarrow
     for name in ("recording, MCAP", "recording, SQLite"):
         assert len(read.pop(name, "ab")) == 2  # need the packages that write them
-    for name in ("detections, Parquet", "detections, Feather"):
+    for name in ("detections, Parquet", "detections, Feather", "image"):
         assert len(read.pop(name, "a")) == 1
+    assert json.loads(read.pop("state"))["type"] == "tracks"
     assert {name: len(content) for name, content in read.items() if isinstance(content, Sized)} == SIZES
+    assert len(read["map"].points) == 1
     assert [len(scene) for scene in read["nuScenes"]] == [3, 2]
     assert read["configuration"].tracker.max_delay == 0.5
     assert read["run record"].method == "kf"

@@ -62,8 +62,10 @@ def test_errors_that_name_their_place_stay_as_they_are() -> None:
 
 def test_time_and_output_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(isolated_reading, "SECONDS", 0.5)
+    monkeypatch.setattr(isolated_reading, "PATIENCE", 1000.0)
     with pytest.raises(InputError, match=r"a\.file: expected a good file: its reader took more than 0.5 s of CPU time"):
         records(readers.spins)
+    monkeypatch.setattr(isolated_reading, "PATIENCE", 4.0)
     with pytest.raises(InputError, match=r"a\.file: expected a good file: its reader gave nothing for 2 s"):
         records(readers.sleeps)
     monkeypatch.undo()
@@ -115,11 +117,19 @@ def test_paths_are_those_of_this_process(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_reader_that_nobody_waits_for_ends() -> None:
-    found = isolated(PROBLEM, readers.process, "a")
+    found = isolated(PROBLEM, readers.sleeps, "a")
     child = next(found)
     del found  # which closes it
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
+
+
+def test_a_child_whose_last_record_is_refused_serves_the_next_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(isolated_reading, "ENDING", 60.0)
+    found = isolated(PROBLEM, readers.process, "a")
+    child = next(found)
+    del found
+    assert records(readers.process) == [child]
 
 
 PARENT = """

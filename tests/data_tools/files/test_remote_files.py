@@ -90,6 +90,28 @@ def test_a_list_in_itself_is_refused(tmp_path: Path) -> None:
     other.write_text(f"{one}\n")
     with pytest.raises(InputError, match=r"one\.txt: expected a list of files, this one is in itself"):
         expanded([str(one)])
+    other.write_text(f"{other.parent}/./other.txt\n")
+    with pytest.raises(InputError, match=r"other\.txt: expected a list of files, this one is in itself"):
+        expanded([str(one)])
+
+
+def test_lists_of_lists_are_read_once(tmp_path: Path) -> None:
+    for k in range(40):  # 2^40 paths through them
+        (tmp_path / f"{k}.txt").write_text(f"{tmp_path}/{k + 1}.txt\n{tmp_path}/./{k + 1}.txt\n")
+    (tmp_path / "40.txt").write_text(f"{tmp_path}/a.csv\n")
+    assert expanded([str(tmp_path / "0.txt")]) == [str(tmp_path / "a.csv")]
+
+
+def test_entries_that_can_be_no_files_are_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    path = tmp_path / "list.txt"
+    for entry, message in [
+        ("a\0b.csv", r"list\.txt: expected names without a zero byte, got 'a\\x00b\.csv'"),
+        ("[" * 5000, r"list\.txt, \[+: expected at least one file, there is none"),
+    ]:
+        with subtests.test(message):
+            path.write_text(f"{entry}\n")
+            with pytest.raises(InputError, match=message):
+                expanded([str(path)])
 
 
 def test_other_protocols_and_chains_are_refused(subtests: pytest.Subtests) -> None:
