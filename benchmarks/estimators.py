@@ -2,8 +2,7 @@
 
 Filters read all means and all per-node covariances after every frame; the fixed-lag smoothers all means of their window
 and (ours only) the newest covariances; the batch smoothers all means and all per-node covariances of a recording. The
-running graph takes vehicles with linear interactions and with those of intelligent drivers. In the endurance run a
-young filter takes turns with one that went all the way, over its last tenth.
+running graph takes vehicles with linear interactions and with those of intelligent drivers.
 
     ratio            of the times to the baseline's
     largest, mean    difference of a mean from the reference's, standard deviations
@@ -16,7 +15,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Annotated, Any
 
@@ -25,10 +24,9 @@ import typer
 
 from benchmarks.filters import Filter, GtsamWindow, Ours, OurWindow, Read, Textbook, blocks, dense
 from benchmarks.flocks import DT, Flock, FlockFrame, Kind, flock
-from benchmarks.runner import Row, Rows, Seed, counts, each, growth, in_turn, timed
+from benchmarks.runner import Row, Rows, Seed, counts, each, growth, in_turn
 from benchmarks.sampled_traffic import Interaction
 from factors import gaussian_factors, prior_factors
-from pipelines.tracking import one_thread, resident_memory
 from saga_fg.estimators import (
     Gaussian,
     GraphFilter,
@@ -52,7 +50,7 @@ ROW = 5  # vehicles
 F = np.eye(4) + DT * np.eye(4, k=2)
 Q: FloatArray = np.asarray(0.3 * np.kron([[DT**3 / 3, DT**2 / 2], [DT**2 / 2, DT]], np.eye(2)), dtype=np.float64)
 OWN, LEADER = np.diag([1.0, 1.0, 0.95, 0.95]) @ F, np.diag([0.0, 0.0, 0.05, 0.05])
-COST, GROWTH, ENDURANCE = "cost, and error in standard deviations", "growth of the cost", "endurance"
+COST, GROWTH = "cost, and error in standard deviations", "growth of the cost"
 
 
 def estimators(
@@ -64,8 +62,7 @@ def estimators(
     batch: Annotated[
         int, typer.Option("--batch-frames", min=0, help="Length of the batch smoothers' recording; 0: none.")
     ] = 200,
-    soak: Annotated[int, typer.Option("--soak-frames", min=0, help="Frames of the endurance run; 0: none.")] = 10_000,
-    nodes: Annotated[int, typer.Option("--nodes", min=2, help="Nodes of these two.")] = 100,
+    nodes: Annotated[int, typer.Option("--nodes", min=2, help="Nodes of it.")] = 100,
     seed: Seed = 0,
 ) -> Rows:
     """Measure time, memory and exactness of the estimators.
@@ -76,7 +73,7 @@ def estimators(
     \b
     Examples:
       python -m benchmarks estimators
-      python -m benchmarks estimators --sizes 10,100 --frames 5 --soak-frames 0 --json figures.json
+      python -m benchmarks estimators --sizes 10,100 --frames 5 --json figures.json
     """
     numbers = counts("--sizes", sizes, least=2)
     cases: list[Callable[[], Iterator[Row]]] = []
@@ -98,10 +95,6 @@ def estimators(
     for (name, graph), points in costs.items():
         if len(points) > 2:
             yield GROWTH, {"estimator": name, "graph": graph, "nodes^": growth(*zip(*points, strict=True))}
-    if soak:
-        scene = flock("components", nodes, 50, seed)
-        with one_thread():
-            yield from _endurance("isam2", soak, partial(_endless, scene))
 
 
 def _filters(kind: Kind, n: int, frames: int, seconds: float, seed: int) -> Iterator[Row]:
@@ -192,27 +185,6 @@ def _running_graph(kind: Kind, n: int, frames: int, seconds: float) -> Iterator[
     for name, spent in times.items():
         about = {"case": "running graph", "graph": kind, "nodes": n, "estimator": name, "ms": float(np.median(spent))}
         yield COST, {**about, "ratio": float(np.median(spent) / np.median(times["linear"]))}
-
-
-def _endless(scene: Flock) -> Callable[[int], None]:
-    """The linear filter on the same frames over and over."""
-    ours = Ours(GraphFilter(), scene)
-    return lambda k: ours.step(scene.frames[k % len(scene.frames)])
-
-
-def _endurance(name: str, frames: int, make: Callable[[], Callable[[int], None]]) -> Iterator[Row]:
-    """`make` gives a fresh filter, which takes frame k. The young one is one to two tenths old when it counts."""
-    part = max(1, frames // 10)
-    old, young, memory = make(), make(), np.zeros(frames)
-    times: list[tuple[float, float]] = []
-    for k in each(range(frames), f"endurance, {name}"):
-        taken = timed(old, k), timed(young, k - frames + 2 * part) if k >= frames - 2 * part else 0.0
-        times.append(taken)
-        memory[k] = resident_memory()
-    at_end, at_start = np.median(times[-part:], axis=0).tolist()
-    held = np.median(memory[part : 2 * part]), np.median(memory[-part:])
-    about: Mapping[str, Any] = {"estimator": name, "frames": frames, "ms at the end": at_end, "ms, young": at_start}
-    yield ENDURANCE, {**about, "old / young": at_end / at_start, "memory, end / start": held[1] / held[0]}
 
 
 def _anees(truth: FloatArray, means: FloatArray, covariances: FloatArray) -> float:
