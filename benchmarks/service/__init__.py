@@ -28,10 +28,11 @@ def service(
 ) -> Rows:
     """Two good clients of a service among hostile ones.
 
-    Poisonous, broken and random messages, clocks that are wrong, drift or jump in both directions, a listener that does
-    not read, a good client that is killed, and a service that is killed half-way and goes on from its snapshot. Fails
-    if less than 99 % of the valid frames are tracked, one is lost or judged twice, a good client waits for more than
-    0.5 s outside the restart, or memory grows by more than 5 %.
+    Two hundred of them: poisonous, broken and random messages, clocks that are wrong, drift or jump. A listener does
+    not read, a good client is killed, the disk is full for a while, another service wants the same snapshot, and the
+    service is killed half-way and goes on from it. Fails if less than 99 % of the valid frames are tracked, one is lost
+    or judged twice, a good client waits outside the restart for 0.3 s more than a thread that sleeps, memory grows by
+    more than 5 %, the full disk is not told, or the other service is not refused.
 
     With --clocks, three sensors in one process, one with a wrong clock: which share of the frames of the others is
     tracked; and how well steady offsets are estimated. Fails below 99 %, above 10 ms, and where positions are more than

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import threading
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -41,6 +44,16 @@ class Served:
         self.address = self._address()
         self._listening = threading.Thread(target=self._listen, daemon=True)  # or it would wait with its warnings
         self._listening.start()
+
+    @contextmanager
+    def full_disk(self) -> Iterator[None]:
+        """Let it write no files, as on a full disk; Linux only."""
+        whole = resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, (0, whole[1]))
+        try:
+            yield
+        finally:
+            resource.prlimit(self.process.pid, resource.RLIMIT_FSIZE, whole)
 
     def kill(self) -> None:
         """SIGKILL."""

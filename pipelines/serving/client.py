@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import time
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
@@ -27,11 +28,22 @@ class StreamClient:
         self._socket = socket.socket(family)
         self._socket.settimeout(timeout)
         try:
-            self._socket.connect(str(address.path) if address.path is not None else (address.host, address.port))
+            self._connect(timeout)
         except OSError as error:
             self._socket.close()
             raise InputError(f"{address}: nobody answers there: {error.strerror or error}") from error
         self._lines = self._socket.makefile("rb")
+
+    def _connect(self, timeout: float | None) -> None:
+        where = str(self._address.path) if self._address.path is not None else (self._address.host, self._address.port)
+        end = time.monotonic() + (timeout or 0.0)
+        while True:
+            try:
+                return self._socket.connect(where)
+            except BlockingIOError:  # as many others wait to be accepted at this Unix socket as may
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.01)
 
     def send(self, message: Mapping[str, Any] | bytes) -> None:
         """Send one message, or a raw line."""

@@ -14,22 +14,27 @@ from pipelines.config import load_config
 from pipelines.serving import StreamTracker
 from pipelines.serving.messages import encode
 
-FINE = {"valid": 10, "tracked": 10, "lost": 0, "doubled": 0, "longest_stall": 0.1, "memory_growth": 1.01}
+FINE = {"valid": 10, "tracked": 10, "lost": 0, "doubled": 0, "longest_stall": 0.3, "machine_stall": 0.1}
+FINE |= {"memory_growth": 1.01, "full_disk_told": True, "second_refused": True}
 
 
 def test_no_good_frame_is_lost_or_doubled_by_kills_and_floods():
     found = bench_hostile_service(messages=400, objects=3, pace=20.0, seed=0)
     assert [found[name] for name in ("valid", "answered", "lost", "doubled", "hostile")] == [80, 80, 0, 0, 320]
     assert 0 < found["tracked"] <= 80 - found["late"] - found["unconfirmed"]
+    assert found["full_disk_told"]
+    assert found["second_refused"]
     assert all(found[name] > 0 for name in ("refused", "sent_again", "first_answer"))
 
 
 def test_what_falls_short_is_named():
     assert shortcomings(FINE) == []
-    bad = FINE | {"tracked": 9, "lost": 1, "doubled": 2, "longest_stall": 0.7, "memory_growth": 1.06}
+    bad = FINE | {"tracked": 9, "lost": 1, "doubled": 2, "longest_stall": 0.5, "memory_growth": 1.06}
+    bad |= {"full_disk_told": False, "second_refused": False}
     assert [text.split(",")[0] for text in shortcomings(bad)] == [
         *("1 frames lost", "2 frames doubled", "9 of 10 frames tracked"),
-        *("a stall of 0.700 s", "memory grew to 1.060 of the start"),
+        *("a stall of 0.400 s over that of the machine", "a full disk was not told in the status"),
+        *("another service has taken the same snapshot", "memory grew to 1.060 of the start"),
     ]
 
 

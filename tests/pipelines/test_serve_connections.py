@@ -6,12 +6,16 @@ import asyncio
 import json
 import resource
 import socket
+import threading
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from pipelines.serving import Address, SocketServer, StreamClient, StreamSettings
+from saga_fg.errors import InputError
 from tests.pipelines.running_service import frame, limits, serving, status, wait_for
 
 
@@ -49,6 +53,25 @@ def test_a_silent_client_is_told_and_closed_and_a_listener_is_not(tmp_path: Path
             assert sender.receive()["type"] == listener.receive()["type"] == "tracks"
             time.sleep(0.05)
         assert "within 0.5 s" in silent.receive()["message"]
+
+
+def test_a_client_waits_for_its_turn_where_many_connect_at_once(tmp_path: Path):
+    address = Address(path=tmp_path / "full.sock")
+    with ExitStack() as stack:
+        server = stack.enter_context(socket.socket(socket.AF_UNIX))
+        server.bind(str(address.path))
+        server.listen(1)
+        with suppress(BlockingIOError):
+            while True:
+                other = stack.enter_context(socket.socket(socket.AF_UNIX))
+                other.setblocking(False)
+                other.connect(str(address.path))
+        with pytest.raises(InputError, match=r"full\.sock: nobody answers there"):
+            StreamClient(address, timeout=0.1)
+        later = threading.Timer(0.2, lambda: stack.enter_context(server.accept()[0]))
+        later.start()
+        stack.enter_context(StreamClient(address))
+        later.join()
 
 
 def test_unfinished_lines_of_all_clients_share_a_budget():
