@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 from data_tools.datasets import source
 from data_tools.datasets.source import DatasetSource
 from saga_fg.errors import InputError
-from tests.pipelines.command import saga_fg
+from tests.pipelines.command import COMMAND, saga_fg
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "add-a-dataset.md"
 
@@ -115,6 +116,18 @@ def test_by_module_and_class_it_need_not_be_installed(square: Path, tmp_path: Pa
         result = saga_fg("track", name, "--folder", square)
         assert result.exit_code == 2
         assert message in result.stderr
+
+
+def test_by_module_and_class_it_is_smoothed_on_ray(square: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="Ray comes with the extra ray")
+    run = ("smooth", "square:Square", "--folder", str(square), "-o")
+    assert saga_fg(*run, tmp_path / "serial").exit_code == 0
+    command = [*COMMAND, *run, str(tmp_path / "run"), "--ray", "local"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert "2 scenes: 2 done, 0 unchanged, 0 failed" in done.stdout
+    assert rows(tmp_path / "run" / "labels") == (tmp_path / "serial" / "labels.csv").read_text()
 
 
 def test_a_broken_package_is_named_and_hinders_no_other(packages: Path, square: Path, tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from pipelines.serving import Address, StreamClient
 from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
@@ -84,6 +86,25 @@ def test_the_state_of_another_configuration_is_refused(tmp_path: Path):
     assert "'estimator: kalman' instead of 'estimator: isam2'" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert state.read_bytes() == before
+
+
+def test_a_damaged_state_file_is_one_line_and_stays(tmp_path: Path, subtests: pytest.Subtests):
+    state = tmp_path / "state"
+    command = [*COMMAND, "serve", "--snapshot", str(state)]
+    subprocess.run(command, input=frame(0), capture_output=True, check=True)
+    whole = state.read_bytes()
+    for damaged, message in [
+        (whole[: len(whole) // 2], "the state file is damaged: its checksum differs; remove it to begin anew"),
+        (whole[:-9] + b"x" + whole[-8:], "the state file is damaged: its checksum differs; remove it to begin anew"),
+        (whole.replace(b"state 1", b"state 9", 1), "expected the format 'saga-fg state 1', got b'saga-fg state 9'"),
+        (b"", "expected a state file of `saga-fg serve`, this is none"),
+    ]:
+        with subtests.test(message):
+            state.write_bytes(damaged)
+            done = subprocess.run(command, input=frame(1), capture_output=True, check=False)
+            assert (done.returncode, done.stdout) == (2, b"")
+            assert done.stderr.decode() == f"error: {state}: {message}\n"
+            assert state.read_bytes() == damaged
 
 
 def test_factors_of_ones_own_cannot_be_kept(tmp_path: Path):

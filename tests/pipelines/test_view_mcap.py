@@ -22,6 +22,7 @@ from pipelines.view import Drawing, SceneView, draw_scene, in_order, write_view
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
+from tests.pipelines.test_view import read_back as read_rrd
 
 ROOT = "/scene-0001"
 
@@ -160,6 +161,46 @@ def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path: Path, show
     (transform,) = topics[f"{ROOT}/ego"][k].content.transforms
     assert (transform.parent_frame_id, transform.child_frame_id) == ("scene-0001", "scene-0001/ego")
     np.testing.assert_allclose(xyz(transform.translation), scene.world_T_ego[k, :3, 3] - origin, atol=1e-3)
+
+
+PLACES = {"Boxes3D:centers", "Ellipsoids3D:centers", "Points3D:positions", "LineStrips3D:strips", "Arrows3D:origins"}
+
+
+def places(message: Any) -> list[list[float]]:
+    """Where a message of Foxglove has solids, points of lines, tails of arrows, points of a cloud, or a frame."""
+    if hasattr(message, "transforms"):
+        return [xyz(each.translation) for each in message.transforms]
+    if hasattr(message, "data"):
+        return np.frombuffer(message.data, dtype="<f4").reshape(-1, 3).tolist()
+    found = []
+    for entity in message.entities:
+        found += [xyz(each.pose.position) for each in (*entity.cubes, *entity.spheres, *entity.arrows)]
+        found += [xyz(point) for line in entity.lines for point in line.points]
+    return found
+
+
+def test_both_kinds_of_file_show_the_same(tmp_path: Path, shown: ReportScene) -> None:
+    view = SceneView(shown, TwoScans(shown.scene.timestamps[0] + np.array([0.0, 0.6])))
+    found = {}
+    for suffix in ("rrd", "mcap"):
+        write_view(tmp_path / f"a.{suffix}", "a", ["scene-0001"], draw_scene(view))
+    for topic, messages in read_back(tmp_path / "a.mcap").items():
+        found[topic] = {round(each.time / 1e9, 6): places(each.content) for each in messages}
+    rows = {}
+    for entity, columns in read_rrd(tmp_path / "a.rrd").items():
+        for name in columns.keys() & {*PLACES, "Transform3D:translation"}:
+            rows[entity] = {
+                round(time or 0.0, 6): np.concatenate(
+                    [np.empty((0, 3)), *(np.reshape(each, (-1, 3)) for each in value)]
+                )
+                for time, value in columns[name].items()
+            }
+    assert rows.keys() == found.keys()
+    assert {f"{ROOT}/{name}" for name in ("ego", "saga/boxes", "saga/trajectories", "truth/seen")} < rows.keys()
+    for entity, at in rows.items():
+        assert at.keys() == found[entity].keys(), entity
+        for time, there in at.items():
+            np.testing.assert_allclose(np.reshape(found[entity][time], (-1, 3)), there, atol=2e-3, err_msg=entity)
 
 
 def test_scans_are_clouds_in_the_frame_of_their_sensor(tmp_path: Path, shown: ReportScene) -> None:
