@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
 from pathlib import Path
+from typing import Any
 
+from benchmarks.class_figures import class_rows
 from benchmarks.recordings.crossings import simulated_crossings
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
@@ -46,10 +48,11 @@ Runs = Mapping[str, TrackedScene]
 @dataclass(frozen=True, eq=False)
 class Score:
     """Headline figures of some scenes, by their numbers, of which any may occur more than once; errors at the labels,
-    scene by scene."""
+    scene by scene; figures class by class, where there are such."""
 
     figures_of: Callable[[Sequence[int]], dict[str, float]]
     errors: tuple[LabelErrors, ...]
+    class_rows: Callable[[], Iterable[Mapping[str, Any]]] = tuple
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +100,8 @@ def _nuscenes(name: str, split: str, sensor: str, file: str, data: Path) -> Reco
             return {"AMOTA": f.amota, "AMOTP": f.amotp, "MOTA": f.mota, "IDS": f.ids, "FRAG": f.frag}
 
         pairs = zip(scored, scenes, strict=True)
-        return Score(figures_of, tuple(nuscenes_label_errors(s, placed_detections(runs[n].scene)) for n, s in pairs))
+        errors = tuple(nuscenes_label_errors(s, placed_detections(runs[n].scene)) for n, s in pairs)
+        return Score(figures_of, errors, partial(class_rows, scenes))
 
     return RecordingSet(name, "nuscenes", dataset, score)
 

@@ -105,6 +105,8 @@ def set_rows(recordings: RecordingSet, compared: Sequence[Contender], draws: int
         if name not in (KF, BASELINE) and (found := changes(scores[name], scores[KF], recordings.units, draws)):
             title = f"{recordings.name}: changes from kf (RMSE: relative), 95 % intervals over scenes"
             yield title, {"variant": name, **found}
+    for row in scores[names_of[0]].class_rows():
+        yield f"{recordings.name}: classes by {names_of[0]}", row
     for label, errors_of in errors_by_class(LabelErrors.pool(scores[names_of[0]].errors)).items():
         c = calibration(errors_of)
         if c.enough_data:

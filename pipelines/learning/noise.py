@@ -32,6 +32,8 @@ from saga_fg.learning import (
     fit_curvilinear_by_class,
     fit_sensor,
     fit_trajectory_noise,
+    learn_confusion,
+    learn_sizes,
     measured_trajectories,
     sample_with_tracker,
     sample_with_truth,
@@ -88,6 +90,13 @@ def _reported(dataset: Dataset, names: Sequence[str], suffix: str, progress: Pro
 
 def _from_truth(scenes: Iterable[Scene], config: TrackConfig) -> LearnedNoise:
     kept = list(scenes)
+    for name, rows in learn_confusion(kept, config.sensors).items():
+        sensor = replace(sensor_model(config.sensors, name), confusion=rows)
+        config = replace(config, sensors={**config.sensors, name: sensor})
+    classes = dict(config.tracker.classes)
+    for label, size in learn_sizes(kept, config.sensors).items():
+        classes[label] = replace(class_settings(classes, ClassSettings, label), typical_size=size)
+    config = replace(config, tracker=replace(config.tracker, classes=classes))
     pooled = sample_with_truth(kept, config.sensors)
     learned = {name: fit_sensor(sample, sensor_model(config.sensors, name), GATE) for name, sample in pooled.items()}
     config = replace(config, sensors={**config.sensors, **learned})
@@ -207,7 +216,7 @@ def _joined(parts: list[SensorTime]) -> tuple[float, float]:
     return mean, math.sqrt(max(1.0, chi2 / max(len(parts) - 1, 1)) / total)
 
 
-LEARNED = ("noise", "calibration", "detection_probability", "class_detection_probability", "field_of_view")
+LEARNED = ("noise", "calibration", "detection_probability", "class_detection_probability", "field_of_view", "confusion")
 KINDS: dict[type, str] = {ConstantVelocity: "constant_velocity", Curvilinear: "curvilinear"}
 
 
@@ -217,14 +226,14 @@ def learned_fragment(learned: LearnedNoise, origin: str) -> str:
     for name in learned.detections:
         values = asdict(learned.config.sensors[name])
         sensors[name] = {key: _rounded(values[key]) for key in LEARNED if values[key] != {}}
-    tracker: dict[str, Any] = {}
-    if learned.classes:
-        classes = learned.config.tracker.classes
-        motions = {label: class_settings(classes, ClassSettings, label).motion for label in learned.classes}
-        tracker["classes"] = {
-            label: {"motion": {"kind": KINDS[type(motion)], **_rounded(asdict(motion))}}
-            for label, motion in motions.items()
-        }
+    written: dict[str, dict[str, Any]] = {}
+    for label, settings in learned.config.tracker.classes.items():
+        if label in learned.classes:
+            motion = {"kind": KINDS[type(settings.motion)], **_rounded(asdict(settings.motion))}
+            written.setdefault(label, {})["motion"] = motion
+        if settings.typical_size is not None:
+            written.setdefault(label, {})["typical_size"] = _rounded(asdict(settings.typical_size))
+    tracker: dict[str, Any] = {"classes": written} if written else {}
     data: dict[str, Any] = {"sensors": sensors, **({"tracker": tracker} if tracker else {})}
     text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
     return f"# Learned by saga-fg learn noise from {origin}; pass it to --config.\n{text}"

@@ -25,12 +25,10 @@ from saga_fg.smoothing import (
     Headings,
     LabelCounts,
     Labels,
-    Lifespans,
     OfflineClass,
     SmoothingSettings,
     StateTable,
     constant_sizes,
-    lifespans_of,
     quality_of,
     scalar_readings,
     smooth_headings,
@@ -186,9 +184,7 @@ def _sources(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -
     observed = np.zeros(len(states), dtype=np.bool_)
     hit = states.rows_of(nearest, objects.object_of[rows])
     observed[hit[hit >= 0]] = True
-    online: Lifespans = lifespans_of(
-        np.where(objects.track_of >= 0, objects.object_of, -1), evidence.boxes.label, evidence.moment
-    )
+    online = evidence.lifespans(np.where(objects.track_of >= 0, objects.object_of, -1))
     row = online.rows_of(states.id)
     beyond = (states.moment < online.first[row]) | (states.moment > online.last[row])
     return np.where(beyond, "extended", np.where(observed, "observed", "filled"))

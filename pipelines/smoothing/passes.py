@@ -41,7 +41,6 @@ from saga_fg.smoothing import (
     assign_free_detections,
     constant_sizes,
     evidence_scores,
-    lifespans_of,
     measured_in_order,
     no_edges,
     robust_weights,
@@ -135,8 +134,7 @@ def smooth_objects(
     settings, asked from the first moment on every time the final states are solved for.
     """
     passes = _Passes(evidence, settings, tracker, providers)
-    label, moment = evidence.boxes.label, evidence.moment
-    everything = lifespans_of(track_of, label, moment)
+    everything = evidence.lifespans(track_of)
     ahead = max(EXTENSION, settings.max_gap)
     alone = passes.alone(everything, track_of, ahead)
     score = evidence_scores(evidence, track_of, everything, alone.within(everything), PRIOR_OPPORTUNITY_TIME)
@@ -148,14 +146,14 @@ def smooth_objects(
     first = stitch_tracklets(tracklets, states, passes.motion(tracklets).velocity_prior, evidence, settings.max_gap)
     object_of[strong] = first[tracklets.rows_of(track_of[strong])]
 
-    joined = lifespans_of(object_of, label, moment)
+    joined = evidence.lifespans(object_of)
     states = passes.alone(joined, object_of, EXTENSION)
     states = passes.coupled(joined, object_of, EXTENSION, states)
     object_of = assign_free_detections(evidence, object_of, joined, states, _ASSOCIATION_GATE, MAX_FREE_DISTANCE)
     track_of = np.where(strong | (object_of < 0), track_of, -1)
     object_of = np.where(object_of < 0, track_of, object_of)
     states = states.merged(alone.select(~is_strong))
-    lifespans = lifespans_of(object_of, label, moment)
+    lifespans = evidence.lifespans(object_of)
     within = states.within(lifespans)
     score = evidence_scores(evidence, object_of, lifespans, within, PRIOR_OPPORTUNITY_TIME)
     kept = score >= settings.min_score
@@ -181,7 +179,7 @@ def smooth_known_objects(
     """States by the last pass alone, without stationary states; object_of (N,): true object of each detection, -1 for
     none."""
     passes = _Passes(evidence, settings, tracker, ())
-    lifespans = lifespans_of(object_of, evidence.boxes.label, evidence.moment)
+    lifespans = evidence.lifespans(object_of)
     states = smooth_states(evidence, object_of, lifespans, passes.motion(lifespans))
     return passes.final(lifespans, object_of, states, StationaryStates(settings.position_drift))
 

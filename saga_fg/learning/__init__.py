@@ -1,5 +1,6 @@
 """Learn from recordings: noise, scores and detection probability of sensors, process noise, and interactions."""
 
+from saga_fg.learning.class_confusion import learn_confusion, learn_sizes
 from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects, hidden_objects
 from saga_fg.learning.interaction_fit import (
     MAX_GAPS,
@@ -53,6 +54,8 @@ __all__ = [
     "fit_sensor",
     "fit_trajectory_noise",
     "hidden_objects",
+    "learn_confusion",
+    "learn_sizes",
     "match_to_truth",
     "measured_trajectories",
     "negative_log_likelihood",

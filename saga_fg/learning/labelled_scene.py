@@ -25,6 +25,7 @@ from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import assign
 from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, LabelledObjects, Scene
 from saga_fg.types.frame import Detections, Frame
@@ -203,10 +204,12 @@ class MatchedFrame:
 def match_to_truth(scene: Scene, sensors: Mapping[str, Sensor], gate: float = GATE) -> Iterator[MatchedFrame]:
     """The frames between the first and the last annotated moment, matched class by class within `gate`, m.
 
+    Of classes that the sensors confuse, also across classes within half of it.
     Raises `InputError` for a scene without ground truth.
     """
     if scene.ground_truth is None:
         raise InputError(f"scene {scene.name}: expected ground truth")
+    confused = ConfusedClasses.of(sensors, {})
     for frame in scene.frames:
         sensor = sensor_model(sensors, frame.sensor)
         time = frame.timestamp + sensor.time_offset
@@ -217,7 +220,9 @@ def match_to_truth(scene: Scene, sensors: Mapping[str, Sensor], gate: float = GA
         detections = sensor.in_world(frame)
         boxes, truth = detections.boxes, annotations.boxes
         distance = np.hypot(*np.moveaxis(boxes.position[:, None, :2] - truth.position[None, :, :2], -1, 0))
-        possible = (distance < gate) & (boxes.label[:, None] == truth.label)
+        group, true_group = confused.numbers(boxes.label, truth.label)
+        same, akin = boxes.label[:, None] == truth.label, group[:, None] == true_group
+        possible = distance < np.where(same, gate, gate / 2 * akin)
         yield MatchedFrame(
             frame, detections, sensor.origin(frame), annotations, *assign(distance, possible, unmatched=gate)
         )

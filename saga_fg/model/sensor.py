@@ -161,6 +161,10 @@ class Sensor(Settings):
         lambda: {DEFAULT: ScoreCalibration()},
         "calibration of the scores by class; the entry named default serves all others",
     )
+    confusion: Mapping[str, Mapping[str, NonNegative]] = settings_group(
+        dict,
+        "by true class, how many of its detections are reported as each class, counts or shares; {}: none is confused",
+    )
     colour_accuracy: Fraction = setting(
         0.9, "probability that the reported colour of a traffic light is right; higher: beliefs change faster"
     )
@@ -175,6 +179,14 @@ class Sensor(Settings):
     time_offset: Annotated[float, Range(-LATEST, LATEST)] = setting(
         0.0, "added to the sensor's timestamps to get the time of measurement, s; usual -0.1 to 0"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for label, reported in self.confusion.items():
+            if not reported.get(label, 0.0) > 0:
+                raise InputError(
+                    f"confusion.{label}: expected a share above 0 of {label} itself, got {dict(reported)!r}"
+                )
 
     def logit(self, score: FloatArray) -> FloatArray:
         """The logits (N,) of the detector's own scores, before calibration; of probabilities in [0.001, 0.999]."""

@@ -48,7 +48,8 @@ from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import gate, least_total, mahalanobis_of_pairs
 from saga_fg.numerics.gating import near_pairs
-from saga_fg.smoothing.states import Lifespans, StateTable
+from saga_fg.smoothing.states import Lifespans, StateTable, lifespans_of
+from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.boxes import Boxes
@@ -78,6 +79,7 @@ class Evidence:
     with_velocity (N,)        whether the velocity was measured
     z_noise, yaw_noise (N,)   standard deviations, m and rad
     distance     (N,)         from the vehicle, m; NaN where its place is unknown
+    confused     classes that the sensors confuse; class_likelihood (N, C) of each detection in them
     """
 
     times: FloatArray
@@ -91,6 +93,8 @@ class Evidence:
     z_noise: FloatArray
     yaw_noise: FloatArray
     distance: FloatArray
+    confused: ConfusedClasses
+    class_likelihood: FloatArray
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -100,6 +104,19 @@ class Evidence:
         """(N,) the moment of each detection."""
         moments = np.array([frame.moment for frame in self.frames], dtype=np.int64)
         return moments[self.frame] if len(self) else np.empty(0, dtype=np.int64)
+
+    def lifespans(self, object_of: IntArray) -> Lifespans:
+        """The lifespans of all objects, with the likeliest class of each by all of its detections.
+
+        object_of (N,): the object of each detection, negative for none
+        """
+        found, rows, confused = lifespans_of(object_of, self.boxes.label, self.moment), object_of >= 0, self.confused
+        if not len(confused):
+            return found
+        belief = np.tile(confused.log_prior, (len(found), 1))
+        with np.errstate(divide="ignore"):
+            np.add.at(belief, found.rows_of(object_of[rows]), np.log(self.class_likelihood[rows]))
+        return replace(found, label=confused.labels(belief, found.label))
 
     def rows_of_frame(self) -> list[slice]:
         """The rows of each frame."""
@@ -121,11 +138,12 @@ def gather_evidence(
     stamps = np.array([time for time, _ in ordered])
     times = np.unique(np.concatenate([wanted, stamps]))
     origin = _origin(frames)
+    confused = ConfusedClasses.of(sensors, classes)
     taken, parts = [], []
     for time, frame in ordered:
         sensor = sensor_model(sensors, frame.sensor)
         taken.append(EvidenceFrame(int(np.searchsorted(times, time)), sensor, frame.world_T_ego))
-        parts.append(frame_measurements(frame, sensor, classes))
+        parts.append(frame_measurements(frame, sensor, classes, confused))
     boxes = Boxes.concatenate([part.boxes for part in parts])
     poses = [part.world_T_ego for part in parts]
     places = [np.full(2, np.nan) if pose is None else pose[:2, 3] for pose in poses]
@@ -146,6 +164,8 @@ def gather_evidence(
         z_noise=column("z_noise"),
         yaw_noise=column("yaw_noise"),
         distance=np.hypot(*(boxes.position[:, :2] - np.reshape(places, (-1, 2))[number]).T),
+        confused=confused,
+        class_likelihood=column("class_likelihood", len(confused)),
     )
 
 
@@ -215,8 +235,9 @@ def assign_detections(
     of true pairs that the chi-square gate lets through
     """
     objects, detections = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
-    for name in np.unique(label):
-        a, b = np.flatnonzero(label == name), rows[evidence.boxes.label[rows] == name]
+    group, reported = evidence.confused.numbers(label, evidence.boxes.label[rows])
+    for number in np.unique(group):
+        a, b = np.flatnonzero(group == number), rows[reported == number]
         if len(b) == 0:
             continue
         z = evidence.boxes.position[b, :2]
@@ -267,7 +288,8 @@ def stitch_tracklets(
     (n, 2, 2): covariance of the velocity of a new object; max_gap: longest between two tracklets of an object, s
     """
     limit = gate(GATE, 4)
-    end, begin, a, b = _meetings(seen, states, evidence.times, max_gap, limit)
+    (group,) = evidence.confused.numbers(seen.label)
+    end, begin, a, b = _meetings(seen, group, states, evidence.times, max_gap, limit)
     d = states.mean[a] - states.mean[b]
     S = states.covariance[a] + states.covariance[b]
     d2 = np.einsum("ni,ni->n", d, np.linalg.solve(S, d[..., None])[..., 0])
@@ -284,10 +306,10 @@ def stitch_tracklets(
 
 
 def _meetings(
-    seen: Lifespans, states: StateTable, times: FloatArray, max_gap: float, limit: float
+    seen: Lifespans, group: IntArray, states: StateTable, times: FloatArray, max_gap: float, limit: float
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Pairs of tracklets of a class, one that ended at most `max_gap` s before the other begins, whose states may be
-    inside the gate there: rows (p,) of both, and rows (p,) of their states at the later one's first moment.
+    """Pairs of tracklets of one group (n,) of classes, one that ended at most `max_gap` s before the other begins, with
+    states that may be inside the gate there: rows (p,) of both, and rows (p,) of their states at the later one's start.
 
     limit: of d^2, which is at least |d|^2 / tr S of the positions alone; the pairs are found by these
     """
@@ -307,7 +329,7 @@ def _meetings(
         b = states.rows_of(np.full(len(begin), moment), seen.id[begin])
         begin, b = begin[b >= 0], b[b >= 0]
         i, j = near_pairs(states.mean[a, :2], states.mean[b, :2], reach[a], reach[b])
-        alike = seen.label[end[i]] == seen.label[begin[j]]
+        alike = group[end[i]] == group[begin[j]]
         i, j = i[alike], j[alike]
         found.append(np.stack([end[i], begin[j], a[i], b[j]]))
     pairs = np.concatenate(found, axis=1)

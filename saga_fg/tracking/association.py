@@ -11,8 +11,9 @@ below 1 reduce their influence. lambda is the number of false detections of the 
 scores suggest, so that it fits any detector. A track of low existence can't take a strong detection from afar, least of
 all among many weak ones, and of two detections the more probable one is preferred.
 
-Candidates are the pairs of one class inside its gate. The assignment is the one of least total cost (`hungarian`), is
-made cheapest pair first (`greedy`), or registers the observed graph to the predicted graph (`graph`): the costs above
+Candidates are the pairs of one class, or of classes that a sensor confuses, with a cost of their own
+(`saga_fg.tracking.class_belief`), inside its gate. The assignment is the one of least total cost (`hungarian`), is made
+cheapest pair first (`greedy`), or registers the observed graph to the predicted graph (`graph`): the costs above
 are then joined by those of `saga_fg.numerics.assignment` between pairs of candidates, of all classes, whose tracks
 have correlated errors.
 
@@ -38,6 +39,7 @@ from saga_fg.numerics.assignment import (
     pair_costs,
 )
 from saga_fg.numerics.gating import near_pairs
+from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.relinking import relinked
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
@@ -84,7 +86,8 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
     predicted = state.boxes(position, np.full_like(position, np.nan))
     expected = table.existence * sensor.detection_chance(table.label)
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
-    tracks = ExpectedTracks(predicted, P, expected, cross, over_confirmed(state, predicted))
+    deferred = over_confirmed(state, predicted)
+    tracks = ExpectedTracks(predicted, P, expected, cross, deferred, state.confused, state.class_belief())
     found = match(tracks, measurements, state.settings, area)
     return relinked(state, measurements, found, position, P)
 
@@ -97,6 +100,7 @@ class ExpectedTracks(NamedTuple):
     chance    (n,) that the track is detected: its existence times the sensor's detection probability
     cross     covariances between the positions of tracks, for the method `graph`
     deferred  (n,) tracks that are matched to what the others leave; None: none
+    confused  classes that sensors confuse, and the log-beliefs (n, C) in them
     """
 
     boxes: Boxes
@@ -104,6 +108,8 @@ class ExpectedTracks(NamedTuple):
     chance: FloatArray
     cross: CrossCovariances | None = None
     deferred: BoolArray | None = None
+    confused: ConfusedClasses = NONE_CONFUSED
+    class_belief: FloatArray | None = None
 
 
 def match(
@@ -133,9 +139,9 @@ def _chosen(found: CandidatePairs, association: AssociationSettings, cross: Cros
 def _candidates(
     tracks: ExpectedTracks, measurements: FrameMeasurements, settings: TrackerSettings, clutter_area: float
 ) -> CandidatePairs:
-    """The pairs of one class that are inside its gate; the arguments are those of `match`."""
-    boxes, detected = tracks.boxes, measurements.boxes
-    of_track, of_detection = common_numbers(boxes.label, detected.label)
+    """The pairs of one class, or group, that are inside its gate; the arguments are those of `match`."""
+    boxes, detected, confused = tracks.boxes, measurements.boxes, tracks.confused
+    of_track, of_detection = confused.numbers(boxes.label, detected.label)
     reach, share = class_values(settings.classes, ClassSettings, boxes.label, "max_distance", "gate")
     x, z = boxes.position[:, :2], detected.position[:, :2]
     row, column = near_pairs(x, z, reach)
@@ -151,6 +157,10 @@ def _candidates(
         group_z=of_detection,
     )
     found = CandidatePairs(*pairs)
+    if tracks.class_belief is not None and len(confused):
+        reported = measurements.class_likelihood[found.detection]
+        found = found._replace(gain=found.gain - 2 * confused.log_evidence(tracks.class_belief[found.track], reported))
+        (of_detection,) = common_numbers(detected.label)
     unmatched = _unmatched(found, tracks.chance, measurements.probability, of_detection, clutter_area)
     return found._replace(gain=found.gain - unmatched)
 

@@ -53,6 +53,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         has_moved=np.zeros(k, dtype=bool),
         required_hits=np.full(k, required_hits(state, measurements.sensor)),
         unresolved=unresolved,
+        class_belief=state.confused.initial(measurements.class_likelihood[rows]),
         box=BoxFilter.initiated(boxes.size, p, boxes.position[:, 2], z_noise, boxes.yaw, yaw_noise),
         stationarity=Stationarity.initiated(kinematics, stationary),
         turn=TurnRate.initiated(boxes.yaw, yaw_noise),

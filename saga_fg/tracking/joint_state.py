@@ -133,6 +133,21 @@ class JointTrackState:
         for track in ids.tolist():
             del self._initiated[track]
 
+    def reclassify(self, ids: IntArray, label: StrArray, new: StrArray, speed: FloatArray) -> None:
+        """Give tracks (k,) of classes `label` new ones. Those that move by another kind of motion keep what they have
+        in common with it, position and velocity, and lose their correlation with others.
+
+        speed (k,): standard deviation of a velocity that they did not have, m/s
+        """
+        pairs = zip(label.tolist(), new.tolist(), strict=True)
+        apart = np.flatnonzero([len(self._kinds_of(pair, False)[0]) > 1 for pair in pairs])
+        if len(apart):
+            now, fixed = self.kinematics_of(ids[apart], label[apart]), self.places(label[apart])[:, 2] < 0
+            unknown = speed[apart, None, None] ** 2 * np.eye(2)
+            now = now._replace(P_velocity=np.where(fixed[:, None, None], unknown, now.P_velocity))
+            self.remove(ids[apart])
+            self.add(ids[apart], new[apart], now)
+
     def predict(self, graph: SceneGraph, dt: float) -> None:
         """Move all tracks by `dt` s under the graph's dynamics."""
         estimator = self._estimator_to_change()

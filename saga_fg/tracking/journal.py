@@ -352,11 +352,12 @@ class Journal:
     def _candidates(
         self, row: int, position: FloatArray, measurements: FrameMeasurements, taken: dict[int, int], chosen: int | None
     ) -> list[Event]:
-        """Detections near a track, of its class, the nearest first; the chosen one is always among them."""
+        """Detections near a track, of its class or one confused with it, nearest first; the chosen one among them."""
         assert self._predicted is not None
         label = str(self._predicted.table.label[row])
         settings = class_settings(self._settings.classes, ClassSettings, label)
-        rows = np.flatnonzero(measurements.boxes.label == label)
+        confused = (measurements.class_likelihood > 0) & np.isfinite(self._predicted.table.class_belief[row])
+        rows = np.flatnonzero((measurements.boxes.label == label) | confused.any(axis=1))
         measured = measurements.boxes.position[rows, :2]
         d2, _ = mahalanobis(position[None], self._predicted.P[row][None], measured, measurements.R[rows, :2, :2])
         apart, limit = np.hypot(*(measured - position).T), gate(settings.gate)

@@ -5,7 +5,8 @@ Measurements are the usable detections, with the sensor's model of their noise.
 Duplicates are left out by non-maximum suppression. Of two detections of a class closer than `nms_distance` the
 less probable one is suppressed; within `weak_nms_distance` only where its probability is below `WEAK_RATIO` of the
 other's: two people may walk half a metre apart, but a weak detection that close to a strong one is most often a
-duplicate. Boxes of different classes do not suppress each other.
+duplicate. Boxes of classes that no sensor confuses do not suppress each other; of those that some does, boxes in one
+place are one report with several labels (`saga_fg.tracking.class_belief`).
 
 The vehicle as a node of the scene graph: it leads and follows like any other, and is never reported.
 
@@ -32,6 +33,7 @@ from saga_fg.model.sensor import MAX_MEASURED_SPEED, Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, of_classes, unchecked
 from saga_fg.numerics.gating import near_pairs
 from saga_fg.numerics.geometry import yaw_of
+from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings
 from saga_fg.tracking.track_filters import MOVING, Kinematics, RelativePositions
@@ -62,6 +64,7 @@ class FrameMeasurements:
     range_rate_variance          (m,) (m/s)^2
     covariance_scale             (m,) factor on the reported deviation of positions, see `saga_fg.tracking.reporting`
     position_bias                 (m,) part of the reported error of positions that does not average out, m
+    class_likelihood             (m, C) of the confused classes
     delay                        time by which the frame is older than the state, s
     relative                     positions seen from a vehicle whose pose is estimated, else None
     """
@@ -81,6 +84,7 @@ class FrameMeasurements:
     range_rate_variance: FloatArray
     covariance_scale: FloatArray
     position_bias: FloatArray
+    class_likelihood: FloatArray
     delay: float = 0.0
     relative: RelativePositions | None = None
 
@@ -92,7 +96,9 @@ class FrameMeasurements:
         return unchecked(FrameMeasurements, **vars(self) | {"delay": delay, "relative": relative})
 
 
-def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings]) -> FrameMeasurements:
+def frame_measurements(
+    frame: Frame, sensor: Sensor, classes: Mapping[str, ClassSettings], confused: ConfusedClasses = NONE_CONFUSED
+) -> FrameMeasurements:
     """Return the detections that are probable enough for their class and no duplicates."""
     detections = sensor.in_world(frame)
     label = detections.boxes.label
@@ -100,10 +106,16 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
     objects = ~of_classes(label, COLOUR_LABELS)  # the colours of lights are not objects of their own
     keep = (objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0])).nonzero()[0]
     detections, probability, viewpoint = detections.select(keep), probability[keep], sensor.origin(frame)
-    distances = class_values(classes, ClassSettings, detections.boxes.label, "nms_distance", "weak_nms_distance")
-    kept = suppress_duplicates(detections.boxes, probability, *distances)
+    near, wide = class_values(classes, ClassSettings, detections.boxes.label, "nms_distance", "weak_nms_distance")
+    label = detections.boxes.label
+    into = suppress_duplicates(detections.boxes, probability, near, wide, confused.numbers(label)[0])
+    likelihood = confused.likelihood(frame.sensor, label)
+    kept = (into == np.arange(len(into))).nonzero()[0]
     if len(kept) < len(keep):
+        if len(confused):
+            probability, likelihood = as_one_report(label, probability, into, likelihood)
         keep, detections, probability = keep[kept], detections.select(kept), probability[kept]
+        likelihood = likelihood[kept]
     boxes = detections.boxes
     R = sensor.detection_covariance(detections, viewpoint, probability)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
@@ -125,24 +137,26 @@ def frame_measurements(frame: Frame, sensor: Sensor, classes: Mapping[str, Class
         range_rate_variance=sensor.range_rate_variance(boxes.label, probability),
         covariance_scale=covariance_scale,
         position_bias=position_bias,
+        class_likelihood=likelihood,
     )
 
 
 def suppress_duplicates(
-    boxes: Boxes, probability: FloatArray, distance: FloatArray, weak_distance: FloatArray
+    boxes: Boxes, probability: FloatArray, distance: FloatArray, weak_distance: FloatArray, group: IntArray
 ) -> IntArray:
-    """Rows of the boxes that stay, ascending, after suppression within the classes.
+    """The row (n,) that suppresses each box, its own where it stays, within groups of classes.
 
-    boxes (n); probability (n,); of their classes nms_distance (n,) and weak_nms_distance (n,), m. Greedy from the most
-    probable down, so that a suppressed box suppresses no other.
+    boxes (n); probability (n,); of their classes nms_distance (n,) and weak_nms_distance (n,), m, and group (n,).
+    Greedy from the most probable down, so that a suppressed box suppresses no other.
     """
+    into = np.arange(len(boxes))
     if len(boxes) < 2:
-        return np.arange(len(boxes))
+        return into
     position = boxes.position[:, :2]
     a, b = near_pairs(position, position, np.full(len(boxes), max(distance.max(), weak_distance.max())))
     once = (a < b).nonzero()[0]
     if len(once) == 0:
-        return np.arange(len(boxes))
+        return into
     a, b = a[once], b[once]
     apart = np.hypot(*(position[a] - position[b]).T)
     swap = probability[b] > probability[a]
@@ -150,13 +164,28 @@ def suppress_duplicates(
     duplicate = apart < np.minimum(distance[a], distance[b])
     much_weaker = probability[weak] < WEAK_RATIO * probability[strong]
     duplicate |= (apart < np.minimum(weak_distance[a], weak_distance[b])) & much_weaker
-    rival = (boxes.label[a] == boxes.label[b]) & duplicate
+    rival = (group[a] == group[b]) & duplicate
     strong, weak = strong[rival], weak[rival]
-    alive = np.ones(len(boxes), dtype=bool)
     for k in np.argsort(-probability[strong], kind="stable"):
-        if alive[strong[k]]:
-            alive[weak[k]] = False
-    return alive.nonzero()[0]
+        if into[strong[k]] == strong[k] and into[weak[k]] == weak[k]:
+            into[weak[k]] = strong[k]
+    return into
+
+
+def as_one_report(
+    label: StrArray, probability: FloatArray, into: IntArray, likelihood: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Probabilities (n,) and class likelihoods (n, C) of boxes with those that they suppress, where classes differ.
+
+    label, probability, into (n,): which box suppresses each; likelihood (n, C), see `saga_fg.tracking.class_belief`
+    """
+    odds = np.where((into == np.arange(len(into))) | (label != label[into]), probability / (1 - probability), 0.0)
+    total, joint = np.zeros(len(odds)), np.zeros_like(likelihood)
+    np.add.at(total, into, odds)
+    np.add.at(joint, into, odds[:, None] * likelihood)
+    merged = np.bincount(into, odds > 0, minlength=len(into)) > 1
+    share = joint / np.where(merged, total, 1.0)[:, None]
+    return np.where(merged, total / (1 + total), probability), np.where(merged[:, None], share, likelihood)
 
 
 EGO_ID = 0  # tracks begin at 1, nodes of the map count down from -1

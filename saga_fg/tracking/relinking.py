@@ -50,7 +50,7 @@ import numpy as np
 from saga_fg.kernels.pairs import relinking_pairs, return_evidence, returned_pairs
 from saga_fg.kernels.tracks import log_peaks
 from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, common_numbers
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
@@ -78,6 +78,9 @@ def relinked(
         return matching
     places, noise = measurements.boxes.position[rows, :2] - state.origin, measurements.R[rows, :2, :2]
     t, j, cost = _pairs(state, tracks, position, P, label, places, noise)
+    if len(state.confused):
+        cost -= _class_odds(state, t, measurements.class_likelihood[rows[j]])
+        t, j, cost = t[cost < 0], j[cost < 0], cost[cost < 0]
     if len(t) == 0:
         return matching
     chosen = least_total(t, j, cost)
@@ -98,7 +101,7 @@ def _pairs(
     """Rows of tracks, of places `z` (m, 2) of classes `label` (m,), and costs (k,) of pairs
     that re-linking pays for."""
     still = state.table.stationarity
-    group, of_place = common_numbers(state.table.label, label)
+    group, of_place = state.confused.numbers(state.table.label, label)
     log_density = np.log(np.bincount(of_place)[of_place] / area(state))
     return relinking_pairs(
         tracks=tracks,
@@ -116,6 +119,14 @@ def _pairs(
         least=min_log_odds(state),
         rounding=_ROUNDING,
     )
+
+
+def _class_odds(state: TrackerState, tracks: IntArray, likelihood: FloatArray) -> FloatArray:
+    """(k,) log-odds that reports of this likelihood (k, C) are of the classes of `tracks` (k,), not of any; at most 0,
+    so that a common class links nothing."""
+    confused = state.confused
+    of_any = confused.log_evidence(np.where(likelihood > 0, confused.log_prior, -np.inf), likelihood)
+    return np.minimum(confused.log_evidence(state.class_belief()[tracks], likelihood) - of_any, 0.0)
 
 
 def relinkable(state: TrackerState) -> BoolArray:
@@ -165,11 +176,15 @@ def hand_over(state: TrackerState, matching: Matching) -> Matching:
     moving, still = _log_evidence(state, new, old)
     evidence = np.logaddexp(moving, still)
     log_odds = log_survival(state)[old] + evidence + math.log(area(state)) - np.log(others)
+    if len(state.confused):
+        log_odds += _class_odds(state, old, state.confused.report(state.table.class_belief[new]))
     chosen = least_total(new, old, min_log_odds(state) - log_odds)
     if len(chosen) == 0:
         return matching
     new, old = new[chosen], old[chosen]
+    state.reclassify(new, state.table.label[old])
     _join(state, old, new, np.exp(still - evidence)[chosen])
+    state.reclassify()
     row, kept = np.arange(len(state)), np.ones(len(state), dtype=bool)
     row[new], kept[new] = old, False
     state.remove(~kept)
@@ -187,7 +202,7 @@ def _possible_returns(state: TrackerState, matching: Matching) -> tuple[IntArray
         return new, new, new
     old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
     now, still = state.kinematics(), table.stationarity
-    (group,) = common_numbers(table.label)
+    (group,) = state.confused.numbers(table.label)
     return returned_pairs(
         new=new,
         old=old,
@@ -247,6 +262,8 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
     z_noise, yaw_noise = np.sqrt(box.z_variance[new]), np.sqrt(box.yaw_variance[new])
     box.update(old, box.size[new], box.size_weight[new], box.z[new], z_noise, box.yaw[new], yaw_noise)
     table.turn.update(old, table.turn.heading[new], np.sqrt(table.turn.P[new, 0, 0]))
+    report = state.confused.report(table.class_belief[new])
+    table.class_belief[old] = state.confused.updated(table.class_belief[old], report)
     table.sensors.join(old, new)
     for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected, table.last_in_view):
         column[old] = column[new]

@@ -55,6 +55,7 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     centre = np.concatenate([now.position + state.origin, table.box.z[rows, None]], axis=1)
     P = biased_covariances(now.P, yaw, scale, bias)
     score = reported_score(table, rows, coasting > 0, settings.existence)
+    score = score * state.confused.certainty(state.class_belief()[rows])
     if settings.tentative_score_factor < 1:
         score = np.where(table.tentative[rows], settings.tentative_score_factor * score, score)
     columns = {"label": table.label[rows], "position": centre, "size": table.box.size.take(rows, 0)}

@@ -41,6 +41,18 @@ AssociationName = Literal["hungarian", "greedy", "graph"]
 
 
 @dataclass(frozen=True)
+class TypicalSize(Settings):
+    """Boxes of a class, to tell it from those that a sensor confuses it with."""
+
+    length: Positive = setting(4.5, "geometric mean of the length, m")
+    width: Positive = setting(1.9, "geometric mean of the width, m")
+    height: Positive = setting(1.7, "geometric mean of the height, m")
+    spread: Positive = setting(
+        0.15, "standard deviation of the logarithm of each; usual 0.1 to 0.3; higher: sizes say less"
+    )
+
+
+@dataclass(frozen=True)
 class ClassSettings(Settings):
     """Motion, initiation, association and deletion of the tracks of one class."""
 
@@ -79,6 +91,10 @@ class ClassSettings(Settings):
         1.5,
         "keep and report a track without detections while the standard deviation of its position is below this in "
         "every direction, m; usual 1 to 4; higher: hidden objects are reported for longer, at less certain places",
+    )
+    typical_size: TypicalSize | None = settings_group(
+        lambda: None,
+        "boxes of the class, where sensors confuse it with others; null: sizes say nothing about the class",
     )
     yaw_drift: NonNegative = setting(
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"

@@ -172,6 +172,7 @@ class TrackTable(Columns):
     has_moved         (n,) whether it was ever clearly in motion
     required_hits     (n,) detections after which it is no longer tentative, if they are of one sensor
     unresolved        (n,) further frames to tell it from the track that it overlaps, see `saga_fg.tracking.unresolved`
+    class_belief      (n, C) log-probabilities by its detections, see `saga_fg.tracking.class_belief`
     box               size, height and heading
     stationarity      probability and place of standing still
     turn              turn rate
@@ -193,14 +194,15 @@ class TrackTable(Columns):
     has_moved: BoolArray
     required_hits: FloatArray
     unresolved: FloatArray
+    class_belief: FloatArray
     box: BoxFilter
     stationarity: Stationarity
     turn: TurnRate
     sensors: SensorEvidence
 
     @classmethod
-    def empty(cls) -> Self:
-        """A table without tracks."""
+    def empty(cls, classes: int = 0) -> Self:
+        """A table without tracks, with beliefs over this many confused classes."""
         number, truth = np.empty(0), np.empty(0, dtype=bool)
         return cls(
             np.empty(0, dtype=np.int64),
@@ -208,6 +210,7 @@ class TrackTable(Columns):
             *(number,) * 9,
             *(truth,) * 2,
             *(number,) * 2,
+            np.empty((0, classes)),
             BoxFilter.empty(),
             Stationarity.empty(),
             TurnRate.empty(),

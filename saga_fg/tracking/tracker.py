@@ -24,7 +24,7 @@ from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, Undet
 from saga_fg.model.edge_rules import EdgeRule, require_rules
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.by_name import new_provider
@@ -85,7 +85,7 @@ class Tracker:
             if not callable(getattr(provider, "factors", None)):
                 raise InputError(f"providers: expected factor providers, with a method factors, got {provider!r:.40}")
         self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
-        self._state = TrackerState(self.settings, self.rules, self.providers)
+        self._state = TrackerState(self.settings, self.rules, self.providers, self.sensors)
         self._last_step_failed = False
 
     def __repr__(self) -> str:
@@ -134,7 +134,7 @@ class Tracker:
             return self._process_frame(state, frame, sensor, time)
         several, placed = len(state.clock.sensors) > 1, frame.coordinates == "world" or frame.world_T_ego is not None
         if several and placed and len(frame):  # left out of the tracks, but it tells about the clocks
-            measurements = frame_measurements(frame, sensor, self.settings.classes)
+            measurements = frame_measurements(frame, sensor, self.settings.classes, state.confused)
             state.clock, state.shared = compared(state.clock, state.shared, timestamp, measurements)
         state.assignment = Assignment.empty()
         return report_tracks(state, state.clock.newest)
@@ -155,7 +155,7 @@ class Tracker:
             state.ego.update(frame, state.time, state.origin, state.joint)
         self._notify("predict", state, frame.sensor)
 
-        measurements = frame_measurements(frame, sensor, self.settings.classes)
+        measurements = frame_measurements(frame, sensor, self.settings.classes, state.confused)
         measurements = measurements.with_context(delay, state.ego.relative_positions(measurements, frame))
         stamp = frame.timestamp + sensor.time_offset
         state.clock, state.shared = compared(state.clock, state.shared, stamp, measurements)
@@ -244,6 +244,10 @@ class Tracker:
     def sensor(self, name: str) -> Sensor:
         """The model of a sensor."""
         return sensor_model(self.sensors, name)
+
+    def classes_of(self, ids: IntArray) -> StrArray:
+        """The present classes (k,) of live tracks, reported or not."""
+        return self._state.table.label[self._state.table.rows(ids)]
 
     @property
     def assignment(self) -> Assignment:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -23,9 +24,11 @@ from saga_fg.kernels.components import velocities_along
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import POSITION
 from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.assignment import Assignment, CrossCovariances
 from saga_fg.tracking.by_name import new_estimator
+from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
 from saga_fg.tracking.edge_record import EdgeRecord
@@ -96,9 +99,14 @@ class TrackerState:
     """The attributes of a `TrackerSnapshot`, and the joint state of the tracks as a running estimator."""
 
     def __init__(
-        self, settings: TrackerSettings, rules: tuple[EdgeRule, ...], providers: tuple[FactorProvider, ...] = ()
+        self,
+        settings: TrackerSettings,
+        rules: tuple[EdgeRule, ...],
+        providers: tuple[FactorProvider, ...] = (),
+        sensors: Mapping[str, Sensor] | None = None,
     ) -> None:
         self.settings, self.rules, self.providers = settings, rules, providers
+        self.confused = ConfusedClasses.of(sensors or {}, settings.classes)
         self.graph: SceneGraph | None = None
         self.start, self.time, self.origin = 0.0, 0.0, np.zeros(2)
         self.next_id = 1
@@ -115,7 +123,7 @@ class TrackerState:
         poses = settings.ego is not None and settings.ego.estimated
         estimator = new_estimator(settings.estimator, values, self.providers, poses)
         self.joint = JointTrackState(estimator, lambda label: motion_of(settings, label))
-        self.table = TrackTable.empty()
+        self.table = TrackTable.empty(len(self.confused))
         read = MAP_CLASSES if self.providers else classes_read(self.rules)
         self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.from_settings(settings)
         self.traffic = Traffic(settings.traffic)
@@ -142,6 +150,29 @@ class TrackerState:
         if rows is not None:
             now, still, coasting = now.select(rows), still.select(rows), coasting[rows]
         return still.reported(now, coasting) if self.settings.stationary_share > 0 else now
+
+    def class_belief(self) -> FloatArray:
+        """(n, C) log-probabilities of the confused classes, by detections, size and speed."""
+        table, confused = self.table, self.confused
+        if not len(confused):
+            return table.class_belief
+        now = self.kinematics()
+        speed = np.where(table.has_moved, np.hypot(*now.velocity.T), np.nan)
+        return confused.with_shape(table.class_belief, table.box.size, speed, now.speed_deviation**2)
+
+    def reclassify(self, rows: IntArray | None = None, new: StrArray | None = None) -> None:
+        """Give each track its likeliest class, or those of `rows` (k,) the classes `new` (k,)."""
+        if not len(self.confused):
+            return
+        label = self.table.label.copy()
+        if rows is None or new is None:
+            label = self.confused.labels(self.class_belief(), label)
+        else:
+            label[rows] = new
+        changed = (label != self.table.label).nonzero()[0]
+        (speed,) = self.class_values(label[changed], "initial_speed_deviation")
+        self.joint.reclassify(self.table.id[changed], self.table.label[changed], label[changed], speed)
+        self.table.label = label
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""

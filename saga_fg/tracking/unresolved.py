@@ -62,7 +62,7 @@ def unresolved_frames(
     track = detected[column[~is_new] - len(boxes)]
     surer[~is_new] = (state.table.unresolved[track] == 0) & (state.table.existence[track] >= probability[row[~is_new]])
     row, column = row[surer], column[surer]
-    covered = _largest(_overlaps(boxes, others, row, column), row, len(boxes)) > OVERLAP
+    covered = _largest(_overlaps(state, boxes, others, row, column), row, len(boxes)) > OVERLAP
     if not covered.any():
         return np.zeros(len(boxes))
     precise = np.sqrt(np.linalg.eigvalsh(R)[:, -1]) < PRECISE * boxes.size[:, :2].min(axis=1)
@@ -84,7 +84,7 @@ def resolve_tracks(state: TrackerState, matching: Matching) -> None:
     row, column = touching_pairs(mine, theirs)
     surer = table.existence[sure[column]] >= table.existence[rows[row]]
     row, column = row[surer], column[surer]
-    overlap = _overlaps(mine, theirs, row, column)
+    overlap = _overlaps(state, mine, theirs, row, column)
     most, seen, other = _largest(overlap, row, len(rows)), detected[rows], np.zeros(len(rows), dtype=bool)
     other[row[(overlap > OVERLAP) & detected[sure[column]]]] = True
     apart = (most <= OVERLAP) | (other & (most <= MAX_OVERLAP))
@@ -101,14 +101,14 @@ def over_confirmed(state: TrackerState, predicted: Boxes) -> BoolArray:
         sure = (table.confirmed & (table.unresolved == 0)).nonzero()[0]
         mine, theirs = predicted.select(rows), predicted.select(sure)
         row, column = touching_pairs(mine, theirs)
-        result[rows] = _largest(_overlaps(mine, theirs, row, column), row, len(rows)) > OVERLAP
+        result[rows] = _largest(_overlaps(state, mine, theirs, row, column), row, len(rows)) > OVERLAP
     return result
 
 
-def _overlaps(boxes: Boxes, others: Boxes, row: IntArray, column: IntArray) -> FloatArray:
-    """(K,) bird's-eye IoU of boxes[row] with others[column] of their class, 0 with those of other classes."""
+def _overlaps(state: TrackerState, boxes: Boxes, others: Boxes, row: IntArray, column: IntArray) -> FloatArray:
+    """(K,) bird's-eye IoU of boxes[row] with others[column] of their class or group, 0 with those of other classes."""
     overlap = np.zeros(len(row))
-    alike = (boxes.label[row] == others.label[column]).nonzero()[0]
+    alike = state.confused.alike(boxes.label[row], others.label[column]).nonzero()[0]
     found = paired_bev_iou(boxes.select(row[alike]), others.select(column[alike]))
     overlap[alike] = np.where(np.isnan(found), 0.0, found)
     return overlap

@@ -1,6 +1,6 @@
 """Update: matched measurements correct the state, and existence follows from all that was seen.
 
-The matched measurements correct position and velocity, box and stationarity of their tracks.
+The matched measurements correct position and velocity, box, stationarity and class of their tracks.
 
 Where they are, and how fast, is remembered for the paths and speeds of others (`saga_fg.tracking.traffic`).
 
@@ -53,6 +53,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     p, z_noise, yaw_noise = measurements.probability[d], measurements.z_noise[d], measurements.yaw_noise[d]
     table.box.update(t, boxes.size[d], p, boxes.position[d, 2], z_noise, boxes.yaw[d], yaw_noise)
     table.turn.update(t, boxes.yaw[d], yaw_noise)
+    table.class_belief[t] = state.confused.updated(table.class_belief[t], measurements.class_likelihood[d])
     if len(table):
         now = state.reported_kinematics()
         speed = np.hypot(*now.velocity.T)
@@ -67,6 +68,7 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
                 table.id[t], table.label[t], there, table.box.yaw[t], moves[t], state.time, still
             )
             state.traffic.update(passing, state.time)
+    state.reclassify()
 
 
 def infer_signals(state: TrackerState, matching: Matching) -> None:

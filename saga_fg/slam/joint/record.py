@@ -261,7 +261,7 @@ class EpochRecorder:
         rows = rows[order]
         z, R = measurements.boxes.position[rows], measurements.R[rows, :2, :2]
         seen = RecordedDetections(ids[order], z, R, np.ones(len(rows)), measurements.row[rows])
-        return seen, measurements.boxes.label[rows].tolist()
+        return seen, tracker.classes_of(seen.id).tolist()
 
     def _objects(self, seen: RecordedDetections, label: list[str]) -> RecordedObjects:
         for name in label:

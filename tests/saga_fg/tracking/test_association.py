@@ -37,6 +37,7 @@ def measured(found, probability, noise=0.3):
         range_rate_variance=flat,
         covariance_scale=flat,
         position_bias=flat,
+        class_likelihood=np.empty((n, 0)),
         viewpoint=None,
     )
 

@@ -6,14 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import Boxes
+from saga_fg.numerics.arrays import common_numbers
 from saga_fg.tracking.measurements import suppress_duplicates
 
 
 def kept(x, probability, distance=1.0, label="car", shadow=0.0):
     n = len(x)
     boxes = Boxes.of(np.broadcast_to(label, n), np.stack([x, np.zeros(n), np.zeros(n)], axis=-1))
-    distances = (np.broadcast_to(d, n).astype(float) for d in (distance, shadow))
-    return suppress_duplicates(boxes, np.asarray(probability), *distances).tolist()
+    near, wide = (np.broadcast_to(d, n).astype(float) for d in (distance, shadow))
+    (group,) = common_numbers(boxes.label)
+    into = suppress_duplicates(boxes, np.asarray(probability), near, wide, group)
+    assert (into[into] == into).all()
+    return np.flatnonzero(into == np.arange(n)).tolist()
 
 
 @pytest.mark.parametrize(
@@ -45,10 +49,13 @@ def test_what_stays_is_apart_and_what_goes_was_beaten(seed, n):
     probability = rng.permutation(n) / n
     label = rng.choice(["car", "bus"], n)
     distance = np.where(label == "car", 1.0, 1.5)
-    stays = suppress_duplicates(Boxes.of(label, position), probability, distance, np.zeros(n))
+    (group,) = common_numbers(label)
+    into = suppress_duplicates(Boxes.of(label, position), probability, distance, np.zeros(n), group)
+    stays = np.flatnonzero(into == np.arange(n))
     apart = np.hypot(*np.moveaxis(position[:, None, :2] - position[None, :, :2], -1, 0))
     rival = (label[:, None] == label) & (apart < distance[:, None]) & ~np.eye(n, dtype=bool)
     assert (np.diff(stays) > 0).all()
     assert not rival[np.ix_(stays, stays)].any()
     for k in np.setdiff1d(np.arange(n), stays):
-        assert (rival[k, stays] & (probability[stays] > probability[k])).any()
+        assert rival[k, into[k]]
+        assert probability[into[k]] > probability[k]
