@@ -203,18 +203,28 @@ class TrackTable(Columns):
     @classmethod
     def empty(cls, classes: int = 0) -> Self:
         """A table without tracks, with beliefs over this many confused classes."""
-        number, truth = np.empty(0), np.empty(0, dtype=bool)
+        none, no = np.empty(0), np.empty(0, dtype=bool)
         return cls(
-            np.empty(0, dtype=np.int64),
-            np.empty(0, dtype="<U1"),
-            *(number,) * 9,
-            *(truth,) * 2,
-            *(number,) * 2,
-            np.empty((0, classes)),
-            BoxFilter.empty(),
-            Stationarity.empty(),
-            TurnRate.empty(),
-            SensorEvidence.empty(),
+            id=np.empty(0, dtype=np.int64),
+            label=np.empty(0, dtype="<U1"),
+            existence=none,
+            last_existence=none,
+            score=none,
+            best_score=none,
+            covariance_scale=none,
+            position_bias=none,
+            initiated=none,
+            last_detected=none,
+            last_in_view=none,
+            confirmed=no,
+            has_moved=no,
+            required_hits=none,
+            unresolved=none,
+            class_belief=np.empty((0, classes)),
+            box=BoxFilter.empty(),
+            stationarity=Stationarity.empty(),
+            turn=TurnRate.empty(),
+            sensors=SensorEvidence.empty(),
         )
 
     def rows(self, ids: IntArray) -> IntArray:
