@@ -15,10 +15,11 @@ import numpy as np
 
 from data_tools.evaluation import best_thresholds
 from data_tools.metrics import NuScenesTrackingScene, SceneBoxes, nuscenes_tracking_metrics
-from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.arrays import BoolArray
 from saga_fg.types.boxes import paired_bev_iou, touching_pairs
 
 TWICE = 0.2
+LOW_SCORE = 0.1  # hidden objects at places that are hardly known have less
 GATE = 2.0  # m, that of the official evaluation
 
 
@@ -36,7 +37,8 @@ def class_rows(scenes: Sequence[NuScenesTrackingScene]) -> Iterator[Mapping[str,
             )
     yield from rows
     labels = np.array([row["labels"] for row in rows])
-    share = frames_with_two_classes([each.found for each in scenes], best_thresholds(found))
+    twice = [frames_with_two_classes(each.found, best_thresholds(found)) for each in scenes]
+    share = float(np.average(twice, weights=[len(each.timestamps) for each in scenes]))
     for name, weight in (("mean", np.ones(len(rows))), ("by labels", labels)):
         means = {key: float(np.average([row[key] for row in rows], weights=weight)) for key in list(rows[0])[2:5]}
         sums = {key: sum(row[key] for row in rows) for key in ("labels", "false", "missed", "IDS")}
@@ -54,15 +56,17 @@ def _matching(scene: NuScenesTrackingScene) -> BoolArray:
     return np.isin(found.id, found.id[near])
 
 
-def frames_with_two_classes(results: Sequence[SceneBoxes], thresholds: Mapping[str, float]) -> float:
-    """Share of the frames with boxes in which a place is reported as two classes; thresholds: least score by class."""
-    twice, total = 0, 0
-    for result in results:
-        least: FloatArray = np.array([thresholds.get(label, np.inf) for label in result.boxes.label.tolist()])
-        for frame in np.unique(result.frame):
-            boxes = result.boxes.select(np.flatnonzero((result.frame == frame) & (result.score >= least)))
-            a, b = touching_pairs(boxes, boxes)
-            other = boxes.label[a] < boxes.label[b]
-            overlap = paired_bev_iou(boxes.select(a[other]), boxes.select(b[other]))
-            twice, total = twice + bool((overlap > TWICE).any()), total + 1
-    return twice / max(total, 1)
+def frames_with_two_classes(result: SceneBoxes, thresholds: Mapping[str, float] | None = None) -> float:
+    """Share of the frames with boxes in which a place is reported as two classes.
+
+    thresholds  least score by class, `LOW_SCORE` where it is not known
+    """
+    scores = [(thresholds or {}).get(label, LOW_SCORE) for label in result.boxes.label.tolist()]
+    shown, frames = result.score >= np.array(scores), np.unique(result.frame)
+    twice = 0
+    for frame in frames:
+        boxes = result.boxes.select(np.flatnonzero((result.frame == frame) & shown))
+        a, b = touching_pairs(boxes, boxes)
+        other = boxes.label[a] < boxes.label[b]
+        twice += bool((paired_bev_iou(boxes.select(a[other]), boxes.select(b[other])) > TWICE).any())
+    return twice / max(len(frames), 1)

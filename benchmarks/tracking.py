@@ -35,7 +35,8 @@ class RecordingOptions:
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated, ngsim, openacc.  [default: all but the last two]",
+            help="Of megvii, centerpoint, camera, kitti, simulated, confused, crossings, ngsim, openacc.  "
+            "[default: the first five]",
         ),
     ] = None
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10

@@ -64,6 +64,7 @@ COMPONENTS = (
     Variant("without output while coasting", changes={"tracker.report_coasting": 0.0}),
     Variant("headings that drift freely", changes={"tracker.classes.*.yaw_drift": 3.0}),
 )
+CONFUSED = {c: {z: 8.0 if z == c else 1.0 for z in ("car", "truck", "bus")} for c in ("car", "truck", "bus")}
 TURNING = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle", "cyclist", "default")
 """Classes of vehicles."""
 CLASSICAL_NOISE: Mapping[str | Path, Mapping[str, float]] = {
@@ -86,6 +87,7 @@ def variants(family: str | Path) -> dict[str, Variant]:
     found = (
         *SHIPPED,
         Variant("without trails", changes={"tracker.traffic.reach": 0.0}),
+        Variant("class beliefs", changes={"sensors.*.confusion": CONFUSED}),
         Variant("without lights", changes={"tracker.edges": _without(RedLight, GreenLight)}),
         _classical(family, "constant velocity", stationary=False, turn=False),
         _classical(family, "turn", stationary=False, turn=True),

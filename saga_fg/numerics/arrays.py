@@ -9,7 +9,7 @@ number is needed, ever reaches the numerics (or GTSAM, which would crash the int
 from __future__ import annotations
 
 import weakref
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
@@ -197,13 +197,16 @@ def _numbered(label: StrArray) -> _Distinct:
     return tuple(label[first].tolist()), number
 
 
-def common_numbers(*labels: StrArray) -> list[IntArray]:
-    """Numbers (n,) of the classes of several arrays of labels (n,), the same in all of them."""
+def common_numbers(*labels: StrArray, alias: Mapping[str, str] | None = None) -> list[IntArray]:
+    """Numbers (n,) of the classes of several arrays of labels (n,), the same in all of them; alias: other names."""
+    known = alias or {}
     number: dict[str, int] = {}
     found = []
     for label in labels:
         names, of_row = distinct(label)
-        found.append(np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)[of_row])
+        found.append(
+            np.array([number.setdefault(known.get(name, name), len(number)) for name in names], dtype=np.int64)[of_row]
+        )
     return found
 
 

@@ -42,7 +42,8 @@ OUTLIERS = 0.01  # share of objects of which no class is typical: of any size al
 class ConfusedClasses:
     """C classes that sensors confuse.
 
-    classes    their names, sorted; group (C,): a class of each one's group, the same for all of it
+    classes    their names, sorted
+    head       a class of each one's group, the same for all of it
     log_prior  (C,) of each class in its group
     tables     by sensor, (C, C) chance of each report (row) by true class (column), 0 between groups
     shape      (C, 4) logs of the typical length, width and height, and their deviation, NaN where the group has none
@@ -50,7 +51,7 @@ class ConfusedClasses:
     """
 
     classes: tuple[str, ...]
-    group: IntArray
+    head: Mapping[str, str]
     log_prior: FloatArray
     tables: Mapping[str, FloatArray]
     shape: FloatArray
@@ -81,18 +82,15 @@ class ConfusedClasses:
         shape = np.reshape(parts, (C, 4))
         shape[alike @ np.isnan(shape[:, 0])] = np.nan
         speed = np.array([each.initial_speed_deviation for each in of_class])
-        return cls(classes, group, np.log(prior / (alike @ prior)), found, shape, speed)
+        head = {label: classes[k] for label, k in zip(classes, group.tolist(), strict=True)}
+        return cls(classes, head, np.log(prior / (alike @ prior)), found, shape, speed)
 
     def __len__(self) -> int:
         return len(self.classes)
 
     def numbers(self, *labels: StrArray) -> list[IntArray]:
         """Numbers (n,) of the groups of several arrays of labels (n,), of a class outside of all groups its own."""
-        if not self.classes:
-            return common_numbers(*labels)
-        head = {label: self.classes[k] for label, k in zip(self.classes, self.group.tolist(), strict=True)}
-        heads = [([head.get(name, name) for name in names], index) for names, index in map(distinct, labels)]
-        return common_numbers(*[np.array(names, dtype=np.str_)[index] for names, index in heads])
+        return common_numbers(*labels, alias=self.head)
 
     def alike(self, one: StrArray, other: StrArray) -> BoolArray:
         """(n,) which pairs of labels (n,) are of one class, or group."""
