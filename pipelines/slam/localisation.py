@@ -19,7 +19,7 @@ them, those at the start backwards from the first.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -49,95 +49,66 @@ from saga_fg.slam.sensors import SensorConsistency
 from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 
 _REGISTERED = 6  # places for each search
+_MAX_RESIDUAL = 0.3  # largest mean distance of the points of a scan from the map, m
+_MIN_PAIRS = 0.4  # least share of the points of a scan that the map must have surfels for
+_RELOADED = 15.0  # m of way after which the surfels around are taken anew
+MIN_OVERLAP = 0.5  # least share of what stands above the ground that scans and map have in common
+RADIUS = 80.0  # distance of the submaps around a place, m
+SCAN_SPACING = 1.5  # spacing of the points of a scan that is registered, m
 
 
-@dataclass(eq=False)
-class MapPlaces:
-    """Places of a map, m.
+class KnownMap:
+    """A map in which places are recognised, and in whose surroundings of the vehicle scans are registered.
 
-    radius       of what counts as around a place
-    min_overlap  share of the structure that a cloud and its place have in common
-    spacing      of the points that are registered
-    ambiguous    whether the last cloud that was looked for has fitted several places
+    ambiguous: whether the last cloud that was looked for has fitted several places
     """
 
-    slam_map: SlamMap
-    radius: float
-    min_overlap: float
-    spacing: float
-    ambiguous: bool = False
-    _index: PlaceIndex | None = field(default=None, init=False)
+    def __init__(self, slam_map: SlamMap) -> None:
+        self.ambiguous = False
+        self._map, self._index = slam_map, PlaceIndex()
+        self._surfels, self._centre = SurfelMap(SURFEL, np.inf), np.full(3, np.inf)
+        self._structure = Structure.of(np.zeros((1, 3)))
 
-    def around(self, number: int, centre: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Points (N, 3) around a centre, that of submap `number` if None, in its frame, and that frame (4, 4)."""
-        frames = self.slam_map.map_T_submap
-        frame = frames[number]
-        near = np.linalg.norm(frames[:, :3, 3] - (frame[:3, 3] if centre is None else centre), axis=1) <= self.radius
-        near[number] = True
-        inverse = inverse_transform(frame)
-        moved = [
-            transform_points(inverse @ frames[k], self.slam_map.points[k].astype(np.float64))
-            for k in np.flatnonzero(near).tolist()
-        ]
-        return np.concatenate(moved), frame
-
-    def nearest(self, centre: FloatArray) -> int:
-        """The submap whose frame is nearest to a point (3,) of the map."""
-        return int(np.argmin(np.linalg.norm(self.slam_map.map_T_submap[:, :3, 3] - centre, axis=1)))
+    def around(self, centre: FloatArray) -> FloatArray:
+        """Points (N, 3) of the submaps around a centre (3,), and of the nearest one at least."""
+        apart = np.linalg.norm(self._map.map_T_submap[:, :3, 3] - centre, axis=1)
+        near = np.flatnonzero(apart <= max(RADIUS, float(apart.min()))).tolist()
+        placed = [transform_points(self._map.map_T_submap[k], self._map.points[k].astype(np.float64)) for k in near]
+        return np.concatenate(placed)
 
     def recognised(self, query: FloatArray, near: FloatArray | None = None) -> FloatArray | None:
         """map_T_query (4, 4) of the one place that points (N, 3), z up, show, None for none and for several.
 
         near: a place (2,) or (3,) in the map; places farther than the radius from it are left out
         """
-        self.ambiguous = False
+        self.ambiguous, frames, older = False, self._map.map_T_submap, None
         if len(query) < FEWEST:
             return None
-        if self._index is None:
-            self._index = PlaceIndex()
-            for number, cloud in enumerate(self.slam_map.points):
+        if not len(self._index):
+            for number, cloud in enumerate(self._map.points):
                 if len(cloud) >= FEWEST:
                     self._index.add(number, PlaceImage.of(cloud.astype(np.float64)))
-        mine, points = Structure.of(query), query[voxel_downsample(query, self.spacing)]
-        found: list[tuple[float, FloatArray]] = []
-        otherwise = False
-        older = None
         if near is not None:
-            off = np.linalg.norm(self.slam_map.map_T_submap[:, :2, 3] - near[:2], axis=1)
-            older = np.flatnonzero(off <= self.radius).tolist()
+            older = np.flatnonzero(np.linalg.norm(frames[:, :2, 3] - near[:2], axis=1) <= RADIUS).tolist()
+        mine, points = Structure.of(query), query[voxel_downsample(query, SCAN_SPACING)]
+        found, otherwise = list[tuple[float, FloatArray]](), False
         for match in self._index.candidates(PlaceImage.of(query), older, COMPARED)[:_REGISTERED]:
-            around, frame = self.around(match.number)
-            fine = registered(around, points, match.place_T_query)
-            if fine is None:
-                continue
-            overlap = Structure.of(around).shared(mine, fine.map_T_scan)
-            if overlap > self.min_overlap:
+            around = self.around(frames[match.number][:3, 3])
+            fine = registered(around, points, frames[match.number] @ match.place_T_query)
+            overlap = 0.0 if fine is None else Structure.of(around).shared(mine, fine.map_T_scan)
+            if fine is not None and overlap > MIN_OVERLAP:
                 if fits_otherwise(match):
                     otherwise = True
                 else:
-                    found.append((overlap, frame @ fine.map_T_scan))
-        found.sort(key=lambda one: -one[0])
-        self.ambiguous = otherwise and not found
+                    found.append((overlap, fine.map_T_scan))
         if not found:
+            self.ambiguous = otherwise
             return None
+        found.sort(key=lambda one: -one[0])
         places = np.array([map_T_query for _, map_T_query in found])
         agreed = agreeing(places[:, :3, 3], np.array([overlap for overlap, _ in found]))
         self.ambiguous = not agreed
         return places[0] if agreed else None
-
-
-_MAX_RESIDUAL = 0.3  # largest mean distance of the points of a scan from the map, m
-_MIN_PAIRS = 0.4  # least share of the points of a scan that the map must have surfels for
-_RELOADED = 15.0  # m of way after which the surfels around are taken anew
-
-
-class MapRegistration:
-    """The surroundings of a place in a map, which follow the vehicle; spacing: of the points registered, m."""
-
-    def __init__(self, places: MapPlaces, spacing: float) -> None:
-        self._places, self._spacing = places, spacing
-        self._surfels, self._centre = SurfelMap(SURFEL, np.inf), np.full(3, np.inf)
-        self._structure, self._structure_frame = Structure.of(np.zeros((1, 3))), np.eye(4)
 
     def registered(self, points: FloatArray, predicted: FloatArray, rough: bool) -> Registration | None:
         """The registration of a scan (N, 3) with the map, None where it does not fit.
@@ -145,8 +116,11 @@ class MapRegistration:
         predicted: map_T_scan (4, 4); rough: to metres alone
         """
         if np.linalg.norm(predicted[:3, 3] - self._centre) > _RELOADED:
-            self._load(predicted[:3, 3])
-        thin = points[voxel_downsample(points, self._spacing)] if len(points) else points
+            self._surfels, self._centre = SurfelMap(SURFEL, np.inf), predicted[:3, 3]
+            around = self.around(self._centre)
+            self._surfels.add(around, self._centre)
+            self._structure = Structure.of(around)
+        thin = points[voxel_downsample(points, SCAN_SPACING)] if len(points) else points
         start = predicted
         try:
             if rough:
@@ -159,23 +133,12 @@ class MapRegistration:
 
     def agreement(self, points: FloatArray, map_T_points: FloatArray) -> float | None:
         """Share of what stands above the ground in points (N, 3) that the map has, None where there is too little."""
-        near_T_points = inverse_transform(self._structure_frame) @ map_T_points
-        return self._structure.agreement(Structure.of(points), near_T_points)
-
-    def _load(self, centre: FloatArray) -> None:
-        """Take the surfels and the structure around a place."""
-        points, frame = self._places.around(self._places.nearest(centre), centre)
-        self._surfels, self._centre = SurfelMap(SURFEL, np.inf), centre
-        self._surfels.add(transform_points(frame, points), centre)
-        self._structure, self._structure_frame = Structure.of(points), frame
+        return self._structure.agreement(Structure.of(points), map_T_points)
 
 
 _LOG = logging.getLogger(__name__)
 _GUESSED = np.diag([0.02, 0.02, 0.1, 1.0, 1.0, 0.5]) ** 2  # of a pose that was given or recognised
 _ACCURACY = np.diag([1e-3] * 3 + [0.03] * 3) ** 2  # of the map, rad and m
-MIN_OVERLAP = 0.5  # least share of what stands above the ground that scans and map have in common
-RADIUS = 80.0  # distance of the submaps that scans are registered with, m
-SCAN_SPACING = 1.5  # spacing of the points of a scan that is registered, m
 ROBUST_SCALE = 3.0  # residual from which the Cauchy loss discounts a measured pose, deviations
 _COMPARED, _WINDOW = 5.0, 10.0  # m of way between comparisons of the structure, and of the scans compared
 _FIX_AGE = 60.0  # s, from which a fix says nothing of where the vehicle is; it is nearer than the way since, too
@@ -228,8 +191,7 @@ class Localiser:
         self._sensors = VehicleSensors(vehicle or Vehicle())
         self._measured, self._of_sensors = self._sensors.since_keyframe, self._sensors.new_providers()
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
-        self._places = MapPlaces(slam_map, RADIUS, MIN_OVERLAP, SCAN_SPACING)
-        self._map = MapRegistration(self._places, SCAN_SPACING)
+        self._map = KnownMap(slam_map)
         self._path = Drive()
         # of keyframes as estimated when they came: map_T_lidar, and the covariance of its tangent
         self._found: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -317,7 +279,7 @@ class Localiser:
     @property
     def ambiguous(self) -> bool:
         """True if the last cloud searched for fits several places of the map."""
-        return self._places.ambiguous
+        return self._map.ambiguous
 
     @property
     def consistency(self) -> SensorConsistency:
@@ -354,9 +316,9 @@ class Localiser:
         query, frame = self._seen()
         thin = query[voxel_downsample(query, 0.5)]
         fix = self._fix_nearby()
-        map_T_frame = None if fix is None else self._places.recognised(thin, fix)
+        map_T_frame = None if fix is None else self._map.recognised(thin, fix)
         if map_T_frame is None:
-            map_T_frame = self._places.recognised(thin)
+            map_T_frame = self._map.recognised(thin)
         self._searched = self.way
         if map_T_frame is None:
             self._clouds = self._clouds[len(self._clouds) // 2 :]

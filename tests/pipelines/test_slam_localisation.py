@@ -224,7 +224,7 @@ def test_a_fix_counts_as_long_as_the_vehicle_is_near(known: SlamMap, way: int, w
     def recognised(query: np.ndarray, place: np.ndarray | None = None) -> None:
         asked.append(place is not None)
 
-    localiser._places.recognised = recognised  # type: ignore[method-assign]
+    localiser._map.recognised = recognised  # type: ignore[method-assign]
     for k in range(way):
         fix = GpsFix(np.array([500.0, 0.0, 0.0])) if k == 0 else None
         localiser.step(scans[k], 0.1 * k + (wait if k > 5 else 0.0), gps=fix)
