@@ -186,9 +186,9 @@ def with_objects(
         alone=result.trajectory,
     )
     if lag is not None:
-        observed: list[list[Observation]] = [[] for _ in rows]
+        observed: list[list[tuple[int, Observation]]] = [[] for _ in rows]
         for one in result.observations:
-            observed[at[one.pose]].append(one.observation)
+            observed[at[one.pose]].append((one.landmark, one.observation))
         estimator = OnlineEstimator(new_tracker(), lag, s.objects, start, [*of_sensors, *new_providers()])
         online = estimate_online(seen, odometry, estimator, observed)
         placed = result.drive.carried(online.newest, rows) @ lidar_T_ego

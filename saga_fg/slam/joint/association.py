@@ -14,12 +14,11 @@ the graph the detection has a share p_i of its information: one that fits a neig
 Source of the probabilities: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation
 (2001), section 6.6, probabilistic data association.
 
-Association of landmarks of unknown identity, along a path and online.
+Association of landmarks of unknown identity.
 
-Along a path assumed so far an observation belongs to the nearest landmark of its kind, by its last observation, within
-`reach`, else to a new one: a pose drifts little between two views of one thing, and association is repeated along the
-path found. Online the joint Gaussian of the new pose and the landmarks of the window that can be seen from it decides
-(`saga_fg.slam.mapping.associate`).
+An observation belongs to the nearest landmark of its kind, by its last observation along the path assumed so far,
+within `reach`, else to a new one: a pose drifts little between two views of one thing. Association is repeated along
+the path that was found; online the path is that of the window.
 
 Stationarity of objects: the probability that each one is at rest, from its detections along a path.
 
@@ -53,19 +52,10 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.estimators.solution import GraphSolution
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, motion_covariances
-from saga_fg.slam.mapping import (
-    LandmarkObservations,
-    LocalMap,
-    NearbyLandmarks,
-    associate,
-    landmark_key,
-    place_of,
-    pose_key,
-)
+from saga_fg.slam.mapping import LandmarkObservations, landmark_key
 from saga_fg.types.by_class import class_numbers
 from saga_fg.types.landmark import LandmarkType, Observation
 
@@ -109,69 +99,55 @@ def with_all_identities(
     ]
 
 
-Observations = Sequence[Sequence[Observation]]
+Seen = Observation | tuple[int, Observation]
+Observations = Sequence[Sequence[Seen]]
+"""Of landmarks at each epoch, all with the numbers of these or none."""
 
 
-def nearest_landmarks(observations: Observations, path: FloatArray, reach: float) -> LandmarkObservations:
-    """Associate the observations of n epochs along a path (n, 4, 4); reach in m."""
-    start: dict[int, Any] = {}
-    places: dict[LandmarkType, dict[int, FloatArray]] = {}
-    seen: dict[int, list[tuple[int, Observation]]] = {}
-    for epoch, (now, pose) in enumerate(zip(observations, path, strict=True)):
-        for observation in now:
-            state = observation.kind.initialise(pose, observation.value)
-            where = observation.kind.coordinates(state)
+class NearestLandmarks:
+    """Landmarks along a path; reach: m, within which an observation is of the nearest one of its kind."""
+
+    def __init__(self, reach: float = 2.5) -> None:
+        self._reach, self._numbers = reach, 0
+        self._last: dict[int, tuple[LandmarkType, FloatArray, int]] = {}  # type, place (2,) and epoch
+
+    def observe(self, epoch: int, pose: FloatArray, observations: Sequence[Seen]) -> LandmarkObservations:
+        """Associate the observations from a pose (4, 4), those without a number."""
+        start, seen = dict[int, Any](), list[tuple[int, Observation]]()
+        for one in observations:
+            number, observation = one if isinstance(one, tuple) else (None, one)
+            kind, state = observation.kind, observation.kind.initialise(pose, observation.value)
+            where = kind.coordinates(state)
             place = np.array([where["x"], where["y"]])
-            known = places.setdefault(observation.kind, {})
-            distance = {number: float(np.linalg.norm(there - place)) for number, there in known.items()}
-            number = min(distance, key=distance.__getitem__, default=len(start))
-            if distance.get(number, np.inf) > reach:
-                number = len(start)
+            number = self._nearest(kind, place) if number is None else number
+            if number not in self._last:
                 start[number] = state
-            known[number] = place
-            seen.setdefault(epoch, []).append((number, observation))
-    return LandmarkObservations(seen, start)
-
-
-class WindowLandmarks:
-    """Landmarks of an online estimator, those observed in the window."""
-
-    def __init__(self) -> None:
-        self._last_seen: dict[int, int] = {}
-        self._kinds: dict[int, LandmarkType] = {}
-        self._numbers = 0
-        self._near = NearbyLandmarks(by_odometry=False)
-
-    def observe(self, k: int, solution: GraphSolution, observations: Sequence[Observation]) -> LandmarkObservations:
-        """Associate observations from the epoch k; one without a match initiates a new landmark."""
-        places = [place_of(observation) for observation in observations]
-        pose, covariance = solution.values.atPose3(pose_key(k)).matrix(), solution.marginal(pose_key(k))
-        numbers = self._near.near(pose[:2, 3], covariance).tolist()
-        P = solution.covariance([pose_key(k), *map(landmark_key, numbers)])
-        states = {n: self._kinds[n].variable.read(solution.values, landmark_key(n)) for n in numbers}
-        local = LocalMap(pose, P, {n: (self._kinds[n], state) for n, state in states.items()})
-        pairs = associate(local, observations)
-        start: dict[int, object] = {}
-        seen: list[tuple[int, Observation]] = []
-        for row, observation in enumerate(observations):
-            if row in pairs:
-                number = pairs[row].landmark
-            else:
-                self._numbers = number = self._numbers + 1
-                self._kinds[number] = observation.kind
-                start[number] = observation.kind.initialise(pose, observation.value)
-            self._last_seen[number] = k
-            self._near.see(number, places[row], pose, covariance)
+            self._last[number] = kind, place, epoch
             seen.append((number, observation))
-        return LandmarkObservations({k: seen}, start)
+        return LandmarkObservations({epoch: seen} if seen else {}, start)
+
+    def _nearest(self, kind: LandmarkType, place: FloatArray) -> int:
+        """The number of the landmark at a place (2,); that of a new one if none is near."""
+        alike = {number: there for number, (other, there, _) in self._last.items() if other == kind}
+        apart = {number: float(np.linalg.norm(there - place)) for number, there in alike.items()}
+        number = min(apart, key=apart.__getitem__, default=-1)
+        if apart.get(number, np.inf) <= self._reach:
+            return number
+        self._numbers += 1
+        return self._numbers
+
+    def observe_all(self, path: FloatArray, observations: Observations) -> LandmarkObservations:
+        """Associate the observations of n epochs along a path (n, 4, 4)."""
+        found = [self.observe(epoch, *each) for epoch, each in enumerate(zip(path, observations, strict=True))]
+        seen = {epoch: now for one in found for epoch, now in one.seen.items()}
+        return LandmarkObservations(seen, {number: state for one in found for number, state in one.start.items()})
 
     def forget(self, first: int) -> list[int]:
         """Let landmarks leave that were last observed before the epoch `first`; returns their keys."""
-        gone = [number for number, last in self._last_seen.items() if last < first]
+        gone = [number for number, (_, _, last) in self._last.items() if last < first]
         for number in gone:
-            del self._kinds[number], self._last_seen[number]
-        self._near.forget(gone)
-        return [landmark_key(number) for number in gone]
+            del self._last[number]
+        return list(map(landmark_key, gone))
 
 
 _CREEPING = 0.3  # speed of creeping traffic, as a share of the usual one

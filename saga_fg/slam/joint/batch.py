@@ -18,9 +18,9 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.joint.association import (
+    NearestLandmarks,
     Observations,
     SlowErrors,
-    nearest_landmarks,
     stationary_probabilities,
     with_all_identities,
 )
@@ -31,7 +31,6 @@ from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 
 TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
-MAX_LANDMARK_DISTANCE = 2.5  # largest distance between two observations of one landmark, m
 
 
 def estimate_jointly(
@@ -63,7 +62,7 @@ def estimate_jointly(
         before, links = links, [now.seen.id.tolist() for now in record]
         if links == before:
             break
-        seen = nearest_landmarks(landmarks, path, MAX_LANDMARK_DISTANCE)
+        seen = NearestLandmarks().observe_all(path, landmarks)
         clutter = tracker.settings.association.clutter_area
         start_moving = estimate is None
         providers = [seen, *new_providers()]

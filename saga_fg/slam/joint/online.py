@@ -1,8 +1,7 @@
 """Path, landmarks and objects online: the running graph of the last seconds, with a joint prior for all before.
 
 Each frame adds an epoch to the window. The stationarity of objects follows from the window, the identity of detections
-from the objects after it, landmarks are associated by the joint Gaussian of the new pose and the landmarks
-(`saga_fg.slam.mapping.associate`), and iSAM2 solves the window with the new factors. Epochs older than `lag` leave, and
+from the objects after it, and iSAM2 solves the window with the new factors. Epochs older than `lag` leave, and
 landmarks last observed from them (`saga_fg.slam.joint.providers`). With a lag longer than the recording this is the
 batch estimate, but for associations made online.
 """
@@ -21,9 +20,10 @@ from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform
 from saga_fg.slam.joint.association import (
+    NearestLandmarks,
     Observations,
+    Seen,
     SlowErrors,
-    WindowLandmarks,
     stationary_probabilities,
     with_identities,
 )
@@ -33,7 +33,6 @@ from saga_fg.slam.joint.providers import Window
 from saga_fg.slam.joint.record import EpochRecorder, JointSettings, OdometryIncrements, RecordedEpoch
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
-from saga_fg.types.landmark import Observation
 
 _DOUBTFUL = 0.9  # probability of an assignment below which its detection is weighed anew
 
@@ -77,7 +76,7 @@ class OnlineEstimator:
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._window = Window(self._settings, providers)
         self._clutter_area = tracker.settings.association.clutter_area
-        self._landmarks = WindowLandmarks()
+        self._landmarks = NearestLandmarks()
         self._stationary: list[FloatArray] = []
         self._slow = SlowErrors.at_start(self._settings)
         self._solution: GraphSolution | None = None
@@ -87,13 +86,14 @@ class OnlineEstimator:
         frame: Frame,
         a_T_b: FloatArray | None = None,
         covariance: FloatArray | None = None,
-        observations: Sequence[Observation] = (),
+        observations: Sequence[Seen] = (),
     ) -> OnlineStep:
         """Add the next frame, after the vehicle moved by a_T_b (4, 4) since the last one by its odometry.
 
         a_T_b: not needed for the first frame; covariance: (6, 6) of it as in `OdometryIncrements`, if the device states
-        one; observations: of landmarks, from the new pose. Raises `InputError` for a motion that is missing or not
-        rigid, a bad covariance, a frame that is not later than the last one, or in world coordinates without a pose.
+        one; observations: of landmarks, from the new pose, all with their numbers or none. Raises `InputError` for a
+        motion that is missing or not rigid, a bad covariance, a frame that is not later than the last one, or in world
+        coordinates without a pose.
         """
         window = self._window
         if not window.record:
@@ -111,7 +111,7 @@ class OnlineEstimator:
         solution = window.add(now, frame, pose, self._stationary)
         more: list[FactorProvider] = []
         if observations:
-            more.append(self._landmarks.observe(number, solution, observations))
+            more.append(self._landmarks.observe(number, window.pose(number), observations))
         newest = read_estimate(window.record[-1:], solution, self._stationary[-1:])
         doubtful = with_identities(now, newest.world_T_ego[-1], newest.objects[-1].position, self._clutter_area)
         if (doubtful.seen.probability < _DOUBTFUL).any():

@@ -47,7 +47,7 @@ last, Q_t of translation and Q_R of rotation. So neither a large map nor a long 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from itertools import combinations
 
 import numpy as np
@@ -201,14 +201,10 @@ _SIGMAS = 4.0  # standard deviations, of a sum of variances over all axes
 
 
 class NearbyLandmarks:
-    """Regions of landmarks by number, counted from 1, and the way of the vehicle.
+    """Regions of landmarks by number, counted from 1, and the way of the vehicle."""
 
-    by_odometry: whether `move` says how uncertain its way is; otherwise sigma is what both have in the world
-    """
-
-    def __init__(self, by_odometry: bool = True) -> None:
+    def __init__(self) -> None:
         self.reach = 0.0  # m
-        self._by_odometry = by_odometry
         self._way = np.zeros(3)  # variance of translation, m^2, and of rotation, rad^2, and metres, since the start
         self._box = np.empty((64, 2, 2))  # smallest and largest x and y
         self._then = np.empty((64, 3))  # `_way` when each was seen last
@@ -243,11 +239,7 @@ class NearbyLandmarks:
         self._box[kept] = low, high
         self._then[kept] = np.maximum(self._then[merged], self._then[kept])
         self._sigma[kept] = min(self._sigma[merged], self._sigma[kept])
-        self.forget([merged])
-
-    def forget(self, landmarks: Iterable[int]) -> None:
-        """Let landmarks leave."""
-        self._sigma[list(landmarks)] = -1.0
+        self._sigma[merged] = -1.0
 
     def centre(self, landmark: int) -> FloatArray:
         """The middle (2,) of a region."""
@@ -259,9 +251,8 @@ class NearbyLandmarks:
         box, since = self._box[numbers], self._way - self._then[numbers]
         distance = np.linalg.norm(np.maximum(box[:, 0] - place, place - box[:, 1]).clip(0), axis=1)
         sigma = _sigma(_variances(covariance), self.reach) + self._sigma[numbers]
-        if self._by_odometry:
-            since_seen = (since[:, 0] + since[:, 1] * since[:, 2] ** 2, since[:, 1])
-            sigma = np.minimum(sigma, _sigma(since_seen, self.reach))
+        since_seen = (since[:, 0] + since[:, 1] * since[:, 2] ** 2, since[:, 1])
+        sigma = np.minimum(sigma, _sigma(since_seen, self.reach))
         return np.asarray(numbers[distance <= self.reach + self.travel + _SIGMAS * sigma])
 
 
