@@ -97,22 +97,15 @@ def _stacked(
     marginal: Sequence[gtsam.JacobianFactor], point: LinearisationPoint, first: Sequence[int]
 ) -> tuple[list[int], FloatArray]:
     """Keys, `first` in front, and all rows [J | b] on increments from the point."""
-    priors = [PriorGroup(stacked([factor], point.dims(factor.keys()))) for factor in marginal]
-    here = [factor for prior in priors for factor in prior.here(np.array([0]), point)]
-    found = {key for factor in here for key in factor.keys()}  # noqa: SIM118
+    here = gtsam.GaussianFactorGraph()
+    for factor in marginal:
+        for row in PriorGroup(stacked([factor], point.dims(factor.keys()))).here(np.array([0]), point):
+            here.push_back(row)
+    found, ordering = set(here.keyVector()), gtsam.Ordering()
     keys = [*(key for key in first if key in found), *sorted(found.difference(first))]
-    ends = dict(zip(keys, np.cumsum(point.dims(keys)).tolist(), strict=True))
-    rows = []
-    for factor in here:
-        augmented = factor.augmentedJacobian()
-        row, column = np.zeros((len(augmented), sum(point.dims(keys)) + 1)), 0
-        row[:, -1] = augmented[:, -1]
-        for key in factor.keys():  # noqa: SIM118
-            d = point.variables[key].dim
-            row[:, ends[key] - d : ends[key]] = augmented[:, column : column + d]
-            column += d
-        rows.append(row)
-    return keys, np.concatenate(rows) if rows else np.empty((0, 1))
+    for key in keys:
+        ordering.push_back(key)
+    return keys, here.augmentedJacobian(ordering)
 
 
 def _marginal(keys: Sequence[int], J: FloatArray, kept: Sequence[int], point: LinearisationPoint) -> FloatArray:
