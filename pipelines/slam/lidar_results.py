@@ -21,7 +21,7 @@ World coordinates are those of the recording (KITTI: x east, y north, z up, from
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ import numpy as np
 
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes
-from data_tools.lidar import scan_to_map_residual, voxel_downsample, write_cloud
+from data_tools.lidar import scan_to_map_residual, write_cloud
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
@@ -45,7 +45,7 @@ from pipelines.slam.results import (
 )
 from pipelines.slam.saved_graph import write_graph, write_landmark_table
 from pipelines.slam.scan_content import LINE, WALL
-from pipelines.slam.submaps import Origin, SlamMap, write_map
+from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import transform_points
 from saga_fg.types.landmark import Landmark
@@ -118,52 +118,48 @@ def write_lidar_slam(
     settings: of the run, with the spacing of the map's points; origin: of the world, on Earth
     """
     s = settings or LidarSlamSettings()
-    points, objects = accumulated_map(result, s.map_spacing), result.objects
+    clouds, objects = [submap.points for submap in result.submaps], result.objects
+    points, lines = placed_clouds(clouds, result.world_T_submap, s.map_spacing), _lines(result)
     figures = metrics(result, scans, s.odometry)
     if objects is not None:
         figures["objects"] = len(object_paths(objects))
     with atomic_directory(output, known=LIDAR_FILES) as folder:
-        write_kitti_poses(folder / "trajectory.txt", result.trajectory, folder / "times.txt")
-        for name, trajectory in (
-            ("trajectory", result.trajectory), ("odometry", result.odometry), ("online", result.online)
-        ):  # fmt: skip
-            write_tum_poses(folder / f"{name}.tum", trajectory)
-        write_tum_poses(folder / "reference.tum", Trajectory(scans.timestamps, scans.world_T_ego))
+        given = {name: getattr(result, name) for name in ("trajectory", "odometry", "online")}
+        write_paths(folder, **given, reference=Trajectory(scans.timestamps, scans.world_T_ego))
         if len(points):
             (folder / "map").mkdir()
-            clouds = [submap.points for submap in result.submaps]
             write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin), s.map_format)
             write_cloud(folder / "map.ply", points)
         write_graph(folder, result)
         times = result.trajectory.timestamps[result.keyframes].tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
         if result.landmarks:
-            _write_landmarks(folder, result)
+            _write_landmarks(folder, result, lines)
         paths = {"reference": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
         if objects is not None:
             write_objects(folder / "tracks.csv", objects)
         driven = () if objects is None else tuple(confirmed_paths(objects).values())
-        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _lines(result), driven)
+        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _by_kind(lines, result.landmarks), driven)
         write_bytes(folder / "above.png", png(figure))
         write_figures(folder / "metrics.json", figures)
     return figures
 
 
-def accumulated_map(result: LidarSlamResult, spacing: float) -> FloatArray:
-    """Points (N, 3) of all submaps in world coordinates, m, one in each voxel of `spacing` m."""
-    placed = zip(result.world_T_submap, result.submaps, strict=True)
-    points = np.concatenate([transform_points(pose, submap.points.astype(np.float64)) for pose, submap in placed])
-    return points[voxel_downsample(points, spacing)]
+def write_paths(folder: Path, **paths: Trajectory) -> None:
+    """Write each path as NAME.tum, and that of the name `trajectory` in KITTI's format besides."""
+    write_kitti_poses(folder / "trajectory.txt", paths["trajectory"], folder / "times.txt")
+    for name, path in paths.items():
+        write_tum_poses(folder / f"{name}.tum", path)
 
 
-def _write_landmarks(folder: Path, result: LidarSlamResult) -> None:
+def _write_landmarks(folder: Path, result: LidarSlamResult, lines: Mapping[int, FloatArray]) -> None:
     write_figures(folder / "landmarks.json", landmark_rows(result.landmarks))
-    lined = {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind.name in _LINED}
-    write_landmark_table(folder / "landmarks.csv", result.landmarks, lined)
-    ground, lines, poles = float(result.world_T_lidar[0, 2, 3]), _lines(result), _poles(result.landmarks)
-    shapes = [(pole[None], np.arange(ground - 1.5, ground + HEIGHT, 0.1), POLE_COLOUR) for pole in poles]
-    shapes += [(_sampled(*ends), np.array([ground - 1.7]), LINE_COLOUR) for ends in lines["road lines"]]
-    shapes += [(_sampled(*ends), np.arange(ground - 1.0, ground + HEIGHT, 0.4), WALL_COLOUR) for ends in lines["walls"]]
+    write_landmark_table(folder / "landmarks.csv", result.landmarks, lines)
+    ground, kinds = float(result.world_T_lidar[0, 2, 3]), _by_kind(lines, result.landmarks)
+    poles, walls = np.arange(ground - 1.5, ground + HEIGHT, 0.1), np.arange(ground - 1.0, ground + HEIGHT, 0.4)
+    shapes = [(pole[None], poles, POLE_COLOUR) for pole in _poles(result.landmarks)]
+    shapes += [(_sampled(*ends), np.array([ground - 1.7]), LINE_COLOUR) for ends in kinds["road lines"]]
+    shapes += [(_sampled(*ends), walls, WALL_COLOUR) for ends in kinds["walls"]]
     points, colours = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
     for foot, z, colour in shapes:
         points.append(np.column_stack([np.repeat(foot, len(z), axis=0), np.tile(z, len(foot))]))
@@ -176,21 +172,22 @@ def _sampled(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.linspace(a, b, max(2, int(np.linalg.norm(b - a) / 0.2)))
 
 
-def _lines(result: LidarSlamResult) -> dict[str, FloatArray]:
-    """Pieces of walls and road lines, under their names."""
-    return {"walls": _pieces(result, WALL.name), "road lines": _pieces(result, LINE.name)}
+def _lines(result: LidarSlamResult) -> dict[int, FloatArray]:
+    """Ends (n, 2, 2), from above, of the pieces of each wall and road line that were observed."""
+    return {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind.name in _LINED}
+
+
+def _by_kind(lines: Mapping[int, FloatArray], landmarks: Sequence[Landmark]) -> dict[str, FloatArray]:
+    """Pieces (W, 2, 2) of walls and of road lines."""
+    kinds = {"walls": WALL.name, "road lines": LINE.name}
+    found = {name: [lines[mark.number] for mark in landmarks if mark.kind.name == kind] for name, kind in kinds.items()}
+    return {name: np.concatenate([np.empty((0, 2, 2)), *ends]) for name, ends in found.items()}
 
 
 def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
     """Places (P, 2) of all but walls and lines."""
     places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (LINE, WALL)]
     return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
-
-
-def _pieces(result: LidarSlamResult, kind: str) -> FloatArray:
-    """Ends (W, 2, 2), from above, of the pieces of walls or road lines that were observed, one or several of each."""
-    ends = [_seen_pieces(result, mark) for mark in result.landmarks if mark.kind.name == kind]
-    return np.concatenate([np.empty((0, 2, 2)), *ends])
 
 
 def _seen_pieces(result: LidarSlamResult, mark: Landmark) -> FloatArray:

@@ -36,7 +36,7 @@ from data_tools.lidar.places import PlaceImage, PlaceIndex, Structure
 from factors import Robust, pose_prior_factor
 from pipelines.slam.loop_closures import COMPARED, FEWEST, SURFEL, agreeing, fits_otherwise, registered
 from pipelines.slam.odometry import LOST_TRANSLATION, Drive, LidarOdometry, OdometrySettings, moved_pose
-from pipelines.slam.submaps import SlamMap
+from pipelines.slam.submaps import SlamMap, placed_clouds
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators import IncrementalSmoother
@@ -72,9 +72,8 @@ class KnownMap:
     def around(self, centre: FloatArray) -> FloatArray:
         """Points (N, 3) of the submaps around a centre (3,), and of the nearest one at least."""
         apart = np.linalg.norm(self._map.map_T_submap[:, :3, 3] - centre, axis=1)
-        near = np.flatnonzero(apart <= max(RADIUS, float(apart.min()))).tolist()
-        placed = [transform_points(self._map.map_T_submap[k], self._map.points[k].astype(np.float64)) for k in near]
-        return np.concatenate(placed)
+        near = np.flatnonzero(apart <= max(RADIUS, float(apart.min())))
+        return placed_clouds([self._map.points[k] for k in near.tolist()], self._map.map_T_submap[near])
 
     def recognised(self, query: FloatArray, near: FloatArray | None = None) -> FloatArray | None:
         """map_T_query (4, 4) of the one place that points (N, 3), z up, show, None for none and for several.

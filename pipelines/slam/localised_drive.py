@@ -19,20 +19,19 @@ import numpy as np
 
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes
-from data_tools.lidar import voxel_downsample
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.sensor_logs import SensorLog
-from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
-from pipelines.slam.lidar_results import LIDAR_FILES
+from data_tools.trajectories import Trajectory, trajectory_errors
+from pipelines.slam.lidar_results import LIDAR_FILES, write_paths
 from pipelines.slam.localisation import Localiser, LocaliserSettings
 from pipelines.slam.results import write_covariances
-from pipelines.slam.submaps import SlamMap
+from pipelines.slam.submaps import SlamMap, placed_clouds
 from pipelines.slam.vehicle_sensors import Vehicle
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.numerics.geometry import inverse_transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +104,9 @@ def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, sl
         "trajectory": asdict(trajectory_errors(path, truth, "none")),
         "aligned": asdict(trajectory_errors(path, truth, "rigid")),
     }
-    placed = zip(slam_map.map_T_submap, slam_map.points, strict=True)
-    points = np.concatenate([transform_points(pose, cloud.astype(np.float64)) for pose, cloud in placed])
-    points = points[voxel_downsample(points, 0.3)]
+    points = placed_clouds(slam_map.points, slam_map.map_T_submap, 0.3)
     with atomic_directory(output, known=LIDAR_FILES) as folder:
-        write_kitti_poses(folder / "trajectory.txt", path, folder / "times.txt")
-        write_tum_poses(folder / "trajectory.tum", path)
-        write_tum_poses(folder / "reference.tum", truth)
+        write_paths(folder, trajectory=path, reference=truth)
         registered, times = found.registered.astype(int).tolist(), path.timestamps.tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, found.covariances, registered=registered)
         drawn = {"reference": truth.positions, "trajectory": path.positions}

@@ -86,9 +86,7 @@ class SubmapBuilder:
         """Return the submap, given the poses (n, 4, 4) of its keyframes, and begin the next."""
         inner = np.array(self._inner) if self._straighten else inverse_transform(world_T_sensor[0]) @ world_T_sensor
         frame = inverse_transform(self._anchor_T_submap)
-        clouds = zip(inner, self._clouds, strict=True)
-        every = np.concatenate([transform_points(frame @ T, cloud.astype(np.float64)) for T, cloud in clouds])
-        points = every[voxel_downsample(every, self._spacing)].astype(np.float32)
+        points = placed_clouds(self._clouds, frame @ inner, self._spacing).astype(np.float32)
         last, count = self._first + len(self._clouds), self._number
         submap = Submap(
             count, (self._first, last), self._first, self._anchor_T_submap, points, (self._way, self._driven)
@@ -104,6 +102,15 @@ class SubmapBuilder:
 def world_T_submap(submap: Submap, world_T_anchor: FloatArray) -> FloatArray:
     """The frame (4, 4) of a submap, given the pose of its anchor."""
     return np.asarray(world_T_anchor @ submap.anchor_T_submap)
+
+
+def placed_clouds(
+    clouds: Sequence[npt.NDArray[np.float32]], poses: Sequence[FloatArray] | FloatArray, spacing: float | None = None
+) -> FloatArray:
+    """Points (N, 3) of clouds at their poses (4, 4); spacing: one in each voxel of so many m."""
+    placed = zip(poses, clouds, strict=True)
+    points = np.concatenate([transform_points(pose, cloud.astype(np.float64)) for pose, cloud in placed])
+    return points if spacing is None else points[voxel_downsample(points, spacing)]
 
 
 _COLUMNS = ("number", "file", "x", "y", "z", "qx", "qy", "qz", "qw")
