@@ -20,7 +20,7 @@ from data_tools.plots import png
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
-from pipelines.cli.options import ScaleOptions, Source, TrackerOptions, dataset_commands
+from pipelines.cli.options import ScaleOptions, TrackerOptions, dataset_commands
 from pipelines.cli.track import exit_on_failures, run_at_scale
 from pipelines.config import Method, TrackConfig
 from pipelines.evaluation import evaluate_labels, judge_run
@@ -134,11 +134,6 @@ def _evaluate_labels(
     report(evaluation.tables(), evaluation.figures(), json_file)
 
 
-def _evaluate_texts(source: Source) -> dict[str, str | None]:
-    """Options of datasets whose figures have a summary."""
-    return {} if source.summarised else {"full": None}
-
-
 evaluate_app = dataset_commands(
     "evaluate",
     "Compare results with the ground truth.",
@@ -148,7 +143,7 @@ evaluate_app = dataset_commands(
         "evaluate {result} --hota --json figures.json --plots plots",
         "evaluate {recordings} --method kf",
     ),
-    _evaluate_texts,
+    lambda source: {} if source.summarised else {"full": None},
     listed=lambda source: source.has_truth or bool(source.truth_option),
 )
 labels_app = dataset_commands(

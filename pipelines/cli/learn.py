@@ -11,7 +11,7 @@ from data_tools.datasets.source import DatasetSource, dataset_names, input_files
 from data_tools.files.atomic_files import check_writable, write_text
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, ReportingGroup, counted, new_group, progress_bar, report
-from pipelines.cli.options import Source, dataset_commands
+from pipelines.cli.options import dataset_commands
 from pipelines.config import load_config, load_interactions
 from pipelines.configuration import write_settings
 from pipelines.learning import learn_noise, learned_fragment, scenes_to_learn_from
@@ -86,10 +86,6 @@ def _noise(
     typer.echo(f"{output}: learned from {scenes} {truth}: {found}")
 
 
-def _noise_texts(source: Source) -> dict[str, str | None]:
-    return {} if source.has_truth else {"without_truth": None}
-
-
 noise_app = dataset_commands(
     "learn noise",
     """Learn what sensors are like, and how objects move, from recordings.
@@ -104,7 +100,7 @@ noise_app = dataset_commands(
         "learn noise {recordings} --output noise.yaml",
         "track {recordings} --output {tracks} --config noise.yaml",
     ),
-    _noise_texts,
+    lambda source: {} if source.has_truth else {"without_truth": None},
 )
 interactions_app = dataset_commands(
     "learn interactions",

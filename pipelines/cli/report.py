@@ -14,7 +14,7 @@ from data_tools.files.atomic_files import check_writable, write_text
 from pipelines import view
 from pipelines.cli import options
 from pipelines.cli.console import working
-from pipelines.cli.options import Source, dataset_commands
+from pipelines.cli.options import dataset_commands
 from pipelines.explaining import journal_of, read_graphs
 from pipelines.report import report_page, result_report
 from saga_fg.errors import InputError
@@ -44,17 +44,12 @@ def _report(
     typer.echo(f"{output}: {len(page) / 1e6:.1f} MB")
 
 
-def _report_texts(source: Source) -> dict[str, str | None]:
-    """Options of datasets without camera images."""
-    return {} if "images" in source.shows else {"images": None}
-
-
 report_app = dataset_commands(
     "report",
     "Make a page of a result: a player, figures, charts; one HTML file that needs no network.",
     _report,
     ("report {result} --output report.html", "report {result} --beside other/{tracks} --output report.html"),
-    _report_texts,
+    lambda source: {} if "images" in source.shows else {"images": None},
 )
 
 Save = Annotated[
@@ -86,17 +81,12 @@ def _view(
     _show(result, save, lambda: view.result_views(source, result, spacing), slam)
 
 
-def _view_texts(source: Source) -> dict[str, str | None]:
-    """Options of datasets without LiDAR scans."""
-    return {} if "scans" in source.shows else {"spacing": None}
-
-
 view_app = dataset_commands(
     "view",
     "See a result in space: boxes, tracks, ellipses, edges, graph, truth, LiDAR, landmarks (rerun or Foxglove).",
     _view,
     ("view {result}", "view {result} --save tracks.mcap"),
-    _view_texts,
+    lambda source: {} if "scans" in source.shows else {"spacing": None},
 )
 
 

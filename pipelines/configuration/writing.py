@@ -201,7 +201,8 @@ def _document(
     for item, value in items:
         shown = "required" if settings is None and item.required else _default_text(item.schema, value)
         kind_of_value = _type_text(item.schema, item.bounds)
-        parts.append(f"| `{item.name}` | {shown} | {kind_of_value} | {_cell(item.comment)} |")
+        comment = item.comment.replace("|", "\\|")
+        parts.append(f"| `{item.name}` | {shown} | {kind_of_value} | {comment} |")
     parts.append("")
     for item, value in items:
         owner = kind.replace(", kind", " of")
@@ -276,7 +277,3 @@ def _plural(text: str) -> str:
 def _first_paragraph(cls: type) -> str:
     doc = inspect.getdoc(cls) or ""
     return "" if doc.startswith(f"{cls.__name__}(") else doc.split("\n\n")[0].replace("\n", " ")
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")

@@ -258,7 +258,7 @@ class Imu(Settings):
             ("BiasAcc", self.accelerometer_drift),
             ("BiasOmega", self.gyroscope_drift),
         ):
-            getattr(parameters, f"set{name}Covariance")(_isotropic(deviation))
+            getattr(parameters, f"set{name}Covariance")(deviation**2 * np.eye(3))
         return parameters
 
 
@@ -266,7 +266,3 @@ def _turned(native: gtsam.CombinedImuFactor, place: gtsam.Pose3, *states: Any) -
     first, v1, second, v2, bias1, bias2, rotation = states
     mounted = place.compose(gtsam.Pose3(gtsam.Rot3.Expmap(rotation), np.zeros(3)))
     return np.asarray(native.evaluateError(first.compose(mounted), v1, second.compose(mounted), v2, bias1, bias2))
-
-
-def _isotropic(deviation: float) -> FloatArray:
-    return np.asarray(deviation**2 * np.eye(3))

@@ -24,12 +24,11 @@ from factors import RangeRate
 from saga_fg.kernels.components import existences
 from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.arrays import IntArray, StrArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.gating import chi_square_quantile
 from saga_fg.tracking.joint_state import moved_to_present
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_filters import MOVING
 from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 from saga_fg.tracking.traffic import Passages
@@ -136,7 +135,10 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     excused = table.sensors.detected_by_others(measurements.name, time, SCORE_MEMORY)
     p, p_miss, resolved = measurements.probability[d], np.where(excused, 0.0, p_detect), table.unresolved[t] == 0
     # a detection of an unresolved track may be of the track that it overlaps
-    table.existence = _existence(table.existence, missed, p_miss, t[resolved], p[resolved], elapsed, settings)
+    survival = math.exp(-elapsed / LIFETIME)
+    table.existence = existences(
+        table.existence, missed, p_miss, t[resolved], p[resolved], survival, settings.neutral_score
+    )
     table.last_existence[t] = table.existence[t]
     table.confirmed |= table.existence >= settings.confirm_above
     table.sensors.update(measurements.name, time, t, p, missed & visible, p_detect)
@@ -146,18 +148,3 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     table.covariance_scale[t], table.position_bias[t] = measurements.covariance_scale[d], measurements.position_bias[d]
     table.last_detected[t] = np.maximum(table.last_detected[t], time)
     table.last_in_view[t] = state.time
-
-
-def _existence(
-    before: FloatArray,
-    missed: BoolArray,
-    chance: FloatArray,
-    rows: IntArray,
-    probability: FloatArray,
-    elapsed: float,
-    settings: ExistenceSettings,
-) -> FloatArray:
-    """Existence (n,) after a frame in which tracks are `missed` (n,), by the chance (n,) to detect them, and those of
-    `rows` (k,) have detections of a probability (k,)."""
-    survival = math.exp(-elapsed / LIFETIME)
-    return existences(before, missed, chance, rows, probability, survival, settings.neutral_score)

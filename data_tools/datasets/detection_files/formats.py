@@ -277,17 +277,13 @@ def _read_columns(reading: _Reading) -> Iterator[RawTable]:
             raise InputError(f"{path}: {ours}: expected shape ({length},) as {first} has, got {np.shape(column)}")
         if ours in NAMED and not archive:
             columns[ours] = _names(column)
-    yield RawTable(path, columns, length, _row, False, found, reading.hint(names))
+    yield RawTable(path, columns, length, "row {}".format, False, found, reading.hint(names))
 
 
 def _names(values: Values) -> Values:
     """Whole numbers as text, where names are expected."""
     values = values.tolist() if isinstance(values, np.ndarray) else values
     return [str(value) if type(value) is int else value for value in values]
-
-
-def _row(row: int) -> str:
-    return f"row {row}"
 
 
 def _moment(how: TableImport) -> Callable[[dict[str, Any]], list[Any]]:

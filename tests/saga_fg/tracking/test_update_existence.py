@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.config import load_config
+from saga_fg.kernels.components import existences
 from saga_fg.tracking import ExistenceSettings
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import SensorEvidence, TrackTable
 from saga_fg.tracking.tracker_state import LIFETIME
-from saga_fg.tracking.update import _existence
 from tests.saga_fg.traffic_frames import frame
 
 SETTINGS = ExistenceSettings()
@@ -33,12 +33,13 @@ def score(probability, hits, opportunities, coasting=False, existence=0.9, setti
 
 def after_miss(r, p_detect, elapsed, settings):
     none = np.empty(0, dtype=np.int64), np.empty(0)
-    return _existence(r, np.ones(len(r), dtype=bool), p_detect, *none, elapsed, settings)
+    missed, survival = np.ones(len(r), dtype=bool), np.exp(-elapsed / LIFETIME)
+    return existences(r, missed, p_detect, *none, survival, settings.neutral_score)
 
 
 def after_hit(r, probability, settings):
     missed, every = np.zeros(len(r), dtype=bool), np.arange(len(r))
-    return _existence(r, missed, np.zeros(len(r)), every, probability, 0.0, settings)
+    return existences(r, missed, np.zeros(len(r)), every, probability, 1.0, settings.neutral_score)
 
 
 def test_a_miss_is_the_likelier_the_less_the_track_exists():
