@@ -166,7 +166,7 @@ def _distance(one: FloatArray, other: FloatArray) -> float:
 
 
 def _crowd(most: int, seed: int) -> Iterator[Row]:
-    rows = {}
+    rows: dict[float, Mapping[str, float]] = {}
     for count in (most // 10, most):
         rng, tracker, side = np.random.default_rng([seed, count]), _tracker(), math.ceil(math.sqrt(count))
         at = SPACING * np.stack(np.divmod(np.arange(count), side), axis=-1)
@@ -179,7 +179,7 @@ def _crowd(most: int, seed: int) -> Iterator[Row]:
 
 
 def _sensors(most: int, seed: int) -> Iterator[Row]:
-    rows = {}
+    rows: dict[float, Mapping[str, float]] = {}
     for count in (1, most):
         made = []
         for k in range(SENSOR_FRAMES * most):
@@ -190,7 +190,7 @@ def _sensors(most: int, seed: int) -> Iterator[Row]:
 
 
 def _far(seed: int) -> Iterator[Row]:
-    rows = {}
+    rows: dict[float, Mapping[str, float]] = {}
     for origin in (0.0, 0.9 * MAX_POSITION):
         rows[origin] = _measured(_tracker(), [traffic_frame(k, seed, origin) for k in range(SETTLED)])
     yield from _compared("position, m", rows, per=False)

@@ -140,7 +140,7 @@ class _Run:
 
     def _second_is_refused(self) -> bool:
         """Start another service with the same snapshot; True if it ends with one line that says why."""
-        options = ("--listen", str(self._address.path.with_name("second.sock")), *self._options[2:])
+        options = ("--listen", str(Path(str(self._address)).with_name("second.sock")), *self._options[2:])
         try:
             done = subprocess.run(
                 [*PROGRAM, "serve", *options], capture_output=True, text=True, timeout=PATIENCE, check=False

@@ -24,10 +24,10 @@ def numbers(value):
     return [leaf for each in value for leaf in numbers(each)] if isinstance(value, tuple) else [np.asarray(value)]
 
 
-def both(self, *args):
-    name, expected = self.source.__name__, self.load()(*args)
+def both(self, *args, **named):
+    name, expected = self.source.__name__, self.load()(*args, **named)
     with np.errstate(all="ignore"):
-        plain = self.source(*args)
+        plain = self.source(*args, **named)
     compared[name] += 1
     for one, other in zip(numbers(expected), numbers(plain), strict=True):
         if one.dtype.kind == "f":
