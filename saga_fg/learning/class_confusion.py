@@ -7,7 +7,7 @@ class, within half the gate: reports of another class *in place of* the right on
 of the right class says something else: the detector has an output for every class, and reports one object as several.
 Each class of such a detector is tracked by itself, with what it says of the class; on recordings, beliefs made these
 worse. So a sensor confuses classes only if more of its detections stand in place of the right one than beside it, those
-that are a share `RARE` of the detections of a class at least.
+that are a share `MIN_SHARE` of the detections of a class at least.
 
 Rows are counts, which tell how frequent the classes are as well (`saga_fg.tracking.class_belief`).
 """
@@ -27,9 +27,9 @@ from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.tracking.settings import TypicalSize
 from saga_fg.types.dataset import Scene
 
-FEWEST = 20.0  # expected detections of a class, for a row or a size of its own
-RARE = 0.02  # share of the detections of a class below which those of another one are chance
-LEAST_SPREAD = 0.05  # of sizes, relative; objects in other recordings differ by more than a few do in these
+MIN_DETECTIONS = 20.0  # expected detections of a class, for a row or a size of its own
+MIN_SHARE = 0.02  # share of the detections of a class below which those of another one are chance
+MIN_SPREAD = 0.05  # of sizes, relative; objects in other recordings differ by more than a few do in these
 
 
 def learn_confusion(scenes: Iterable[Scene], sensors: Mapping[str, Sensor]) -> dict[str, dict[str, dict[str, float]]]:
@@ -59,8 +59,8 @@ def learn_confusion(scenes: Iterable[Scene], sensors: Mapping[str, Sensor]) -> d
 def _rows(instead: Mapping[tuple[str, str], float], beside: float) -> dict[str, dict[str, float]]:
     """The rows of one sensor; beside: expected number of its detections beside one of another class."""
     total = {c: sum(n for (d, _), n in instead.items() if d == c) for c, _ in instead}
-    known = [c for c in sorted(total) if total[c] >= FEWEST and instead[c, c] > 0]
-    pairs = [(c, z) for c, z in instead if c in known and c != z and instead[c, z] >= RARE * total[c]]
+    known = [c for c in sorted(total) if total[c] >= MIN_DETECTIONS and instead[c, c] > 0]
+    pairs = [(c, z) for c, z in instead if c in known and c != z and instead[c, z] >= MIN_SHARE * total[c]]
     if sum(instead[pair] for pair in pairs) <= beside:
         return {}
     mixed = [c for c in known if any(c in pair for pair in pairs)]
@@ -82,7 +82,7 @@ def learn_sizes(scenes: Iterable[Scene], sensors: Mapping[str, Sensor]) -> dict[
     for name, parts in found.items():
         logs = np.concatenate(parts)
         logs = logs[np.isfinite(logs).all(axis=1)]
-        if len(logs) >= FEWEST:
+        if len(logs) >= MIN_DETECTIONS:
             length, width, height = np.exp(np.median(logs, axis=0)).tolist()
-            sizes[name] = TypicalSize(length, width, height, max(float(np.sqrt(logs.var(axis=0).mean())), LEAST_SPREAD))
+            sizes[name] = TypicalSize(length, width, height, max(float(np.sqrt(logs.var(axis=0).mean())), MIN_SPREAD))
     return sizes

@@ -5,15 +5,16 @@
     p        = sum of o_k / (1 + sum of o_k)
 
 up to a constant. A(z | c) is the chance that a sensor reports an object of class c as z, the table `confusion` of its
-model; P(c) is the share of the class among what the tables count. Boxes of confused classes in one place of a frame are
-one report with several labels: hypotheses that exclude each other, with the odds o_k of their probabilities p_k. So
-they count for the existence of the object together, p, and for each class by their share, L. Detections of successive
-frames are taken for independent; a class never falls below `LEAST_BELIEF`, so that a belief can always be changed.
+model, in which a class without a row is reported rightly as often as the others; P(c) is the share of the class among
+what the tables count. Boxes of confused classes in one place of a frame are one report with several labels: hypotheses
+that exclude each other, with the odds o_k of their probabilities p_k. So they count for the existence of the object
+together, p, and for each class by their share, L. Detections of successive frames are taken for independent; a class
+never falls below `MIN_BELIEF`, so that a belief can always be changed.
 
 Size and speed count once, as they are estimated now, since a detector's errors in them persist: m_c and s_c are the
 typical size of the class (`ClassSettings.typical_size`), v_c the deviation of its speeds; a share `OUTLIERS` of objects
-has any size. A class without a typical size
-takes that evidence from its whole group; objects that have never moved say nothing by their speed.
+has any size. A class without a typical size takes that evidence from its whole group; objects that have never moved say
+nothing by their speed.
 
 Classes are of one group if a chain of confusions joins them. A detection may be of any track of its group, at the cost
 -2 log sum_c b(c) L(c). Without tables there are no groups, and every track has the class of its detections.
@@ -33,8 +34,8 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, c
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.by_class import DEFAULT, class_settings
 
-LEAST_BELIEF = 1e-3  # of a class of the group
-LEAST_CONFUSION = 1e-3  # chance of any report within the group
+MIN_BELIEF = 1e-3  # of a class of the group
+MIN_CONFUSION = 1e-3  # chance of any report within the group
 OUTLIERS = 0.01  # share of objects of which no class is typical: of any size alike, over a factor e each way
 
 
@@ -67,15 +68,17 @@ class ConfusedClasses:
         for i, j in ((classes.index(c), classes.index(z)) for c, z in entries if c in classes):
             group[group == group[j]] = group[i]
         alike = group[:, None] == group
-        found = {name: np.eye(C) for name in tables}
+        found = {}
         for name, rows in tables.items():
-            for k, c in ((k, c) for k, c in enumerate(classes) if c in rows):
-                found[name][:, k] = [rows[c].get(z, 0.0) for z in classes]
-            A = np.where(alike, np.maximum(found[name] / found[name].sum(axis=0), LEAST_CONFUSION), 0.0)
+            A = np.reshape([[rows[c].get(z, 0.0) if c in rows else np.nan for c in classes] for z in classes], (C, C))
+            A = A / A.sum(axis=0)
+            right = np.nanmean(np.diagonal(A)) if np.isfinite(A).any() else 1.0
+            usual = np.where(np.eye(C) > 0, right, (1 - right) / np.maximum(alike.sum(axis=0) - 1, 1))
+            A = np.where(alike, np.maximum(np.where(np.isnan(A), usual, A), MIN_CONFUSION), 0.0)
             found[name] = A / A.sum(axis=0)
         totals = [[sum(rows[c].values()) for rows in tables.values() if c in rows] for c in classes]
-        usual = [n for own in totals for n in own]
-        prior = np.array([np.mean(own or usual) for own in totals])
+        of_all = [n for own in totals for n in own]
+        prior = np.array([np.mean(own or of_all) for own in totals])
         of_class = [class_settings(settings, ClassSettings, label) for label in classes]
         sizes = [each.typical_size for each in of_class]
         parts = [[np.nan] * 4 if s is None else [*np.log([s.length, s.width, s.height]), s.spread] for s in sizes]
@@ -120,7 +123,7 @@ class ConfusedClasses:
             return log_belief
         with np.errstate(divide="ignore"):
             after = _normalised(log_belief + np.log(likelihood))
-        return _normalised(np.where(np.isfinite(log_belief), np.maximum(after, np.log(LEAST_BELIEF)), -np.inf))
+        return _normalised(np.where(np.isfinite(log_belief), np.maximum(after, np.log(MIN_BELIEF)), -np.inf))
 
     def report(self, log_belief: FloatArray) -> FloatArray:
         """Likelihood (n, C) of all detections together that led to log-beliefs (n, C)."""

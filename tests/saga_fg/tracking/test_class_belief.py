@@ -13,7 +13,7 @@ from saga_fg import Boxes, Detections, Frame, InputError, Tracker
 from saga_fg.model.motion import ConstantVelocity, RandomWalk
 from saga_fg.model.sensor import Sensor
 from saga_fg.tracking import ClassSettings, TrackerSettings
-from saga_fg.tracking.class_belief import LEAST_BELIEF, OUTLIERS, ConfusedClasses
+from saga_fg.tracking.class_belief import MIN_BELIEF, OUTLIERS, ConfusedClasses
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.settings import AssociationSettings, TypicalSize
 
@@ -62,7 +62,7 @@ def test_a_belief_is_the_product_of_the_reports(reports):
         table = SENSORS[sensor].confusion
         expected = {c: p * table[c][label] for c, p in expected.items()}
         total = sum(expected.values())
-        raised = {c: max(p / total, LEAST_BELIEF) for c, p in expected.items()}
+        raised = {c: max(p / total, MIN_BELIEF) for c, p in expected.items()}
         expected = {c: p / sum(raised.values()) for c, p in raised.items()}
     found = beliefs(LIDAR, belief[0])
     for label in LIDAR.classes:
@@ -88,6 +88,14 @@ def test_a_sensor_without_a_table_is_nearly_sure():
     assert row[confused.classes.index("bicycle")] == 0
 
 
+def test_a_class_without_a_row_is_reported_rightly_as_often_as_the_others():
+    rows = {"car": {"car": 80.0, "truck": 15.0, "bus": 5.0}, "bus": {"bus": 9.0, "car": 1.0}}
+    confused = ConfusedClasses.of({"camera": Sensor(confusion=rows)}, {})
+    column = confused.classes.index("truck")
+    chance = dict(zip(confused.classes, confused.tables["camera"][:, column].tolist(), strict=True))
+    assert chance == pytest.approx({"truck": 0.85, "car": 0.075, "bus": 0.075})
+
+
 def test_without_tables_nothing_is_confused():
     confused = ConfusedClasses.of({"lidar": Sensor(), "camera": Sensor(confusion={"car": {"car": 1.0}})}, {})
     assert len(confused) == 0
@@ -106,12 +114,12 @@ def test_a_belief_can_always_be_changed():
     belief, label = LIDAR.initial(car), np.array(["car"])
     for _ in range(200):
         belief = LIDAR.updated(belief, car)
-    assert math.exp(belief[np.isfinite(belief)].min()) >= 0.9 * LEAST_BELIEF
+    assert math.exp(belief[np.isfinite(belief)].min()) >= 0.9 * MIN_BELIEF
     reported = []
     for _ in range(4):
         belief = LIDAR.updated(belief, bus)
         reported.append(str(LIDAR.labels(belief, label)[0]))
-    assert reported == ["car", "car", "bus", "bus"]  # after log(1 / LEAST_BELIEF) / log(0.9 / 0.05) detections
+    assert reported == ["car", "car", "bus", "bus"]  # after log(1 / MIN_BELIEF) / log(0.9 / 0.05) detections
 
 
 def test_size_and_speed_count_once_by_their_densities():
