@@ -52,6 +52,7 @@ from saga_fg.types.boxes import MAX_POSITION
 
 _UNIT = 1e-3  # what the norm of a quaternion may be off 1
 _SLIGHT = 1e-4  # share of the largest eigenvalue by which the smallest may be negative: four digits are rounded so
+_LEAST_SIGMA = 1e-7  # m and rad; the information is then below the largest number
 _LEAST = 1e-9  # share of the largest eigenvalue that it is then raised to
 
 
@@ -155,8 +156,9 @@ def information(table: TextTable, record: Record) -> FloatArray:
     if record.weight == "sigmas":
         names = tuple(f"sigma of the {name}" for name in record.values)
         sigmas = table.numbers(slice(start, start + k), names)
-        if (sigmas <= 0).any():
-            raise table.fault(int(np.argmax((sigmas <= 0).any(axis=1))), "expected standard deviations > 0")
+        if (small := (sigmas < _LEAST_SIGMA).any(axis=1)).any():
+            row, least = int(np.argmax(small)), float(sigmas[small][0].min())
+            raise table.fault(row, f"expected standard deviations of at least {_LEAST_SIGMA:g}, got {least:g}")
         return np.asarray(np.eye(k) / sigmas[:, None] ** 2)
     upper = np.triu_indices(k)
     names = tuple(f"I{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))
