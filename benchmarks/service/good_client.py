@@ -21,6 +21,7 @@ class GoodClient(threading.Thread):
 
     line      the message of a frame
     dies_at   at this frame the connection is cut off, with frames on the way and answers unread
+    in_step   of all good clients: none sends a frame before the others have the answer to the one before
 
     After a broken connection it asks for the status, and sends again what was not answered; or, where `last_seq` shows
     that the service has forgotten answered frames, what comes after `durable_seq`.
@@ -31,7 +32,14 @@ class GoodClient(threading.Thread):
     """
 
     def __init__(
-        self, address: Address, sensor: str, frames: int, pace: float, line: Callable[[int], bytes], dies_at: int
+        self,
+        address: Address,
+        sensor: str,
+        frames: int,
+        pace: float,
+        line: Callable[[int], bytes],
+        dies_at: int,
+        in_step: threading.Barrier,
     ) -> None:
         super().__init__(name=sensor, daemon=True)
         self.sensor, self.frames = sensor, frames
@@ -41,6 +49,7 @@ class GoodClient(threading.Thread):
         self.sent_again = 0
         self.error: Exception | None = None
         self._address, self._pace, self._line, self._dies_at = address, pace, line, dies_at
+        self._in_step = in_step
         self._client = StreamClient(address, timeout=PATIENCE)
 
     def run(self) -> None:
@@ -49,13 +58,17 @@ class GoodClient(threading.Thread):
             start = time.monotonic()
             for seq in range(self.frames):
                 time.sleep(max(0.0, start + seq / self._pace - time.monotonic()))
+                self._in_step.wait()
                 if seq == self._dies_at:
                     self._die(seq)
                 sent = time.monotonic()
                 self._deliver(seq)
                 self.waits.append((sent, time.monotonic()))
+        except threading.BrokenBarrierError:  # another client has failed
+            pass
         except Exception as error:  # for the benchmark to raise
             self.error = error
+            self._in_step.abort()
         finally:
             self._client.close()
 

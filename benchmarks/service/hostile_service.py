@@ -1,6 +1,7 @@
 """A service among hostile clients: which frames of two good clients are lost, doubled or late.
 
-    two good clients   numbered frames of the same objects, each of its own sensor
+    two good clients   numbered frames of the same objects, each of its own sensor, in step, so that on a slow machine
+                       none is late
     hostile clients    200 at a time: broken, poisonous and random messages, connections that break off; sensors whose
                        clocks are wrong, drift or jump
     a listener         that has subscribed and does not read
@@ -99,10 +100,10 @@ class _Run:
         self, folder: Path, frames: int, pace: float, objects: CirclingObjects, seed: int, progress: Progress | None
     ) -> None:
         self._frames, self._pace, self._objects, self._seed, self._progress = frames, pace, objects, seed, progress
-        self._address = Address(path=folder / "service.sock")
+        self._folder, self._address = folder, Address(path=folder / "service.sock")
         self._options = ("--listen", str(self._address), "--snapshot", str(folder / "state"), "--every", "0.2")
         self._rng = np.random.default_rng([seed, 5])
-        self._pulse = _Pulse()
+        self._pulse, self._in_step = _Pulse(), threading.Barrier(len(SENSORS))
 
     def run(self, hostile: int) -> dict[str, Any]:
         """With so many hostile messages."""
@@ -140,7 +141,7 @@ class _Run:
 
     def _second_is_refused(self) -> bool:
         """Start another service with the same snapshot; True if it ends with one line that says why."""
-        options = ("--listen", str(Path(str(self._address)).with_name("second.sock")), *self._options[2:])
+        options = ("--listen", str(self._folder / "second.sock"), *self._options[2:])
         try:
             done = subprocess.run(
                 [*PROGRAM, "serve", *options], capture_output=True, text=True, timeout=PATIENCE, check=False
@@ -160,7 +161,7 @@ class _Run:
             return encode(message | {"detections": self._objects.detections(elapsed, rng)})
 
         dies_at = int(self._rng.integers(frames // 10, max(2, frames // 3))) if number == 0 else -1
-        return GoodClient(self._address, sensor, frames, self._pace, line, dies_at)
+        return GoodClient(self._address, sensor, frames, self._pace, line, dies_at, self._in_step)
 
     def _wait(self, clients: list[GoodClient], attack: Attack, until: float) -> None:
         """Until so much of the run is done, telling the hostile clients how far it is."""
