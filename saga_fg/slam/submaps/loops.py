@@ -20,7 +20,8 @@ that some s leads to gets the s that fits it; the cheapest is taken. So a loop a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Self
 
@@ -83,20 +84,22 @@ def loop_factors(
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """Provider of loops, without a loss; `epochs` are those of the poses by their numbers `first` and `second`."""
+    """Provider of loops, without a loss; `epochs` are those of the poses by their numbers `first` and `second`.
+
+    All come with the last of these epochs.
+    """
 
     loops: Sequence[LoopClosure]
     epochs: Sequence[int]
     name: str = "loops"
-    _by_epoch: dict[int, list[LoopClosure]] = field(default_factory=dict, init=False)
 
-    def __post_init__(self) -> None:
-        for loop in self.loops:
-            later = max(self.epochs[loop.first], self.epochs[loop.second])
-            self._by_epoch.setdefault(later, []).append(loop)
+    @cached_property
+    def last(self) -> int | None:
+        """The last epoch of a loop, None without one."""
+        return max((self.epochs[end] for loop in self.loops for end in (loop.first, loop.second)), default=None)
 
     def factors(self, view: GraphView) -> Additions:
-        return Additions(factors=loop_factors(self._by_epoch.get(view.epoch, ()), self.epochs, None))
+        return Additions(factors=loop_factors(self.loops, self.epochs, None) if view.epoch == self.last else [])
 
 
 _FALSE = 1e-3  # probability that a proven loop is false
