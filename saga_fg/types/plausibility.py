@@ -204,9 +204,9 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
     """
     from scipy.spatial import cKDTree
 
-    found = np.full(position.shape, np.nan)
+    found, known = np.full(position.shape, np.nan), np.isfinite(time) & np.isfinite(position).all(axis=1)
     for name in np.unique(label).tolist():
-        mine = np.flatnonzero((label == name) & np.isfinite(time))
+        mine = np.flatnonzero((label == name) & known)
         moments = np.unique(time[mine])[: MAX_FRAMES + 1]
         mine = mine[time[mine] <= moments.max(initial=-np.inf)]
         frames = [mine[time[mine] == moment] for moment in moments]
