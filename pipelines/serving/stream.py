@@ -160,12 +160,15 @@ class StreamTracker(Generic[Client]):
             return state, self._numbering.durable(), self.version
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
+        """Go on from a state. Raises `InputError` for counts that are none."""
+        counts = Counter(state["counts"])
+        if not all(type(count) is int for count in counts.values()):
+            raise InputError("counts: expected whole numbers")
         with self._lock:
             self._tracker.restore(state["tracker"])
             self._numbering.restore(state["numbering"])
             self._held.set_clock(state["newest"])
-            self.counts = Counter(state["counts"])
+            self.counts = counts
             self._durable = self._numbering.durable()
 
     def made_durable(self, durable: dict[str, int]) -> None:

@@ -122,7 +122,8 @@ def test_a_full_disk_is_told_and_got_over(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_state_that_does_not_fit_is_never_half_used(tmp_path: Path):
     path = tmp_path / "state.saga"
-    for state in (None, {"tracker": 1}, {"tracker": None, "numbering": {}, "newest": 0, "counts": {}}):
+    nothing = {"tracker": None, "numbering": {}, "newest": 0}
+    for state in (None, {"tracker": 1}, nothing | {"counts": {"messages": "a"}}, nothing | {"counts": {}}):
         write_state(path, HEADER, state)
         with pytest.raises(InputError, match="expected a state that fits"):
             kept(stream(), path)
