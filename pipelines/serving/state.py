@@ -92,7 +92,7 @@ class TreeWriter:
         if cls is frozenset:
             return {"frozenset": [self._add(part) for part in sorted(value)]}
         if cls is SceneFactorGraph:
-            return {"graph": self._add(GraphRecord.of(value))}
+            return {"graph": self._add(GraphRecord.from_graph(value))}
         if cls is MethodType and value.__name__ in METHODS:
             return {"method": [self._add(value.__self__), value.__name__]}
         if isinstance(value, np.generic):

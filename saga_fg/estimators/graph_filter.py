@@ -350,16 +350,16 @@ class GraphFilter(Estimator):
 
     def _state(self) -> GraphState:
         return GraphState(
-            self._smoother.graph(),
-            self._layout,
-            self._keys,
-            self._independent,
-            self._window,
-            self._labels,
-            self._auxiliary,
-            self._predictions,
-            self._posterior,
-            self._before if self._keys else None,
+            graph=self._smoother.graph(),
+            layout=self._layout,
+            keys=self._keys,
+            independent=self._independent,
+            window=self._window,
+            labels=self._labels,
+            auxiliary=self._auxiliary,
+            predictions=self._predictions,
+            posterior=self._posterior,
+            before=self._before if self._keys else None,
         )
 
     def _note(self, method: str, *arguments: Any) -> None:

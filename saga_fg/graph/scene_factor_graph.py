@@ -396,7 +396,7 @@ class GraphRecord:
     carried_over: Mapping[int, int]
 
     @staticmethod
-    def of(graph: SceneFactorGraph) -> GraphRecord:
+    def from_graph(graph: SceneFactorGraph) -> GraphRecord:
         """The record of a graph. Raises `GraphError` for poses and for factors that are more than arrays."""
         variables, point, groups = tuple(graph.variables.values()), graph.point(), dict(graph.groups)
         for one in variables:
@@ -406,19 +406,19 @@ class GraphRecord:
             if not isinstance(held.factors, _RECORDED):
                 raise GraphError(f"provider {held.provider}: {held.factors.name}: it can't be written to a file")
         return GraphRecord(
-            graph.elimination,
-            graph.epoch,
-            graph.time,
-            graph.previous_time,
-            variables,
-            tuple(one.type.read(point.base, one.key) for one in variables),
-            tuple(one.type.read(point.values, one.key) for one in variables),
-            tuple(graph.births[one.key] for one in variables),
-            graph._added,
-            groups,
-            graph.index.count,
-            graph._newest,
-            graph.carried_over,
+            elimination=graph.elimination,
+            epoch=graph.epoch,
+            time=graph.time,
+            previous_time=graph.previous_time,
+            variables=variables,
+            base=tuple(one.type.read(point.base, one.key) for one in variables),
+            values=tuple(one.type.read(point.values, one.key) for one in variables),
+            births=tuple(graph.births[one.key] for one in variables),
+            additions=graph._added,
+            groups=groups,
+            count=graph.index.count,
+            newest=graph._newest,
+            carried_over=graph.carried_over,
         )
 
     def restored(self) -> SceneFactorGraph:

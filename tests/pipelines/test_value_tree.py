@@ -202,7 +202,7 @@ def test_a_running_graph_goes_on_from_its_written_state(lag: float):
 def record() -> GraphRecord:
     estimator = GraphFilter()
     estimator.add(NODES, np.zeros((3, 4)), np.stack([np.eye(4)] * 3))
-    return GraphRecord.of(estimator.graph())
+    return GraphRecord.from_graph(estimator.graph())
 
 
 def test_a_graph_whose_parts_do_not_fit_is_refused():
