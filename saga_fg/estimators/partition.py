@@ -159,6 +159,11 @@ class Partition:
     layout: StateLayout
     label: IntArray
 
+    def __post_init__(self) -> None:
+        n, label = len(self.layout), self.label
+        if label.shape != (n,) or label.dtype != np.int64 or (n and not 0 <= label.min() <= label.max() < n):
+            raise InputError(f"label: expected components (n,) of {n} nodes, whole numbers from 0")
+
     @staticmethod
     def apart(layout: StateLayout) -> Partition:
         """Every node a component of its own."""

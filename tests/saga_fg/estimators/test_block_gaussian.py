@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from saga_fg import InputError
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.partition import Partition, StateLayout
 
@@ -97,3 +98,10 @@ def test_nobody_is_correlated_with_nobody():
     none = np.empty(0, dtype=np.int64)
     assert [len(rows) for rows in x.correlated(none)] == [0, 0]
     assert x.between(none, none).shape == (0, 0, 0)
+
+
+def test_components_that_are_none_never_reach_a_kernel() -> None:
+    layout = StateLayout().extended([1, 2], 4)
+    for label in ([0], [0, 2], [0, -1], [0.0, 1.0]):
+        with pytest.raises(InputError, match="label: expected components"):
+            Partition(layout, np.array(label))
