@@ -38,7 +38,7 @@ from saga_fg.numerics.arrays import FloatArray
 
 TITLE = "the incremental smoother against Levenberg-Marquardt on the whole graph"
 MIXED, EVADING, STRAIGHT = "mixed", "crossing, evading", "crossing, straight on"
-SILENT = 0.01  # standard deviations
+SILENT = 1e-3  # standard deviations
 NEAR = 0.5  # m, that two who cross come to each other at least
 APART = 2.0  # m, at the start
 INTERVAL = 0.2  # s, of crossings

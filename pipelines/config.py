@@ -41,7 +41,8 @@ class TrackConfig:
     def with_estimator(self, estimator: str | None, lag: float | None) -> TrackConfig:
         """Return a copy with this estimator and window (s); None keeps the present one."""
         tracker = self.tracker
-        tracker = replace(tracker, estimator=estimator or tracker.estimator, lag=tracker.lag if lag is None else lag)
+        name = tracker.estimator if estimator is None else estimator
+        tracker = replace(tracker, estimator=name, lag=tracker.lag if lag is None else lag)
         return replace(self, tracker=tracker)
 
     def with_association(self, method: AssociationName | None) -> TrackConfig:

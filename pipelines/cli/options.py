@@ -89,7 +89,7 @@ class TrackerOptions:
         str | None,
         typer.Option(
             "--estimator",
-            help="kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph of "
+            help="kalman: fastest; isam2: the same filter as a factor graph of the last interval; fixed-lag: that of "
             "the last --lag seconds, which puts late frames where they belong; MODULE:NAME, which is imported, or the "
             "name of an installed entry point: your own. The bounds of kalman (tracker.tolerance, "
             "tracker.max_component) move tracks by millimetres, a centimetre at most in our recordings.  "
@@ -109,7 +109,9 @@ class TrackerOptions:
         settings = with_interactions(load_config(family, config), self.method, self.interactions)
         if self.method == "centerpoint" and (self.estimator is not None or self.lag is not None):
             raise InputError("--estimator, --lag: the method centerpoint has no estimator")
-        if self.lag is not None and "lag" not in estimator_parameters(self.estimator or settings.tracker.estimator):
+        if self.lag is not None and "lag" not in estimator_parameters(
+            settings.tracker.estimator if self.estimator is None else self.estimator
+        ):
             raise InputError(f"--lag {self.lag:g}: goes with --estimator fixed-lag")
         association_fits(self.method, self.association)
         return settings.with_estimator(self.estimator, self.lag).with_association(self.association)

@@ -40,7 +40,7 @@ from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
 from saga_fg.graph.variables import MAP_NODE, OBJECT, node_key, node_kind
 from saga_fg.model.discretisation import Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, shallow_copy
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, shallow_copy
 from saga_fg.types.frame import Frame
 
 _RELEASE_EVERY = 10  # predictions between looks for objects whose correlation with others has decayed
@@ -78,7 +78,7 @@ class GraphFilter(Estimator):
     """
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0) -> None:
-        self.providers, self.lag = tuple(providers), float(lag)
+        self.providers, self.lag = tuple(providers), float(checked("lag", lag, ()))
         self._smoother = IncrementalSmoother(lag=lag)
         self._smoother.step(0.0)
         self._layout = StateLayout()
@@ -299,7 +299,10 @@ class GraphFilter(Estimator):
             }
             graph.marginalise(old & graph.variables.keys())  # of nodes of the same ids that have left
             added = self._independent.add_to(graph, nodes, self._labels)
-            graph.moved_to(graph.base.retract(linear_solution(graph).step))
+            step, base, values = linear_solution(graph).step, graph.base, graph.values
+            for key in {key for own in added for key in own.values()}:  # the others are where iSAM2 has them
+                values.update(key, base.atVector(key) + step.at(key))
+            graph.moved_to(values)
             for epoch, own in zip(self._independent.epochs, added, strict=True):
                 keys[epoch.number] = {**keys.get(epoch.number, {}), **own}
         return graph, [keys[epoch.number] for epoch in self._window.epochs]

@@ -1,7 +1,7 @@
 """`gtsam.ISAM2` as the engine of a running graph: any factors, one variable a node and epoch, fluid relinearisation.
 
 iSAM2 gets linear factors on increments from the base of every variable (`saga_fg.graph.variables`) and never
-linearises itself: no callback runs inside it, and a factor that raises does so before. When a variable has moved by
+linearises itself: no callback runs in an update, and a factor that raises does so before. When a variable has moved by
 more than `threshold` of its own standard deviations from where its factors were linearised, these are linearised
 anew, families in NumPy all at once, and exchanged: the old ones out, the new ones in (Kaess et al., "iSAM2", IJRR 31,
 2012). Robust losses are weighted anew with it (iteratively reweighted least squares). Where that does not

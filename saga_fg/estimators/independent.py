@@ -4,9 +4,10 @@ Over the epochs of a window,
 
     x_i' = F_ii x_i + b_i + q_i,    z = H x_i + v        P = blockdiag( P_1, ..., P_n )
 
-Eliminating the chain of such an object in the order of time is the Kalman filter, whose kernels do it here for all
-objects at once (`saga_fg.estimators.filtering`). What would be their factors are arrays; those of an object that is
-tied to others, or that somebody looks at, are made then, over all of its epochs in the window.
+where those whose correlation has not faded yet are one block together. Eliminating the chain of such objects in the
+order of time is the Kalman filter, whose kernels do it here for all at once (`saga_fg.estimators.filtering`). What
+would be their factors are arrays; those of an object that is tied to others, or that somebody looks at, are made then,
+over all of its epochs in the window.
 """
 
 from __future__ import annotations

@@ -143,7 +143,10 @@ class Engine:
         Where the tree has too few digits, all factors are eliminated anew; raises `FactorError` where that fails, too.
         """
         P = self._clique_covariance(keys)
-        return marginal_moments(self.linear(), keys, "qr")[1] if P is None else P
+        if P is None:
+            log.debug("a joint covariance of %d variables is not in one clique, or lacks digits", len(keys))
+            P = marginal_moments(self.linear(), keys, "qr")[1]
+        return P
 
     def _clique_covariance(self, keys: list[int]) -> FloatArray | None:
         """From R of the clique at the root that holds all of `keys`, P = R^-1 R^-T; None where there is no such.

@@ -206,7 +206,7 @@ class TrackerSettings(Settings):
     )
     estimator: str = setting(
         "kalman",
-        "kalman: fastest; isam2: the same filter as a factor graph of one epoch; fixed-lag: a factor graph "
+        "kalman: fastest; isam2: the same filter as a factor graph of the last interval; fixed-lag: a factor graph "
         "of the last `lag` seconds, exact for late frames; MODULE:NAME or the name of an entry point: your own",
     )
     tolerance: FractionBelowOne = setting(

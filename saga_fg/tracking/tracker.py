@@ -14,12 +14,13 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from traceback import walk_tb
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError, require_type
+from saga_fg.errors import InputError, SagaError, require_type
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
 from saga_fg.model.edge_rules import EdgeRule, require_rules
 from saga_fg.model.scene_graph import SceneGraph
@@ -113,6 +114,8 @@ class Tracker:
         try:
             reported = self._step(state, frame)
         except BaseException as error:
+            if (named := self._of_own_estimator(error)) is not None:
+                raise named from error
             if self.providers and isinstance(error, ProviderError | UndeterminedError):  # tracks are not to blame
                 raise
             failed_before, self._last_step_failed = self._last_step_failed, isinstance(error, Exception)
@@ -124,6 +127,15 @@ class Tracker:
             log.warning("tracks %s are deleted, they can't go on: %s", self._state.table.id.tolist(), error)
         self._state, self._last_step_failed = state, False
         return reported
+
+    def _of_own_estimator(self, error: BaseException) -> InputError | None:
+        """The error of an estimator that is not of this package, with its name; None for one of another origin."""
+        module = type(self._state.joint.estimator).__module__
+        if module.startswith("saga_fg.") or not isinstance(error, Exception) or isinstance(error, SagaError):
+            return None
+        if all(frame.f_globals.get("__name__") != module for frame, _ in walk_tb(error.__traceback__)):
+            return None
+        return InputError(f"estimator: {self.settings.estimator}: {type(error).__name__}: {error}")
 
     def _step(self, state: TrackerState, frame: Frame) -> Tracks:
         """Take a frame into a state."""
@@ -281,7 +293,7 @@ class Tracker:
 
     @property
     def running_graph(self) -> SceneFactorGraph:
-        """The factor graph of the estimator: variables, factors, values; with `providers` the one that runs."""
+        """Variables, factors and values of the graph; with `isam2` and `fixed-lag` it is the one that runs."""
         return self._state.joint.estimator.graph()
 
     @property

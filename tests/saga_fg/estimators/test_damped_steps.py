@@ -117,6 +117,18 @@ def test_what_has_not_settled_is_not_better_known_than_predicted(lag: float) -> 
     np.testing.assert_allclose(P[0], reported[:4, :4])
 
 
+@pytest.mark.parametrize("lag", [0.0, 0.25])
+def test_the_graph_has_what_has_not_settled_where_the_filter_has_it(lag: float) -> None:
+    estimator = filtered(Uphill([1]), lag=lag)
+    graph = estimator.graph()
+    newest = graph.of(OBJECT, graph.epoch)
+    assert len(estimator._independent.layout.nodes) == 1
+    for node in (1, 2):
+        np.testing.assert_allclose(graph.state(newest[node].key), estimator.mean([node])[0], atol=1e-9)
+    latest = estimator.smoothed()[-1]
+    np.testing.assert_allclose(latest.x.mean, estimator.mean([1, 2]).ravel(), atol=1e-9)
+
+
 def test_a_restored_filter_says_the_same() -> None:
     estimator = filtered(Uphill([1]))
     state = pickle.loads(pickle.dumps(estimator.snapshot()))

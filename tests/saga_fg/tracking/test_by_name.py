@@ -94,6 +94,11 @@ def with_lag(lag, max_delay):
     return made
 
 
+class Breaks(Textbook):
+    def update(self, measurements, time=None):
+        raise ZeroDivisionError("no gain")
+
+
 class Needy(Textbook):
     def __init__(self, gain):
         super().__init__()
@@ -160,6 +165,14 @@ def test_a_users_estimator_tracks_as_the_toolkits_do(subtests):
             horizon = tracker.predict([1.0]), usual.predict([1.0])
             assert horizon[0].position == pytest.approx(horizon[1].position, abs=1e-6)
             assert len(list(tracker.running_graph.variables)) >= 3
+
+
+def test_an_estimator_that_raises_is_named():
+    tracker = Tracker(settings("my_estimators:Breaks"))
+    with pytest.raises(InputError, match=r"estimator: my_estimators:Breaks: ZeroDivisionError: no gain"):
+        run(tracker, frames(3))
+    with pytest.raises(InputError, match=r"estimator: expected one of kalman"):
+        Tracker(settings(""))
 
 
 def test_a_subclass_is_what_runs(mine):
