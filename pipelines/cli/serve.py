@@ -137,7 +137,7 @@ def _restored(
     if settings.tracker.providers:
         raise InputError("--snapshot: expected no tracker.providers, whose factors cannot be kept in a file")
     tracker = settings.tracker
-    if tracker.estimator != "kalman" and tracker.nonlinear(tracker.edges):
+    if tracker.estimator in ("isam2", "fixed-lag") and tracker.nonlinear(tracker.edges):
         raise InputError(
             f"--snapshot: expected estimator: kalman where objects move nonlinearly, got {tracker.estimator}"
         )
