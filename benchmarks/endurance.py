@@ -15,7 +15,6 @@ apart           largest distance between tracks of both trackers, m
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -25,7 +24,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from benchmarks.runner import Row, Rows, Seed, chosen, clocked, each, timed
+from benchmarks.runner import Row, Rows, Seed, chosen, clocked, each, only_errors, timed
 from pipelines.config import TrackConfig, load_config
 from pipelines.tracking import one_thread, resident_memory
 from saga_fg.numerics.arrays import FloatArray
@@ -65,8 +64,7 @@ def endurance(
       python -m benchmarks endurance
       python -m benchmarks endurance --frames 4000 --estimators kalman --crowd 2000 --json figures.json
     """
-    logging.getLogger("saga_fg.tracking").setLevel(logging.ERROR)  # the clock is set after a day of nothing
-    with one_thread():
+    with one_thread(), only_errors("saga_fg.tracking"):  # the clock is set after a day of nothing
         for name in chosen("--estimators", names, ESTIMATORS):
             yield from _nothing(name, seed)
             yield from _long_run(name, frames if name == "kalman" else max(40, frames // SHORTER), seed)

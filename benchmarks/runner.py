@@ -10,11 +10,13 @@ else the machine does hits all of them alike. Figures are medians, and ratios of
 from __future__ import annotations
 
 import inspect
+import logging
 import math
 import platform
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -117,6 +119,18 @@ def counts(option: str, value: str, least: int = 1) -> tuple[int, ...]:
     if not entries or not all(entry.isdecimal() and len(entry) < 10 and int(entry) >= least for entry in entries):
         raise InputError(f"{option}: expected whole numbers >= {least} with commas between them, got {value[:40]!r}")
     return tuple(map(int, entries))
+
+
+@contextmanager
+def only_errors(name: str) -> Iterator[None]:
+    """Let a logger tell nothing but errors, for the length of a block."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def each(items: Sequence[T], name: str) -> Iterator[T]:

@@ -5,12 +5,11 @@ Round trips are part of `benchmarks.speed`.
 
 from __future__ import annotations
 
-import logging
 from typing import Annotated
 
 import typer
 
-from benchmarks.runner import Rows, Seed
+from benchmarks.runner import Rows, Seed, only_errors
 from benchmarks.service.clocks import fault_rows, offset_rows
 from benchmarks.service.hostile_service import bench_hostile_service, shortcomings
 from pipelines.cli.console import progress_bar
@@ -45,9 +44,9 @@ def service(
       python -m benchmarks service --clocks
     """
     if clocks:
-        logging.getLogger("saga_fg.tracking").setLevel(logging.ERROR)  # each frame that is left out is warned of
-        yield from fault_rows(seed)
-        yield from offset_rows(seed)
+        with only_errors("saga_fg.tracking"):  # each frame that is left out is warned of
+            yield from fault_rows(seed)
+            yield from offset_rows(seed)
         return
     with progress_bar() as progress:
         figures = bench_hostile_service(messages, objects, pace, seed, progress)
