@@ -17,7 +17,7 @@ import typer
 
 from benchmarks.gap_picture import write_telling_picture
 from benchmarks.gap_runs import LIVES, GapBenchSettings, Judgement, LivedRun, bench_gaps
-from benchmarks.recording_sets import TRAFFIC_SETS, RecordingSet, chosen_sets
+from benchmarks.recording_sets import TRAFFIC_SETS, RecordingOptions, RecordingSet, chosen_sets
 from benchmarks.recordings.sensed import ABOVE
 from benchmarks.runner import Data, Row, Rows, chosen
 from benchmarks.variants import contenders
@@ -93,32 +93,15 @@ class GapOptions:
 
 
 @dataclass(frozen=True)
-class RecordingOptions:
-    """Recordings that are tracked."""
+class TrafficOptions(RecordingOptions):
+    """Recordings that are tracked, and how much of them."""
 
-    sets: Annotated[
-        str | None,
-        typer.Option(
-            "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated; ngsim, openacc, crossings (simulated, without "
-            "signals), with made detections.  "
-            "[default: the first five]",
-        ),
-    ] = None
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10
-    test: Annotated[str | None, typer.Option("--test", help="Take these recordings alone, with commas.")] = None
-    viewpoint: Annotated[
-        str | None,
-        typer.Option(
-            "--viewpoint",
-            help="Of the sensors in the sets ngsim and openacc: above, where nothing is hidden, mast, vehicle, the id "
-            "of one, or X,Y,Z in m.  [default: above]",
-        ),
-    ] = None
     longest: Annotated[
         float | None,
         typer.Option(
-            "--longest", min=1.0, help="Of recordings of ngsim and openacc, s, from the middle of longer ones."
+            "--longest",
+            min=1.0,
+            help="Of recordings of ngsim, openacc and crossings, s, from the middle of longer ones.",
         ),
     ] = None
 
@@ -147,7 +130,7 @@ class ShownOptions:
 def gaps(
     *,
     data: Data = None,
-    recorded: RecordingOptions,
+    recorded: TrafficOptions,
     made: GapOptions,
     shown: ShownOptions,
     config: Config = None,

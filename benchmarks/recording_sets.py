@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 from benchmarks.class_figures import class_rows, frames_with_two_classes
 from benchmarks.recordings.crossings import simulated_crossings
@@ -45,6 +46,30 @@ from saga_fg.types.dataset import Dataset, Scene
 VERSION = "v1.0-mini"
 Runs = Mapping[str, TrackedScene]
 """A tracker's output by scene."""
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Recordings that are tracked."""
+
+    sets: Annotated[
+        str | None,
+        typer.Option(
+            "--sets",
+            help="Of megvii, centerpoint, camera, kitti, simulated; confused (classes); ngsim, openacc and crossings "
+            "(simulated, without signals), with made detections.  [default: the first five]",
+        ),
+    ] = None
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10
+    viewpoint: Annotated[
+        str | None,
+        typer.Option(
+            "--viewpoint",
+            help="Of the sensors in the sets ngsim, openacc and crossings: mast, above, where nothing is hidden, "
+            "vehicle, the id of one, or X,Y,Z in m.  [default: above in gaps, else mast, vehicle, above]",
+        ),
+    ] = None
+    test: Annotated[str | None, typer.Option("--test", help="Take these recordings alone, with commas.")] = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +212,7 @@ def recording_set(
     if name == "confused":
         return confused_set(scenes)
     if name == "crossings":
-        return _sensed(name, simulated_crossings(scenes), viewpoint or ABOVE)
+        return _sensed(name, simulated_crossings(scenes).middle(longest), viewpoint or ABOVE)
     if data is None:
         raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
     if name in SETS:
@@ -225,11 +250,10 @@ def chosen_sets(
         if sets
         else (*(SETS if data is not None else ()), "simulated")
     )
+    trajectories = (*TRAFFIC_SETS, "crossings")
     for option, value in (("--viewpoint", viewpoint), ("--longest", longest)):
-        if value is not None and not set(wanted) & {*TRAFFIC_SETS, "crossings"}:
-            raise InputError(
-                f"{option}: expected {' or '.join((*TRAFFIC_SETS, 'crossings'))} among --sets, others do not use it"
-            )
+        if value is not None and not set(wanted) & set(trajectories):
+            raise InputError(f"{option}: expected {' or '.join(trajectories)} among --sets, others do not use it")
     found = [recording_set(name, data, scenes, viewpoint or usual, longest or inf) for name in wanted]
     if test is None:
         return found

@@ -8,13 +8,12 @@ scenes anew.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from benchmarks.recording_sets import RecordingSet, Score, chosen_sets
+from benchmarks.recording_sets import RecordingOptions, RecordingSet, Score, chosen_sets
 from benchmarks.runner import Data, Row, Rows, clocked, each, resampled
 from benchmarks.variants import COMPONENTS, SHIPPED, contenders
 from data_tools.metrics import Interval, LabelErrors, calibration, error_summary, errors_by_class, paired_bootstrap
@@ -25,32 +24,6 @@ from pipelines.tracking import TrackedScene, track_scene
 
 KF, BASELINE = "kf", "centerpoint"
 ERRORS = ("position", "velocity", "heading")
-
-
-@dataclass(frozen=True)
-class RecordingOptions:
-    """Recordings that are tracked."""
-
-    sets: Annotated[
-        str | None,
-        typer.Option(
-            "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated, confused, crossings, ngsim, openacc.  "
-            "[default: the first five]",
-        ),
-    ] = None
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10
-    viewpoint: Annotated[
-        str | None,
-        typer.Option(
-            "--viewpoint",
-            help="Of the sensors in the sets ngsim and openacc: mast, above, vehicle, the id of one, or X,Y,Z in m.  "
-            "[default: mast, vehicle]",
-        ),
-    ] = None
-    test: Annotated[
-        str | None, typer.Option("--test", help="Track these recordings alone, with commas.  [default: all]")
-    ] = None
 
 
 def tracking(

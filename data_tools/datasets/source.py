@@ -312,7 +312,7 @@ class DatasetSource(ABC):
         return None
 
     def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
-        """What else there is to see of the scenes; its kinds are those in `shows`."""
+        """Scans, maps and images of the scenes, of the kinds in `shows`."""
         return Surroundings()
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:

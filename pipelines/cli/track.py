@@ -119,7 +119,7 @@ def exit_on_failures(report: RunSummary) -> None:
 
 @dataclass(frozen=True)
 class BesideOptions:
-    """What is kept beside the tracks."""
+    """Predictions and a journal, kept beside the tracks."""
 
     predict: Annotated[
         str | None,

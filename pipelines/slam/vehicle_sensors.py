@@ -153,7 +153,7 @@ class WheelComparison:
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """What carries the LiDAR.
+    """The vehicle that carries the LiDAR.
 
     ego_T_lidar (4, 4) pose of the LiDAR on it
     sensors     names of those whose measurements come with the scans; settings: noise and places of all of them

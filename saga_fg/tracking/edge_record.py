@@ -77,8 +77,8 @@ class Trials(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EdgeRecord:
-    """Sums of log-likelihood ratios, with the time of each, s, by rule, whether the source is
-    faster, and pair, place or nothing else.
+    """Sums of log-likelihood ratios, with the time of each, s, by rule, whether the source is faster, and pair, place
+    or nothing else.
 
     time, places, trials   when the last trials began, where the objects were, and these
     """
@@ -89,7 +89,7 @@ class EdgeRecord:
     trials: tuple[Trials, ...] = ()
 
     def log_odds(self, keys: Iterable[Key], memory: Memory, time: float) -> FloatArray:
-        """What is known of each key now."""
+        """Sums of log-likelihood ratios (k,) of keys, faded until `time`."""
         found = (self.sums.get(key) for key in keys)
         return np.array([0.0 if one is None else one[0] * math.exp((one[1] - time) / memory.time) for one in found])
 
@@ -109,7 +109,7 @@ class EdgeRecord:
             ends = zip(faster.tolist(), nodes.id[target].tolist(), nodes.id[source].tolist(), strict=True)
             there = zip(faster.tolist(), back.tolist(), strict=True)
             known = self.log_odds([(number, *pair) for pair in ends], PAIR, time)
-            known = known + self.log_odds([(number, way, *places[row]) for way, row in there], PLACE, time)
+            known = known + self.log_odds([(number, sign, *places[row]) for sign, row in there], PLACE, time)
             known = known + self.log_odds([(number, 0), (number, 1)], RULE, time)[faster]
             own = 1 / (1 + np.exp(-(usual + known)))
             return np.asarray(own * np.where(faster, 1 - halting.across(nodes, target, source), 1.0))
@@ -177,7 +177,7 @@ def _places(nodes: NodeTable, rows: IntArray) -> list[Key]:
     """Tile and direction of some nodes."""
     tiles = np.floor(nodes.position[rows] / TILE).astype(np.int64)
     direction = np.floor((nodes.heading[rows] / (2 * np.pi / DIRECTIONS) + 0.5) % DIRECTIONS).astype(np.int64)
-    return [(*tile, -1 - way) for tile, way in zip(tiles.tolist(), direction.tolist(), strict=True)]
+    return [(*tile, -1 - quarter) for tile, quarter in zip(tiles.tolist(), direction.tolist(), strict=True)]
 
 
 def _trials(number: int, rule: Any, nodes: NodeTable, able: BoolArray) -> Trials | None:
@@ -198,9 +198,9 @@ def _trials(number: int, rule: Any, nodes: NodeTable, able: BoolArray) -> Trials
     if len(rows) == 0:
         return None
     ids = nodes.id[rows]
-    way = _faster(nodes, rows, strongest[rows]).astype(np.int64).tolist()
-    ends = zip(way, ids.tolist(), nodes.id[strongest[rows]].tolist(), strict=True)
-    places = zip(way, _places(nodes, rows), strict=True)
+    faster = _faster(nodes, rows, strongest[rows]).astype(np.int64).tolist()
+    ends = zip(faster, ids.tolist(), nodes.id[strongest[rows]].tolist(), strict=True)
+    places = zip(faster, _places(nodes, rows), strict=True)
     keys = tuple((number, *pair) for pair in ends), tuple((number, one, *place) for one, place in places)
     return Trials(*keys, ids, nodes.velocity[rows], nodes.velocity_variance[rows], a[rows], K[rows])
 

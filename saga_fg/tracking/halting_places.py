@@ -53,13 +53,11 @@ class Lines(Columns):
 
     def beyond(self, position: FloatArray) -> FloatArray:
         """(n, k) m by which places (n, 2) are beyond each line."""
-        return np.asarray(np.einsum("nki,ki->nk", position[:, None] - self.position, unit(self.heading)))
+        return _seen_from(self.position, self.heading, position)[0]
 
     def approached(self, position: FloatArray, heading: FloatArray) -> BoolArray:
         """(n, k) whether vehicles are in the lane of each line, and go its way."""
-        u = unit(self.heading)
-        offset = position[:, None] - self.position
-        aside = u[:, 0] * offset[..., 1] - u[:, 1] * offset[..., 0]
+        _, aside = _seen_from(self.position, self.heading, position)
         return np.asarray((np.abs(aside) < LANE) & (np.abs(wrap_angle(heading[:, None] - self.heading)) < ALIKE))
 
 
@@ -137,9 +135,13 @@ class HaltingPlaces:
 
 def _nobody_before(position: FloatArray, heading: FloatArray, rows: IntArray) -> BoolArray:
     """(k,) which of `rows` have no other vehicle within `FREE` on their way."""
-    u, offset = unit(heading[rows]), position - position[rows, None]
-    ahead = np.einsum("kni,ki->kn", offset, u)
-    aside = u[:, None, 0] * offset[..., 1] - u[:, None, 1] * offset[..., 0]
-    turned = np.abs(wrap_angle(heading - heading[rows, None]))
+    ahead, aside = _seen_from(position[rows], heading[rows], position)
+    turned = np.abs(wrap_angle(heading[:, None] - heading[rows]))
     before = (ahead > 0.5) & (ahead < FREE) & (np.abs(aside) < LANE) & (turned < math.pi / 3)
-    return np.asarray(~before.any(axis=1))
+    return np.asarray(~before.any(axis=0))
+
+
+def _seen_from(place: FloatArray, heading: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far positions (n, 2) are ahead of places (k, 2) along their headings (k,), and to the left, (n, k), m."""
+    u, offset = unit(heading), position[:, None] - place
+    return np.einsum("nki,ki->nk", offset, u), u[:, 0] * offset[..., 1] - u[:, 1] * offset[..., 0]

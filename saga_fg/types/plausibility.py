@@ -36,6 +36,7 @@ __all__ = [
     "headings_of_frames",
     "idle_lanes",
     "idle_rules",
+    "known_velocities",
     "length_below_width",
     "scores_beyond_one",
     "settings_without_data",
@@ -219,14 +220,22 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
     return found
 
 
+def known_velocities(
+    velocity: FloatArray, time: FloatArray, label: StrArray, position: FloatArray, in_world: bool
+) -> FloatArray:
+    """Velocities (n, 2) as they were measured; where none was, `velocities_between_frames` of places in the world."""
+    if in_world and not np.isfinite(velocity).any():
+        return velocities_between_frames(time, label, position)
+    return velocity
+
+
 def headings_of_frames(frames: Sequence[Frame]) -> Finding | None:
-    """`headings_against_motion` of the first frames, by the velocities in them, or else, in the world, between them."""
+    """`headings_against_motion` of the first frames."""
     first = [frame for frame in frames[:MAX_FRAMES] if len(frame)]
     boxes = Boxes.concatenate([frame.detections.boxes for frame in first])
-    velocity = boxes.velocity
-    if not np.isfinite(velocity).any() and all(frame.coordinates == "world" for frame in first):
-        time = np.repeat([frame.timestamp for frame in first], [len(frame) for frame in first])
-        velocity = velocities_between_frames(time, boxes.label, boxes.position[:, :2])
+    time = np.repeat([frame.timestamp for frame in first], [len(frame) for frame in first])
+    in_world = all(frame.coordinates == "world" for frame in first)
+    velocity = known_velocities(boxes.velocity, time, boxes.label, boxes.position[:, :2], in_world)
     return headings_against_motion(boxes.label, boxes.yaw, velocity, "rad")
 
 

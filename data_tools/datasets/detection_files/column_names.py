@@ -36,7 +36,7 @@ FACTORS: Mapping[Kind, Mapping[str, float]] = {
     "score": {"share": 1.0, "percent": 0.01},
 }
 OFFSETS = {"compass": pi / 2, "compass_rad": pi / 2}
-"""What is added: a compass counts clockwise from the y axis, which is north."""
+"""Offset of angles in these units, rad: a compass counts clockwise from the y axis, which is north."""
 ISO = "iso8601"
 UNITS: Mapping[str, Mapping[str, str]] = {
     "time": {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "millis": "ms"}

@@ -34,7 +34,7 @@ from saga_fg.types.plausibility import (
     frames_taken_for_seconds,
     headings_against_motion,
     headings_in_degrees,
-    velocities_between_frames,
+    known_velocities,
 )
 
 log = logging.getLogger(__name__)
@@ -162,14 +162,14 @@ class RawTable:
 
     def _headings_against_motion(self) -> Finding | None:
         """A finding where headings differ from velocities, given or, in the world, between frames."""
-        columns = {name: self.numbers(name) for name in ("timestamp", "x", "y", "yaw", "vx", "vy")}
-        velocity = np.column_stack([columns["vx"], columns["vy"]])
-        known = self.how.coordinates or ("" if "coordinates" in self.columns else "world")
-        if not np.isfinite(velocity).any() and known == "world" and "timestamp" in self.columns:
-            place = np.column_stack([columns["x"], columns["y"]])
-            velocity = velocities_between_frames(columns["timestamp"], self.labels()[0], place)
+        velocity, place = (
+            np.column_stack([self.numbers(name) for name in pair]) for pair in (("vx", "vy"), ("x", "y"))
+        )
+        label, _ = self.labels()
+        in_world = (self.how.coordinates or ("" if "coordinates" in self.columns else "world")) == "world"
+        velocity = known_velocities(velocity, self.numbers("timestamp"), label, place, in_world)
         unit = self.how.unit("yaw", self.found.units.get("yaw")) or "rad"
-        return headings_against_motion(self.labels()[0], columns["yaw"], velocity, unit)
+        return headings_against_motion(label, self.numbers("yaw"), velocity, unit)
 
     def argoverse_command(self) -> str:
         """The command for a file in Argoverse's format without poses, "" for another."""

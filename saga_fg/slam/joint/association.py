@@ -101,7 +101,7 @@ def with_all_identities(
 
 Seen = Observation | tuple[int, Observation]
 Observations = Sequence[Sequence[Seen]]
-"""Of landmarks at each epoch, all with the numbers of these or none."""
+"""Observations at each epoch, all with the numbers of their landmarks or none."""
 
 
 class NearestLandmarks:

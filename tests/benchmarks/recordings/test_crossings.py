@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.recording_sets import recording_set
 from benchmarks.recordings.crossings import LENGTH, LINE, RULES, simulated_crossings
 
 
@@ -27,3 +28,10 @@ def test_a_name_and_a_seed_make_one_recording() -> None:
     one, same, other = (simulated_crossings(2, seed).read("priority-0").vehicles for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.position, same.position)
     assert one.position.shape != other.position.shape or (one.position != other.position).any()
+
+
+def test_the_middle_of_a_crossing_is_what_is_asked_for() -> None:
+    whole, middle = (recording_set("crossings", None, 1, longest=longest) for longest in (np.inf, 5.0))
+    (name,) = whole.dataset.scenes
+    assert middle.scene(name).timestamps[-1] == pytest.approx(5.0)
+    assert whole.scene(name).timestamps[-1] == pytest.approx(40.0)
