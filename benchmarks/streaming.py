@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -18,9 +19,10 @@ import typer
 
 from benchmarks.runner import Rows, Seed
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
-from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream, write_streamed_labels
+from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream, write_labels
 from pipelines.tracking import one_thread, peak_memory, resident_memory
 from saga_fg.smoothing import Labels
+from saga_fg.types.dataset import Scene
 
 PLATOON, GAP = 5, 15.0  # cars, and m between them
 ROADS, APART = 400, 1000.0  # side by side, m apart: platoons do not meet
@@ -62,16 +64,17 @@ def streaming(
         write_traffic(table, objects, seconds, seed, detected, clutter)
         begin = time.thread_time()
 
-        def look(_: str, done: int, __: int) -> None:
-            figures = {"read, s": done / RATE, "memory, MB": resident_memory(), "most so far, MB": peak_memory()}
+        def look(seconds: float) -> None:
+            figures = {"read, s": seconds, "memory, MB": resident_memory(), "most so far, MB": peak_memory()}
             rows.append({**figures, "CPU, s": time.thread_time() - begin})
 
-        parts = round(PART * RATE * objects)
-        (done,) = write_streamed_labels(
-            Path(folder) / "labels",
-            lambda kept: smooth_stream(read_scenes_in_parts(table, parts), config, kept, progress=look),
-        )
-        look("written", round(seconds * RATE), 0)
+        def parts() -> Iterator[Scene]:
+            for part in read_scenes_in_parts(table, round(PART * RATE * objects)):
+                yield part
+                look(float(part.timestamps[-1]))  # the next part is asked for when this one is smoothed
+
+        (done,) = write_labels(Path(folder) / "labels", lambda kept: smooth_stream(parts(), config, kept))
+        look(seconds)
         yield from (("read and smoothed", row) for row in rows)
         first = next(row for row in rows if row["read, s"] >= seconds / 4)
         ratios = {
@@ -121,10 +124,8 @@ def _against_batch(table: Path, spools: Path, seconds: float) -> dict[str, Any]:
     tracemalloc.stop()
     chunks = ChunkSettings(seconds / 4, ChunkSettings().margin)
     (run,) = smooth_stream(read_scenes_in_parts(table, 1000), config, spools, chunks=chunks)
-    parts = [moment for _, moments in run.spool.labels() for moment in moments]
-    apart, alone = zip(
-        *(_apart(mine, theirs) for mine, theirs in zip(parts, smoothed.labels, strict=True)), strict=True
-    )
+    moments = zip(run.labels, smoothed.labels, strict=True)
+    apart, alone = zip(*(_apart(mine, theirs) for mine, theirs in moments), strict=True)
     boxes, counts = sum(map(len, smoothed.labels)), smoothed.counts
     return {
         "off by at most, m": max(apart),

@@ -237,21 +237,23 @@ def _smooth(
         report = run_at_scale(source, task, output, scale, labels=True)
         exit_on_failures(report)
         return
-    stream = source.stream()
+    stream, table = source.stream(), f".{labels.table}"
     if stream is not None:
         with stream as parts, progress_bar() as progress:
-            streamed = smoothing.write_streamed_labels(
+            done = smoothing.write_labels(
                 output,
                 lambda folder: smoothing.smooth_stream(checks.over(parts), settings, folder, method, progress=progress),
-                f".{labels.table}",
+                table,
             )
-        _show(output, streamed)
-        return
-    with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
-        runs = smoothing.smooth_dataset(CheckedDataset(dataset, checks), settings, method, progress=progress)
-        done = smoothing.write_labels(
-            output, runs, f".{labels.table}", lambda folder, found: source.write_labels(folder, dataset, found)
-        )
+    else:
+        with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
+            checked = CheckedDataset(dataset, checks)
+            done = smoothing.write_labels(
+                output,
+                lambda _: smoothing.smooth_dataset(checked, settings, method, progress=progress),
+                table,
+                lambda folder, found: source.write_labels(folder, dataset, found),
+            )
     _show(output, done)
 
 
@@ -267,7 +269,7 @@ smooth_app = dataset_commands(
 )
 
 
-def _show(output: Path, runs: Sequence[smoothing.SmoothedScene | smoothing.StreamedScene]) -> None:
+def _show(output: Path, runs: Sequence[smoothing.SmoothedScene]) -> None:
     """The line that says what was done."""
     total = LabelCounts.sum(run.counts for run in runs)
     typer.echo(

@@ -178,7 +178,7 @@ class SmoothTask:
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         """Write the labels; counts objects, and boxes by where they come from."""
         runs = tuple(smooth_dataset(dataset, self.settings, self.method))
-        labels = [(run.scene, run.labels) for run in runs]
+        labels = [part for run in runs for part in run.parts]
         (folder / "labels").mkdir()
         write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
         self.source.write_labels(folder, dataset, labels, file_name(name))

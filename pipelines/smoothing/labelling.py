@@ -1,10 +1,8 @@
-"""Smoothed objects to labels, by attributes of whole objects: size, height, heading, score, quality.
+"""Smoothed objects to labels, and the attributes that belong to a whole object: size, score, front, identity.
 
-Attributes of whole objects, gathered chunk by chunk while a recording streams by: size, score, front, identity.
-
-A chunk has all positions of its objects, and a part of the evidence on their sizes, scores and fronts. The parts are
-summed: probabilities and opportunities of the score, metres and votes of the front, and of the size the weights of all
-measured values, to half a millimetre.
+A chunk of a recording has all positions of its objects, and a part of the evidence on their sizes, scores and fronts.
+The parts are summed: probabilities and opportunities of the score, metres and votes of the front, and of the size the
+weights of all measured values, to half a millimetre where they are many.
 
 Every chunk stitches tracklets into objects anew, and names an object after its first tracklet there. A tracklet that
 was part of an object before stays so: the object keeps the name of its tracklets. Where they have several, it is that
@@ -13,13 +11,16 @@ of the tracklet that reaches furthest towards the chunk, so that an object's nam
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
 from pipelines.smoothing.passes import SmoothedObjects
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.smoothing import (
     Evidence,
     Headings,
@@ -28,7 +29,7 @@ from saga_fg.smoothing import (
     OfflineClass,
     SmoothingSettings,
     StateTable,
-    constant_sizes,
+    is_reversed,
     quality_of,
     scalar_readings,
     smooth_headings,
@@ -37,6 +38,7 @@ from saga_fg.smoothing import (
 )
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
+from saga_fg.types.dataset import Scene
 from saga_fg.types.track import Tracks
 
 HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, m
@@ -47,28 +49,26 @@ YAW_DRIFT = (
 
 @dataclass(frozen=True, eq=False)
 class LabelColumns(Columns):
-    """Columns of R labels; positions (R, 3) in the world, other shapes and units as in `Tracks` and `Labels`."""
+    """Columns of R labels, but those of whole objects; positions (R, 3) in the world, other shapes and units as in
+    `Tracks` and `Labels`."""
 
     id: IntArray
     label: StrArray
     position: FloatArray
-    size: FloatArray
     yaw: FloatArray
     yaw_variance: FloatArray
     velocity: FloatArray
     position_covariance: FloatArray
     velocity_covariance: FloatArray
     coasting: FloatArray
-    score: FloatArray
     source: StrArray
-    quality: StrArray
 
-    def labels(self, time: float) -> Labels:
-        """All rows as the labels of one moment, at `time` s."""
-        boxes = Boxes(self.label, self.position, self.size, self.yaw, self.velocity)
+    def labels(self, time: float, size: FloatArray, score: FloatArray) -> Labels:
+        """All rows as the labels of one moment, at `time` s; size (R, 3), m, and score (R,) of their objects."""
+        boxes = Boxes(self.label, self.position, size, self.yaw, self.velocity)
         P, P_velocity = self.position_covariance, self.velocity_covariance
-        tracks = Tracks(time, self.id, boxes, self.score, P, P_velocity, self.coasting)
-        return Labels(tracks, self.yaw_variance, self.source, self.quality)
+        tracks = Tracks(time, self.id, boxes, score, P, P_velocity, self.coasting)
+        return Labels(tracks, self.yaw_variance, self.source, quality_of(score, P))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +79,6 @@ class LabelledStates:
     headings: Headings
     columns: LabelColumns
 
-    def at(self, moment: int, time: float) -> Labels:
-        """The labels of a moment of the evidence, which is at `time` s."""
-        return self.columns.select(self.states.at(moment)).labels(time)
-
-
-def label_moments(
-    evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray, settings: SmoothingSettings
-) -> tuple[Labels, ...]:
-    """The labels at the times `wanted` (M,), s."""
-    labelled = label_states(evidence, objects, wanted, settings)
-    return tuple(labelled.at(int(np.searchsorted(evidence.times, time)), time) for time in wanted.tolist())
-
 
 def label_states(
     evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray, settings: SmoothingSettings
@@ -99,12 +87,9 @@ def label_states(
     lifespans, states = objects.lifespans, objects.states
     owner = lifespans.rows_of(states.id)
     rows = np.flatnonzero(objects.object_of >= 0)
-    holder = lifespans.rows_of(objects.object_of[rows])
     at = states.rows_of(evidence.moment[rows], objects.object_of[rows])
-    boxes, p = evidence.boxes, evidence.probability[rows]
-    size = constant_sizes(holder, len(lifespans), boxes.size[rows], p, evidence.distance[rows])
     duration = states.elapsed(evidence.times)
-    heights = scalar_readings(at, boxes.position[rows, 2], evidence.z_noise[rows] ** 2)
+    heights = scalar_readings(at, evidence.boxes.position[rows, 2], evidence.z_noise[rows] ** 2)
     z, _ = smooth_walks(states, HEIGHT_DRIFT**2 * duration, heights)
     label = lifespans.label[owner]
     (lasting,) = class_values(settings.classes, OfflineClass, label, "position_bias")
@@ -113,36 +98,19 @@ def label_states(
     headings = smooth_headings(states, lifespans, evidence, rows, at, turning, moving)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
-    score = objects.score[owner]
     columns = LabelColumns(
         id=states.id,
         label=label,
         position=np.concatenate([states.mean[:, :2] + evidence.origin, z[:, None]], axis=1),
-        size=size[owner],
         yaw=headings.yaw,
         yaw_variance=headings.variance,
         velocity=states.mean[:, 2:],
         position_covariance=P,
         velocity_covariance=states.covariance[:, 2:, 2:],
         coasting=gap,
-        score=score,
         source=_sources(evidence, objects, wanted),
-        quality=quality_of(score, P),
     )
     return LabelledStates(states, headings, columns)
-
-
-def count_labels(
-    evidence: Evidence, objects: SmoothedObjects, labels: tuple[Labels, ...], wanted: FloatArray
-) -> LabelCounts:
-    """The summary of a recording."""
-    return LabelCounts(
-        **source_counts(np.concatenate([np.empty(0, dtype="<U1"), *(moment.source for moment in labels)])),
-        dropped=dropped_boxes(evidence, objects, wanted),
-        objects=len(objects.lifespans),
-        dropped_objects=len(objects.dropped),
-        joined=objects.joined,
-    )
 
 
 def source_counts(source: StrArray) -> dict[str, int]:
@@ -220,10 +188,10 @@ class ObjectSummary:
             return self.sign
         return self.sign * (-1.0 if np.cos(yaw - self.yaw) < 0 else 1.0)
 
-    def add_detections(self, probability: FloatArray, size: FloatArray, weight: FloatArray) -> None:
-        """Add detections (m,): probability, size (m, 3) in m, NaN for unmeasured, and its weight."""
-        self.probability += float(probability.sum())
-        self.detections += len(probability)
+    def add_detections(self, probability: float, size: FloatArray, weight: FloatArray) -> None:
+        """Add detections (m,): the sum of their probabilities, size (m, 3) in m, NaN for unmeasured, and its weight."""
+        self.probability += probability
+        self.detections += len(size)
         known = np.isfinite(size).all(axis=1)
         for axis, values in enumerate(self.sizes):
             more = np.concatenate([values, np.stack([size[known, axis], weight[known]])], axis=1)
@@ -238,19 +206,20 @@ class ObjectSummary:
         self.votes += sign * votes
         self.sign, self.yaw = sign, yaw
 
-    @property
-    def size(self) -> FloatArray:
-        """(3,) m, the medians, NaN where none was measured."""
-        return np.array([_median(*values) for values in self.sizes])
-
     def close(self) -> None:
         """Keep the medians of the sizes alone, weighted by the number of detections."""
         if self.sizes[0].shape[1]:
-            self.sizes = [np.array([[_median(*values)], [float(self.detections)]]) for values in self.sizes]
+            self.sizes = [np.array([[size], [float(self.detections)]]) for size in median_sizes([self])[0]]
 
 
-def _median(value: FloatArray, weight: FloatArray) -> float:
-    return float(weighted_medians(np.zeros(len(value), dtype=np.int64), 1, value, weight)[0])
+def median_sizes(summaries: Sequence[ObjectSummary]) -> FloatArray:
+    """(n, 3) length, width and height of objects, m: the medians, NaN where none was measured."""
+    result = np.empty((len(summaries), 3))
+    for axis in range(3):
+        owner = np.repeat(np.arange(len(summaries)), [each.sizes[axis].shape[1] for each in summaries])
+        value, weight = np.concatenate([np.empty((2, 0)), *(each.sizes[axis] for each in summaries)], axis=1)
+        result[:, axis] = weighted_medians(owner, len(summaries), value, weight)
+    return result
 
 
 class Identities:
@@ -295,3 +264,98 @@ class Identities:
         """Tracklets from before a chunk, the latest first; then those that begin in it, the earliest first."""
         old = sorted((track for track in tracks if first[track] < begin), key=lambda track: -first[track])
         return old + sorted((track for track in tracks if first[track] >= begin), key=lambda track: first[track])
+
+
+LabelledParts = Iterable[tuple[Scene, tuple[Labels, ...]]]
+"""Parts of a recording, with the labels of each of their timestamps."""
+
+
+class LabelSpool:
+    """The labels of a recording, added chunk by chunk, and read back when it is over: iterating gives them chunk by
+    chunk, a part of the scene without frames or poses, and one table a moment."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        folder.mkdir()
+        self._folder, self._name = folder, name
+        self._chunks = 0
+        self._id = np.empty(0, dtype=np.int64)  # of all objects, ascending; then their attributes
+        self._size, self._score, self._turned = np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.bool_)
+
+    def add(
+        self,
+        wanted: FloatArray,
+        at: IntArray,
+        labelled: LabelledStates,
+        names: Mapping[int, int],
+        signs: Mapping[int, float],
+    ) -> None:
+        """Add the labels at the times `wanted` (M,), s, which are the moments `at` (M,) of the states.
+
+        names: the final id of each object; signs: -1 where its headings are half a turn off those before, else 1
+        """
+        spans = [labelled.states.at(moment) for moment in at.tolist()]
+        rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(span.start, span.stop) for span in spans)])
+        ids = labelled.states.id[rows].tolist()
+        columns = replace(labelled.columns.select(rows), id=np.array([names[id_] for id_ in ids], dtype=np.int64))
+        np.savez(
+            self._folder / f"{self._chunks:06d}.npz",
+            time=wanted,
+            bounds=np.cumsum([0, *(span.stop - span.start for span in spans)]),
+            reversed=np.array([signs[id_] < 0 for id_ in ids], dtype=np.bool_),
+            **vars(columns),
+        )
+        self._chunks += 1
+
+    def finish(self, summaries: Mapping[int, ObjectSummary], prior: float) -> None:
+        """Take the final attributes of all objects.
+
+        prior: opportunities without a detection that every object starts with
+        """
+        ids = sorted(summaries)
+        found = [summaries[id_] for id_ in ids]
+        self._id, self._size = np.array(ids, dtype=np.int64), median_sizes(found)
+        self._score = np.array(
+            [each.probability / (max(each.opportunities, each.detections) + prior) for each in found]
+        )
+        self._turned = is_reversed(np.array([each.path for each in found]), np.array([each.votes for each in found]))
+
+    def __iter__(self) -> Iterator[tuple[Scene, tuple[Labels, ...]]]:
+        for number in range(self._chunks):
+            with np.load(self._folder / f"{number:06d}.npz", allow_pickle=False) as file:
+                stored = dict(file)
+            times, bounds, backward = (stored.pop(name) for name in ("time", "bounds", "reversed"))
+            at = np.searchsorted(self._id, stored["id"])
+            turned = backward ^ self._turned[at]
+            yaw = np.where(turned, wrap_angle(stored["yaw"] + np.pi), stored["yaw"])
+            columns, size, score = LabelColumns(**{**stored, "yaw": yaw}), self._size[at], self._score[at]
+            rows = [slice(a, b) for a, b in pairwise(bounds.tolist())]
+            moments = zip(times.tolist(), rows, strict=True)
+            labels = tuple(columns.select(mine).labels(time, size[mine], score[mine]) for time, mine in moments)
+            yield Scene(self._name, times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), ()), labels
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedScene:
+    """A recording that was smoothed.
+
+    parts    its parts, and their labels; they may be read again and again
+    counts   where its boxes come from
+    frames   frames taken in
+    seconds  time spent
+    """
+
+    name: str
+    parts: LabelledParts
+    counts: LabelCounts
+    frames: int
+    seconds: float
+
+    @property
+    def labels(self) -> tuple[Labels, ...]:
+        """The labels of all timestamps, in memory."""
+        return tuple(moment for _, part in self.parts for moment in part)
+
+    @property
+    def tracks(self) -> tuple[Tracks, ...]:
+        """The labels as tracks."""
+        return tuple(moment.tracks for moment in self.labels)

@@ -107,9 +107,8 @@ class SmoothedObjects:
     object_of  (N,) the object of each detection, -1 for none or one that was dropped
     track_of   (N,) the online track of each detection, -1 for none or a weak one that lost it to another object
     states     of the objects at all moments of their lifespans, and before them of those that came from far away
-    score      (n,) of the lifespans
+    judged     the states, within the lifespans, that scores and stationary states follow from
     stationary the states in which an object is stationary
-    joined     number of tracklets stitched to another
     dropped    the lifespans of the objects dropped
     """
 
@@ -117,9 +116,8 @@ class SmoothedObjects:
     object_of: IntArray
     track_of: IntArray
     states: StateTable
-    score: FloatArray
+    judged: StateTable
     stationary: StationaryStates
-    joined: int
     dropped: Lifespans
 
 
@@ -166,9 +164,8 @@ def smooth_objects(
         object_of=object_of,
         track_of=track_of,
         states=final,
-        score=score[kept],
+        judged=within.within(lifespans.select(kept)),
         stationary=stationary,
-        joined=len(tracklets) - len(joined),
         dropped=lifespans.select(~kept),
     )
 

@@ -1,4 +1,4 @@
-"""A recording smoothed chunk by chunk as it is read, in memory that does not grow with its length.
+"""Recordings smoothed chunk by chunk as they are read, in memory that does not grow with their length.
 
     frames -> tracker, frame by frame -> chunks, smoothed one by one with margins -> labels, on disk
 
@@ -7,10 +7,8 @@ are made anew for every chunk. Size, score, front and identity of objects are ga
 over the chunks (`pipelines.smoothing.labelling`) and put in at the end, when the labels are read back from disk.
 Memory is that of a chunk with its margins, and a few numbers for every object that ever was.
 
-A recording no longer than a chunk and a margin is one chunk, with exactly the labels of `smooth_scene`. Where it is
-longer, stationary and weak objects are judged by a chunk with its margins.
-
-Chunks of a recording that is smoothed as it is read; they follow each other without a gap.
+A recording at hand is one chunk. Where there are several, stationary and weak objects are judged by a chunk with its
+margins. Chunks follow each other without a gap.
 
     [a, b) is smoothed within [a - margin, b + margin]        b = a + length, earlier where there are enough detections
 
@@ -22,43 +20,42 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import groupby, pairwise
+from itertools import chain, groupby
 from pathlib import Path
-from typing import Annotated, Any
+from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import numpy as np
 
 from pipelines.config import Method
 from pipelines.smoothing.labelling import (
     Identities,
-    LabelColumns,
     LabelledStates,
+    LabelSpool,
     ObjectSummary,
+    SmoothedScene,
     dropped_boxes,
     label_states,
     source_counts,
 )
 from pipelines.smoothing.passes import SmoothConfig, SmoothedObjects, smooth_objects, track_evidence
-from pipelines.tracking import OnlineTracker, Progress, one_thread
+from pipelines.tracking import OnlineTracker, Progress, one_thread, scene_with_frames
+from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.smoothing import (
     Evidence,
     LabelCounts,
-    Labels,
     gather_evidence,
-    is_reversed,
     measured_in_order,
     opportunities,
-    quality_of,
     size_weights,
 )
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME
-from saga_fg.types.dataset import Scene
+from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
 
 MIN_LENGTH = 5.0  # s, of a chunk that ends early: below the margins at its ends, which are smoothed again, take over
@@ -71,6 +68,9 @@ class ChunkSettings(Settings):
     length: Positive = setting(30.0, "length of a chunk, s; higher: more memory")
     margin: Positive = setting(7.0, "time smoothed beyond either end of a chunk, s")
     detections: Annotated[int, Range(1, 10**9)] = setting(60_000, "number of detections that ends a chunk early")
+
+
+WHOLE = ChunkSettings(length=1e12, detections=10**9)  # one chunk
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,96 +148,33 @@ class Backlog:
         return min([*self._moments[:1].tolist(), *(tracked.time for tracked in self._frames[:1])], default=otherwise)
 
 
-_FINAL = ("size", "score", "quality")  # columns that are known at the end
+def smooth_scene(
+    scene: Scene,
+    config: SmoothConfig,
+    method: Method = "saga",
+    progress: Progress | None = None,
+    providers: Sequence[FactorProvider] = (),
+) -> SmoothedScene:
+    """Smooth one recording at once, with the edges of the tracker's settings unless `method` is another than `saga`.
+
+    providers: of factors of your own, in place of those that the configuration names
+    """
+    with TemporaryDirectory() as folder:
+        spool = LabelSpool(Path(folder) / "labels", scene.name)
+        run = _Run(scene.name, config, method, WHOLE, spool, providers).over([scene], progress)
+        return replace(run, parts=((scene, run.labels),))
 
 
-@dataclass(frozen=True, eq=False)
-class _AttributeTable:
-    """Columns of the final attributes of all objects, by ascending id."""
-
-    id: IntArray
-    size: FloatArray
-    score: FloatArray
-    turn: FloatArray  # of the headings, rad
-
-
-class LabelSpool:
-    """The labels of a recording, added chunk by chunk, and read back when it is over."""
-
-    def __init__(self, folder: Path, name: str) -> None:
-        folder.mkdir()
-        self._folder, self._name = folder, name
-        self._chunks = 0
-        self._attributes: _AttributeTable | None = None
-
-    def add(
-        self,
-        wanted: FloatArray,
-        at: IntArray,
-        labelled: LabelledStates,
-        names: Mapping[int, int],
-        signs: Mapping[int, float],
-    ) -> None:
-        """Add the labels at the times `wanted` (M,), s, which are the moments `at` (M,) of the states.
-
-        names: the final id of each object; signs: -1 where its headings are half a turn off those before, else 1
-        """
-        spans = [labelled.states.at(moment) for moment in at.tolist()]
-        rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(span.start, span.stop) for span in spans)])
-        ids = labelled.states.id[rows].tolist()
-        columns = replace(labelled.columns.select(rows), id=np.array([names[id_] for id_ in ids], dtype=np.int64))
-        np.savez(
-            self._folder / f"{self._chunks:06d}.npz",
-            time=wanted,
-            bounds=np.cumsum([0, *(span.stop - span.start for span in spans)]),
-            sign=np.array([signs[id_] for id_ in ids], dtype=np.float64),
-            **{name: column for name, column in vars(columns).items() if name not in _FINAL},
-        )
-        self._chunks += 1
-
-    def finish(self, summaries: Mapping[int, ObjectSummary], prior: float) -> None:
-        """Take the final attributes of all objects.
-
-        prior: opportunities without a detection that every object starts with
-        """
-        ids = sorted(summaries)
-        found = [summaries[id_] for id_ in ids]
-        score = [each.probability / (max(each.opportunities, each.detections, 1) + prior) for each in found]
-        turned = is_reversed(np.array([each.path for each in found]), np.array([each.votes for each in found]))
-        size = np.array([each.size for each in found]).reshape(-1, 3)
-        self._attributes = _AttributeTable(
-            np.array(ids, dtype=np.int64), size, np.array(score), np.where(turned, np.pi, 0.0)
-        )
-
-    def labels(self) -> Iterator[tuple[Scene, tuple[Labels, ...]]]:
-        """The labels, chunk by chunk: a part of the scene without frames or poses, and one table a moment."""
-        assert self._attributes is not None, "the recording is not over"
-        for number in range(self._chunks):
-            with np.load(self._folder / f"{number:06d}.npz", allow_pickle=False) as columns:
-                yield self._complete(dict(columns), self._attributes)
-
-    def _complete(self, stored: dict[str, Any], attributes: _AttributeTable) -> tuple[Scene, tuple[Labels, ...]]:
-        times, bounds, sign = (stored.pop(name) for name in ("time", "bounds", "sign"))
-        at = np.searchsorted(attributes.id, stored["id"])
-        score = attributes.score[at]
-        quality = quality_of(score, stored["position_covariance"])
-        stored["yaw"] = wrap_angle(stored["yaw"] + np.pi * (sign < 0) + attributes.turn[at])
-        columns = LabelColumns(**stored, size=attributes.size[at], score=score, quality=quality)
-        spans = zip(times.tolist(), pairwise(bounds.tolist()), strict=True)
-        moments = tuple(columns.select(slice(a, b)).labels(time) for time, (a, b) in spans)
-        return Scene(self._name, times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), ()), moments
-
-
-@dataclass(frozen=True, eq=False)
-class StreamedScene:
-    """A recording that was smoothed as it was read. counts: where its boxes come from; frames taken in; seconds spent;
-    spool: its labels, on disk."""
-
-    name: str
-    counts: LabelCounts
-    frames: int
-    seconds: float
-    spool: LabelSpool
+def smooth_dataset(
+    dataset: Dataset,
+    config: SmoothConfig,
+    method: Method = "saga",
+    scenes: Iterable[str] | None = None,
+    progress: Progress | None = None,
+) -> Iterator[SmoothedScene]:
+    """Smooth some recordings (default: all), one at a time as they are asked for."""
+    for name in dataset.scenes if scenes is None else scenes:
+        yield smooth_scene(scene_with_frames(dataset, name), config, method, progress)
 
 
 def smooth_stream(
@@ -247,7 +184,7 @@ def smooth_stream(
     method: Method = "saga",
     chunks: ChunkSettings | None = None,
     progress: Progress | None = None,
-) -> Iterator[StreamedScene]:
+) -> Iterator[SmoothedScene]:
     """Smooth recordings that come in parts: successive scenes of the same name, each beginning after the one before.
 
     folder: where labels wait on disk; it must outlive the scenes. The frames of a part are of its timestamps. Raises
@@ -255,8 +192,7 @@ def smooth_stream(
     """
     for number, (name, scene) in enumerate(groupby(parts, key=lambda part: part.name)):
         spool = LabelSpool(folder / f"{number:06d}", name)
-        run = _Run(name, config, method, chunks or ChunkSettings(), spool)
-        yield run.over(scene, progress)
+        yield _Run(name, config, method, chunks or ChunkSettings(), spool).over(scene, progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +215,7 @@ class _Chunk:
 class _Sums:
     """Counts while a recording streams by."""
 
-    counts: LabelCounts = field(default_factory=LabelCounts)
+    counts: LabelCounts = LabelCounts()
     frames: int = 0
     first: float = np.inf
     last: float = -np.inf
@@ -294,9 +230,16 @@ class _Run:
     """One recording."""
 
     def __init__(
-        self, name: str, config: SmoothConfig, method: Method, chunks: ChunkSettings, spool: LabelSpool
+        self,
+        name: str,
+        config: SmoothConfig,
+        method: Method,
+        chunks: ChunkSettings,
+        spool: LabelSpool,
+        providers: Sequence[FactorProvider] = (),
     ) -> None:
         self._name, self._config, self._chunks, self._spool = name, config, chunks, spool
+        self._providers = providers
         self._tracking = config.tracking.of_method(method)
         self._tracker: OnlineTracker = self._tracking.new_tracker(method)
         offsets = [0.0, *(sensor.time_offset for sensor in config.sensors.values())]
@@ -308,41 +251,42 @@ class _Run:
         self._present: set[int] = set()  # in the latest chunk
         self._sums = _Sums()
 
-    def over(self, parts: Iterable[Scene], progress: Progress | None) -> StreamedScene:
+    def over(self, parts: Iterable[Scene], progress: Progress | None) -> SmoothedScene:
         """Take in everything."""
-        frames, cpu = 0, 0.0
-        for part in parts:
-            begin = time.perf_counter()
-            with one_thread():
+        frames, done, seconds = 0, 0, 0.0
+
+        def advance(_: str, count: int, __: int) -> None:
+            if progress is not None:
+                progress(self._name, done + count, frames)
+
+        for part in chain(parts, [None]):
+            begin, until = time.perf_counter(), np.inf
+            if part is not None:
+                frames += len(part.frames)
                 self._coming += part.frames
                 self._backlog.want(part.timestamps)
-                self._track(float(part.timestamps[-1]) + self._early)
-                self._smooth(self._backlog.tracked)
-            frames += len(part.frames)
-            cpu += time.perf_counter() - begin
-            if progress is not None:
-                progress(self._name, frames, frames)
-        begin = time.perf_counter()
-        with one_thread():
-            self._track(np.inf)
-            self._smooth(np.inf)
+                until = float(part.timestamps[-1]) + self._early
+            with one_thread():
+                done += self._track(until, advance)
+                self._smooth(until if part is None else self._backlog.tracked)
+            seconds += time.perf_counter() - begin
         self._spool.finish(self._summaries, PRIOR_OPPORTUNITY_TIME * self._sums.rate)
         counts = replace(self._sums.counts, objects=len(self._summaries), joined=self._identities.joined)
-        return StreamedScene(self._name, counts, frames, cpu + time.perf_counter() - begin, self._spool)
+        return SmoothedScene(self._name, self._spool, counts, frames, seconds)
 
-    def _track(self, until: float) -> None:
-        """The online pass over what was measured before a time."""
+    def _track(self, until: float, progress: Progress) -> int:
+        """The online pass over what was measured before a time; the number of these frames."""
         sensors, classes = self._config.sensors, self._tracking.tracker.classes
         ordered = measured_in_order(self._coming, sensors)
         ready = [(at, frame) for at, frame in ordered if at < until]
-        if not ready:
-            return
-        self._coming = [frame for at, frame in ordered if at >= until]
-        frames = [frame for _, frame in ready]
-        evidence = gather_evidence(frames, np.empty(0), sensors, classes)
-        track_of = track_evidence(self._name, frames, self._tracker, evidence, sensors, classes)
-        rows = evidence.rows_of_frame()
-        self._backlog.extend([TrackedFrame(at, f, track_of[mine]) for (at, f), mine in zip(ready, rows, strict=True)])
+        if ready:
+            self._coming = [frame for at, frame in ordered if at >= until]
+            frames = [frame for _, frame in ready]
+            evidence = gather_evidence(frames, np.empty(0), sensors, classes)
+            track_of = track_evidence(self._name, frames, self._tracker, evidence, sensors, classes, progress)
+            rows = zip(ready, evidence.rows_of_frame(), strict=True)
+            self._backlog.extend([TrackedFrame(at, frame, track_of[mine]) for (at, frame), mine in rows])
+        return len(ready)
 
     def _smooth(self, until: float) -> None:
         """All chunks that are complete, with their margins, before a time; infinite: all that is left."""
@@ -352,7 +296,9 @@ class _Run:
             evidence = gather_evidence(frames, wanted, self._config.sensors, self._tracking.tracker.classes)
             if len(evidence.times):
                 track_of = np.concatenate([np.empty(0, dtype=np.int64), *(each.track_of for each in tracked)])
-                objects = smooth_objects(evidence, track_of, self._config.smoothing, self._tracking.tracker)
+                objects = smooth_objects(
+                    evidence, track_of, self._config.smoothing, self._tracking.tracker, self._providers
+                )
                 labelled = label_states(evidence, objects, wanted, self._config.smoothing)
                 mine = wanted[(wanted >= begin) & (wanted < end)]
                 self._add(_Chunk(begin, end, evidence, objects, labelled), mine)
@@ -376,13 +322,12 @@ class _Run:
         evidence, objects, inside = chunk.evidence, chunk.objects, chunk.inside
         rows = np.flatnonzero((objects.object_of >= 0) & inside[evidence.moment])
         weight = size_weights(evidence.probability, evidence.distance)
+        total = np.bincount(objects.object_of[rows], evidence.probability[rows]).tolist()
         for id_, mine in _by_id(objects.object_of, rows):
             if id_ in names:
-                seen = evidence.boxes.size[mine]
-                self._summaries[names[id_]].add_detections(evidence.probability[mine], seen, weight[mine])
+                self._summaries[names[id_]].add_detections(total[id_], evidence.boxes.size[mine], weight[mine])
         frames = tuple(frame for frame in evidence.frames if inside[frame.moment])
-        states = chunk.labelled.states.within(objects.lifespans)
-        count = opportunities(replace(evidence, frames=frames), objects.lifespans, states)
+        count = opportunities(replace(evidence, frames=frames), objects.lifespans, objects.judged)
         for id_, looked in zip(objects.lifespans.id.tolist(), count.tolist(), strict=True):
             if id_ in names:
                 self._summaries[names[id_]].opportunities += looked
@@ -403,17 +348,17 @@ class _Run:
                 id_: self._heading_sign(labelled, names[id_], id_, before)
                 for id_ in np.unique(states.id[emitted]).tolist()
             }
-            inside = np.flatnonzero((states.moment > before) & (states.moment <= at[-1]))
+            after = len(evidence.times) if chunk.end == np.inf else int(at[-1]) + 1
+            inside = np.flatnonzero((states.moment > before) & (states.moment < after))
             for id_, rows in _by_id(states.id, inside):
                 if id_ in signs:
                     path, votes = float(headings.path[rows].sum()), float(headings.votes[rows].sum())
                     self._summaries[names[id_]].add_headings(signs[id_], float(headings.yaw[rows[-1]]), path, votes)
             self._spool.add(wanted, at, labelled, names, signs)
-        begun = (at[:1] <= objects.dropped.first) & (objects.dropped.first <= at[-1:])
         new = LabelCounts(
             **source_counts(labelled.columns.source[emitted]),
             dropped=dropped_boxes(evidence, objects, wanted),
-            dropped_objects=int(begun.sum()),
+            dropped_objects=int(chunk.inside[objects.dropped.first].sum()),
         )
         self._sums.counts = LabelCounts.sum([self._sums.counts, new])
 

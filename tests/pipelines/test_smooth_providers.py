@@ -87,7 +87,7 @@ def test_in_chunks_and_from_python_it_is_the_same(walkers: Path) -> None:
     config = load_smooth_config("file", configuration(walkers.parent, "Wall"))
     parts = read_scenes_in_parts(walkers, 20)
     (run,) = smooth_stream(parts, config, walkers.parent, chunks=ChunkSettings(length=5.0, margin=5.0))
-    streamed = [moment.tracks for _, part in run.spool.labels() for moment in part]
+    streamed = run.tracks
     scene = read_detections(walkers).scene("drive")
     for whole in (smooth_scene(scene, config), smooth_scene(scene, load_smooth_config("file"), providers=[Wall()])):
         assert len(list(walkers.parent.glob("000000/*.npz"))) > 1

@@ -21,7 +21,7 @@ def smoothed() -> SmoothedScene:
 
 
 def test_labels_fit_the_scene_and_are_counted(smoothed: SmoothedScene) -> None:
-    assert len(smoothed.labels) == len(smoothed.scene)
+    assert len(smoothed.labels) == len(next(iter(smoothed.parts))[0])
     sources = np.concatenate([moment.source for moment in smoothed.labels])
     counts = smoothed.counts
     assert (counts.observed, counts.filled, counts.extended) == tuple(
@@ -43,7 +43,7 @@ def test_an_object_keeps_size_class_and_score_and_has_no_holes(smoothed: Smoothe
 
 
 def test_smoothed_positions_and_headings_are_better_than_online_ones(smoothed: SmoothedScene) -> None:
-    scene = smoothed.scene
+    ((scene, _),) = smoothed.parts
     assert scene.ground_truth is not None
     online = track_scene(scene, load_smooth_config("simulated").tracking.new_tracker("saga")).tracks
     errors: list[list[float]] = []

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts, read_tracks
 from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
-from pipelines.smoothing.labelling import Identities, ObjectSummary
+from pipelines.smoothing.labelling import Identities, ObjectSummary, median_sizes
 from pipelines.smoothing.streaming import Backlog, TrackedFrame
 from saga_fg import Detections, Frame, InputError
 
@@ -50,7 +50,7 @@ def test_chunks_come_to_what_the_whole_comes_to(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("000000/*.npz"))) == 3  # it was cut
     assert run.frames == whole.frames
     assert replace(run.counts, joined=0) == replace(whole.counts, joined=0)
-    moments = [moment for _, part in run.spool.labels() for moment in part]
+    moments = run.labels
     assert len(moments) == len(whole.labels)
     for mine, theirs in zip(moments, whole.labels, strict=True):
         a, b = mine.tracks, theirs.tracks
@@ -77,7 +77,7 @@ def test_chunks_in_which_nothing_is_seen(tmp_path: Path, pause: str) -> None:
     (run,) = smooth_stream(
         read_scenes_in_parts(path, 5), load_smooth_config("file"), tmp_path, chunks=ChunkSettings(5.0, 6.0)
     )
-    moments = [moment.tracks for _, part in run.spool.labels() for moment in part]
+    moments = run.tracks
     seen = [len(tracks) for tracks in moments if tracks.timestamp < 4 or tracks.timestamp >= later]
     assert seen == [1] * 16
     assert len(moments) == len(np.unique([row.split(",")[0] for row in rows]))
@@ -174,21 +174,21 @@ def test_what_lasts_of_an_object_is_gathered_over_its_chunks() -> None:
     summary = ObjectSummary()
     for size, probability in ((4.0, 0.5), (4.2, 0.9), (9.0, 0.1)):
         for height in (np.nan, 1.5):
-            summary.add_detections(np.array([probability]), np.array([[size, 2.0, height]]), np.array([probability]))
+            summary.add_detections(probability, np.array([[size, 2.0, height]]), np.array([probability]))
     summary.add_headings(summary.heading_sign(0.1), yaw=0.1, path=-3.0, votes=3.0)
     assert summary.heading_sign(0.2) == 1
     turned = summary.heading_sign(0.1 - np.pi)  # the next chunk sees it the other way round
     assert turned == -1
     summary.add_headings(turned, yaw=0.1 - np.pi, path=12.0, votes=1.0)
-    size = summary.size
+    size = median_sizes([summary])[0]
     assert 4.0 < size[0] < 4.2  # the far guess of 9 m does not count for more than its weight
     assert size[1:] == pytest.approx([2.0, 1.5])
     assert (summary.probability, summary.detections) == (pytest.approx(3.0), 6)
     assert summary.path == -15.0  # against the direction of its start
     summary.close()
-    np.testing.assert_array_equal(summary.size, size)
-    summary.add_detections(np.array([0.9]), np.array([[5.0, 2.0, 1.5]]), np.array([0.9]))  # it appears again
-    assert size[0] < summary.size[0] < 4.5
+    np.testing.assert_array_equal(median_sizes([summary])[0], size)
+    summary.add_detections(0.9, np.array([[5.0, 2.0, 1.5]]), np.array([0.9]))  # it appears again
+    assert size[0] < median_sizes([summary])[0, 0] < 4.5
 
 
 def test_many_values_are_kept_by_their_weights() -> None:
@@ -196,5 +196,5 @@ def test_many_values_are_kept_by_their_weights() -> None:
     sizes = rng.normal([4.5, 1.8, 1.5], 0.1, (20_000, 3))
     summary = ObjectSummary()
     for part in np.split(sizes, 20):
-        summary.add_detections(np.ones(1000), part, np.ones(1000))
-    np.testing.assert_allclose(summary.size, np.median(sizes, axis=0), atol=1e-3)
+        summary.add_detections(1000.0, part, np.ones(1000))
+    np.testing.assert_allclose(median_sizes([summary])[0], np.median(sizes, axis=0), atol=1e-3)
