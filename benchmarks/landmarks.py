@@ -15,6 +15,7 @@ import numpy as np
 import typer
 
 from benchmarks.agreement import pairwise_agreement
+from benchmarks.landmark_mapper import LandmarkMapper, MapperSettings
 from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.recordings.ranges import compared, map_beacons
 from benchmarks.runner import Rows, each
@@ -27,7 +28,6 @@ from pipelines.slam.results import landmark_row, landmark_rows, planar_trajector
 from saga_fg.errors import InputError
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.mapping import LandmarkMapper, MapperSettings
 from saga_fg.types.landmark import Observation
 
 SCALES = (1.0, 4.0, 16.0, 64.0, 256.0)  # of the covariance, to choose of

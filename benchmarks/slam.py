@@ -30,6 +30,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.agreement import pairwise_agreement
 from benchmarks.course import SimulatedCourse
+from benchmarks.landmark_mapper import LandmarkMapper
 from benchmarks.runner import Row, Rows, Seed, clocked, each, in_turn, timed
 from benchmarks.scans import ScannerSettings
 from data_tools.datasets.kitti import KittiScans
@@ -44,7 +45,6 @@ from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.slam.mapping import LandmarkMapper
 from saga_fg.types.landmark import Observation
 
 OURS, KISS = "saga-fg", "kiss-icp"

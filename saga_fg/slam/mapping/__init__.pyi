@@ -1,12 +1,9 @@
-from .association import NearbyLandmarks, associate, duplicates, log_odds, place_of
+from .association import associate, log_odds
 from .local_map import Innovation, LocalMap
 from .mapper import (
     AssociatedObservation,
     Given,
-    LandmarkMap,
-    LandmarkMapper,
     LandmarkObservations,
-    MapperSettings,
     MeasuredMotion,
     landmark_key,
     pose_key,
@@ -16,17 +13,11 @@ __all__ = [
     "AssociatedObservation",
     "Given",
     "Innovation",
-    "LandmarkMap",
-    "LandmarkMapper",
     "LandmarkObservations",
     "LocalMap",
-    "MapperSettings",
     "MeasuredMotion",
-    "NearbyLandmarks",
     "associate",
-    "duplicates",
     "landmark_key",
     "log_odds",
-    "place_of",
     "pose_key",
 ]

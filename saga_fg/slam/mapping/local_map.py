@@ -98,7 +98,6 @@ def _linearised(
     return r, by_pose, by_landmark
 
 
-_SAME = 1e-6  # variance of the difference of a landmark from itself, for the numerics
 POSE = 0  # key of the pose; landmarks have positive ones
 
 
@@ -215,44 +214,6 @@ class LocalMap:
         self.P -= K @ PA.T
         self.P = (self.P + self.P.T) / 2
         self._retract(-K @ r)
-
-    def differences(self, pairs: Sequence[tuple[int, int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Differences of K pairs of one kind: l_j in the tangent of l_i, (K, d), to first order delta + J dl.
-
-        Returns the differences, and their derivatives J_i and J_j (K, d, d).
-        """
-        variable = self.kinds[pairs[0][0]].variable
-        states = {number: self.state(number) for number in {number for pair in pairs for number in pair}}
-        if isinstance(variable, Vector):
-            first, second = (np.stack([states[pair[side]] for pair in pairs]) for side in (0, 1))
-            one = np.broadcast_to(np.eye(variable.dim), (len(pairs), variable.dim, variable.dim))
-            return second - first, -one, one
-        both = [(states[i], states[j]) for i, j in pairs]
-        delta = np.stack([variable.local(first, second) for first, second in both])
-        J = [central_differences(variable.local, pair, (variable, variable)) for pair in both]
-        return delta, np.stack([first for first, _ in J]), np.stack([second for _, second in J])
-
-    def difference_covariances(self, pairs: Sequence[tuple[int, int]], J_i: FloatArray, J_j: FloatArray) -> FloatArray:
-        """The covariance (K, d, d) of each difference."""
-        starts = np.array([[self._columns[number].start for number in pair] for pair in pairs])
-        both = (starts[:, :, None] + np.arange(J_i.shape[2])).reshape(len(pairs), -1)
-        J = np.concatenate([J_i, J_j], axis=2)
-        return np.asarray(
-            J @ self.P[both[:, :, None], both[:, None, :]] @ J.swapaxes(1, 2) + _SAME * np.eye(J.shape[1])
-        )
-
-    def joint_difference_covariance(
-        self, pairs: Sequence[tuple[int, int]], J_i: FloatArray, J_j: FloatArray
-    ) -> FloatArray:
-        """The covariance (K, d, K, d) of all differences together."""
-        K, d, _ = J_i.shape
-        i, j = (self._columns_of([pair[side] for pair in pairs]) for side in (0, 1))
-        rows = J_i @ self.P[i].reshape(K, d, -1) + J_j @ self.P[j].reshape(K, d, -1)
-        flat = rows.reshape(K * d, -1)
-        C = np.einsum("rkd,ked->rke", flat[:, i].reshape(-1, K, d), J_i)
-        C += np.einsum("rkd,ked->rke", flat[:, j].reshape(-1, K, d), J_j)
-        C = C.reshape(K * d, K * d) + _SAME * np.eye(K * d)
-        return np.asarray(C.reshape(K, d, K, d))
 
     def augment(self, landmark: int, observation: Observation) -> None:
         """Add a landmark at its first observation, from the present pose.

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from benchmarks.landmark_mapper import LandmarkMapper, MapperSettings
 from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.mapping import LandmarkMapper, MapperSettings
 from saga_fg.types.landmark import Observation
 
 DRIVES = 30

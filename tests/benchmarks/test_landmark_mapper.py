@@ -3,45 +3,30 @@
 from __future__ import annotations
 
 import tracemalloc
+from itertools import product
 
 import gtsam
 import numpy as np
 import pytest
 
+from benchmarks.landmark_mapper import LandmarkMap, LandmarkMapper, MapperSettings
+from benchmarks.landmark_merging import NearbyLandmarks, duplicates, place_of
 from saga_fg import InputError
-from saga_fg.model.landmarks import PlaneLandmark, PointLandmark, PoleLandmark
+from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PointLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.mapping import LandmarkMapper, LocalMap, MapperSettings, NearbyLandmarks, place_of
+from saga_fg.numerics.assignment import gate
+from saga_fg.slam.mapping import LocalMap
 from saga_fg.types.landmark import Observation
 
 TREE, R = PointLandmark(density=0.01), 0.05**2 * np.eye(2)
 Q = np.diag([0.02, 0.02, 0.002]) ** 2
 SURE = 1e-6 * np.eye(3)
+MOTION = np.diag([0.01, 0.01, 0.01, 0.05, 0.02, 0.02]) ** 2
+NOISE = {"pole": np.diag([0.1, 0.1]) ** 2, "plane": np.diag([0.01, 0.01, 0.05]) ** 2}
 
 
 def ahead(metres: float, turn: float = 0.0) -> FloatArray:
     return np.asarray(gtsam.Pose2(metres, 0.0, turn).matrix())
-
-
-def test_a_filter_of_some_landmarks_is_that_of_all_marginalised() -> None:
-    rng = np.random.default_rng(0)
-    places = rng.uniform(-20, 20, (6, 2))
-    everything = LocalMap(np.eye(3), np.diag([1e-2, 1e-2, 1e-4]))
-    for number, place in enumerate(places, start=1):
-        everything.augment(number, Observation(TREE, place + rng.normal(0, 0.1, 2), R))
-    everything.predict(ahead(2.0, 0.3), Q)
-    some = [2, 3, 5]
-    local = LocalMap(
-        everything.pose.matrix(), everything.covariance([0, *some]), {n: (TREE, everything.state(n)) for n in some}
-    )
-    for _ in range(3):
-        pose = everything.pose
-        seen = [Observation(TREE, pose.transformTo(places[n - 1]) + rng.normal(0, 0.1, 2), R) for n in some]
-        for held in (everything, local):
-            held.update([held.innovations([z], [n])[0] for z, n in zip(seen, some, strict=True)])
-            held.predict(ahead(1.0, -0.1), Q)
-    np.testing.assert_allclose(local.covariance([0, *some]), everything.covariance([0, *some]), atol=1e-12)
-    np.testing.assert_allclose(local.pose.matrix(), everything.pose.matrix(), atol=1e-12)
 
 
 def test_near_is_what_can_be_seen_before_the_next_question() -> None:
@@ -188,3 +173,120 @@ def test_a_landmark_that_one_observation_leaves_open_is_refused() -> None:
     with pytest.raises(InputError, match=r"at 0\.00 s: point observed .*: components \[0\] of its state are not"):
         mapper.observe([Observation(Sideways(), np.array([4.0, 1.0]), R)])
     assert mapper.landmarks == {}
+
+
+def test_the_filter_is_the_smoother_where_everything_is_linear() -> None:
+    """A straight drive past points, without turns: joint filter and global solution agree."""
+    kind, rng = PointLandmark(), np.random.default_rng(0)
+    mapper = LandmarkMapper(np.eye(3), np.diag([1e-4, 1e-4, 1e-12]), MapperSettings(smooth_every=10**6))
+    trees = np.array([[3.0, 4.0], [8.0, -5.0], [15.0, 3.0]])
+    step = np.eye(3)
+    step[0, 2] = 1.0
+    for k in range(8):
+        seen = trees - [k, 0] + 0.05 * rng.normal(size=trees.shape)
+        mapper.observe([Observation(kind, z, 0.01 * np.eye(2)) for z in seen])
+        mapper.move(step, np.diag([1e-3, 1e-3, 1e-12]))
+    filtered = mapper.local
+    mapper.smooth()
+    for number in (1, 2, 3):
+        np.testing.assert_allclose(mapper.local.state(number), filtered.state(number), atol=1e-4)
+    np.testing.assert_allclose(mapper.local.covariance([1, 2, 3]), filtered.covariance([1, 2, 3]), rtol=1e-2, atol=1e-6)
+
+
+def poles_at(places: FloatArray, drift: float) -> LocalMap:
+    """A map of poles, and a pose that is known to `drift` m within it."""
+    local = LocalMap(np.eye(4), 1e-6 * np.eye(6))
+    for number, (x, y) in enumerate(places, start=1):
+        local.augment(number, Observation(PoleLandmark(), np.array([x, y, 0.5]), NOISE["pole"]))
+    local.predict(np.eye(4), np.diag([1e-8, 1e-8, 1e-8, drift**2, drift**2, 1e-8]))
+    return local
+
+
+def revisited(shift: tuple[float, float], drift: float, count: int) -> LocalMap:
+    """Poles 1 ... count, and begun anew after a drift of unknown direction, `shift` in truth."""
+    places = np.array([[5.0, 5.0], [12.0, -4.0], [20.0, 6.0], [26.0, -7.0]])[:count]
+    local = poles_at(places, drift)
+    for number, (x, y) in enumerate(places + shift, start=count + 1):
+        local.augment(number, Observation(PoleLandmark(), np.array([x, y, 0.5]), NOISE["pole"]))
+    return local
+
+
+def test_a_constellation_is_recognised_where_no_single_landmark_is() -> None:
+    assert duplicates(revisited((4.0, 3.0), 5.0, 1), 0.999, set()) == {}
+    assert duplicates(revisited((4.0, 3.0), 5.0, 4), 0.999, set()) == {5: 1, 6: 2, 7: 3, 8: 4}
+
+
+def test_what_was_seen_side_by_side_is_never_one() -> None:
+    local = revisited((0.1, 0.0), 0.2, 2)
+    assert duplicates(local, 0.999, set()) == {3: 1, 4: 2}
+    assert duplicates(local, 0.999, {(1, 3)}) == {4: 2}
+
+
+def test_an_edge_is_one_whichever_way_its_normal_points(subtests: pytest.Subtests) -> None:
+    """A curb in any direction, seen again a little turned: theta beyond pi, or (theta + pi, -rho)."""
+    for way, side in product([0.0, np.pi / 2, np.pi, -np.pi + 1e-3], [4.0, 0.0]):
+        with subtests.test(way=way, side=side):
+            kind, noise = LineLandmark(), 0.01 * np.eye(2)
+            local = LocalMap(np.eye(4), 1e-6 * np.eye(6))
+            for number, (turn, shift) in enumerate([(0.002, 0.02), (-0.002, -0.02)], start=1):
+                along = np.array([np.cos(way + turn), np.sin(way + turn), 0.0])
+                foot = (side + shift) * np.array([-along[1], along[0], 0.0])
+                local.augment(number, Observation(kind, np.concatenate([foot - 5 * along, foot + 5 * along]), noise))
+            local.augment(3, Observation(kind, np.array([-5.0, -9.0, 0.0, 5.0, 11.0, 0.0]), noise))
+            assert duplicates(local, 0.999, set()) == {2: 1}
+
+
+def street(seed: int) -> tuple[LandmarkMap, FloatArray, FloatArray, list[gtsam.OrientedPlane3]]:
+    """Two rounds past poles, walls and the ground: the map, true poses, true poles, true planes."""
+    rng = np.random.default_rng(seed)
+    poles = np.array([[x, y] for x in (-12.0, 0.0, 12.0) for y in (-16.0, 0.5, 16.0)]) + rng.uniform(-1, 1, (9, 2))
+    walls = np.array([[-1, 0.1, 0, 25], [1, 0, 0, 24], [0, -1, 0, 22], [0.1, 1, 0, 23], [0, 0, 1, 0]])
+    planes = [gtsam.OrientedPlane3(wall / np.linalg.norm(wall[:3])) for wall in walls]
+    true = [gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.array([9.0, 0.0, 1.5]))]
+    turn = 2 * np.pi / 30
+    mapper = LandmarkMapper(true[0].matrix(), 1e-6 * np.eye(6), MapperSettings(confirm_after=5, smooth_every=200))
+    for _ in range(60):
+        observations = []
+        for x, y in poles:
+            z = true[-1].transformTo(np.array([x, y, rng.uniform(0, 3)]))
+            if np.hypot(*z[:2]) < 18:
+                level = true[-1].rotation().matrix().T @ [
+                    *(true[-1].rotation().matrix() @ [*rng.normal(0, 0.1, 2), 0])[:2],
+                    0,
+                ]
+                observations.append(Observation(PoleLandmark(), z + level, NOISE["pole"]))
+        for plane in planes:
+            near = plane.transform(true[-1]).retract(rng.normal(0, np.sqrt(np.diag(NOISE["plane"]))))
+            observations.append(Observation(PlaneLandmark(), near.planeCoefficients(), NOISE["plane"]))
+        mapper.observe(observations)
+        step = gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.array([9.0 * turn, 0.0, 0.0]))
+        mapper.move(step.retract(rng.normal(0, np.sqrt(np.diag(MOTION)))).matrix(), MOTION)
+        true.append(true[-1].compose(step))
+    return mapper.map(), np.stack([pose.matrix() for pose in true]), poles, planes
+
+
+def test_planes_and_poles_are_recovered_within_their_stated_covariance() -> None:
+    normalised: dict[str, list[float]] = {"pole": [], "plane": []}
+    inside, worst = [], 0.0
+    for seed in range(2):
+        found, true, poles, planes = street(seed)
+        truths = {"pole": list(poles), "plane": planes}
+        confirmed = [landmark for landmark in found.landmarks if landmark.confirmed]
+        assert len(confirmed) == len(poles) + len(planes)
+        worst = max(worst, float(np.abs(found.world_T_pose[:, :3, 3] - true[:, :3, 3]).max()))
+        for landmark in confirmed:
+            errors = [landmark.kind.variable.local(landmark.state, t) for t in truths[landmark.kind.name]]
+            squared = [float(e @ np.linalg.solve(landmark.covariance, e)) for e in errors]
+            normalised[landmark.kind.name].append(min(squared) / len(errors[0]))
+            inside.append(min(squared) < gate(0.95, len(errors[0])))
+    assert worst < 0.6
+    assert np.mean(inside) > 0.88
+    for values in normalised.values():  # 1 on average if the covariance is honest; a map's landmarks err together
+        assert 0.6 < np.mean(values) < 1.5
+
+
+def test_every_observation_belongs_to_one_landmark_of_the_map() -> None:
+    found, *_ = street(seed=0)
+    numbers = {landmark.number for landmark in found.landmarks}
+    assert {observation.landmark for observation in found.observations} == numbers
+    assert sum(landmark.observations for landmark in found.landmarks) == len(found.observations)
