@@ -1,7 +1,5 @@
 """The documentation keeps up: settings are complete, examples are marked, links lead somewhere."""
 
-from __future__ import annotations
-
 import json
 import pkgutil
 import re
@@ -100,13 +98,13 @@ def on_the_site(*pages: tuple[str, str]) -> list[str]:
     return found
 
 
-def test_the_site_has_every_setting() -> None:
+def test_the_site_has_every_setting():
     (page,) = on_the_site(("configuration.md", "# Configuration"))
     assert page.startswith("# Configuration\n")
     assert {name.split(".")[-1] for name in all_settings()} - {"*"} <= set(re.findall(r"^\| `(\w+)` \|", page, re.M))
 
 
-def test_links_within_the_documentation_lead_somewhere() -> None:
+def test_links_within_the_documentation_lead_somewhere():
     broken = []
     for page in PAGES:
         text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
@@ -130,14 +128,14 @@ def leads_somewhere(page: Path, target: str) -> bool:
     return anchor in {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def test_names_in_the_documentation_exist() -> None:
+def test_names_in_the_documentation_exist():
     """Modules, classes and functions of the packages. `saga_fg.datasets` is the name of an entry point group."""
     name = re.compile(r"(?<![\w.])(?:factors|saga_fg|data_tools|pipelines)(?:[.:][A-Za-z]\w*)+")
     named = {(page_name(page), found) for page in PAGES for span in code_spans(page) for found in name.findall(span)}
     assert not [(page, found) for page, found in sorted(named) if found != "saga_fg.datasets" and not resolves(found)]
 
 
-def test_settings_in_the_documentation_exist() -> None:
+def test_settings_in_the_documentation_exist():
     """Dotted names that begin with a section of settings; `tracker.graph` may be an attribute of a tracker as well."""
     known = all_settings()
     sections = {name.split(".")[0] for name in known} - {"*"}
@@ -157,7 +155,7 @@ def test_settings_in_the_documentation_exist() -> None:
             assert name in known or attribute, f"{page_name(page)} names the setting {span}"
 
 
-def test_the_contents_and_the_site_name_every_page() -> None:
+def test_the_contents_and_the_site_name_every_page():
     contents = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     for page in (ROOT / "docs").rglob("*.md"):
@@ -167,12 +165,12 @@ def test_the_contents_and_the_site_name_every_page() -> None:
         assert re.search(entry, navigation, flags=re.M), f"mkdocs.yml does not name {name}"
 
 
-def test_every_example_says_whether_it_is_run() -> None:
+def test_every_example_says_whether_it_is_run():
     run = run_examples("--mark", "ci", *(page for page in PAGES if page.name != "README.md"))
     assert run.returncode == 0, run.stderr
 
 
-def test_the_readmes_examples_of_the_library_work() -> None:
+def test_the_readmes_examples_of_the_library_work():
     page = (ROOT / "README.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"^```python\n(.*?)^```$", page, flags=re.M | re.S)
     assert len([line for line in example.splitlines() if line.strip()]) <= 15
@@ -181,7 +179,7 @@ def test_the_readmes_examples_of_the_library_work() -> None:
     assert "2 car at" in run.stdout  # the hidden car is still there
 
 
-def test_examples_that_fail_or_are_not_marked_are_reported(tmp_path: Path) -> None:
+def test_examples_that_fail_or_are_not_marked_are_reported(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
         "<!-- run -->\n```bash\necho first > a\n```\n\n<!-- run -->\n```python\nopen('a').read(); 1 / 0\n```\n"
@@ -196,7 +194,7 @@ def test_examples_that_fail_or_are_not_marked_are_reported(tmp_path: Path) -> No
     assert f"{page}:1: expected a mark such as <!-- run --> before the block" in run.stderr
 
 
-def test_pages_run_at_the_same_time_are_told_apart(tmp_path: Path) -> None:
+def test_pages_run_at_the_same_time_are_told_apart(tmp_path):
     pages = [tmp_path / f"{name}.md" for name in ("good", "bad")]
     for page, ending in zip(pages, ("true", "false"), strict=True):
         page.write_text(f"<!-- run -->\n```bash\necho from {page.stem}\n{ending}\n```\n")
@@ -207,7 +205,7 @@ def test_pages_run_at_the_same_time_are_told_apart(tmp_path: Path) -> None:
         assert re.search(rf"^--- {re.escape(str(page))}:2 \([0-9.]+ s\)\nfrom {page.stem}$", run.stdout, re.M)
 
 
-def test_ci_runs_the_commands_of_the_readme() -> None:
+def test_ci_runs_the_commands_of_the_readme():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert re.findall(r"<!-- ci -->\n```bash\n(.*?)\n```", text) == [
         "pip install -e . && saga-fg demo",
@@ -216,7 +214,7 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
     assert "run_examples.py --mark ci README.md" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
-def test_the_api_reference_names_every_face() -> None:
+def test_the_api_reference_names_every_face():
     """Every package with an `__all__`, but the command and the benchmarks, which are documented by what they print."""
     faces = {
         ".".join(face.parent.relative_to(ROOT).parts)
@@ -228,7 +226,7 @@ def test_the_api_reference_names_every_face() -> None:
     assert faces - {"pipelines.cli"} <= set(re.findall(r"^::: (\S+)$", pages, flags=re.M))
 
 
-def test_links_to_the_top_of_the_repository_are_links_of_the_site() -> None:
+def test_links_to_the_top_of_the_repository_are_links_of_the_site():
     pages = (
         ("index.md", "[a](../CONTRIBUTING.md#b) [c](install.md)"),
         ("guides/slam.md", "[a](../../CHANGELOG.md) [c](../model.md)"),

@@ -1,7 +1,5 @@
 """The API pages: fields and parameters as tables, from the docstrings as they are."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -43,7 +41,7 @@ def module(monkeypatch: pytest.MonkeyPatch):
     return griffe.visit("page", Path("page.py"), CODE, extensions=griffe.load_extensions(FieldTables))
 
 
-def test_fields_become_a_table_with_their_types_and_comments(module) -> None:
+def test_fields_become_a_table_with_their_types_and_comments(module):
     text, fields, more = module["Rows"].docstring.parsed
     assert (text.value, more.value) == ("Some rows.", "More text.")
     rows = {row.name: (str(row.annotation), row.description) for row in fields.value}
@@ -55,7 +53,7 @@ def test_fields_become_a_table_with_their_types_and_comments(module) -> None:
     }
 
 
-def test_parameters_become_a_table_with_their_defaults(module) -> None:
+def test_parameters_become_a_table_with_their_defaults(module):
     text, parameters = module["add"].docstring.parsed
     assert text.value == "The sum."
     assert [(row.name, str(row.annotation), row.description) for row in parameters.value] == [

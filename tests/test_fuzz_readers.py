@@ -1,7 +1,5 @@
 """`python tests/fuzz_readers.py` in an editable install, stopped and started again."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -31,7 +29,7 @@ def fuzz(folder: Path, inputs: int) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
-def test_a_second_run_goes_on_where_the_first_one_stopped(tmp_path: Path) -> None:
+def test_a_second_run_goes_on_where_the_first_one_stopped(tmp_path):
     first = fuzz(tmp_path, 1000)
     assert first.returncode == 0, first.stderr
     kept = tmp_path / "fuzz-state" / "seed-0.json"

@@ -1,6 +1,4 @@
-"""Maps whose cost does not grow: which landmarks are near, a filter of these alone, and what a long drive holds."""
-
-from __future__ import annotations
+"""The mapper of planar drives: maps whose cost does not grow, merging, and covariances that are honest."""
 
 import tracemalloc
 from itertools import product
@@ -8,6 +6,7 @@ from itertools import product
 import gtsam
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from benchmarks.landmark_mapper import LandmarkMap, LandmarkMapper, MapperSettings
 from benchmarks.landmark_merging import NearbyLandmarks, duplicates, place_of
@@ -17,6 +16,8 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.assignment import gate
 from saga_fg.slam.mapping import LocalMap
 from saga_fg.types.landmark import Observation
+
+# Maps whose cost does not grow: which landmarks are near, a filter of these alone, and what a long drive holds
 
 TREE, R = PointLandmark(density=0.01), 0.05**2 * np.eye(2)
 Q = np.diag([0.02, 0.02, 0.002]) ** 2
@@ -29,7 +30,7 @@ def ahead(metres: float, turn: float = 0.0) -> FloatArray:
     return np.asarray(gtsam.Pose2(metres, 0.0, turn).matrix())
 
 
-def test_near_is_what_can_be_seen_before_the_next_question() -> None:
+def test_near_is_what_can_be_seen_and_a_wall_where_its_foot_was():
     near = NearbyLandmarks()
     for number, x in enumerate([5.0, 18.0, 30.0, 100.0], start=1):
         near.see(number, np.array([5.0, 0.0]), np.array([[1.0, 0, x - 5.0], [0, 1, 0], [0, 0, 1]]), SURE)
@@ -37,9 +38,11 @@ def test_near_is_what_can_be_seen_before_the_next_question() -> None:
     assert near.near(np.array([10.0, 0.0]), SURE).tolist() == [1, 2]
     near.merge(2, 1)
     assert near.near(np.array([28.0, 0.0]), SURE).tolist() == [1, 3]  # anywhere between the two places
+    wall = Observation(PlaneLandmark(), np.array([0.0, -1.0, 0.0, 4.0]), 1e-4 * np.eye(3))
+    np.testing.assert_allclose(place_of(wall), [0.0, 4.0], atol=1e-12)
 
 
-def test_drift_makes_more_landmarks_near_and_a_way_without_loops_does_not() -> None:
+def test_drift_makes_more_landmarks_near_and_a_way_without_loops_does_not():
     near = NearbyLandmarks()
     near.see(1, np.array([5.0, 0.0]), np.eye(3), SURE)
     lost, place = np.diag([400.0, 400.0, 1e-2]), np.array([60.0, 0.0])
@@ -49,11 +52,6 @@ def test_drift_makes_more_landmarks_near_and_a_way_without_loops_does_not() -> N
     for _ in range(600):
         near.move(ahead(1.0), Q)
     assert near.near(place, lost).tolist() == [1]
-
-
-def test_a_wall_is_near_where_its_foot_was_seen() -> None:
-    wall = Observation(PlaneLandmark(), np.array([0.0, -1.0, 0.0, 4.0]), 1e-4 * np.eye(3))
-    np.testing.assert_allclose(place_of(wall), [0.0, 4.0], atol=1e-12)
 
 
 def corridor(landmarks: int) -> tuple[LandmarkMapper, int, int]:
@@ -77,7 +75,7 @@ def corridor(landmarks: int) -> tuple[LandmarkMapper, int, int]:
     return mapper, widest, peak
 
 
-def test_no_array_holds_all_pairs_of_landmarks() -> None:
+def test_no_array_holds_all_pairs_of_landmarks():
     few, narrow, little = corridor(40)
     many, wide, much = corridor(160)
     assert (len(few.landmarks), len(many.landmarks)) == (40, 160)
@@ -85,7 +83,7 @@ def test_no_array_holds_all_pairs_of_landmarks() -> None:
     assert much < 6 * little  # an array of all pairs is sixteen times as large
 
 
-def test_duplicates_are_merged_along_the_whole_way_that_led_to_them() -> None:
+def test_duplicates_are_merged_along_the_whole_way_that_led_to_them():
     """Round a block with a drift that odometry tells, past the first trees again before the loop is found."""
     kind, rng = PointLandmark(density=0.05), np.random.default_rng(0)
     angle = 2 * np.pi * np.arange(60) / 60
@@ -107,7 +105,7 @@ def test_duplicates_are_merged_along_the_whole_way_that_led_to_them() -> None:
     assert len(set(zip(found, true, strict=True))) == len(set(found)) == len(set(true)) == 60
 
 
-def test_what_an_observation_cannot_be_names_type_and_time_and_changes_nothing() -> None:
+def test_what_an_observation_cannot_be_names_type_and_time_and_changes_nothing():
     mapper = LandmarkMapper(np.eye(3), SURE)
     good = Observation(TREE, np.array([4.0, 1.0]), R)
     mapper.observe([good])
@@ -127,7 +125,7 @@ def test_what_an_observation_cannot_be_names_type_and_time_and_changes_nothing()
     assert [landmark.observations for landmark in mapper.map().landmarks] == [1]
 
 
-def test_what_is_no_motion_is_refused_and_the_drive_goes_on(subtests: pytest.Subtests) -> None:
+def test_what_is_no_motion_is_refused_and_the_drive_goes_on(subtests):
     for motion, message in [
         (np.eye(4), r"a_T_b: expected a 3 x 3 transform like the mapper's poses, got shape \(4, 4\)"),
         (np.full((3, 3), np.nan), "a_T_b"),
@@ -142,7 +140,7 @@ def test_what_is_no_motion_is_refused_and_the_drive_goes_on(subtests: pytest.Sub
             assert len(mapper.map().world_T_pose) == 2
 
 
-def test_a_first_pose_has_a_covariance(subtests: pytest.Subtests) -> None:
+def test_a_first_pose_has_a_covariance(subtests):
     for covariance in [np.eye(6), np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)]:
         with subtests.test(covariance=covariance):
             with pytest.raises(InputError, match="covariance"):
@@ -168,14 +166,14 @@ class Sideways(PointLandmark):
         ]
 
 
-def test_a_landmark_that_one_observation_leaves_open_is_refused() -> None:
+def test_a_landmark_that_one_observation_leaves_open_is_refused():
     mapper = LandmarkMapper(np.eye(3), SURE)
     with pytest.raises(InputError, match=r"at 0\.00 s: point observed .*: components \[0\] of its state are not"):
         mapper.observe([Observation(Sideways(), np.array([4.0, 1.0]), R)])
     assert mapper.landmarks == {}
 
 
-def test_the_filter_is_the_smoother_where_everything_is_linear() -> None:
+def test_the_filter_is_the_smoother_where_everything_is_linear():
     """A straight drive past points, without turns: joint filter and global solution agree."""
     kind, rng = PointLandmark(), np.random.default_rng(0)
     mapper = LandmarkMapper(np.eye(3), np.diag([1e-4, 1e-4, 1e-12]), MapperSettings(smooth_every=10**6))
@@ -211,18 +209,15 @@ def revisited(shift: tuple[float, float], drift: float, count: int) -> LocalMap:
     return local
 
 
-def test_a_constellation_is_recognised_where_no_single_landmark_is() -> None:
+def test_constellations_are_recognised_and_what_was_seen_side_by_side_is_never_one():
     assert duplicates(revisited((4.0, 3.0), 5.0, 1), 0.999, set()) == {}
     assert duplicates(revisited((4.0, 3.0), 5.0, 4), 0.999, set()) == {5: 1, 6: 2, 7: 3, 8: 4}
-
-
-def test_what_was_seen_side_by_side_is_never_one() -> None:
     local = revisited((0.1, 0.0), 0.2, 2)
     assert duplicates(local, 0.999, set()) == {3: 1, 4: 2}
     assert duplicates(local, 0.999, {(1, 3)}) == {4: 2}
 
 
-def test_an_edge_is_one_whichever_way_its_normal_points(subtests: pytest.Subtests) -> None:
+def test_an_edge_is_one_whichever_way_its_normal_points(subtests):
     """A curb in any direction, seen again a little turned: theta beyond pi, or (theta + pi, -rho)."""
     for way, side in product([0.0, np.pi / 2, np.pi, -np.pi + 1e-3], [4.0, 0.0]):
         with subtests.test(way=way, side=side):
@@ -265,7 +260,7 @@ def street(seed: int) -> tuple[LandmarkMap, FloatArray, FloatArray, list[gtsam.O
     return mapper.map(), np.stack([pose.matrix() for pose in true]), poles, planes
 
 
-def test_planes_and_poles_are_recovered_within_their_stated_covariance() -> None:
+def test_planes_and_poles_are_recovered_within_their_stated_covariance():
     normalised: dict[str, list[float]] = {"pole": [], "plane": []}
     inside, worst = [], 0.0
     for seed in range(2):
@@ -285,8 +280,86 @@ def test_planes_and_poles_are_recovered_within_their_stated_covariance() -> None
         assert 0.6 < np.mean(values) < 1.5
 
 
-def test_every_observation_belongs_to_one_landmark_of_the_map() -> None:
+def test_every_observation_belongs_to_one_landmark_of_the_map():
     found, *_ = street(seed=0)
     numbers = {landmark.number for landmark in found.landmarks}
     assert {observation.landmark for observation in found.observations} == numbers
     assert sum(landmark.observations for landmark in found.landmarks) == len(found.observations)
+
+
+# Planes, poles and road lines are recovered within their stated covariance: the chi-square test over many drives
+
+DRIVES = 30
+CONSISTENCY_Q = np.diag([0.003, 0.003, 0.004, 0.03, 0.02, 0.02]) ** 2  # of a motion: rad, m
+R_PLANE, R_POLE = np.diag([0.01, 0.01, 0.05]) ** 2, np.diag([0.08, 0.05]) ** 2
+R_EDGE = np.array([[0.0064, 0.002], [0.002, 0.01]])
+# edges are rare: what is tested is the covariance, not who is taken for whom
+POLE, LINE, PLANE = PoleLandmark(), LineLandmark(density=1e-3), PlaneLandmark()
+
+
+def drawn(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
+    return np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
+
+
+def drive(seed: int) -> tuple[dict[str, tuple[float, int]], float]:
+    """Squared error and dimension of all landmarks of each kind together, and squared error of the last pose."""
+    rng = np.random.default_rng(seed)
+    poles = np.array([[5.0, 6.0], [14.0, -7.0], [22.0, 6.5]]) + rng.uniform(-1, 1, (3, 2))
+    walls = np.array([[0, -1, 0.05, 12], [-1, 0.1, 0, 45]])
+    planes = [gtsam.OrientedPlane3(wall / np.linalg.norm(wall[:3])) for wall in walls]
+    lines = np.array([[np.pi / 2 + rng.normal(0, 0.05), 4.0], [-np.pi / 2 + rng.normal(0, 0.05), 3.5]])
+    pose = gtsam.Pose3(gtsam.Rot3.Yaw(rng.normal(0, 0.1)), np.array([0.0, 0.0, 1.5]))
+    mapper = LandmarkMapper(pose.matrix(), 1e-8 * np.eye(6), MapperSettings(smooth_every=30))
+    for _ in range(9):
+        seen = []
+        for x, y in poles:
+            z = pose.transformTo(np.array([x, y, rng.uniform(0.5, 2.5)]))
+            R = pose.rotation().matrix()
+            level = R.T @ np.append((R @ np.append(drawn(rng, R_POLE), 0.0))[:2], 0.0)
+            seen.append(Observation(POLE, z + level, R_POLE))
+        for plane in planes:
+            noisy = plane.transform(pose).retract(drawn(rng, R_PLANE))
+            seen.append(Observation(PLANE, noisy.planeCoefficients(), R_PLANE))
+        for theta, rho in lines:
+            n, along = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
+            middle = float(along @ pose.translation()[:2])
+            off = rho + drawn(rng, R_EDGE)
+            at = middle + np.array([rng.uniform(-9, -4), rng.uniform(4, 9)])
+            ends = np.column_stack([off[:, None] * n + at[:, None] * along, np.zeros(2)])
+            seen.append(Observation(LINE, np.concatenate([pose.transformTo(end) for end in ends]), R_EDGE))
+        mapper.observe(seen)
+        step = gtsam.Pose3(gtsam.Rot3.Yaw(0.01), np.array([1.5, 0.0, 0.0]))
+        pose = pose.compose(step)
+        mapper.move(step.retract(drawn(rng, CONSISTENCY_Q)).matrix(), CONSISTENCY_Q)
+    mapper.smooth()
+    truth = {"pole": list(poles), "plane": planes, "road line": list(lines)}
+    found = {}
+    for name, things in truth.items():
+        numbers = sorted(n for n, kind in mapper.local.kinds.items() if kind.name == name)
+        assert len(numbers) == len(things), f"{name}: {len(numbers)} landmarks of {len(things)}"
+        variable = mapper.local.kinds[numbers[0]].variable
+        errors = np.concatenate(
+            [variable.local(mapper.local.state(n), t) for n, t in zip(numbers, things, strict=True)]
+        )
+        squared = float(errors @ np.linalg.solve(mapper.local.covariance(numbers), errors))
+        found[name] = (squared, len(errors))
+    error = mapper.local.pose.localCoordinates(pose)
+    return found, float(error @ np.linalg.solve(mapper.local.covariance([0]), error))
+
+
+@pytest.fixture(scope="module")
+def drives() -> list[tuple[dict[str, tuple[float, int]], float]]:
+    return [drive(seed) for seed in range(DRIVES)]
+
+
+def test_squared_errors_of_landmarks_and_poses_lie_in_the_band(drives, subtests):
+    for kind in ["pole", "plane", "road line"]:
+        with subtests.test(kind=kind):
+            squared = sum(found[kind][0] for found, _ in drives)
+            dim = sum(found[kind][1] for found, _ in drives)
+            low, high = chi2.ppf([0.0005, 0.9995], dim)
+            assert low < squared < high, (
+                f"{squared / dim:.2f} a dimension, expected {low / dim:.2f} to {high / dim:.2f}"
+            )
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(drives))
+    assert low < sum(pose for _, pose in drives) < high

@@ -1,11 +1,8 @@
 """The runner of benchmarks: options and output, contenders in turn, and intervals."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -37,7 +34,7 @@ def nothing() -> Rows:
 APP = application((counting, nothing))
 
 
-def test_a_benchmark_is_a_function_that_yields_rows(tmp_path: Path) -> None:
+def test_a_benchmark_is_a_function_that_yields_rows(tmp_path):
     files = tmp_path / "f.json", tmp_path / "t.md"
     options = ["counting", "--to", "3", "--json", str(files[0]), "--markdown", str(files[1])]
     done = CliRunner().invoke(APP, options)
@@ -53,7 +50,7 @@ def test_a_benchmark_is_a_function_that_yields_rows(tmp_path: Path) -> None:
     assert "Count." in CliRunner().invoke(APP, ["counting", "--help"]).stdout
 
 
-def test_what_was_found_before_an_error_is_shown(tmp_path: Path) -> None:
+def test_what_was_found_before_an_error_is_shown(tmp_path):
     done = CliRunner().invoke(APP, ["counting", "--broken", "--json", str(tmp_path / "f.json")])
     assert done.exit_code == 2
     assert "error: it broke" in done.stderr
@@ -62,15 +59,18 @@ def test_what_was_found_before_an_error_is_shown(tmp_path: Path) -> None:
     assert CliRunner().invoke(APP, ["nothing"]).stdout == ""
 
 
-def test_columns_are_those_of_all_rows() -> None:
+def test_columns_are_those_of_all_rows_and_the_environment_names_versions():
     (table,) = tables([("t", {"a": 1, "b": 2.0}), ("t", {"a": None, "c": math.nan})])
     assert table.columns == ("a", "b", "c")
     assert table.rows == (("1", "2", ""), ("", "", "-"))
     assert text(Interval(-0.1, -0.2, 0.05, 0.95)) == "-0.1 (-0.2 to +0.05)"
     assert text(Interval(0.5, math.nan, math.nan, 0.95)) == "+0.5 (-)"
+    assert growth([1, 10, 100], [5.0, 500.0, 50_000.0]) == pytest.approx(2.0)
+    assert math.isnan(growth([1], [1.0]))
+    assert {"numba", "numpy", "gtsam"} <= set(environment())
 
 
-def test_contenders_take_turns_and_what_they_prepare_is_not_timed() -> None:
+def test_contenders_take_turns_and_what_they_prepare_is_not_timed():
     order: list[tuple[str, str, int]] = []
 
     def contender(name: str) -> Any:
@@ -92,12 +92,7 @@ def test_contenders_take_turns_and_what_they_prepare_is_not_timed() -> None:
     assert len(in_turn({"a": contender("a")}, items(), warm_up=1, seconds=-1.0)["a"]) == 1
 
 
-def test_growth_is_the_exponent() -> None:
-    assert growth([1, 10, 100], [5.0, 500.0, 50_000.0]) == pytest.approx(2.0)
-    assert math.isnan(growth([1], [1.0]))
-
-
-def test_scenes_of_one_unit_are_drawn_together() -> None:
+def test_scenes_of_one_unit_are_drawn_together():
     values = np.array([0.0, 1.0, 0.0, 1.0])
 
     def figures(rows: Any) -> dict[str, float]:
@@ -109,7 +104,3 @@ def test_scenes_of_one_unit_are_drawn_together() -> None:
     assert apart.low < 0.2
     assert apart.high > 0.8
     assert (together.low, together.high) == (0.5, 0.5)
-
-
-def test_the_environment_names_versions() -> None:
-    assert {"numba", "numpy", "gtsam"} <= set(environment())

@@ -124,10 +124,7 @@ def detected_objects(k, covariance=0.0):
         rows.append(
             {
                 "existence_probability": 0.75,
-                "classification": [
-                    {"label": 2, "probability": 0.2},
-                    {"label": labels[label], "probability": 0.8},
-                ],
+                "classification": [{"label": 2, "probability": 0.2}, {"label": labels[label], "probability": 0.8}],
                 "kinematics": {
                     "pose_with_covariance": {
                         "pose": {"position": vector(*in_lidar(k, place)), "orientation": turn(HEADING[label])},

@@ -1,18 +1,18 @@
-"""Pictures: what is drawn is where the data say."""
+"""Plots."""
 
-from __future__ import annotations
+import json
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
+from data_tools.figures import FigureTable, as_json, cell, count, write_figures
 from data_tools.metrics import LabelErrors, RecallCurves
-from data_tools.plots import (
-    calibration_plot,
-    error_histograms,
-    png,
-    recall_sweep,
-    running_graph_picture,
-)
+from data_tools.plots import calibration_plot, error_histograms, plot, png, recall_sweep, running_graph_picture
+from saga_fg import Detection, Detections, Frame, InputError, Tracker, track
+
+# Pictures: what is drawn is where the data say
 
 
 def label_errors(nees: np.ndarray) -> LabelErrors:
@@ -23,7 +23,7 @@ def label_errors(nees: np.ndarray) -> LabelErrors:
     )
 
 
-def test_calibration_follows_the_diagonal_where_covariances_are_right() -> None:
+def test_calibration_follows_the_diagonal_where_covariances_are_right():
     nees = np.random.default_rng(0).chisquare(2, 4000)
     (ax,) = calibration_plot(label_errors(nees)).axes
     line = next(line for line in ax.lines if str(line.get_label()).startswith("car"))
@@ -33,7 +33,7 @@ def test_calibration_follows_the_diagonal_where_covariances_are_right() -> None:
     assert len(calibration_plot(label_errors(np.full(5, np.nan))).axes[0].lines) == 1  # the diagonal alone
 
 
-def test_error_histograms_are_cumulative_and_show_the_detections() -> None:
+def test_error_histograms_are_cumulative_and_show_the_detections():
     figure = error_histograms(label_errors(np.ones(1000)))
     position, velocity, heading = figure.axes
     overall, detections = (line for line in position.lines if line.get_color() == "C0")
@@ -43,7 +43,7 @@ def test_error_histograms_are_cumulative_and_show_the_detections() -> None:
     assert len(velocity.lines) == len(heading.lines) == 2
 
 
-def test_recall_sweeps_leave_out_what_is_not_reached() -> None:
+def test_recall_sweeps_leave_out_what_is_not_reached():
     recall = np.linspace(1.0, 0.1, 10)
     reached = np.where(recall > 0.75, np.nan, 0.5)
     curves = RecallCurves(recall, *([reached] * 8))
@@ -56,7 +56,7 @@ def test_recall_sweeps_leave_out_what_is_not_reached() -> None:
     assert png(figure).startswith(b"\x89PNG")
 
 
-def test_a_running_graph_is_drawn_where_it_is() -> None:
+def test_a_running_graph_is_drawn_where_it_is():
     car = {"name": "car 1 at 1.00 s", "kind": "object", "time": 1.0, "position": [20.0, 0.0]}
     nodes = [
         car | {"covariance": [[1, 0], [0, 4]]},
@@ -83,3 +83,58 @@ def test_a_running_graph_is_drawn_where_it_is() -> None:
     (around,) = running_graph_picture({"nodes": nodes, "factors": factors}, centre=[20, 0], radius=5.0).axes
     assert around.get_xlim() == (15.0, 25.0)
     running_graph_picture({"nodes": [], "factors": []})
+
+
+# `plot`: tracks from above
+
+
+def some_tracks():
+    tracker = Tracker()
+    cars = [Detections.of([Detection("car", (k * 1.0, 3.0 * n, 0.0)) for n in range(3)]) for k in range(6)]
+    return [tracker.step(Frame(k / 10, "lidar", found)) for k, found in enumerate(cars)], cars[-1]
+
+
+def test_each_track_has_a_path_and_a_box():
+    history, detections = some_tracks()
+    (ax,) = plot(history, detections).axes
+    assert len(ax.lines) == 4  # with the detections
+    assert len(ax.patches) == 3
+    assert sorted(text.get_text() for text in ax.texts) == ["1", "2", "3"]
+    assert ax.lines[1].get_xdata()[-1] == pytest.approx(5, abs=0.3)
+    assert png(plot(history[-1], ids=False)).startswith(b"\x89PNG")
+    assert not plot([]).axes[0].lines
+
+
+def test_the_table_of_the_one_line_tracker_is_drawn():
+    pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
+    rows = pd.DataFrame([{"timestamp": k / 10, "x": k * 1.0, "y": 3.0 * n} for k in range(6) for n in range(2)])
+    (ax,) = plot(track(rows)).axes
+    assert len(ax.patches) == 2
+
+
+def test_anything_else_is_refused():
+    with pytest.raises(InputError, match="got str"):
+        plot("tracks.csv")
+
+
+# Figures as tables and as JSON
+
+
+@dataclass
+class Figure:
+    name: str
+    value: float
+
+
+def test_cells_and_tables_of_them():
+    assert [cell(0.12345), cell(3), cell(np.int64(4)), cell(math.nan), cell(1.0, 1)] == ["0.123", "3", "4", "-", "1.0"]
+    assert [count(3.0), count(math.nan)] == ["3", "-"]
+    table = FigureTable("speeds", ("method", "ms"), (("a", "1.0"), ("b", "-")))
+    assert table.markdown() == "**speeds**\n\n| method | ms |\n| --- | ---: |\n| a | 1.0 |\n| b | - |\n"
+
+
+def test_json_has_null_for_what_is_not_finite(tmp_path):
+    figures = {"a": Figure("x", math.nan), 0.5: (np.array([1.0, math.inf]), np.float64(2.0), np.int64(3)), "n": None}
+    assert as_json(figures) == {"a": {"name": "x", "value": None}, "0.5": [[1.0, None], 2.0, 3], "n": None}
+    write_figures(tmp_path / "f.json", figures)
+    assert json.loads((tmp_path / "f.json").read_text()) == as_json(figures)

@@ -169,14 +169,11 @@ def test_many_states_at_once(model):
     np.testing.assert_allclose(model.jacobian(x)[1, 2], model.jacobian(x[1, 2]))
 
 
-def test_polar_measurements_of_a_known_scene():
+def test_polar_measurements_of_a_known_scene_and_across_the_cut():
     x = np.array([1.0, 1.0, 2.0, 3.0])  # three metres to the left of a sensor that looks along x
     radar = Radar(4, sensor_pose=(1.0, -2.0, 0.0), sensor_velocity=(9.0, 1.0))
     np.testing.assert_allclose(radar.predict(x), [3.0, np.pi / 2, 2.0])
     np.testing.assert_allclose(RangeBearing(4, sensor_pose=(1.0, -2.0, np.pi / 2)).predict(x), [3.0, 0.0], atol=1e-15)
-
-
-def test_bearing_across_the_cut():
     values = values_of([1], [np.array([-10.0, -0.01])])
     error = detection_factors([1], RangeBearing(2), [[10.0, np.pi - 0.001]], np.eye(2)).error(values)
     assert error == pytest.approx(0.5 * 0.002**2, rel=1e-2)

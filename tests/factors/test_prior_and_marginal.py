@@ -1,4 +1,6 @@
-"""Priors and marginals against the dense formulas: Schur complement and block of the covariance."""
+"""Priors, marginals, relative poses, robust losses and angles that wrap."""
+
+from itertools import product
 
 import gtsam
 import numpy as np
@@ -6,17 +8,31 @@ import pytest
 
 from factors import (
     FactorError,
+    Mixture,
+    PlanarPose,
+    ResidualFactors,
+    Robust,
     SingularSystemError,
+    SpatialPose,
+    Vector,
+    between_factor,
     gaussian_factor,
     gaussian_factors,
     gaussian_graph,
     joint_prior_factor,
     marginal_factors,
     marginal_moments,
+    noise_model,
+    pose,
+    pose_prior_factor,
     prior_factor,
     prior_factors,
+    residual_factor,
+    unwrapped_angles,
 )
 from factors.gaussian import block_covariances
+
+# Priors and marginals against the dense formulas: Schur complement and block of the covariance
 
 
 def random_graph(rng, dims, covariance):
@@ -157,12 +173,19 @@ def test_untouched_factors_are_passed_on(covariance):
     )
 
 
-def test_unknown_key_is_refused(covariance):
+def test_unknown_keys_and_eliminations_are_refused(covariance, subtests):
     graph = gaussian_graph([prior_factor(1, [0.0], [[1.0]])])
     with pytest.raises(FactorError, match="no variable x7"):
         marginal_factors(graph, [gtsam.symbol("x", 7)])
     with pytest.raises(FactorError, match="no variable 2"):
         marginal_moments(graph, [1, 2])
+    with pytest.raises(FactorError, match="elimination: expected one of cholesky, qr"):
+        marginal_factors(gaussian_graph([prior_factor(1, [0.0], [[1.0]])]), [1], "lu")
+    for elimination in ["cholesky", "qr"]:
+        with subtests.test(elimination=elimination):
+            graph = gaussian_graph([gaussian_factor([1, 2], [np.eye(2), np.eye(2)], [0.0, 0.0])])
+            with pytest.raises(SingularSystemError, match="does not determine"):
+                marginal_moments(graph, [1], elimination)
 
 
 def test_singular_system_names_the_free_variables_only(subtests):
@@ -184,14 +207,6 @@ def test_singular_system_names_the_free_variables_only(subtests):
                 marginal_moments(graph, x, elimination)
 
 
-def test_variable_whose_factors_vanish_is_named(subtests):
-    for elimination in ["cholesky", "qr"]:
-        with subtests.test(elimination=elimination):
-            graph = gaussian_graph([gaussian_factor([1, 2], [np.eye(2), np.eye(2)], [0.0, 0.0])])
-            with pytest.raises(SingularSystemError, match="does not determine"):
-                marginal_moments(graph, [1], elimination)
-
-
 def test_nan_is_found_when_marginalising(subtests):
     for elimination in ["cholesky", "qr"]:
         for others in [[], [6]]:
@@ -204,11 +219,6 @@ def test_nan_is_found_when_marginalising(subtests):
                     )
                     with pytest.raises(FactorError, match="factors on 5 hold numbers that are not finite"):
                         marginal_factors(graph, [5], elimination)
-
-
-def test_unknown_elimination_is_refused():
-    with pytest.raises(FactorError, match="elimination: expected one of cholesky, qr"):
-        marginal_factors(gaussian_graph([prior_factor(1, [0.0], [[1.0]])]), [1], "lu")
 
 
 def test_qr_keeps_the_digits_that_cholesky_loses():
@@ -236,3 +246,191 @@ def test_bad_joint_prior_is_refused(subtests):
     ]:
         with subtests.test(message), pytest.raises(FactorError, match=message):
             joint_prior_factor(keys, means, covariance)
+
+
+# Between and prior factors: GTSAM's residuals, and nothing that would crash it gets in
+
+
+def transforms(dim: int, seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    kind = gtsam.Pose2 if dim == 2 else gtsam.Pose3
+    return [kind.Expmap(rng.normal(size=3 * (dim - 1))).matrix() for _ in range(3)]
+
+
+def test_the_residual_is_that_of_the_equation(covariance, subtests):
+    for dim, seed in product([2, 3], range(4)):
+        with subtests.test(dim=dim, seed=seed):
+            first, second, measured = transforms(dim, seed)
+            P = covariance(np.random.default_rng(seed), 3 * (dim - 1))
+            values = gtsam.Values()
+            values.insert(9, pose("first", first))
+            values.insert(2, pose("second", second))
+            log = gtsam.Pose2.Logmap if dim == 2 else gtsam.Pose3.Logmap
+            r = log(pose("r", np.linalg.inv(measured) @ np.linalg.inv(first) @ second))
+            assert between_factor(9, 2, measured, P).error(values) == pytest.approx(0.5 * r @ np.linalg.solve(P, r))
+            r = log(pose("r", np.linalg.inv(measured) @ first))
+            assert pose_prior_factor(9, measured, P).error(values) == pytest.approx(0.5 * r @ np.linalg.solve(P, r))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_jacobians_are_those_of_central_differences(dim, seed, covariance):
+    first, second, measured = transforms(dim, seed)
+    k = 3 * (dim - 1)
+    factor = between_factor(9, 2, measured, covariance(np.random.default_rng(seed), k))
+    values = gtsam.Values()
+    values.insert(9, pose("first", first))
+    values.insert(2, pose("second", second))
+    A, _ = factor.linearize(values).jacobian()
+    columns = {int(key): A[:, i * k : (i + 1) * k] for i, key in enumerate(factor.keys())}
+    for key in (9, 2):
+        for i in range(k):
+            ends = []
+            for sign in (1, -1):
+                step = gtsam.VectorValues()
+                for other in (9, 2):
+                    step.insert(other, sign * 1e-6 * np.eye(k)[i] * (other == key))
+                ends.append(factor.whitenedError(values.retract(step)))  # type: ignore[attr-defined]
+            np.testing.assert_allclose(columns[key][:, i], (ends[0] - ends[1]) / 2e-6, atol=1e-6)
+
+
+def test_a_robust_loss_is_gtsams_and_keeps_correlations(subtests):
+    values = gtsam.Values()
+    values.insert(1, gtsam.Pose2())
+    values.insert(2, gtsam.Pose2(10, 0, 0))
+    factor = between_factor(1, 2, np.eye(3), np.eye(3), Robust("huber", 1.0))
+    assert factor.error(values) == pytest.approx(10 - 0.5)
+    P = np.array([[2.0, 0.5], [0.5, 1.0]])
+    np.testing.assert_allclose(noise_model("P", P, 2).covariance(), P)
+    for loss, scale in [("l1", 1.0), ("huber", 0.0), ("huber", -1.0), ("tukey", np.nan)]:
+        with subtests.test(loss=loss, scale=scale), pytest.raises(FactorError):
+            Robust(loss, scale)
+
+
+def test_what_would_crash_gtsam_is_refused(subtests):
+    for arguments, message in [
+        ((1, 1, np.eye(3), np.eye(3)), "occurs twice"),
+        ((1, 2, np.eye(5), np.eye(3)), "3 x 3 or 4 x 4"),
+        ((1, 2, 2 * np.eye(4), np.eye(6)), "rigid"),
+        ((1, 2, np.eye(4) * np.nan, np.eye(6)), "finite"),
+        ((1, 2, np.eye(4), np.eye(3)), "covariance: expected shape"),
+        ((1, 2, np.eye(3), -np.eye(3)), "positive definite"),
+    ]:
+        with subtests.test(message), pytest.raises(FactorError, match=message):
+            between_factor(*arguments)
+
+
+# Robust losses against GTSAM's, and against their own definition
+
+LOSSES = ["huber", "cauchy", "geman-mcclure", "tukey"]
+DISTANCES = np.array([0.0, 0.1, 0.999, 1.7, 1.70001, 5.0, 1e3])
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("scale", [0.3, 1.7])
+def test_cost_and_weight_are_gtsams(loss, scale):
+    robust = Robust(loss, scale)
+    model = robust.model(gtsam.noiseModel.Unit.Create(1))
+    theirs = [(model.loss(s * s), model.weight(np.array([s]))) for s in DISTANCES]
+    np.testing.assert_allclose(robust.cost(DISTANCES), [cost for cost, _ in theirs], rtol=1e-12)
+    np.testing.assert_allclose(robust.weight(DISTANCES), [weight for _, weight in theirs], rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_weight_is_slope_over_distance(loss):
+    robust = Robust(loss, 1.5)
+    s = np.linspace(0.01, 6.0, 200) + 1e-4
+    h = 1e-6
+    slope = (robust.cost(s + h) - robust.cost(s - h)) / (2 * h)
+    np.testing.assert_allclose(robust.weight(s) * s, slope, atol=1e-8)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_small_residuals_cost_what_they_always_do(loss):
+    s = np.array([1e-4, 1e-3])
+    np.testing.assert_allclose(Robust(loss, 2.0).cost(s), s * s / 2, rtol=1e-5)
+
+
+def test_a_mixture_holds_with_its_probability():
+    s = np.linspace(0.01, 6.0, 200) + 1e-4
+    for probability in (0.05, 0.5, 0.99):
+        mixture, h = Mixture(probability), 1e-6
+        slope = (mixture.cost(s + h) - mixture.cost(s - h)) / (2 * h)
+        np.testing.assert_allclose(mixture.weight(s) * s, slope, atol=1e-8)
+        assert mixture.weight(0.0) == pytest.approx(probability)
+        assert mixture.weight(20.0) == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(Mixture(1.0).cost(s), s * s / 2)
+    assert not Mixture(0.0).weight(s).any()
+    each = Mixture([0.2, 0.9])
+    np.testing.assert_allclose(each.weight([1.0, 1.0]), [Mixture(p).weight(1.0) for p in (0.2, 0.9)])
+    for bad in (-0.1, 1.1, np.nan):
+        with pytest.raises(FactorError, match="probability"):
+            Mixture(bad)
+
+
+# Angles of a residual that are not wrapped are found, and nothing else is
+
+POINT = np.array([3.0, -4.0])
+
+
+def seen(pose: gtsam.Pose2, measured: float = 0.4) -> np.ndarray:
+    """Distance, and bearing less the measured one."""
+    local = pose.transformTo(POINT)
+    return np.array([np.hypot(*local) - 5.0, np.arctan2(local[1], local[0]) - measured])
+
+
+def wrapped(pose: gtsam.Pose2) -> np.ndarray:
+    distance, bearing = seen(pose)
+    return np.array([distance, (bearing + np.pi) % (2 * np.pi) - np.pi])
+
+
+@pytest.mark.parametrize(
+    ("residual", "angles", "expected"),
+    [
+        (seen, (), (1,)),
+        (seen, (1,), ()),
+        (wrapped, (), ()),
+        (lambda pose: [pose.theta() - 1.0], (), (0,)),
+        (lambda pose: [np.rad2deg(pose.theta()) - 40.0], (), (0,)),
+        (lambda pose: pose.transformTo(POINT), (), ()),
+        (lambda pose: [1e3 * (pose.transformTo(POINT)[0] > 0)], (), ()),  # a jump, but not by a full turn
+    ],
+)
+def test_a_component_that_jumps_by_a_full_turn_is_an_angle(residual, angles, expected):
+    state, values = gtsam.Pose2(0.3, 0.2, 2.0), gtsam.Values()
+    values.insert(7, state)
+    size = len(np.atleast_1d(residual(state)))
+    factor = residual_factor((7,), (PlanarPose(),), residual, np.eye(size), angles=angles)
+    assert unwrapped_angles(factor, values) == expected
+
+    def of_matrices(poses: np.ndarray) -> np.ndarray:
+        return np.array([residual(gtsam.Pose2(T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0]))) for T in poses])
+
+    jacobians = [np.zeros((1, size, 3))]
+    stack = ResidualFactors([[7]], (PlanarPose(),), of_matrices, np.eye(size), lambda _: jacobians, angles=angles)
+    assert unwrapped_angles(stack, values) == expected
+
+
+def test_a_pose_in_space_turns_about_its_vertical_while_the_others_stand():
+    def bearing(pose: gtsam.Pose3, point: np.ndarray) -> list[float]:
+        x, y, _ = pose.transformTo(point)
+        return [np.arctan2(y, x) - 0.5]
+
+    factor = residual_factor((1, 2), (SpatialPose(), Vector(3)), bearing, [[0.01]])
+    values = gtsam.Values()
+    values.insert(1, gtsam.Pose3())
+    values.insert(2, np.array([5.0, 1.0, 2.0]))
+    assert unwrapped_angles(factor, values) == (0,)
+
+
+def test_a_residual_that_is_undefined_elsewhere_is_left_alone():
+    def ahead(pose: gtsam.Pose2) -> list[float]:
+        local = pose.transformTo(POINT)
+        if local[0] < 0:
+            raise ValueError("behind the camera")
+        return [local[1] / local[0]]
+
+    factor = residual_factor((1,), (PlanarPose(),), ahead, [[1.0]])
+    values = gtsam.Values()
+    values.insert(1, gtsam.Pose2(0, 0, -0.9))
+    assert unwrapped_angles(factor, values) == ()

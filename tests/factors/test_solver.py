@@ -81,7 +81,7 @@ def test_damping_saves_a_step_that_gauss_newton_loses():
         assert solution.values.atVector(0)[0] == pytest.approx(0.0, abs=1e-8)
 
 
-def test_a_line_search_ends_the_to_and_fro_of_gauss_newton():
+def test_a_line_search_ends_the_to_and_fro_of_gauss_newton_or_says_that_nothing_helps():
     """x^2 = -1 at a prior of 0.3: the minimum is beside the prior, and full steps jump over it for ever."""
     factors = [on_vector(lambda x: x**2 + 1, dim=1, m=1), on_vector(lambda x: 0.5 * (x - 0.3), dim=1, m=1)]
     start = values_of({0: np.array([1.0])})
@@ -90,9 +90,6 @@ def test_a_line_search_ends_the_to_and_fro_of_gauss_newton():
     x = searched.values.atVector(0)[0]
     assert 2 * x * (x**2 + 1) + 0.25 * (x - 0.3) == pytest.approx(0.0, abs=1e-5)
     assert searched.step.norm() < 1e-5
-
-
-def test_a_line_search_says_so_where_no_share_of_the_step_helps():
     uphill = on_vector(lambda x: x, dim=1, m=1, jacobians=lambda x: [-np.eye(1)])
     solution = solve(EMPTY, [uphill], values_of({0: np.array([1.0])}), SolverSettings("line-search"))
     assert not solution.converged
@@ -187,7 +184,7 @@ def test_factors_between_poses_and_vectors(spatial):
         np.testing.assert_allclose(difference, 0, atol=1e-3)
 
 
-def test_free_variables_are_named():
+def test_free_variables_and_directions_are_named_in_systems_of_any_size():
     between = gaussian_factor(X[1:3], [np.eye(2), -np.eye(2)], [0.0, 0.0])
     graph = nonlinear_graph([prior_factor(X[0], [0.0, 0.0], np.eye(2)), between], dict.fromkeys(X, 2))
     start = values_of({key: np.ones(2) for key in X[:3]})
@@ -195,16 +192,10 @@ def test_free_variables_are_named():
         with pytest.raises(SingularSystemError, match="does not determine x1, x2") as caught:
             solve(graph, [], start, SolverSettings(method=method))
         assert caught.value.keys == (X[1], X[2])
-
-
-def test_only_the_free_direction_of_a_nonlinear_problem_is_named():
     ranges = residual_factor((X[3],), (Vector(2),), lambda x: [np.hypot(*x) - 5.0], np.eye(1))
     known = on_vector(lambda x: x - [1.0, 2.0], X[1])
     with pytest.raises(SingularSystemError, match="does not determine x3;"):
         solve(EMPTY, [ranges, known], values_of({X[1]: np.ones(2), X[3]: np.array([3.0, 3.0])}))
-
-
-def test_large_singular_system_is_still_named():
     keys = [gtsam.symbol("x", i) for i in range(1100)]
     factors = prior_factors(keys[:-1], np.zeros((1099, 3)), np.eye(3)).native()
     factors.append(gaussian_factor([keys[-1]], [np.ones((1, 3))], [0.0]))
@@ -213,13 +204,10 @@ def test_large_singular_system_is_still_named():
     assert caught.value.keys == (keys[-1],)
 
 
-def test_variable_without_any_factor_is_named():
+def test_variables_without_factors_and_factors_without_variables_are_named():
     graph = nonlinear_graph([prior_factor(X[0], [0.0], [[1.0]])], {X[0]: 1})
     with pytest.raises(SingularSystemError, match="no factor speaks of x4"):
         solve(graph, [], values_of({X[0]: np.zeros(1), X[4]: np.zeros(1)}))
-
-
-def test_factor_on_unknown_variable_is_named():
     graph = nonlinear_graph([prior_factor(X[0], [0.0], [[1.0]])], {X[0]: 1})
     with pytest.raises(FactorError, match="expected x5, which factors speak of"):
         solve(graph, [on_vector(lambda x: x, X[5])], values_of({X[0]: np.zeros(1)}))
@@ -233,14 +221,11 @@ def test_linear_factor_on_another_dimension_is_refused(subtests):
                 solve(graph, [], values_of({X[0]: state}))
 
 
-def test_gtsams_own_complaints_come_as_factor_errors():
+def test_what_gtsam_cannot_evaluate_is_a_factor_error():
     graph = gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorPose2(X[0], gtsam.Pose2(), gtsam.noiseModel.Unit.Create(3)))
     with pytest.raises(FactorError, match="GTSAM could not evaluate"):
         solve(graph, [], values_of({X[0]: np.zeros(3)}))
-
-
-def test_number_that_is_not_finite_is_found_at_the_start():
     factor = prior_factor(X[0], [0.0], [[1.0]])
     factor.getb()[0] = np.nan
     with pytest.raises(FactorError, match="not finite"):

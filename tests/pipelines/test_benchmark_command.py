@@ -1,7 +1,5 @@
 """`saga-fg benchmark`: figures, a page and a submission from one command that goes on where it was."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Mapping
@@ -13,7 +11,7 @@ from pipelines.scale_out import TrackTask
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 from tests.data_tools.kitti_example import write_sequence
-from tests.pipelines.command import saga_fg
+from tests.pipelines.command import done, saga_fg
 from tests.pipelines.scale_out_example import InThisProcess
 
 
@@ -27,22 +25,19 @@ def nuscenes(tmp_path_factory: pytest.TempPathFactory) -> list[str | Path]:
     """Options of four short simulated scenes."""
     folder = tmp_path_factory.mktemp("simulated")
     (folder / "short.yaml").write_text("duration: 3.0\nwarm_up: 3.0\n")
-    result = saga_fg("simulate", "-o", folder / "data", "--scenes", "4", "--config", folder / "short.yaml")
-    assert result.exit_code == 0, result.output
+    done("simulate", "-o", folder / "data", "--scenes", "4", "--config", folder / "short.yaml")
     detections = f"lidar={folder / 'data' / 'detections' / 'lidar.json'}"
     return ["nuscenes", "--dataroot", folder / "data", "--detections", detections, "--split", "all"]
 
 
-def test_the_figures_are_those_of_evaluate(nuscenes: list[str | Path], tmp_path: Path) -> None:
+def test_the_figures_are_those_of_evaluate(nuscenes, tmp_path):
     run = tmp_path / "run"
-    result = saga_fg("benchmark", *nuscenes, "--output", run)
-    assert result.exit_code == 0, result.output
+    result = done("benchmark", *nuscenes, "--output", run)
     assert "4 scenes: 4 done" in result.output
     assert "AMOTA" in result.output
     figures = json.loads((run / "figures.json").read_text())
     assert figures["method"] == "saga"
-    judged = saga_fg("evaluate", *nuscenes, run / "tracks.json", "--json", tmp_path / "evaluated.json")
-    assert judged.exit_code == 0, judged.output
+    done("evaluate", *nuscenes, run / "tracks.json", "--json", tmp_path / "evaluated.json")
     assert figures["figures"] == json.loads((tmp_path / "evaluated.json").read_text())
     page = (run / "report.html").read_text()
     assert "The player shows 3 of 4 scenes." in page
@@ -56,15 +51,13 @@ def test_the_figures_are_those_of_evaluate(nuscenes: list[str | Path], tmp_path:
     assert (run / "submission.zip").read_bytes() == submission
 
 
-def test_a_run_that_was_stopped_goes_on(
-    nuscenes: list[str | Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done = TrackTask.run
+def test_a_run_that_was_stopped_goes_on(nuscenes, tmp_path, monkeypatch):
+    run_of_task = TrackTask.run
 
     def run(task: TrackTask, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         if name == "scene-0003":
             raise InputError("bad weather")
-        return done(task, name, dataset, folder)
+        return run_of_task(task, name, dataset, folder)
 
     with monkeypatch.context() as broken:
         broken.setattr(TrackTask, "run", run)
@@ -73,23 +66,20 @@ def test_a_run_that_was_stopped_goes_on(
     assert "failed: scene-0003: bad weather" in result.output
     assert not (tmp_path / "run" / "figures.json").exists()
     assert not (tmp_path / "run" / "submission.zip").exists()
-    result = saga_fg("benchmark", *nuscenes, "--output", tmp_path / "run", "--method", "kf")
-    assert result.exit_code == 0, result.output
+    result = done("benchmark", *nuscenes, "--output", tmp_path / "run", "--method", "kf")
     assert "1 done, 3 unchanged" in result.output
     assert (tmp_path / "run" / "figures.json").exists()
 
 
-def test_a_test_split_has_a_submission_alone(nuscenes: list[str | Path], tmp_path: Path) -> None:
-    result = saga_fg("benchmark", *nuscenes, "--output", tmp_path / "run", "--without-truth")
-    assert result.exit_code == 0, result.output
+def test_a_test_split_has_a_submission_alone(nuscenes, tmp_path):
+    done("benchmark", *nuscenes, "--output", tmp_path / "run", "--without-truth")
     assert (tmp_path / "run" / "submission.zip").exists()
     assert not (tmp_path / "run" / "figures.json").exists()
 
 
-def test_kitti(tmp_path: Path) -> None:
+def test_kitti(tmp_path):
     root, run = write_sequence(tmp_path / "kitti"), tmp_path / "run"
-    result = saga_fg("benchmark", "kitti", "--dataroot", root, "--detections", root / "found", "--output", run)
-    assert result.exit_code == 0, result.output
+    result = done("benchmark", "kitti", "--dataroot", root, "--detections", root / "found", "--output", run)
     assert "sAMOTA" in result.output
     with zipfile.ZipFile(run / "submission.zip") as archive:
         assert archive.namelist() == ["0007.txt"]
@@ -97,7 +87,7 @@ def test_kitti(tmp_path: Path) -> None:
     assert "KITTI 3D tracking metrics" in (run / "report.html").read_text()
 
 
-def test_a_dataset_without_official_results(tmp_path: Path) -> None:
+def test_a_dataset_without_official_results(tmp_path):
     result = saga_fg("benchmark", "simulated", "--output", tmp_path / "run")
     assert result.exit_code != 0
     assert "expected a dataset with official results" in " ".join(result.output.split())

@@ -15,7 +15,8 @@ from benchmarks.pose_graphs import from_same_starts
 from data_tools.pose_graphs import read_g2o, write_g2o
 from pipelines.cli import app
 from saga_fg.slam.pose_graph import chordal_minimum, chordal_poses, factor_graph, optimise_poses, pose_values
-from tests.data_tools.test_landmark_graph_files import PLANAR
+from tests.data_tools.test_pose_graphs import PLANAR
+from tests.pipelines.command import done, refused
 from tests.saga_fg.loops import loop
 
 RECORDINGS = Path(os.environ.get("SAGA_FG_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "slam"
@@ -26,10 +27,7 @@ def test_the_command_writes_the_optimum(tmp_path: Path, dim: int) -> None:
     graph, _ = loop(dim, seed=0)
     write_g2o(tmp_path / "loop.g2o", graph)
     output = tmp_path / "out"
-    result = CliRunner().invoke(
-        app, ["slam", "g2o", str(tmp_path / "loop.g2o"), "--output", str(output)], catch_exceptions=False
-    )
-    assert result.exit_code == 0
+    result = done("slam", "g2o", tmp_path / "loop.g2o", "--output", output)
     assert "36 poses, 59 measurements, error" in result.stdout
     written = read_g2o(output / "poses.g2o")
     errors = json.loads((output / "errors.json").read_text())
@@ -48,8 +46,7 @@ def test_the_chordal_minimum_is_certified_and_some_covariances_are_written(tmp_p
     edges = [line for line in (tmp_path / "loop.g2o").read_text().splitlines() if line.startswith("EDGE")]
     (tmp_path / "loop.g2o").write_text("\n".join(edges) + "\n")
     arguments = ["slam", "g2o", str(tmp_path / "loop.g2o"), "--output", str(tmp_path / "out"), "--certify"]
-    result = CliRunner().invoke(app, [*arguments, "--covariances", "120,30,120"], catch_exceptions=False)
-    assert result.exit_code == 0
+    result = done(*arguments, "--covariances", "120,30,120")
     assert "the global minimum: no poses below" in result.stdout
     assert "(at the start " in result.stdout  # the file has no vertices, so there is no guess in it
     found = json.loads((tmp_path / "out" / "errors.json").read_text())
@@ -60,8 +57,7 @@ def test_the_chordal_minimum_is_certified_and_some_covariances_are_written(tmp_p
     whole = optimise_poses(read_g2o(tmp_path / "loop.g2o")).covariances()
     np.testing.assert_allclose(rows["P11"], whole[[12, 3], 0, 0], rtol=1e-6)
     arguments[4] = str(tmp_path / "none")
-    result = CliRunner().invoke(app, [*arguments, "--covariances", "none"], catch_exceptions=False)
-    assert result.exit_code == 0
+    done(*arguments, "--covariances", "none")
     assert not (tmp_path / "none" / "covariances.csv").exists()
 
 
@@ -69,9 +65,8 @@ def test_a_graph_in_pieces_is_refused_by_the_name_of_its_file(tmp_path: Path) ->
     file, output = tmp_path / "pieces.g2o", tmp_path / "out"
     poses = "".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in (3, 4, 7))
     file.write_text(poses + "EDGE_SE2 3 4 1 0 0 1 0 0 1 0 1\n")
-    result = CliRunner().invoke(app, ["slam", "g2o", str(file), "--output", str(output)])
-    assert result.exit_code == 2
-    assert result.stderr.startswith(f"error: {file}: pose 7: expected measurements that connect it")
+    said = refused("slam", "g2o", file, "--output", output)
+    assert said.startswith(f"error: {file}: pose 7: expected measurements that connect it")
     assert not output.exists()
 
 
@@ -80,8 +75,7 @@ def test_a_measurement_across_a_country_has_its_covariance(tmp_path: Path, place
     """The first pose is held to 1e-4 rad, which is kilometres at the other end."""
     file, output = tmp_path / "far.g2o", tmp_path / "out"
     file.write_text(f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 {place} 0 0 100 0 0 100 0 400\n")
-    result = CliRunner().invoke(app, ["slam", "g2o", str(file), "--output", str(output)])
-    assert result.exit_code == 0
+    done("slam", "g2o", file, "--output", output)
     rows = np.genfromtxt(output / "covariances.csv", delimiter=",", names=True)
     assert rows["P22"][1] == pytest.approx(place**2 * 1e-8 + 1 / 100, rel=1e-6)
     assert rows["P33"][1] == pytest.approx(1e-8 + 1 / 400, rel=1e-6)
@@ -108,10 +102,7 @@ def test_a_robust_loss_takes_care_of_false_loops(tmp_path: Path) -> None:
         ("consensus", ["--robust", "consensus"]),
     ):
         output = tmp_path / name
-        result = CliRunner().invoke(
-            app, ["slam", "g2o", str(tmp_path / "false.g2o"), "--output", str(output), *options]
-        )
-        assert result.exit_code == 0, result.output
+        done("slam", "g2o", tmp_path / "false.g2o", "--output", output, *options)
         found = read_g2o(output / "poses.g2o").world_T_pose
         found = np.linalg.inv(found[0]) @ found
         off[name] = np.abs((found - np.linalg.inv(truth[0]) @ truth)[:, :2, 2]).max()
@@ -141,16 +132,13 @@ def test_options_that_do_not_go_together(tmp_path: Path, subtests: pytest.Subtes
             graph, _ = loop(2, seed=0)
             write_g2o(tmp_path / "loop.g2o", graph)
             arguments = ["slam", "g2o", str(tmp_path / "loop.g2o"), "--output", str(tmp_path / "out"), *options]
-            result = CliRunner().invoke(app, arguments)
-            assert result.exit_code == 2
-            assert message in result.stderr
+            assert message in refused(*arguments)
 
 
 def test_a_broken_file_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "bad.g2o").write_text("VERTEX_SE2 0 0 0\n")
-    result = CliRunner().invoke(app, ["slam", "g2o", str(tmp_path / "bad.g2o"), "--output", str(tmp_path / "out")])
-    assert result.exit_code == 2
-    assert "line 1: expected 4 values after VERTEX_SE2, got 3" in result.stderr
+    said = refused("slam", "g2o", tmp_path / "bad.g2o", "--output", tmp_path / "out")
+    assert "line 1: expected 4 values after VERTEX_SE2, got 3" in said
     assert not (tmp_path / "out").exists()
 
 

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from pipelines.cli import app
 from pipelines.slam.submaps import SlamMap, read_map, write_map
+from tests.pipelines.command import done
 
 POINT = SlamMap([np.ones((1, 3), dtype=np.float32)], np.eye(4)[None])
 
@@ -60,13 +61,11 @@ def test_options_that_a_map_has_no_use_for_are_refused(tmp_path: Path, subtests:
 
 def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_path: Path) -> None:
     options = ["slam", "kitti", "--dataroot", str(recordings / "kitti")]
-    first = CliRunner().invoke(app, [*options, "--scans", "20", "--no-landmarks", "--output", str(tmp_path / "first")])
-    assert first.exit_code == 0, first.output
+    done(*options, "--scans", "20", "--no-landmarks", "--output", tmp_path / "first")
     assert read_map(tmp_path / "first").origin is not None
     again = ["--scans", "10", "--map", str(tmp_path / "first"), "--guess", "0.5,0.3,0,-1.2", "--sensors", "gps,wheels"]
     again += ["--output"]
-    outcome = CliRunner().invoke(app, [*options, *again, str(tmp_path / "again")])
-    assert outcome.exit_code == 0, outcome.output
+    outcome = done(*options, *again, tmp_path / "again")
     assert "registered with the map, the first of them scan 0" in outcome.stdout
     assert "in the map's frame: ATE 0." in outcome.stdout
     (tmp_path / "first" / "map" / "origin.csv").unlink()
@@ -76,8 +75,7 @@ def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_pat
     fixes = tmp_path / "fixes.csv"
     fixes.write_text("time [s],x [m],y [m],z [m]\n0.1,0.1,0,0\n0.5,0.2,0,0\n")
     own = [*again[: again.index("--sensors")], "--sensor-log", f"gps={fixes}", "--output", str(tmp_path / "metres")]
-    outcome = CliRunner().invoke(app, [*options, *own])
-    assert outcome.exit_code == 0, outcome.output
+    done(*options, *own)
 
 
 def test_a_map_is_not_written_over(tmp_path: Path) -> None:

@@ -1,20 +1,24 @@
-"""From a stranger's table to a judged result."""
-
-from __future__ import annotations
+"""Tables of one's own, and what looks wrong in them."""
 
 import json
 import re
 import shlex
 from importlib.util import find_spec
-from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pipelines.config import load_config
 from pipelines.report.page import read_run_record
-from tests.pipelines.strangers_tables import rows, run_line, saga_fg, write
+from saga_fg import Boxes, Detections, Frame
+from saga_fg.tracking import Tracker
+from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
+from tests.pipelines.strangers_tables import T0, rows, run_line, saga_fg, write
+
+# From a stranger's table to a judged result
 
 
-def test_overlaps_are_those_that_both_have(tmp_path: Path) -> None:
+def test_overlaps_are_those_that_both_have(tmp_path):
     _, true = rows()
     flat = [{name: value for name, value in row.items() if name != "h"} for row in true]
     unturned = [{name: value for name, value in row.items() if name != "hdg"} for row in true]
@@ -34,9 +38,7 @@ def test_overlaps_are_those_that_both_have(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_from_a_strangers_table_to_a_judged_result(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, suffix: str
-) -> None:
+def test_from_a_strangers_table_to_a_judged_result(tmp_path, monkeypatch, caplog, suffix):
     monkeypatch.chdir(tmp_path)
     found, true = rows()
     write(tmp_path / f"det{suffix}", found)
@@ -78,7 +80,7 @@ def test_from_a_strangers_table_to_a_judged_result(
     assert (tmp_path / "report.html").stat().st_size > 20_000
 
 
-def test_tracks_of_another_tracker_and_its_own_clock(tmp_path: Path) -> None:
+def test_tracks_of_another_tracker_and_its_own_clock(tmp_path):
     _, true = rows()
     gt = write(tmp_path / "gt.csv", true)
     other = [
@@ -98,7 +100,7 @@ def test_tracks_of_another_tracker_and_its_own_clock(tmp_path: Path) -> None:
         assert figures["hota"]["car"]["centre"]["hota"] > 0.85
 
 
-def test_tracks_that_do_not_fit_the_truth(tmp_path: Path) -> None:
+def test_tracks_that_do_not_fit_the_truth(tmp_path):
     for change, message in [
         ({"ts_ns": lambda t: t + 10**12}, "expected tracks at the times of the ground truth"),
         ({"scene": lambda _: "b"}, None),
@@ -113,7 +115,7 @@ def test_tracks_that_do_not_fit_the_truth(tmp_path: Path) -> None:
         assert message is None or message in result.stderr
 
 
-def test_each_class_without_a_counterpart_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_each_class_without_a_counterpart_is_told(tmp_path, caplog):
     for theirs, alone, classes in [
         ({"v0": "X"}, "tracks of X and true objects of BUS", "BUS=X"),
         ({"v0": "coach", "v1": "VEHICLE"}, "tracks of coach and true objects of BUS", "BUS=coach"),
@@ -136,7 +138,7 @@ def test_each_class_without_a_counterpart_is_told(tmp_path: Path, caplog: pytest
             assert "BUS" not in caplog.text
 
 
-def test_decimal_commas_and_other_encodings_are_told_in_one_line(tmp_path: Path) -> None:
+def test_decimal_commas_and_other_encodings_are_told_in_one_line(tmp_path):
     table = tmp_path / "d.csv"
     table.write_text("time;x;y;length;label\n0,0;1,5;2,5;4,5;car\n0,1;1,6;2,5;4,5;car\n")
     tracked = saga_fg("track", "file", table, "-o", tmp_path / "t.csv")
@@ -149,12 +151,12 @@ def test_decimal_commas_and_other_encodings_are_told_in_one_line(tmp_path: Path)
     assert f"iconv -f latin1 -t utf-8 {table}" in tracked.stderr
 
 
-def test_without_truth_it_is_asked_for(tmp_path: Path) -> None:
+def test_without_truth_it_is_asked_for(tmp_path):
     result = saga_fg("evaluate", "file", write(tmp_path / "t.csv", rows()[1]))
     assert (result.exit_code, "name it: --truth TABLE" in result.stderr) == (2, True)
 
 
-def test_the_same_in_a_file_and_in_options(tmp_path: Path) -> None:
+def test_the_same_in_a_file_and_in_options(tmp_path):
     found, _ = rows()
     table = write(tmp_path / "d.csv", found)
     (tmp_path / "how.yaml").write_text("classes: {VEHICLE: car}\nunits: {angle: deg, score: percent}\nsort: true\n")
@@ -168,3 +170,286 @@ def test_the_same_in_a_file_and_in_options(tmp_path: Path) -> None:
     (tmp_path / "how.yaml").write_text("clases: {VEHICLE: car}\n")
     wrong = saga_fg("track", "file", table, "--import", tmp_path / "how.yaml", "-o", tmp_path / "a.csv")
     assert "how.yaml: clases: unknown key, did you mean 'classes'?" in wrong.stderr
+
+
+# What `inspect` and `track` say of tables with oddities, and what mends them
+
+
+def test_what_looks_wrong_is_told_once_with_what_mends_it(tmp_path, caplog):
+    table = write(tmp_path / "d.csv", rows()[0])
+    assert saga_fg("smooth", "file", table, "--sort", "--output", tmp_path / "labels").exit_code == 0
+    told = [record.getMessage() for record in caplog.records]
+    for mend in ("--units angle=deg", "--units score=percent"):
+        assert len([line for line in told if line.endswith(f"add {mend}")]) == 1, told
+
+
+def added(text: str) -> list[str]:
+    """The options that a warning or a look says to add."""
+    (mend,) = re.findall(r"; (?:fill in and )?add (--\S+ \S+)$", text, re.MULTILINE)
+    return shlex.split(str(mend))
+
+
+UNITS, CLASSES = ("--units", "angle=deg,score=percent"), ("--classes", "VEHICLE=car")
+
+
+PASTED = [
+    ("inspect", {"l": "wid", "w": "len"}, [*UNITS, *CLASSES], ["--columns", "length=wid,width=len"]),
+    ("track", {"l": "width", "w": "length"}, [*UNITS, *CLASSES], ["--columns", "length=width,width=length"]),
+    ("track", {}, ["--units", "score=percent", *CLASSES], ["--units", "score=percent,angle=deg"]),
+    ("inspect", {"category": "kind"}, ["--columns", "label=kind", *UNITS], ["--classes", "VEHICLE=car"]),
+    ("track", {"category": "kind"}, ["--columns", "label=kind", *UNITS], ["--classes", "VEHICLE=car"]),
+]
+
+
+def test_what_is_told_mends_it_when_pasted(tmp_path, caplog):
+    def told(command: str, *options: str) -> list[str]:
+        caplog.clear()
+        before, after = (["inspect"], []) if command == "inspect" else (["track", "file"], ["-o", tmp_path / "t.csv"])
+        result = saga_fg(*before, tmp_path / "d.csv", *options, *after)
+        assert result.exit_code == 0, result.output
+        lines = [*(record.getMessage() for record in caplog.records), *result.stdout.splitlines()]
+        return [line for line in lines if "; add --" in line]
+
+    for command, renamed, given, option in PASTED:
+        found = [{renamed.get(name, name): value for name, value in row.items()} for row in rows()[0]]
+        write(tmp_path / "d.csv", sorted(found, key=lambda row: row["ts_ns"]))
+        (doubt,) = told(command, *given)
+        assert shlex.split(doubt.rpartition("; add ")[2]) == option
+        assert not told(command, *given, *option)
+
+
+@pytest.mark.parametrize("command", ["inspect", "track"])
+def test_classes_that_are_numbers_are_to_be_filled_in(tmp_path, caplog, command):
+    found = [{**row, "category": n % 2} for n, row in enumerate(rows()[0])]
+    table = write(tmp_path / "d.csv", found)
+    units = ["--units", "angle=deg,score=percent"]
+    if command == "inspect":
+        text = saga_fg("inspect", table, *units).stdout
+        assert "saga-fg track file" in text.split("Next, with what fits in place of ...:")[1]
+        assert "--classes 0=...,1=... " in text.split("Next, with what fits in place of ...:")[1]
+    else:
+        assert saga_fg("track", "file", table, *units, "--sort", "-o", tmp_path / "t.csv").exit_code == 0
+        text = caplog.text
+    assert "objects are tracked one by one; fill in and add --classes 0=...,1=..." in text
+    pasted = saga_fg("track", "file", table, "--classes", "0=...,1=...", "-o", tmp_path / "t.csv")
+    assert pasted.exit_code == 2
+    assert "--classes: 0=...: expected a name in place of the dots" in pasted.stderr
+
+
+def test_settings_for_a_class_or_sensor_that_the_data_lack(tmp_path, caplog):
+    table = write(tmp_path / "d.csv", rows()[0])
+    config = tmp_path / "c.yaml"
+    options = ("--sort", "--classes", "VEHICLE=car", "--units", "angle=deg,score=percent", "-o", tmp_path / "t.csv")
+    for name, warnings in (("Car", 2), ("car", 1)):
+        caplog.clear()
+        config.write_text(f"tracker: {{classes: {{{name}: {{gate: 0.99}}}}}}\nsensors: {{lidar_top: {{}}}}\n")
+        assert saga_fg("track", "file", table, "--config", config, *options).exit_code == 0
+        told = [record.getMessage() for record in caplog.records]
+        assert len(told) == warnings, told
+        assert told[-1].startswith("sensors.lidar_top has settings and the data have none of it; sensor have")
+
+
+def test_looks_at_true_objects_at_none_and_at_scattered_dates(tmp_path):
+    table = write(tmp_path / "gt.csv", rows()[1])
+    result = saga_fg("inspect", table)
+    assert result.exit_code == 0, result.output
+    assert f"saga-fg evaluate file tracks.csv --truth {table} --classes VEHICLE=car --units angle=deg" in result.stdout
+    table = write(tmp_path / "d.csv", [{"foo": 1, "bar": 2}])
+    result = saga_fg("inspect", table)
+    assert result.exit_code == 2
+    assert "the columns there are bar, foo; name it: --columns timestamp=NAME,x=NAME,y=NAME" in result.stderr
+    table = write(tmp_path / "d.csv", [{**GOOD, "timestamp": "2024-05-01"}] * 3)
+    look = saga_fg("inspect", table)
+    assert "timestamp: expected times with the time of day" in look.stdout
+    assert "Next, when the table is mended:" in look.stdout
+
+
+def test_a_look_at_a_table_with_faults_shows_what_is_understood(tmp_path):
+    table = tmp_path / "d.csv"
+    table.write_text("when,x,y,lenght,label,score\n0,1,2,4.5,car,high\n1,1.5,2,4.5,car,0.5\n")
+    result = saga_fg("inspect", table)
+    assert result.exit_code == 0, result.output
+    assert re.search(r"x +1 +1\.25 +1\.5", result.stdout)
+    assert "car: 2, ? x ? x ? m, with interactions" in result.stdout
+    wrong, following = result.stdout.split("What looks wrong:")[1].split("Next, with what fits in place of ...:")
+    assert "expected a column 'timestamp'" in wrong
+    assert "unknown column 'lenght'; did you mean 'length'?" in wrong
+    assert "line 2: score: expected a number, got 'high'" in wrong
+    assert f"saga-fg track file {table} --columns length=lenght,timestamp=... " in following
+    assert "expected a name in place of the dots" in run_line(following.strip().splitlines()[0]).stderr
+    told = saga_fg("inspect", table, "--columns", "timestamp=when,length=lenght,score=")
+    assert "Nothing looks wrong." in told.stdout
+
+
+def test_a_look_takes_the_options_that_it_prints(tmp_path):
+    table = write(tmp_path / "d.csv", rows()[0])
+    look = saga_fg("inspect", table).stdout
+    assert "rows are not in order of time; add --sort" in look
+    (options,) = re.findall(r"track file \S+ (.*) --output tracks.csv", look)
+    again = saga_fg("inspect", table, *shlex.split(options))
+    assert again.exit_code == 0, again.output
+    assert "Nothing looks wrong." in again.stdout
+    assert f" {options} --output tracks.csv" in again.stdout
+
+
+def test_numbers_of_frames_taken_for_seconds(tmp_path, caplog):
+    found = [{"frame": k // 2, "x": k // 2 + 20 * (k % 2), "y": 2, "label": "car"} for k in range(40)]
+    table = write(tmp_path / "d.csv", found)
+    track = ["track", "file", table, "--columns", "time=frame", "-o", tmp_path / "t.csv"]
+    assert saga_fg(*track).exit_code == 0
+    assert "they look like frames, such as 10 a second; add --units time=10Hz" in caplog.text
+    assert "add --units time=10Hz" in saga_fg("inspect", table, "--columns", "time=frame").stdout
+    caplog.clear()
+    assert saga_fg(*track, "--units", "time=10Hz").exit_code == 0
+    assert not caplog.records
+    assert saga_fg(*track, "--units", "time=s").exit_code == 0  # they are seconds
+    assert not caplog.records
+
+
+def test_boxes_of_argoverse_are_not_taken_for_the_world(tmp_path, caplog):
+    for tracks in [False, True]:
+        pose = {"qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "tz_m": 0.0}
+        found = [
+            {"log_id": "a", "timestamp_ns": T0 + k * 10**8, "category": "BUS", "score": 0.5, "length_m": 10.0,
+             "width_m": 2.5, "height_m": 3.0, "tx_m": 5.0 + k, "ty_m": 1.0,
+             **pose, **({"track_id": 3} if tracks else {})}
+            for k in range(30)
+        ]  # fmt: skip
+        table = write(tmp_path / "d.feather.parquet", found)
+        shown = saga_fg("inspect", table).stdout
+        command = f"saga-fg track argoverse2 --dataroot ... --detections {table} --output tracks.feather"
+        if tracks:
+            command = f"saga-fg evaluate argoverse2 {table} --dataroot ..."
+        assert shown.endswith(f"Next, with what fits in place of ...:\n  {command}\n")
+        if not tracks:
+            assert saga_fg("track", "file", table, "--classes", "BUS=bus", "-o", tmp_path / "t.csv").exit_code == 0
+            assert f"in the frame of the vehicle, and are taken for the world; read them with the poses of their logs: {command}" in caplog.text  # fmt: skip # noqa: E501
+
+
+def test_a_look_at_a_table_without_doubts(tmp_path):
+    lines = "".join(f"{k / 10},car,{k},2\n" for k in (*range(10), *range(30, 40)))
+    (tmp_path / "d.csv").write_text("timestamp,label,x,y\n" + lines)
+    result = saga_fg("inspect", tmp_path / "d.csv")
+    assert "Nothing looks wrong." in result.stdout
+    assert "20 frames in 3.9 s, 10 Hz, 1 pause, the longest of 2.1 s" in result.stdout
+    assert "car: 20, ? x ? x ? m, with interactions" in result.stdout
+
+
+def test_the_examples_of_the_help_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found, true = rows()
+    write(tmp_path / "detections.csv", sorted(found, key=lambda row: row["ts_ns"]))
+    write(tmp_path / "truth.csv", true)
+    write(tmp_path / "tracks.csv", true)
+    text = saga_fg("evaluate", "file", "--help").stdout
+    lines = [line.strip() for line in text.replace(" \\\n", " ").splitlines() if "saga-fg evaluate file" in line]
+    assert len(lines) == 3
+    for line in lines:
+        result = run_line(line)
+        assert result.exit_code == 0, result.output
+
+
+POSE = {"ego_x": 0.0, "ego_y": 0.0, "ego_yaw": 0.0}
+GOOD = {"timestamp": 0.0, "x": 1.0, "y": 2.0, "scene": "a", "vx": 0.5, "length": 4.0, **POSE}
+
+
+def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(tmp_path):
+    for row, message in [
+        ({"x": 2e9}, "line 5: x: expected a finite number within 1e+09, got 2e+09"),
+        ({"y": -1e300}, "line 5: y: expected a finite number within 1e+09, got -1e+300"),
+        ({"vx": 1e7}, "line 5: vx: expected a finite number within 1e+06, got 1e+07"),
+        ({"length": 1e6}, "line 5: length: expected a finite number within 100000, got 1e+06"),
+        ({"length": 0}, "line 5: length: expected a positive number of metres, got 0"),
+        ({"ego_x": 1e12}, "line 5: ego_x: expected a finite number within 1e+09, got 1e+12"),
+        ({"ego_yaw": 1.0}, "line 6: ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time"),
+        ({"scene": "n" * 300}, "line 5: scene: expected a name of at most 256 characters"),
+    ]:
+        found = [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("abcd")]
+        table = write(tmp_path / "d.csv", [*found[:3], found[3] | row, found[3]])
+        tracked = saga_fg("track", "file", table, "--output", tmp_path / "t.csv")
+        assert tracked.exit_code == 2
+        assert tracked.stderr.startswith(f"error: {table}: ")
+        assert message in tracked.stderr
+        look = saga_fg("inspect", table)
+        assert message in look.stdout + look.stderr
+        assert look.exit_code == 2 or "Next, when the table is mended:" in look.stdout
+
+
+def test_a_look_sees_scenes_that_are_scattered_in_a_long_table(tmp_path, monkeypatch):
+    monkeypatch.setattr("data_tools.datasets.detection_files.dataset.ROWS", 3)
+    table = write(tmp_path / "d.csv", [{**GOOD, "scene": name, "timestamp": k} for k, name in enumerate("aabbaabb")])
+    look = saga_fg("inspect", table).stdout
+    assert "rows are not in order of time; add --sort" in look
+    assert "--sort --output tracks.csv" in look
+
+
+# Recorded traffic that is odd: a vehicle in the middle of another, a lane that ends, lights nobody reports
+
+SIZE, SPEED = (4.5, 1.8, 1.5), 8.0
+
+
+def frame(time: float, cars: list[tuple[float, float]], road: RoadMap | None = None) -> Frame:
+    """Cars (x, y) that drive along x."""
+    n = len(cars)
+    position = np.column_stack([np.array(cars).reshape(-1, 2), np.zeros(n)])
+    boxes = Boxes.of(["car"] * n, position, np.tile(SIZE, (n, 1)), np.zeros(n))
+    return Frame(time, "lidar", Detections(boxes, np.full(n, 0.9)), road_map=road)
+
+
+def new_tracker() -> Tracker:
+    tracker = load_config("traffic").new_tracker("saga")
+    assert isinstance(tracker, Tracker)
+    return tracker
+
+
+def test_a_vehicle_that_appears_in_the_middle_of_another_is_predicted_all_the_same(subtests):
+    for apart in [0.0, 1e-9, 0.5, 2.0]:
+        with subtests.test(apart=apart):
+            tracker = new_tracker()
+            for k in range(20):
+                x = SPEED * k / 10
+                tracker.step(frame(k / 10, [(x, 0.0)] if k < 10 else [(x, 0.0), (x + apart, 0.0)]))
+            predicted = tracker.predict([1.0, 5.0], joint=True)
+            assert len(predicted) >= 1
+            assert np.isfinite(predicted.position).all()
+            assert (np.linalg.eigvalsh(predicted.position_covariance) > 0).all()
+            assert predicted.joint_covariance is not None
+            assert (np.linalg.eigvalsh(predicted.joint_covariance) > -1e-6).all()
+            first = predicted.position[:, np.argmin(predicted.id), 0]
+            assert SPEED * 1.9 < first[0] < first[1] < SPEED * 1.9 + 1.2 * SPEED * 5
+
+
+def test_where_a_lane_ends_vehicles_are_predicted_straight_on():
+    light = TrafficLight("light", (100.0, 5.0))
+    line = StopLine("line", (100.0, 2.0), (100.0, -2.0), "light")
+    ending = RoadMap((light,), (line,), (Lane("ending", ((-50.0, 0.0), (20.0, 0.0))),))
+    tracker = new_tracker()
+    for k in range(20):
+        tracker.step(frame(k / 10, [(SPEED * k / 10, 0.0)], ending))
+    predicted = tracker.predict([1.0, 3.0, 5.0])
+    x, y = predicted.position[:, 0].T
+    assert (np.diff(x) > 0).all()
+    assert x[1] > 25  # beyond the end of the lane
+    assert np.abs(y).max() < 1.0
+
+
+def test_a_light_that_nobody_reports_stops_nobody_for_sure():
+    """Colours are inferred from traffic: a car that comes at full speed 12 m before the line runs no red light."""
+    light = TrafficLight("light", (40.0, 5.0))
+    line = StopLine("line", (40.0, 2.0), (40.0, -2.0), "light")
+    road = RoadMap((light,), (line,), (Lane("lane", ((-50.0, 0.0), (80.0, 0.0))),))
+    tracker = new_tracker()
+    for k in range(36):
+        tracker.step(frame(k / 10, [(SPEED * k / 10, 0.0)], road))
+    belief = tracker.map_nodes.belief("light")
+    assert sum(belief.values()) == pytest.approx(1.0)
+    assert belief["green"] > 0.5
+    assert tracker.predict([3.0]).position[0, 0, 0] > 45
+
+
+def test_traffic_without_a_map_has_no_nodes_of_one():
+    tracker = new_tracker()
+    for k in range(5):
+        tracker.step(frame(k / 10, [(SPEED * k / 10, 0.0)]))
+    assert len(tracker.map_nodes) == 0
+    assert len(tracker.predict([1.0])) == 1

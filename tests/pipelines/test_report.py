@@ -1,6 +1,4 @@
-"""Reports: the data of the player, charts, the page, and the page in a browser."""
-
-from __future__ import annotations
+"""The report of a run."""
 
 import base64
 import html
@@ -15,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from data_tools.datasets.results import SceneResult
 from data_tools.figures import FigureTable
 from data_tools.metrics import SceneBoxes, label_errors
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
@@ -22,6 +21,7 @@ from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.report import (
     Report,
+    ReportScene,
     RunRecord,
     accuracy_charts,
     latency_chart,
@@ -29,11 +29,18 @@ from pipelines.report import (
     report_page,
     scene_of_run,
 )
-from pipelines.report.figures import SHARES, unseen_for
+from pipelines.report.figures import COLUMNS, SHARES, track_charts, track_figures, unseen_for
 from pipelines.report.page import record_path, write_run_record
 from pipelines.report.scenes import edges_of_frames, scene_data
 from pipelines.tracking import TrackedScene, track_scene
-from saga_fg import Boxes, InputError
+from saga_fg import Boxes, Frame, InputError, Scene
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.types.frame import Detections
+from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
+from tests.pipelines.command import done, refused
+from tests.pipelines.page_in_browser import tried_in_browser
+
+# Reports: the data of the player, charts, the page, and the page in a browser
 
 SHORT = SimulatorSettings(duration=4.0, warm_up=5.0)
 CONFIG = load_config("simulated")
@@ -154,7 +161,7 @@ def test_latencies_are_counted():
     assert len(chart.series[0].x) == len(chart.series[0].y) + 1
 
 
-def test_a_record_is_read_back_and_a_broken_one_refused(tmp_path: Path):
+def test_a_record_is_read_back_and_a_broken_one_refused(tmp_path):
     result = tmp_path / "tracks.json"
     assert read_run_record(result) is None
     record = RunRecord("saga", "tracker: {}", {"a": [1.5, 2.0]})
@@ -166,30 +173,209 @@ def test_a_record_is_read_back_and_a_broken_one_refused(tmp_path: Path):
         read_run_record(result)
 
 
-def test_a_table_of_tracks_becomes_a_page(tmp_path: Path):
+def test_a_table_of_tracks_becomes_a_page(tmp_path):
     detections, tracks, output = tmp_path / "d.csv", tmp_path / "t.csv", tmp_path / "page.html"
     rows = [f"{k / 10},car,{k * 0.8},0,0.9" for k in range(30)]
     detections.write_text("timestamp,label,x,y,score\n" + "\n".join(rows) + "\n")
     run = CliRunner().invoke
     assert run(app, ["track", "file", str(detections), "--output", str(tracks)]).exit_code == 0
-    result = run(app, ["report", "file", str(tracks), "--detections", str(detections), "--output", str(output)])
-    assert result.exit_code == 0, result.output
+    done("report", "file", tracks, "--detections", detections, "--output", output)
     page = output.read_text(encoding="utf-8")
     data = data_of(page)
     assert len(data["scenes"][0]["times"]) == 30
     assert list(data["scenes"][0]["methods"]) == ["saga"]
     assert data["charts"][-1]["title"].startswith("Time in the tracker")
     assert "acceleration_noise" in page  # the configuration
-    alone = run(app, ["report", "file", str(tracks), "--output", str(tmp_path / "alone.html")])
-    assert alone.exit_code == 0, alone.output
+    done("report", "file", tracks, "--output", tmp_path / "alone.html")
     same = run(app, ["report", "file", str(tracks), "--output", str(tracks)])
     assert same.exit_code == 2
-    no_page = run(app, ["report", "file", str(tracks), "--output", str(tmp_path / "page.pdf")])
-    assert no_page.exit_code == 2
-    assert "page.pdf: expected a file name that ends in .html" in no_page.stderr
+    said = refused("report", "file", tracks, "--output", tmp_path / "page.pdf")
+    assert "page.pdf: expected a file name that ends in .html" in said
     assert not (tmp_path / "page.pdf").exists()
     other = tmp_path / "other.csv"
     other.write_text("timestamp,label,x,y,scene\n100,car,0,0,d\n")
-    wrong = run(app, ["report", "file", str(tracks), "--detections", str(other), "--output", str(output)])
-    assert wrong.exit_code == 2
-    assert "expected the times of the detections" in wrong.stderr
+    said = refused("report", "file", tracks, "--detections", other, "--output", output)
+    assert "expected the times of the detections" in said
+
+
+# Reports of results on disk: title and figures without ground truth, and two results beside one another
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    rows = [f"{k / 10},car,{k * 0.8},{4 * n},0.9" for k in range(30) for n in range(2)]
+    (tmp_path / "d.csv").write_text("timestamp,label,x,y,score\n" + "\n".join(rows) + "\n")
+    for method in ("saga", "kf"):
+        done("track", "file", tmp_path / "d.csv", "--method", method, "--output", tmp_path / f"{method}.csv")
+    return tmp_path
+
+
+def report(folder: Path, *more: object):
+    options = ("--detections", folder / "d.csv", "--output", folder / "page.html")
+    return run("report", "file", folder / "saga.csv", *options, *more)
+
+
+def test_the_title_says_method_and_data_and_the_figures_what_is_known(folder):
+    done = report(folder)
+    assert done.exit_code == 0, done.output
+    page = (folder / "page.html").read_text(encoding="utf-8")
+    assert "<h1>saga on d.csv</h1>" in page
+    for fact in ("saga.csv", "d", "30 moments", "58 boxes"):
+        assert f"<li>{fact}</li>" in page
+    assert "<th>tracks</th>" in page
+    titles = [chart["title"] for chart in data_of(page)["charts"]]
+    assert titles[0] == "Tracks at a time"
+    assert titles[-1].startswith("Time in the tracker")
+
+
+def test_tracks_of_own_data_are_drawn_when_the_page_opens(folder, tmp_path):
+    assert report(folder).exit_code == 0
+    page = (folder / "page.html").read_text(encoding="utf-8")
+    found = tried_in_browser(page, 'found.tracks = document.getElementById("view").dataset.tracks;', tmp_path)
+    assert found == {"faults": [], "tracks": "2"}
+
+
+def test_two_results_stand_side_by_side(folder):
+    done = report(folder, "--beside", folder / "kf.csv")
+    assert done.exit_code == 0, done.output
+    page = (folder / "page.html").read_text(encoding="utf-8")
+    assert "<h1>saga and kf on d.csv</h1>" in page
+    data = data_of(page)
+    assert list(data["scenes"][0]["methods"]) == ["kf", "saga"]  # the result itself is the last, which is chosen
+    assert data["beside"] == "kf"
+    assert {"saga: Tracks at a time", "kf: Tracks at a time"} <= {chart["title"] for chart in data["charts"]}
+
+
+def test_results_of_one_method_are_told_apart_by_their_files(folder):
+    (folder / "other").mkdir()
+    for name in ("saga.csv", "saga.run.json"):
+        (folder / "other" / name).write_bytes((folder / name).read_bytes())
+        (folder / name.replace("saga", "again")).write_bytes((folder / name).read_bytes())
+    assert report(folder, "--beside", folder / "again.csv").exit_code == 0
+    assert "<h1>saga and again on" in (folder / "page.html").read_text(encoding="utf-8")
+    assert report(folder, "--beside", folder / "other" / "saga.csv").exit_code == 0
+    assert "and other/saga on d.csv" in (folder / "page.html").read_text(encoding="utf-8")
+
+
+def test_results_that_do_not_belong_together_are_refused(folder):
+    text = (folder / "kf.csv").read_text().splitlines()
+    (folder / "short.csv").write_text("\n".join(text[:20]) + "\n")
+    said = refused(
+        "report", "file", folder / "saga.csv", "--beside", folder / "short.csv", "--output", folder / "p.html"
+    )  # without detections, moments are those of the tracks
+    assert "expected the moments of the other result" in said or "expected a scene" in said
+    same = report(folder, "--beside", folder / "page.html")
+    assert same.exit_code == 2
+
+
+def test_figures_without_ground_truth():
+    """A car that is lost from view once, and a walker of two moments."""
+    ids = ["car"] * 6 + ["walker"] * 2
+    frame = np.array([0, 1, 2, 3, 4, 5, 2, 3])
+    order = np.argsort(frame, kind="stable")
+    label = ["car"] * 6 + ["pedestrian"] * 2
+    boxes = Boxes.of(label, np.zeros((8, 3)), velocity=[[3, 4]] * 6 + [[1, 0]] * 2).select(order)
+    table = SceneBoxes(frame[order], np.array(ids)[order], boxes, np.full(8, 0.5), np.tile(0.04 * np.eye(2), (8, 1, 1)))
+    coasting = np.array([0, 0, 0.5, 1.0, 0, 0, 0, 0])[order]
+    scene = Scene("s", np.arange(6) * 0.5, np.tile(np.eye(4), (6, 1, 1)), ("",) * 6, ())
+    rows = {
+        row[0]: dict(zip(COLUMNS, row, strict=True))
+        for row in track_figures([SceneResult(scene, table, coasting=coasting)]).rows
+    }
+    assert list(rows) == ["all", "car", "pedestrian"]
+    car, walker = rows["car"], rows["pedestrian"]
+    assert (car["tracks"], car["short"], car["boxes"], car["gaps"]) == ("1", "0", "6", "1")
+    assert [float(car[name]) for name in ("life, s", "speed, m/s", "position ±, m", "unseen")] == pytest.approx(
+        [2.5, 5.0, 0.2, 1 / 3], abs=0.001
+    )
+    assert (walker["short"], walker["gaps"]) == ("1", "0")
+    counts = track_charts([SceneResult(scene, table)])[0]
+    assert list(counts.series[0].y) == [1, 1, 2, 2, 1, 1]
+    nothing = table.select([])
+    assert track_figures([SceneResult(scene, nothing)]).rows == ()
+
+
+# The road in the page's player: what it is told, and what it draws
+
+ORIGIN = (100.0, 50.0)
+LIGHT = TrafficLight("north", (130.0, 50.0))
+MAP = RoadMap(
+    (LIGHT,),
+    (StopLine("line", (120.0, 51.75), (120.0, 48.25), "north"),),
+    (Lane("lane", ((90.0, 50.0), (120.0, 50.0), (150.0, 52.0)), 3.5),),
+)
+LATER = RoadMap((TrafficLight("south", (100.0, 90.0)), TrafficLight("north", (0.0, 0.0))))
+RED, GREEN, CAR = "traffic_light_red", "traffic_light_green", "car"
+
+
+def frame(time: float, *seen: tuple[str, float, float], road_map: RoadMap | None = None) -> Frame:
+    """Detections in the coordinates of the vehicle, which is stationary at the origin of the scene."""
+    boxes = Boxes.of([label for label, _, _ in seen], [[x, y, 0.0] for _, x, y in seen])
+    pose = yaw_transform(*ORIGIN)
+    return Frame(time, "camera", Detections(boxes, np.ones(len(seen))), pose, "ego", road_map=road_map)
+
+
+def road_report(*frames: Frame) -> ReportScene:
+    """A scene of five moments, each second, without tracks."""
+    scene = Scene("s", np.arange(5.0), np.tile(yaw_transform(*ORIGIN), (5, 1, 1)), ("",) * 5, frames)
+    none = SceneBoxes(np.empty(0, dtype=np.int64), np.empty(0, dtype="<U1"), Boxes.of([], []), np.empty(0))
+    return ReportScene(scene, {"saga": none}, {})
+
+
+SEEN = road_report(
+    frame(0.0, (CAR, 30.0, 0.0), road_map=MAP),
+    frame(1.5, (GREEN, 30.5, 1.0), (RED, 30.0, 4.5), road_map=MAP),
+    frame(2.5, (GREEN, 30.0, 0.0)),
+    frame(2.7, (RED, 29.0, 0.0), (CAR, 30.0, 0.0), road_map=LATER),
+    frame(4.0),
+)
+
+
+def test_a_road_is_told_about_the_start_with_the_colours_last_reported():
+    assert scene_data(road_report(frame(0.0, (RED, 1.0, 1.0))))["road"] is None
+    road = scene_data(SEEN)["road"]
+    assert road["lanes"] == [[350, -1000, 0, 2000, 0, 5000, 200]]
+    assert road["lines"] == [[0, 2000, 175, 2000, -175]]
+    assert road["lights"] == [[3000, 0], [0, 4000]]  # what the later map says of "north" is not news
+    json.dumps(road)
+    green, red = 2, 0
+    assert scene_data(SEEN)["road"]["colours"] == [[None, None], [None, None], [green, None], [red, None], [red, None]]
+
+
+TRY = """
+  const view = document.getElementById("view"), time = document.getElementById("time");
+  const scene = document.getElementById("scene"), toggle = document.getElementById("show-road");
+  const count = (r, g, b) => {
+    const data = view.getContext("2d").getImageData(0, 0, view.width, view.height).data;
+    let n = 0;
+    for (let i = 0; i < data.length; i += 4) if (data[i] === r && data[i + 1] === g && data[i + 2] === b) n++;
+    return n;
+  };
+  const drawn = () => ({red: count(224, 32, 44), green: count(24, 160, 74), band: count(228, 233, 238)});
+  const at = k => { time.value = k; time.oninput(); return drawn(); };
+  found.toggles = [toggle.parentElement.checkVisibility()];
+  scene.selectedIndex = 1; scene.onchange();
+  found.toggles.push(toggle.parentElement.checkVisibility());
+  found.moments = [0, 2, 4].map(at);
+  toggle.click();
+  found.off = drawn();
+"""
+
+
+def test_the_browser_draws_the_road_where_there_is_one(tmp_path):
+    page = report_page(Report("road", [], [road_report(frame(0.0)), SEEN]))
+    found = tried_in_browser(page, TRY, tmp_path)
+    assert found["faults"] == []
+    assert found["toggles"] == [False, True]
+    nothing, green, red = found["moments"]
+    assert nothing["red"] == nothing["green"] == 0
+    assert green["green"] > 50
+    assert green["red"] == 0
+    assert red["red"] > 50
+    assert red["green"] == 0
+    assert all(moment["band"] > 5000 for moment in found["moments"])
+    assert set(found["off"].values()) == {0}

@@ -1,7 +1,5 @@
 """A parallel run into a folder where somebody has planted links, or a manifest that names files elsewhere."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping
@@ -36,7 +34,7 @@ def unharmed(victim: Path) -> bool:
     return [path.read_text() for path in victim.iterdir()] == ["mine"]
 
 
-def test_a_link_where_a_file_belongs_is_replaced(tmp_path: Path, victim: Path) -> None:
+def test_a_link_where_a_file_belongs_is_replaced(tmp_path, victim):
     links = [tmp_path / "out" / name for name in ("configuration.yaml", "tracks/a00.csv", "manifest/a00.json")]
     for link in links:
         link.parent.mkdir(exist_ok=True)
@@ -47,14 +45,14 @@ def test_a_link_where_a_file_belongs_is_replaced(tmp_path: Path, victim: Path) -
 
 
 @pytest.mark.parametrize("name", ["tracks", ".lock"])
-def test_a_link_where_a_folder_or_the_lock_belongs_is_refused(tmp_path: Path, victim: Path, name: str) -> None:
+def test_a_link_where_a_folder_or_the_lock_belongs_is_refused(tmp_path, victim, name):
     (tmp_path / "out" / name).symlink_to(victim / "a00.csv" if name == ".lock" else victim)
     with pytest.raises(InputError, match=rf"out/{name}.*: not writable: expected no link on the way"):
         run(tmp_path)
     assert unharmed(victim)
 
 
-def test_a_link_where_the_scratch_folder_belongs_is_removed(tmp_path: Path, victim: Path) -> None:
+def test_a_link_where_the_scratch_folder_belongs_is_removed(tmp_path, victim):
     for to in ("victim", "victim/a00.csv", "nowhere"):
         (tmp_path / "out" / ".scratch").symlink_to(tmp_path / to)
         run(tmp_path)
@@ -63,7 +61,7 @@ def test_a_link_where_the_scratch_folder_belongs_is_removed(tmp_path: Path, vict
         assert unharmed(victim)
 
 
-def test_leftovers_are_not_looked_for_behind_links(tmp_path: Path, victim: Path) -> None:
+def test_leftovers_are_not_looked_for_behind_links(tmp_path, victim):
     (victim / "a00.csv").rename(victim / ".a00.csv.0123456789ab.tmp")
     (tmp_path / "out" / "linked").symlink_to(victim)
     (tmp_path / "out" / ".linked.0123456789ab.tmp").symlink_to(victim)
@@ -79,7 +77,7 @@ FORGED = (
 )
 
 
-def test_a_manifest_names_nothing_of_others(tmp_path: Path, victim: Path) -> None:
+def test_a_manifest_names_nothing_of_others(tmp_path, victim):
     run(tmp_path, 2)
     out = tmp_path / "out"
     path = out / "manifest" / "a00.json"
@@ -94,7 +92,7 @@ def test_a_manifest_names_nothing_of_others(tmp_path: Path, victim: Path) -> Non
     assert list(json.loads(path.read_text())["results"]) == ["tracks/a00.csv"]
 
 
-def test_a_record_of_another_scene_is_none(tmp_path: Path) -> None:
+def test_a_record_of_another_scene_is_none(tmp_path):
     run(tmp_path, 2)
     records = tmp_path / "out" / "manifest"
     (records / "a00.json").write_bytes((records / "a01.json").read_bytes())
@@ -115,7 +113,7 @@ class InFoldersOfItsOwn:
         return {}
 
 
-def test_results_may_be_in_a_folder_of_the_scene(tmp_path: Path) -> None:
+def test_results_may_be_in_a_folder_of_the_scene(tmp_path):
     inputs = write_recordings(tmp_path / "in", 1)
     reports = [
         run_scenes(inputs, 1, InFoldersOfItsOwn(), tmp_path / "out", lambda scratch: InThisProcess()) for _ in range(2)
@@ -123,7 +121,7 @@ def test_results_may_be_in_a_folder_of_the_scene(tmp_path: Path) -> None:
     assert (reports[0].done, reports[1].unchanged) == (["a00"], ["a00"])
 
 
-def test_a_result_behind_a_link_is_neither_believed_nor_removed(tmp_path: Path, victim: Path) -> None:
+def test_a_result_behind_a_link_is_neither_believed_nor_removed(tmp_path, victim):
     run(tmp_path)
     (tmp_path / "out" / "tracks").rename(tmp_path / "moved")
     (tmp_path / "out" / "tracks").symlink_to(tmp_path / "moved")
@@ -133,7 +131,7 @@ def test_a_result_behind_a_link_is_neither_believed_nor_removed(tmp_path: Path, 
     assert (tmp_path / "moved" / "a00.csv").read_bytes() == before
 
 
-def test_a_record_of_other_types_is_none(tmp_path: Path) -> None:
+def test_a_record_of_other_types_is_none(tmp_path):
     run(tmp_path)
     path = tmp_path / "out" / "manifest" / "a00.json"
     sound = json.loads(path.read_text())
@@ -149,7 +147,7 @@ def test_a_record_of_other_types_is_none(tmp_path: Path) -> None:
     assert run(tmp_path).done == ["a00"]
 
 
-def test_a_record_that_is_a_pipe_or_nested_too_deeply_is_none(tmp_path: Path) -> None:
+def test_a_record_that_is_a_pipe_or_nested_too_deeply_is_none(tmp_path):
     for number, scene in enumerate(("a00", "a01")):
         run(tmp_path, 2)
         path = tmp_path / "out" / "manifest" / f"{scene}.json"
@@ -158,7 +156,7 @@ def test_a_record_that_is_a_pipe_or_nested_too_deeply_is_none(tmp_path: Path) ->
         assert run(tmp_path, 2).done == [scene]
 
 
-def test_the_output_itself_may_be_a_link(tmp_path: Path) -> None:
+def test_the_output_itself_may_be_a_link(tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "out").symlink_to(tmp_path / "disk")
     assert run(tmp_path).done == ["a00"]
@@ -166,7 +164,7 @@ def test_the_output_itself_may_be_a_link(tmp_path: Path) -> None:
     assert list(content(tmp_path / "disk")) == ["a00.csv"]
 
 
-def test_merged_tables_are_not_written_through_a_link(tmp_path: Path, victim: Path) -> None:
+def test_merged_tables_are_not_written_through_a_link(tmp_path, victim):
     (tmp_path / "short.yaml").write_text("duration: 1.0\nwarm_up: 1.0\n")
 
     def saga_fg(*arguments: object) -> tuple[int, str]:

@@ -1,6 +1,4 @@
-"""`saga-fg serve` as a process of its own, over sockets and pipes."""
-
-from __future__ import annotations
+"""`saga-fg serve` as a process of its own, and how it stops."""
 
 import json
 import os
@@ -9,13 +7,15 @@ import socket
 import stat
 import subprocess
 import sys
-from pathlib import Path
+import time
 
 import pytest
 
 from pipelines.serving import StreamClient, parse_address
 from saga_fg import InputError
-from tests.pipelines.running_service import COMMAND, frame, serving
+from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
+
+# `saga-fg serve` as a process of its own, over sockets and pipes
 
 
 def test_clients_share_one_tracker_and_one_may_listen():
@@ -58,7 +58,7 @@ def test_a_line_without_end_is_refused_and_the_next_one_read():
         assert client.receive()["type"] == "tracks"
 
 
-def test_a_unix_socket_is_for_its_owner_and_gone_afterwards(tmp_path: Path):
+def test_a_unix_socket_is_for_its_owner_and_gone_afterwards(tmp_path):
     path = tmp_path / "saga.sock"
     with serving("--listen", str(path)) as (address, server):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -77,7 +77,7 @@ def test_a_unix_socket_is_for_its_owner_and_gone_afterwards(tmp_path: Path):
     assert not path.exists()
 
 
-def test_a_socket_left_behind_is_taken_over_and_a_file_is_not(tmp_path: Path):
+def test_a_socket_left_behind_is_taken_over_and_a_file_is_not(tmp_path):
     stale = tmp_path / "stale.sock"
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(stale))
@@ -89,13 +89,10 @@ def test_a_socket_left_behind_is_taken_over_and_a_file_is_not(tmp_path: Path):
     assert (done.returncode, file.read_text()) == (2, "mine")
 
 
-def test_other_machines_only_when_asked_for():
+def test_other_machines_are_refused_and_nobody_there_is_one_line():
     done = subprocess.run([*COMMAND, "serve", "--listen", "0.0.0.0:0"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "--allow-remote" in done.stderr
-
-
-def test_nobody_there_is_one_line():
     with pytest.raises(InputError, match="nobody answers there"):
         StreamClient(parse_address("127.0.0.1:9"))
     done = subprocess.run([*COMMAND, "status", "/nowhere/x.sock"], capture_output=True, text=True, check=False)
@@ -151,3 +148,134 @@ def test_kernels_are_there_before_the_service_listens():
             assert server.stderr.readline().startswith("listening at ")
         finally:
             server.kill()
+
+
+# SIGTERM ends the service, with what came in done, whatever the tracker is doing
+
+STUCK = """
+import sys, time
+from pipelines.serving import SocketServer, StopRequest, StreamSettings, StreamTracker, parse_address
+from saga_fg import Tracks
+
+class Stuck:
+    max_jump = 10.0
+
+    def step(self, frame):
+        while True:
+            {waiting}
+
+    def tracks(self, timestamp):
+        return Tracks.empty(timestamp)
+
+stream = StreamTracker(Stuck, StreamSettings(stop_timeout=0.5))
+with StopRequest(0.5) as stop:
+    ready = lambda address: print(f"listening at {{address}}", file=sys.stderr, flush=True)
+    SocketServer(stream, parse_address("127.0.0.1:0"), ready).run(stop)
+"""
+
+
+@pytest.mark.parametrize(("waiting", "number"), [("time.sleep(1)", signal.SIGTERM), ("pass", signal.SIGINT)])
+def test_a_step_without_end_does_not_keep_the_service_alive(waiting, number):
+    command = [sys.executable, "-c", STUCK.format(waiting=waiting)]
+    with serving(command=command) as (address, server), StreamClient(address) as client:
+        client.send(frame(0))
+        with StreamClient(address):  # others may still connect
+            time.sleep(0.2)
+        server.send_signal(number)
+        _, errors = server.communicate(timeout=60)
+        assert server.returncode == 128 + number
+        assert "Traceback" not in errors
+
+
+def test_what_came_in_is_answered_before_the_end():
+    with serving("--listen", "127.0.0.1:0", "--reorder", "0.5") as (address, server), StreamClient(address) as client:
+        for seq in range(4):
+            client.send(frame(seq))
+            assert client.receive()["type"] == "held"
+        server.send_signal(signal.SIGTERM)
+        assert [client.receive()["seq"] for _ in range(4)] == [0, 1, 2, 3]
+        _, errors = server.communicate(timeout=60)
+    assert server.returncode == 143
+    assert "4 frames tracked" in errors
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 0)])
+def test_a_pipe_ends_with_what_came_in(tmp_path, number, code):
+    state = tmp_path / "state"
+    command = [*COMMAND, "serve", "--reorder", "0.5", "--snapshot", str(state)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe) as server:
+        assert server.stdin is not None
+        assert server.stdout is not None
+        server.stdin.write(b"".join(map(frame, range(4))) + frame(4)[:10])
+        server.stdin.flush()
+        assert [json.loads(server.stdout.readline())["type"] for _ in range(4)] == ["held"] * 4
+        assert server.stderr is not None
+        server.send_signal(number)
+        out, errors = server.stdout.read(), server.stderr.read()
+    assert server.returncode == code
+    assert [json.loads(line)["seq"] for line in out.splitlines()] == [0, 1, 2, 3]
+    assert b"Traceback" not in errors
+    assert sorted(file.name for file in tmp_path.iterdir()) == [".state.lock", "state"]
+
+
+def test_a_pipe_whose_reader_sleeps_ends_too_and_keeps_its_state(tmp_path):
+    read, write = os.pipe()
+    command = [*COMMAND, "serve", "--snapshot", str(tmp_path / "state"), "--every", "3600"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=write, stderr=subprocess.PIPE) as server:
+        assert server.stdin is not None
+        asks = b'{"type": "status"}\n'
+        server.stdin.write(frame(0) + frame(1))
+        server.stdin.flush()
+        assert os.read(read, 10)  # it runs
+        os.set_blocking(server.stdin.fileno(), False)
+        refusals = 0
+        while refusals < 20:  # until neither side takes any more
+            try:
+                os.write(server.stdin.fileno(), asks)
+                refusals = 0
+            except BlockingIOError:
+                refusals += 1
+                time.sleep(0.02)
+        server.send_signal(signal.SIGTERM)
+        _, errors = server.communicate(timeout=60)
+    os.close(read)
+    os.close(write)
+    assert server.returncode == 143
+    assert b"Traceback" not in errors
+    command = [*COMMAND, "serve", "--snapshot", str(tmp_path / "state")]
+    done = subprocess.run(command, input=frame(1), capture_output=True, check=True)
+    answer = json.loads(done.stdout)
+    assert (answer["type"], answer["last_seq"]) == ("repeat", 1)
+
+
+@pytest.mark.parametrize("saving", ["time.sleep(3600)", "raise RuntimeError"])
+def test_what_cannot_be_kept_does_not_hold_up_the_end(tmp_path, saving):
+    """A step without end holds the stream, so that its state cannot be collected."""
+    script = (
+        "import os, signal, sys, time\n"
+        "from pathlib import Path\n"
+        "from pipelines.serving import StopRequest\n"
+        "def save():\n"
+        f"    Path({str(tmp_path / 'saved')!r}).touch()\n"
+        f"    {saving}\n"
+        "def clear():\n"
+        f"    Path({str(tmp_path / 'cleared')!r}).touch()\n"
+        "with StopRequest(0.1, save, clear):\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    time.sleep(3600)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], check=False, timeout=60)
+    assert done.returncode == 143
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cleared", "saved"]
+
+
+def test_a_client_that_reads_nothing_does_not_hold_up_the_end():
+    with serving("--listen", "127.0.0.1:0") as (address, server), StreamClient(address) as rude:
+        for _ in range(2000):
+            rude.send({"type": "status"})
+        wait_for(lambda: status(address)["messages"] > 100)
+        server.send_signal(signal.SIGTERM)
+        server.communicate(timeout=60)
+        assert server.returncode == 143

@@ -1,7 +1,5 @@
 """Clients of a service on a socket can do little to it, and to each other."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import resource
@@ -28,7 +26,7 @@ def memory(pid: int) -> float:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
-def test_one_client_more_than_allowed_is_told_and_sent_away(tmp_path: Path):
+def test_one_client_more_than_allowed_is_told_and_sent_away(tmp_path):
     with serving("--listen", "127.0.0.1:0", *limits(tmp_path, max_clients=2)) as (address, _):
         with StreamClient(address) as first, StreamClient(address) as second:
             assert first.ask({"type": "status"})["clients"] in (1, 2)
@@ -42,7 +40,7 @@ def test_one_client_more_than_allowed_is_told_and_sent_away(tmp_path: Path):
         wait_for(lambda: status(address)["clients"] == 1)
 
 
-def test_a_silent_client_is_told_and_closed_and_a_listener_is_not(tmp_path: Path):
+def test_a_silent_client_is_told_and_closed_and_a_listener_is_not(tmp_path):
     impatient = limits(tmp_path, idle_timeout=0.5)
     with ExitStack() as stack:
         address, _ = stack.enter_context(serving("--listen", "127.0.0.1:0", *impatient))
@@ -55,7 +53,7 @@ def test_a_silent_client_is_told_and_closed_and_a_listener_is_not(tmp_path: Path
         assert "within 0.5 s" in silent.receive()["message"]
 
 
-def test_a_client_waits_for_its_turn_where_many_connect_at_once(tmp_path: Path):
+def test_a_client_waits_for_its_turn_where_many_connect_at_once(tmp_path):
     address = Address(path=tmp_path / "full.sock")
     with ExitStack() as stack:
         server = stack.enter_context(socket.socket(socket.AF_UNIX))
@@ -108,7 +106,7 @@ def few_files() -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))
 
 
-def test_more_connections_than_files_do_not_end_the_service(tmp_path: Path):
+def test_more_connections_than_files_do_not_end_the_service(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 4096), hard))
     try:
@@ -175,7 +173,7 @@ def test_a_listener_that_stops_reading_is_dropped():
         assert sender.ask({"type": "status"})["closed"] == {"slow": 1}
 
 
-def test_a_listener_that_stops_reading_delays_nobody(tmp_path: Path):
+def test_a_listener_that_stops_reading_delays_nobody(tmp_path):
     """Here it may stall for an hour; nobody waits for it."""
     patient = limits(tmp_path, client_timeout=3600.0, stop_timeout=1.0, max_outbox=10**6)
     with ExitStack() as stack:

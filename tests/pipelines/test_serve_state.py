@@ -1,7 +1,6 @@
-"""A service that is killed and started again: nothing is lost, nothing counted twice."""
+"""The state of a service on disk."""
 
-from __future__ import annotations
-
+import errno
 import os
 import signal
 import stat
@@ -12,8 +11,14 @@ from typing import Any
 
 import pytest
 
-from pipelines.serving import Address, StreamClient
+from pipelines.config import load_config
+from pipelines.serving import Address, StateKeeper, StreamClient, StreamTracker
+from pipelines.serving.messages import encode
+from pipelines.serving.state import read_state, write_state
+from saga_fg import InputError
 from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
+
+# A service that is killed and started again: nothing is lost, nothing counted twice
 
 FRAMES = 40
 
@@ -28,7 +33,7 @@ def sent(address: Address, seqs: Iterator[int] | range) -> list[dict[str, Any]]:
         return answers
 
 
-def test_after_a_kill_a_client_goes_on_where_the_state_ends(tmp_path: Path):
+def test_after_a_kill_a_client_goes_on_where_the_state_ends(tmp_path):
     with serving("--listen", "127.0.0.1:0") as (address, _):
         whole = sent(address, range(FRAMES))
     keeping = ("--listen", str(tmp_path / "s.sock"), "--snapshot", str(tmp_path / "state"), "--every", "0.05")
@@ -57,7 +62,7 @@ def test_after_a_kill_a_client_goes_on_where_the_state_ends(tmp_path: Path):
     assert [p.name for p in tmp_path.iterdir() if "tmp" in p.name] == []
 
 
-def test_frames_that_were_held_are_sent_again(tmp_path: Path):
+def test_frames_that_were_held_are_sent_again(tmp_path):
     keeping = ("--listen", str(tmp_path / "s.sock"), "--snapshot", str(tmp_path / "state"), "--every", "0.05")
     reordering = (*keeping, "--reorder", "0.35")
     with serving(*reordering) as (address, server):
@@ -75,7 +80,7 @@ def test_frames_that_were_held_are_sent_again(tmp_path: Path):
         assert status(address)["taken"] == {"sensor": 12}
 
 
-def test_the_state_of_another_configuration_is_refused(tmp_path: Path):
+def test_the_state_of_another_configuration_is_refused(tmp_path):
     state = tmp_path / "state"
     command = [*COMMAND, "serve", "--snapshot", str(state)]
     subprocess.run(command, input=frame(0), capture_output=True, check=True)
@@ -88,7 +93,7 @@ def test_the_state_of_another_configuration_is_refused(tmp_path: Path):
     assert state.read_bytes() == before
 
 
-def test_a_damaged_state_file_is_one_line_and_stays(tmp_path: Path, subtests: pytest.Subtests):
+def test_a_damaged_state_file_is_one_line_and_stays(tmp_path, subtests):
     state = tmp_path / "state"
     command = [*COMMAND, "serve", "--snapshot", str(state)]
     subprocess.run(command, input=frame(0), capture_output=True, check=True)
@@ -107,7 +112,7 @@ def test_a_damaged_state_file_is_one_line_and_stays(tmp_path: Path, subtests: py
             assert state.read_bytes() == damaged
 
 
-def test_factors_of_ones_own_cannot_be_kept(tmp_path: Path):
+def test_factors_of_ones_own_cannot_be_kept(tmp_path):
     config = tmp_path / "own.yaml"
     config.write_text("tracker: {estimator: isam2, providers: ['walls:Wall']}\n")
     (tmp_path / "walls.py").write_text("class Wall:\n    name = 'wall'\n    def factors(self, view): ...\n")
@@ -119,7 +124,7 @@ def test_factors_of_ones_own_cannot_be_kept(tmp_path: Path):
     assert "tracker.providers" in done.stderr
 
 
-def test_a_state_file_is_of_one_service(tmp_path: Path):
+def test_a_state_file_is_of_one_service(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "state")
     with serving("--listen", str(tmp_path / "s.sock"), "--snapshot", str(tmp_path / "state")) as (address, server):
         for name in ("state", "link"):
@@ -133,3 +138,118 @@ def test_a_state_file_is_of_one_service(tmp_path: Path):
         server.wait()
     done = subprocess.run(command, input=frame(0), capture_output=True, check=False)  # a killed one holds nothing
     assert done.returncode == 0
+
+
+# A state on disk: whole, for its owner, and of the same configuration, or refused in one line
+
+HEADER = {"version": "1", "configuration": "a: 1\nb: 2\n"}
+
+
+def stream() -> StreamTracker[str]:
+    config = load_config("file")
+    return StreamTracker(lambda: config.new_tracker("saga"))
+
+
+def file_sent(service: StreamTracker[str], *seqs: int) -> list[dict[str, Any]]:
+    lines = [encode({"seq": k, "timestamp": k / 10, "detections": [{"x": 0.8 * k, "y": 0}]}) for k in seqs]
+    return [answer for line in lines for _, answer in service.handle(line, "me")]
+
+
+def kept(service: StreamTracker[str], path: Path) -> StateKeeper:
+    keeper = StateKeeper(service, path, 1.0, HEADER)
+    keeper.restore()
+    return keeper
+
+
+def test_a_state_is_for_its_owner_alone(tmp_path):
+    path = tmp_path / "state.saga"
+    old = os.umask(0)
+    try:
+        write_state(path, HEADER, [1.5])
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert read_state(path, HEADER) == [1.5]
+    assert [file.name for file in tmp_path.iterdir()] == ["state.saga"]
+
+
+def test_damage_anywhere_is_refused(tmp_path):
+    path = tmp_path / "state.saga"
+    write_state(path, HEADER, {"numbers": [1, 2.5, "x"]})
+    whole = path.read_bytes()
+    for k in range(len(whole)):
+        path.write_bytes(whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :])
+        with pytest.raises(InputError, match=r"state\.saga: "):
+            read_state(path, HEADER)
+        path.write_bytes(whole[:k])
+        with pytest.raises(InputError, match=r"state\.saga: "):
+            read_state(path, HEADER)
+
+
+def test_another_configuration_is_refused_with_what_differs(tmp_path):
+    path = tmp_path / "state.saga"
+    write_state(path, HEADER, None)
+    with pytest.raises(InputError, match="configuration: the state is of another one, 'b: 2' instead of 'b: 3'"):
+        read_state(path, {**HEADER, "configuration": "a: 1\nb: 3\n"})
+    with pytest.raises(InputError, match=r"version: .* '1' instead of '2'"):
+        read_state(path, {**HEADER, "version": "2"})
+    with pytest.raises(InputError, match="no regular file"):
+        read_state(tmp_path, HEADER)
+
+
+def test_a_stream_goes_on_as_if_nothing_had_happened(tmp_path):
+    whole = file_sent(stream(), *range(20))
+    first = stream()
+    keeper = kept(first, tmp_path / "state.saga")
+    assert [a["durable_seq"] for a in file_sent(first, *range(8))] == [-1] * 8
+    assert keeper.save()
+    assert file_sent(first, 8, 9)[-1]["durable_seq"] == 7
+    keeper.release()  # and is killed
+    second = stream()
+    kept(second, tmp_path / "state.saga")
+    assert (second.status()["last_seq"], second.status()["frames"]) == ({"sensor": 7}, 8)
+    rest = file_sent(second, *range(7, 20))
+    assert rest[0]["type"] == "repeat"
+    assert [a["tracks"] for a in rest[1:]] == [a["tracks"] for a in whole[8:]]
+    assert (second.status()["frames"], second.status()["taken"]) == (20, {"sensor": 20})
+
+
+def test_a_reset_is_on_the_disk_before_it_is_answered(tmp_path):
+    first = stream()
+    keeper = kept(first, tmp_path / "state.saga")
+    file_sent(first, 0, 1)
+    assert first.handle(b'{"type": "reset"}', "me")[-1][1] == {"type": "reset", "durable": True}
+    keeper.release()
+    second = stream()
+    kept(second, tmp_path / "state.saga")
+    assert second.status()["last_seq"] == {"sensor": 1}
+    assert [t["id"] for t in file_sent(second, 500, 501)[-1]["tracks"]] == [1]
+
+
+def test_a_full_disk_is_told_and_got_over(tmp_path, monkeypatch, caplog):
+    service = stream()
+    keeper = kept(service, tmp_path / "state.saga")
+    file_sent(service, 0)
+
+    def full(fd: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", full)
+        assert not any(keeper.save() for _ in range(5))
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "No space left" in service.status()["state"]["error"]
+    assert [path.name for path in tmp_path.iterdir()] == [".state.saga.lock"]
+    assert file_sent(service, 1)[0]["durable_seq"] == -1
+    assert keeper.save()
+    assert service.status()["state"]["error"] is None
+    assert file_sent(service, 2)[0]["durable_seq"] == 1
+
+
+def test_a_state_that_does_not_fit_is_never_half_used(tmp_path):
+    path = tmp_path / "state.saga"
+    nothing = {"tracker": None, "numbering": {}, "newest": 0}
+    for state in (None, {"tracker": 1}, nothing | {"counts": {"messages": "a"}}, nothing | {"counts": {}}):
+        write_state(path, HEADER, state)
+        with pytest.raises(InputError, match="expected a state that fits"):
+            kept(stream(), path)

@@ -1,14 +1,13 @@
-"""The stream: messages, clock, reordering, and what a line is answered."""
-
-from __future__ import annotations
+"""Streams of frames, predictions, failures."""
 
 import io
 import json
+import logging
 import os
 import re
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import pytest
@@ -20,9 +19,12 @@ from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker, parse_address, serve_pipe
 from pipelines.serving.frame_order import Reordering
 from pipelines.serving.messages import FrameMessage, encode, parse_message
-from saga_fg import InputError
+from saga_fg import Frame, InputError, Tracks
 from saga_fg.model.edge_rules import Following
 from saga_fg.numerics.geometry import yaw_of
+from saga_fg.tracking import Tracker
+
+# The stream: messages, clock, reordering, and what a line is answered
 
 SETTINGS = StreamSettings()
 
@@ -38,7 +40,7 @@ def frame(timestamp: float, seq: int | None = None, sensor: str = "lidar", x: fl
     return encode(message if seq is None else {"seq": seq, **message})
 
 
-def test_edge_rules_that_meet_no_class_are_told_once(caplog: pytest.LogCaptureFixture):
+def test_edge_rules_that_meet_no_class_are_told_once(caplog):
     for label, told in (("truck", 1), ("car", 0)):
         config = load_config("file")
         config = replace(config, tracker=replace(config.tracker, edges=(Following(classes=(label,)),)))
@@ -48,7 +50,7 @@ def test_edge_rules_that_meet_no_class_are_told_once(caplog: pytest.LogCaptureFi
         assert [record.levelname for record in caplog.records] == ["WARNING"] * told
 
 
-def test_what_looks_wrong_in_a_stream_is_told_once(caplog: pytest.LogCaptureFixture):
+def test_what_looks_wrong_in_a_stream_is_told_once(caplog):
     config = load_config("file")
     for degrees in (True, False):
         service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, Checks(config))
@@ -107,10 +109,7 @@ BAD_LINES = [
     (b'{"timestamp": 1}', "detections: expected a list"),
     (b'{"timestamp": 1, "detections": [7]}', r"detections\[0\]: expected an object"),
     (b'{"timestamp": 1, "detections": [{"x": 1}]}', r"detections\[0\].y: expected a finite number, it is left out"),
-    (
-        b'{"timestamp": 1, "detections": [{"x": 1, "y": "2"}]}',
-        r"detections\[0\].y: expected a finite number, got '2'",
-    ),
+    (b'{"timestamp": 1, "detections": [{"x": 1, "y": "2"}]}', r"detections\[0\].y: expected a finite number, got '2'"),
     (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "lenght": 3}]}', "did you mean 'length'"),
     (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "length": 0}]}', r"size\[0\]: expected positive"),
     (b'{"timestamp": 1, "detections": [{"x": 1, "y": 2, "label": ""}]}', "label: expected a name"),
@@ -263,3 +262,146 @@ def test_addresses():
     for text in ("nowhere", "host:", "host:99999", "host:-1", "host:²"):
         with pytest.raises(InputError, match="expected HOST:PORT"):
             parse_address(text)
+
+
+# Predictions of a stream: with every frame, and on request
+
+
+def predictions_stream(method: Any = "saga", horizons: Any = None, **settings: Any) -> StreamTracker[str]:
+    config = load_config("file")
+    return StreamTracker(lambda: config.new_tracker(method), StreamSettings(**settings), horizons=horizons)
+
+
+def predict(horizons: Any) -> bytes:
+    return encode({"type": "predict", "horizons": horizons})
+
+
+def test_a_request_is_answered_with_the_trackers_predictions():
+    service = predictions_stream()
+    answers(service, *(frame(0.1 * k) for k in range(10)))
+    (answer,) = answers(service, predict([0.5, 2]))
+    assert answer["type"] == "predictions"
+    assert answer["timestamp"] == pytest.approx(0.9)
+    assert answer["horizons"] == [0.5, 2.0]
+    (car,) = answer["tracks"]
+    assert (car["id"], car["label"]) == (1, "car")
+    tracker = service._tracker
+    assert isinstance(tracker, Tracker)
+    expected = tracker.predict([0.5, 2])
+    np.testing.assert_allclose([car["x"], car["y"]], expected.position[:, 0].T)
+    np.testing.assert_allclose([car["vx"], car["vy"]], expected.velocity[:, 0].T)
+    np.testing.assert_allclose(car["cov_xy"], expected.position_covariance[:, 0, 0, 1])
+    assert car["cov_xx"][0] < car["cov_xx"][1]
+    assert "yaw" not in car or len(car["yaw"]) == 2
+
+
+def test_a_request_changes_nothing():
+    plain, asked = predictions_stream(), predictions_stream()
+    expected = answers(plain, *(frame(0.1 * k) for k in range(6)))
+    found = answers(asked, *(line for k in range(6) for line in (frame(0.1 * k), predict([3]))))
+    assert found[::2] == expected
+
+
+def test_every_frame_has_predictions_where_horizons_are_given():
+    horizons = np.array([1.0, 3.0])
+    for answer in answers(predictions_stream(horizons=horizons), *(frame(0.1 * k) for k in range(3))):
+        assert answer["type"] == "tracks"
+        predicted = answer["predictions"]
+        assert predicted["timestamp"] == answer["timestamp"]
+        assert predicted["horizons"] == [1.0, 3.0]
+        assert [each["id"] for each in predicted["tracks"]] == [each["id"] for each in answer["tracks"]]
+
+
+BAD_HORIZONS = [
+    (None, "horizons: expected a list of at most 20 s, it is left out"),
+    ([0.1] * 21, "horizons: expected a list of at most 20 s"),
+    (["1"], "horizons: expected a finite number, got '1'"),
+    ([], "horizons: expected increasing seconds"),
+    ([2, 1], "horizons: expected increasing seconds"),
+    ([1, 11], "horizons: expected at most 10 s, got 11"),
+]
+
+
+def test_other_horizons_are_refused():
+    service = predictions_stream()
+    answers(service, frame(0.0))
+    for horizons, why in BAD_HORIZONS:
+        (answer,) = answers(service, predict(horizons))
+        assert answer["type"] == "error"
+        assert why in answer["message"]
+
+
+def test_there_is_nothing_to_predict_from_before_a_frame_or_by_centerpoint():
+    (early,) = answers(predictions_stream(), predict([1]))
+    assert "expected a frame before" in early["message"]
+    (never,) = answers(predictions_stream("centerpoint"), predict([1]))
+    assert "expected --method saga or kf" in never["message"]
+
+
+# A tracker that fails: the client is told, the stream goes on, and begins anew after several failures in a row
+
+
+class Failing:
+    """Fails as the label of the first detection says."""
+
+    time_verdict = "accepted"
+    max_jump = 10.0
+    sensor_times: ClassVar[dict[str, Any]] = {}
+
+    def step(self, frame: Frame) -> Tracks:
+        label = str(frame.detections.boxes.label[0])
+        if label == "bug":
+            raise ZeroDivisionError("two\nlines")
+        if label == "bad":
+            raise InputError("label: expected a good one")
+        return Tracks.empty(frame.timestamp)
+
+    def tracks(self, timestamp: float) -> Tracks:
+        return Tracks.empty(timestamp)
+
+
+def failures_stream(made: list[Failing], **settings: Any) -> StreamTracker[str]:
+    def new_tracker() -> Failing:
+        made.append(Failing())
+        return made[-1]
+
+    return StreamTracker(cast(Any, new_tracker), StreamSettings(**settings))
+
+
+def answer(service: StreamTracker[str], seq: int, label: str) -> dict[str, Any]:
+    line = encode({"seq": seq, "timestamp": seq / 10, "detections": [{"label": label, "x": 0, "y": 0}]})
+    ((_, told),) = service.handle(line, "me")
+    return told
+
+
+def test_an_internal_error_is_answered_logged_and_survived(caplog):
+    service = failures_stream([])
+    assert answer(service, 0, "car")["type"] == "tracks"
+    with caplog.at_level(logging.ERROR):
+        told = answer(service, 1, "bug")
+    assert (told["type"], told["seq"]) == ("error", 1)
+    assert told["message"] == "internal error: ZeroDivisionError: two lines"
+    assert any(record.exc_info for record in caplog.records)
+    status = service.status()
+    assert (status["failures"], status["restarts"], status["refused"]) == (1, 0, 0)
+    assert status["last_seq"] == {"sensor": 0}
+    assert answer(service, 1, "car")["type"] == "tracks"
+
+
+def test_failures_in_a_row_bring_a_fresh_tracker_and_others_do_not():
+    made: list[Failing] = []
+    service = failures_stream(made, max_failures=2)
+    for seq, label in enumerate(["bug", "car", "bug", "bad", "bad"]):
+        answer(service, seq, label)
+    assert (len(made), service.status()["restarts"]) == (1, 0)
+    answer(service, 9, "bug")
+    assert (len(made), service.status()["restarts"]) == (2, 1)
+    assert answer(service, 10, "car")["type"] == "tracks"
+
+
+def test_an_error_outside_of_the_tracker_is_survived_too(monkeypatch):
+    service = failures_stream([])
+    monkeypatch.setattr("pipelines.serving.stream.resident_memory", lambda: 1 // 0)
+    ((_, told),) = service.handle(b'{"type": "status"}', "me")
+    assert told["message"].startswith("internal error: ZeroDivisionError")
+    assert answer(service, 0, "car")["type"] == "tracks"

@@ -18,6 +18,7 @@ from pipelines.config import load_config
 from pipelines.slam.joint import keyframes, run_joint, street
 from saga_fg import InputError
 from saga_fg.slam.joint import JointSettings
+from tests.pipelines.command import done
 
 SHORT = replace(street(), duration=2.0)
 
@@ -25,10 +26,9 @@ SHORT = replace(street(), duration=2.0)
 def test_a_simulated_street(tmp_path: Path) -> None:
     output = tmp_path / "street"
     options = ["--seed", "2", "--duration", "2", "--online", "--lag", "0.5"]
-    done = CliRunner().invoke(app, ["slam", "simulated", *options, "--output", str(output)])
-    assert done.exit_code == 0, done.output
-    assert "ATE: odometry" in done.output
-    assert "settled (lag 0.5 s): ATE" in done.output
+    street = done("slam", "simulated", *options, "--output", output)
+    assert "ATE: odometry" in street.output
+    assert "settled (lag 0.5 s): ATE" in street.output
     errors = json.loads((output / "errors.json").read_text())
     assert errors["joint"]["poses"] == errors["odometry"]["poses"]
     joint = read_tum_poses(output / "joint.tum")

@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from typer.testing import CliRunner
 
 from benchmarks.scans import CURB, SimulatedScans, drive
 from data_tools.lidar import Scan, Submap, read_scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
-from pipelines.cli import app
 from pipelines.slam.lidar_results import covered_spans, metrics, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamResult, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
@@ -25,6 +23,7 @@ from pipelines.slam.submaps import placed_clouds
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.submaps import LoopClosure, SubmapSettings
+from tests.pipelines.command import done
 
 
 @pytest.fixture(scope="module")
@@ -208,8 +207,7 @@ def test_the_residual_is_of_the_run_s_ranges(scans: SimulatedScans, result: Lida
 @pytest.mark.parametrize("odometry", ["lidar", "oxts"])
 def test_the_command_on_real_scans(recordings: Path, tmp_path: Path, odometry: str) -> None:
     options = ["--dataroot", str(recordings / "kitti"), "--scans", "8", "--odometry", odometry]
-    outcome = CliRunner().invoke(app, ["slam", "kitti", *options, "--output", str(tmp_path / "run")])
-    assert outcome.exit_code == 0, outcome.output
+    outcome = done("slam", "kitti", *options, "--output", tmp_path / "run")
     assert "8 scans" in outcome.stdout
     assert "trajectory against GPS/IMU: ATE" in outcome.stdout
     assert ("odometry against GPS/IMU: ATE" in outcome.stdout) == (odometry == "lidar")

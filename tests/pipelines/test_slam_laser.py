@@ -8,23 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from benchmarks.scans import LaserKind, laser_drive, write_carmen
 from data_tools.laser import LaserLog
 from data_tools.trajectories import read_tum_poses
-from pipelines.cli import app
 from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam
 from saga_fg import InputError
 from saga_fg.numerics.geometry import transform, transforms, vectors
+from tests.pipelines.command import done, refused
 
 
 def test_loops_are_closed_and_the_path_is_right(tmp_path: Path) -> None:
     log, true = laser_drive(0, rounds=1.3)
     write_carmen(tmp_path / "drive.log", log)
     output = tmp_path / "out"
-    result = CliRunner().invoke(app, ["slam", "laser", str(tmp_path / "drive.log"), "--output", str(output)])
-    assert result.exit_code == 0, result.output
+    result = done("slam", "laser", tmp_path / "drive.log", "--output", output)
     assert "times real time" in result.stdout
     figures = json.loads((output / "figures.json").read_text())
     assert figures["loops"] >= 10
@@ -46,8 +44,7 @@ def test_times_that_run_backwards_are_named_and_sorted_in_the_result(
     log.time[20] = log.time[19]
     write_carmen(tmp_path / "drive.log", log)
     output = tmp_path / "out"
-    result = CliRunner().invoke(app, ["slam", "laser", str(tmp_path / "drive.log"), "--output", str(output)])
-    assert result.exit_code == 0, result.output
+    done("slam", "laser", tmp_path / "drive.log", "--output", output)
     assert "scan 12: its time is 0.2 s before that of the scan ahead of it; so for 1 of" in caplog.text
     assert "scan 21: its time is that of the scan ahead of it; so for 1 of" in caplog.text
     assert json.loads((output / "figures.json").read_text())["scale_of_the_wheels"] == pytest.approx(1.0, abs=0.05)
@@ -66,9 +63,8 @@ def test_scans_that_hit_nothing_go_by_the_wheels() -> None:
 
 def test_a_broken_log_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "bad.log").write_text("FLASER 3 1 2 3\n")
-    result = CliRunner().invoke(app, ["slam", "laser", str(tmp_path / "bad.log"), "--output", str(tmp_path / "out")])
-    assert result.exit_code == 2
-    assert "line 1: expected a number of readings from 10" in result.stderr
+    said = refused("slam", "laser", tmp_path / "bad.log", "--output", tmp_path / "out")
+    assert "line 1: expected a number of readings from 10" in said
     assert not (tmp_path / "out").exists()
 
 
@@ -92,8 +88,7 @@ def test_a_robot_that_stands_still_has_a_map(tmp_path: Path) -> None:
     log, _ = laser_drive(2, rounds=0.1)
     write_carmen(tmp_path / "drive.log", log)
     arguments = ["slam", "laser", str(tmp_path / "drive.log"), "--output", str(tmp_path / "out"), "--scans", "2"]
-    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    result = done(*arguments)
     assert "2 scans, 1 keyframe, 0 loops" in result.stdout
 
 

@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from benchmarks.scans import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, drive
 from data_tools.sensor_logs import SensorLog
-from pipelines.cli import app
 from pipelines.slam.configuration import sensor_log
 from pipelines.slam.lidar_results import degenerate_spans, metrics
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
@@ -21,6 +19,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.frame import WheelSpeed
 from tests.data_tools.featureless import open_field, tunnel
+from tests.pipelines.command import done
 
 PERIOD = 0.1
 TIMES = PERIOD * np.arange(10)
@@ -101,8 +100,7 @@ def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) 
     table.write_text("time [s],speed [km/h]\n" + "".join(f"{0.1 * k:.1f},12.6\n" for k in range(1, 12)))
     options = ["--dataroot", str(recordings / "kitti"), "--scans", "8", "--no-landmarks", "--sensors", "gps,imu"]
     command = ["slam", "kitti", *options, "--sensor-log", f"wheels={table}", "--output", str(tmp_path / "run")]
-    outcome = CliRunner().invoke(app, command)
-    assert outcome.exit_code == 0, outcome.output
+    done(*command)
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert figures["degenerate"] == []
     assert figures["trajectory"]["ate"] < 0.5

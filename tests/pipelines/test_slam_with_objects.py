@@ -22,6 +22,7 @@ from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.sensors import SensorName, SensorSettings
+from tests.pipelines.command import done
 
 MOVER = np.array([8.0, -1.5]), np.array([7.0, 0.0])  # m, m/s
 
@@ -116,8 +117,7 @@ def test_a_scan_without_a_frame_is_named() -> None:
 @pytest.mark.parametrize("options", [["--scans", "8"], ["--sequence", "0004", "--odometry", "oxts", "--scans", "12"]])
 def test_the_command_with_and_without_scans(recordings: Path, tmp_path: Path, options: list[str]) -> None:
     arguments = ["--dataroot", str(recordings / "kitti"), "--objects", *options, "--output", str(tmp_path / "run")]
-    outcome = CliRunner().invoke(app, ["slam", "kitti", *arguments])
-    assert outcome.exit_code == 0, outcome.output
+    outcome = done("slam", "kitti", *arguments)
     assert "trajectory against GPS/IMU: ATE" in outcome.stdout
     assert ("without objects against GPS/IMU: ATE" in outcome.stdout) == ("0004" not in options)
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts, read_tracks
 from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
+from tests.pipelines.command import done
 
 MODULE = """
 from functools import partial
@@ -65,8 +66,7 @@ def configuration(folder: Path, provider: str) -> Path:
 def test_a_wall_of_the_configuration_moves_the_labels(walkers: Path) -> None:
     arguments = ["smooth", "file", str(walkers), "-o"]
     for more in ([], ["--config", str(configuration(walkers.parent, "Wall"))]):
-        run = CliRunner().invoke(app, [*arguments, str(walkers.parent / f"labels{len(more)}"), *more])
-        assert run.exit_code == 0, run.output
+        done(*arguments, walkers.parent / f"labels{len(more)}", *more)
     plain, walled = (
         read_tracks(walkers.parent / folder / "labels.csv").boxes.position for folder in ("labels0", "labels2")
     )

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts, read_tracks
-from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
 from pipelines.smoothing.labelling import Identities, ObjectSummary, median_sizes
 from pipelines.smoothing.streaming import Backlog, TrackedFrame
 from saga_fg import Detections, Frame, InputError
+from tests.pipelines.command import done
 
 HEADER = "timestamp,label,x,y,length,width,height,yaw,score"
 
@@ -86,8 +85,7 @@ def test_chunks_in_which_nothing_is_seen(tmp_path: Path, pause: str) -> None:
 def test_the_command_streams_several_recordings(tmp_path: Path) -> None:
     rows = [f"{name},{row}" for name in ("a", "b") for row in drive(6.0)]
     path = write(tmp_path / "two.csv", rows, f"scene,{HEADER}")
-    result = CliRunner().invoke(app, ["smooth", "file", str(path), "--output", str(tmp_path / "out")])
-    assert result.exit_code == 0, result.output
+    done("smooth", "file", path, "--output", tmp_path / "out")
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"labels.csv", "summary.json"}
     labels = read_tracks(tmp_path / "out" / "labels.csv")
     first, second = (labels.boxes.position[labels.scene == name] for name in ("a", "b"))

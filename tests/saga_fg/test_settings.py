@@ -124,11 +124,8 @@ def test_a_range_is_that_of_every_entry(subtests):
             assert str(caught.value) == message
 
 
-def test_scales_may_be_infinite_to_switch_a_kernel_off():
+def test_scales_may_be_infinite_and_trackers_work_on_defaults():
     assert Neighbours(speed_scale=math.inf).speed_scale == math.inf
     assert Following(gap_scale=math.inf).gap_scale == math.inf
-
-
-def test_trackers_work_on_defaults_alone():
     assert inspect.signature(GreedyTracker).parameters["settings"].default is None
     assert GreedyTracker().settings == GreedySettings()

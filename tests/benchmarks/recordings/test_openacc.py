@@ -1,7 +1,5 @@
 """The reader of OpenACC platoons, on files written by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +38,7 @@ def write(root: Path, columns: dict[str, Any]) -> Recordings:
     return openacc_platoons(root)
 
 
-def test_a_platoon_drives_in_order_with_its_gaps(tmp_path: Path) -> None:
+def test_a_platoon_drives_in_order_with_its_gaps(tmp_path):
     platoons = write(tmp_path, platoon())
     assert platoons.names == ("short_gap-part1",)
     traffic = platoons.read("short_gap-part1")
@@ -55,7 +53,7 @@ def test_a_platoon_drives_in_order_with_its_gaps(tmp_path: Path) -> None:
     assert traffic.road_map is None
 
 
-def test_moments_without_a_position_and_jumps_are_left_out(tmp_path: Path) -> None:
+def test_moments_without_a_position_and_jumps_are_left_out(tmp_path):
     columns = platoon()
     columns["east"][3] = None
     columns["speed"][5] = float("nan")
@@ -65,7 +63,7 @@ def test_moments_without_a_position_and_jumps_are_left_out(tmp_path: Path) -> No
     assert present[:, 1:].all()
 
 
-def test_a_car_that_stands_keeps_the_heading_that_it_had(tmp_path: Path) -> None:
+def test_a_car_that_stands_keeps_the_heading_that_it_had(tmp_path):
     columns = platoon((5.0,))
     north = np.array(columns["north"])
     north[20:] = north[20]
@@ -75,7 +73,7 @@ def test_a_car_that_stands_keeps_the_heading_that_it_had(tmp_path: Path) -> None
     np.testing.assert_allclose(traffic.vehicles.velocity[30], 0.0)
 
 
-def test_what_is_wrong_in_the_file_is_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_what_is_wrong_in_the_file_is_named(tmp_path, subtests):
     for changes, message in [
         ({"gap_to_next": None}, r"platoons.parquet: gap_to_next: expected this column, the file has setting, run"),
         ({"speed": ["fast"] * K}, r"speed: expected numbers, got object"),
@@ -93,7 +91,7 @@ def test_what_is_wrong_in_the_file_is_named(tmp_path: Path, subtests: pytest.Sub
                 write(tmp_path, columns).read("short_gap-part1")
 
 
-def test_no_file_and_an_empty_one_are_errors(tmp_path: Path) -> None:
+def test_no_file_and_an_empty_one_are_errors(tmp_path):
     with pytest.raises(InputError, match=r"platoons.parquet: cannot be read"):
         openacc_platoons(tmp_path)
     (tmp_path / "platoons.parquet").write_bytes(b"")

@@ -9,16 +9,12 @@ from typer.testing import CliRunner
 
 from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.argoverse2.logs import DetectedLogs
-from data_tools.datasets.argoverse2.source import (
-    SCORED,
-    read_feather_tracks,
-    write_feather_tracks,
-    write_submission,
-)
+from data_tools.datasets.argoverse2.source import SCORED, read_feather_tracks, write_feather_tracks, write_submission
 from pipelines.cli import app
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.track import Tracks
+from tests.pipelines.command import done
 
 feather = pytest.importorskip("pyarrow.feather", reason="the extra [parquet] is not installed")
 pa = pytest.importorskip("pyarrow")
@@ -245,8 +241,7 @@ def test_the_command_from_detections_to_figures(tmp_path):
     options = ["--dataroot", str(tmp_path), "--detections", str(tmp_path / "found.feather")]
 
     def saga_fg(*arguments):
-        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-        assert result.exit_code == 0, result.output
+        result = done(*arguments)
         return result.output
 
     for name in ("tracks.feather", "tracks.csv", "tracks.pkl"):

@@ -1,12 +1,9 @@
-"""Tables of detections in every format."""
-
-from __future__ import annotations
+"""Tables of detections."""
 
 import csv
 import inspect
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,11 +16,13 @@ from data_tools.datasets.detection_files import TableImport, read_detections
 from data_tools.datasets.detection_files.dataset import survey_table
 from saga_fg import Dataset, InputError
 from saga_fg.numerics.geometry import yaw_of
-from tests.data_tools.datasets.drive_tables import write
+from tests.data_tools.datasets.drive_tables import NPZ, write
+
+# Tables of detections in every format
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".ndjson", ".jsonl", ".npz"])
-def test_every_format_says_the_same(tmp_path: Path, suffix: str) -> None:
+def test_every_format_says_the_same(tmp_path, suffix):
     data: Dataset = read_detections(write(tmp_path, suffix))
     assert data.scenes == ("drive",)
     scene = data.scene("drive")
@@ -45,7 +44,7 @@ def test_every_format_says_the_same(tmp_path: Path, suffix: str) -> None:
     assert scene.frames[0].world_T_ego is None
 
 
-def test_three_columns_are_enough_and_others_are_left_alone(tmp_path: Path) -> None:
+def test_three_columns_are_enough_and_others_are_left_alone(tmp_path):
     content: dict[str, Any] = {
         ".csv": "timestamp,x,y,remark,frame\n7,1,2,,9\n",
         ".ndjson": '{"timestamp": 7, "x": 1, "y": 2}\n',
@@ -58,7 +57,7 @@ def test_three_columns_are_enough_and_others_are_left_alone(tmp_path: Path) -> N
         assert (detection.label, detection.position, detection.score) == ("object", (1.0, 2.0, 0.0), 1.0)
 
 
-def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
+def test_the_examples_of_the_documentation(tmp_path):
     doc = inspect.getdoc(data_tools.datasets.detection_files) or ""
     examples = re.findall(r"(?:^    .*\n)+", doc, re.MULTILINE)
     table, csv_text, ndjson_text, npz_call = (inspect.cleandoc(text) for text in examples)
@@ -72,7 +71,18 @@ def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
         assert re.search(rf"\b{name}\b", table) or name == "empty"
 
 
-def test_several_scenes_may_be_interleaved(tmp_path: Path) -> None:
+def test_poses_and_ego_coordinates(tmp_path):
+    text = "timestamp,x,y,coordinates,ego_x,ego_y,ego_yaw\n0,1,1,ego,5,6,0.5\n1,1,1,ego,7,8,-0.5\n1,2,2,ego,7,8,-0.5\n"
+    scene = read_detections(write(tmp_path, ".csv", text)).scene("drive")
+    np.testing.assert_allclose(scene.world_T_ego[:, :3, 3], [[5, 6, 0], [7, 8, 0]])
+    np.testing.assert_allclose(yaw_of(scene.world_T_ego[:, :3, :3]), [0.5, -0.5])
+    assert [frame.coordinates for frame in scene.frames] == ["ego", "ego"]
+    np.testing.assert_array_equal(scene.frames[1].world_T_ego, scene.world_T_ego[1])
+
+
+def test_empty_frames_alone_and_scenes_that_are_interleaved(tmp_path):
+    scene = read_detections(write(tmp_path, ".ndjson", '{"timestamp": 0}\n{"timestamp": 1}\n')).scene("drive")
+    assert [len(frame) for frame in scene.frames] == [0, 0]
     text = "scene,timestamp,x,y\nb,5,1,1\na,0,2,2\nb,6,3,3\na,1,4,4\n"
     data = read_detections(write(tmp_path, ".csv", text))
     assert data.scenes == ("b", "a")
@@ -82,27 +92,13 @@ def test_several_scenes_may_be_interleaved(tmp_path: Path) -> None:
         data.scene("c")
 
 
-def test_poses_and_ego_coordinates(tmp_path: Path) -> None:
-    text = "timestamp,x,y,coordinates,ego_x,ego_y,ego_yaw\n0,1,1,ego,5,6,0.5\n1,1,1,ego,7,8,-0.5\n1,2,2,ego,7,8,-0.5\n"
-    scene = read_detections(write(tmp_path, ".csv", text)).scene("drive")
-    np.testing.assert_allclose(scene.world_T_ego[:, :3, 3], [[5, 6, 0], [7, 8, 0]])
-    np.testing.assert_allclose(yaw_of(scene.world_T_ego[:, :3, :3]), [0.5, -0.5])
-    assert [frame.coordinates for frame in scene.frames] == ["ego", "ego"]
-    np.testing.assert_array_equal(scene.frames[1].world_T_ego, scene.world_T_ego[1])
-
-
-def test_a_file_of_empty_frames_alone(tmp_path: Path) -> None:
-    scene = read_detections(write(tmp_path, ".ndjson", '{"timestamp": 0}\n{"timestamp": 1}\n')).scene("drive")
-    assert [len(frame) for frame in scene.frames] == [0, 0]
-
-
 numbers = st.floats(-1e6, 1e6)
 sizes = st.none() | st.floats(1e-3, 1e3)
 rows = st.tuples(st.integers(0, 5), st.sampled_from("ab"), st.none() | st.tuples(numbers, numbers, sizes))
 
 
 @given(st.lists(rows, min_size=1, max_size=12))
-def test_csv_and_ndjson_agree(tmp_path_factory: pytest.TempPathFactory, table: list[Any]) -> None:
+def test_csv_and_ndjson_agree(tmp_path_factory, table):
     folder = tmp_path_factory.mktemp("agree")
     table = sorted(table, key=lambda row: row[0])
     named = [
@@ -123,7 +119,7 @@ def test_csv_and_ndjson_agree(tmp_path_factory: pytest.TempPathFactory, table: l
         np.testing.assert_array_equal(a.detections.boxes.size, b.detections.boxes.size)
 
 
-def test_a_column_without_a_meaning_is_named_in_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_column_without_a_meaning_is_named_in_a_warning(tmp_path, caplog):
     path = tmp_path / "d.csv"
     path.write_text("timestamp,x,y,camera_model\n0,1,2,fisheye\n")
     assert len(read_detections(path).scene("d").frames) == 1
@@ -139,7 +135,7 @@ timestamp,coordinates,x,y,odometry_x,odometry_y,odometry_yaw,odometry_dt,gps_x,g
 """
 
 
-def test_the_vehicles_own_measurements_come_with_its_frames(tmp_path: Path) -> None:
+def test_the_vehicles_own_measurements_come_with_its_frames(tmp_path):
     first, second, third = read_detections(write(tmp_path, ".csv", EGO_CSV)).scene("drive").frames
     assert [frame.world_T_ego for frame in (first, second, third)] == [None] * 3
     assert first.ego.odometry is None
@@ -151,7 +147,7 @@ def test_the_vehicles_own_measurements_come_with_its_frames(tmp_path: Path) -> N
     assert third.ego.gps.position.tolist() == [502.0, 20.3, 7.5]
 
 
-def test_own_measurements_that_make_no_sense(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_own_measurements_that_make_no_sense(tmp_path, subtests):
     for columns, row, message in [
         ("gps_x", "1.0", "gps_y: expected a number, since gps_x is given"),
         ("odometry_x,odometry_dt", "1.0,0.1", "odometry_y: expected a number, since odometry_x is given"),
@@ -164,7 +160,7 @@ def test_own_measurements_that_make_no_sense(tmp_path: Path, subtests: pytest.Su
                 read_detections(path)
 
 
-def test_short_names_of_sides_and_no_guesses_at_others(tmp_path: Path) -> None:
+def test_sides_have_short_names_and_keep_their_units(tmp_path):
     path = tmp_path / "detections.csv"
     path.write_text("timestamp,x,y,len,wid,hgt,vx_m,vy_m,dx,idx\n0,1,2,4,2,1.5,3,0,9,7\n")
     (frame,) = read_detections(path).scene("detections").frames
@@ -172,11 +168,126 @@ def test_short_names_of_sides_and_no_guesses_at_others(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.detections.boxes.velocity, [[3, 0]])
     path.write_text("timestamp,x,y,coastin,cov_x\n0,1,2,4,2\n")  # columns of tracks are no guess for detections
     assert survey_table(path).raw.found.unread == ("coastin", "cov_x")
-
-
-def test_exchanged_sides_keep_the_units_of_their_names(tmp_path: Path) -> None:
     path = tmp_path / "detections.csv"
     path.write_text("timestamp,x,y,length_cm,width_cm\n0,1,2,190,450\n")
     how = TableImport(columns={"length": "width_cm", "width": "length_cm"})
     (frame,) = read_detections(path, how).scene("detections").frames
     np.testing.assert_allclose(frame.detections.boxes.size[0, :2], [4.5, 1.9])
+
+
+# Tables of detections with faults: each is named with its record and field
+
+HEAD = "timestamp,x,y,z,length,score,label\n0,1,1,1,1,1,car\n"
+OPEN_QUOTE = "expected comma-separated values: a quote is opened and not closed on this line"
+BROKEN_CSV = [
+    ("", "expected a column 'timestamp' and a column 'x' and a column 'y', the columns there are none"),
+    ("timestamp,x,y\n", "expected at least one row"),
+    ("timestamp,x\n0,1\n", "expected a column 'y', the columns there are timestamp, x"),
+    ("timestamp,x,y,lenght\n0,1,1,4\n", "unknown column 'lenght'; did you mean 'length'"),
+    ("timestamp,x,x,y\n0,1,1,4\n", "line 1: expected every column once"),
+    (HEAD + "1,2\n", "line 3: expected 7 columns, got 2"),
+    (HEAD + "\n1,far,1,1,1,1,car\n", "line 4: x: expected a number, got 'far'"),
+    (HEAD + "1,nan,1,1,1,1,car\n", "line 3: x: expected a finite number of metres, got nan"),
+    (HEAD + "1,1,inf,1,1,1,car\n", "line 3: y: expected a finite number, got inf"),
+    (HEAD + "1,1,1e999,1,1,1,car\n", "line 3: y: expected a finite number, got inf"),
+    (HEAD + "1,,1,1,1,1,car\n", "line 3: x: expected a finite number of metres, it is left out"),
+    (HEAD + "1,1,1,1,-4,1,car\n", "line 3: length: expected a positive number of metres, got -4"),
+    (HEAD + "1,1,1,1,0,1,car\n", "line 3: length: expected a positive number of metres, got 0"),
+    (HEAD + "1,1,1,1,1,nan,car\n", "line 3: score: expected a finite number, got nan"),
+    (HEAD + ",1,1,1,1,1,car\n", "line 3: timestamp: expected a finite number of seconds, it is left out"),
+    (HEAD + "-1,1,1,1,1,1,car\n", "line 3: timestamp: expected rows in order of time, time runs backwards at -1.0 s"),
+    ("timestamp,x,y,coordinates\n0,1,1,map\n", "line 2: coordinates: expected world, ego or sensor, got 'map'"),
+    ("timestamp,x,y,coordinates\n0,1,1,ego\n", "line 2: coordinates: ego needs the columns ego_x, ego_y and ego_yaw"),
+    ("timestamp,x,y,ego_x\n0,1,1,3\n", "line 2: ego_y: expected a finite number, since ego_x is given, it is left out"),
+    (HEAD + "1,1,1,1,1,1," + "c" * 200_000, "line 3: expected comma-separated values: field larger"),
+    (HEAD + "1,1,1,1,1,1," + "c" * 1000, "line 3: label: expected a name of at most 256 characters, got 1000"),
+    (HEAD + '1,1,1,1,1,1,"car\n' + "1,1,1,1,1,1,car\n" * 1000, f"line 3: {OPEN_QUOTE}"),
+    (HEAD + '1,1,1,1,1,1,"car\n' + "1,1,1,1,1,1,car\n" * 9 + '1,1,1,1,1,1,car"\n', f"line 3: {OPEN_QUOTE}"),
+    (HEAD + '\n1,1,1,1,1,1,"car\n' + "1,1,1,1,1,1,car\n" * 10_000, f"line 4: {OPEN_QUOTE}"),
+    ('"timestamp,x,y\n0,1,1\n', f"line 1: {OPEN_QUOTE}"),
+    (HEAD + '1,1,1,1,1,1,"ca"r\n', "line 3: expected comma-separated values: ',' expected after '\"'"),
+    ("timestamp,x,y,empty\n0,1,1,yes\n", "empty: expected an array of booleans, in NumPy archives only"),
+]
+
+
+def test_broken_csv(tmp_path, subtests):
+    for text, message in BROKEN_CSV:
+        with subtests.test(message):
+            with pytest.raises(InputError, match=r"drive\.csv: " + re.escape(message)) as caught:
+                read_detections(write(tmp_path, ".csv", text))
+            assert "\n" not in str(caught.value)
+
+
+def test_frame_with_two_poses_or_two_kinds_of_coordinates(tmp_path):
+    poses = "timestamp,x,y,ego_x,ego_y,ego_yaw\n0,1,1,0,0,0\n0,1,1,0,1,0\n"
+    with pytest.raises(InputError, match="line 3: ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time"):
+        read_detections(write(tmp_path, ".csv", poses)).scene("drive")
+    kinds = "timestamp,x,y,ego_x,ego_y,ego_yaw,coordinates\n0,1,1,0,0,0,ego\n0,1,1,0,0,0,world\n"
+    with pytest.raises(InputError, match="line 3: coordinates: expected the same in all rows of a frame"):
+        read_detections(write(tmp_path, ".csv", kinds)).scene("drive")
+
+
+FIRST = '{"timestamp": 0, "x": 1, "y": 1}\n'
+BROKEN_NDJSON = [
+    (FIRST + '{"timestamp": 1, "x"', "line 2: broken or truncated JSON"),
+    (FIRST + "[1]", "line 2: expected an object, got '[1]'"),
+    (FIRST + '{"timestamp": 1, "x": "2", "y": 1}', "line 2: x: expected a number, got '2'"),
+    (FIRST + '{"timestamp": 1, "x": true, "y": 1}', "line 2: x: expected a number, got 'True'"),
+    (FIRST + '{"timestamp": 1, "x": [], "y": 1}', "line 2: x: expected a number, got '[]'"),
+    (FIRST + '{"timestamp": 1, "x": NaN, "y": 1}', "line 2: x: expected a finite number of metres, got nan"),
+    (FIRST + '{"timestamp": 1, "x": 1, "y": 1, "label": 3}', "line 2: label: expected a name, got 3"),
+    (FIRST + '{"x": 1, "y": 1}', "line 2: timestamp: expected a finite number of seconds, it is left out"),
+    (FIRST + '{"timestamp": 1, "x": 1' + "0" * 400 + ', "y": 1}', "line 2: x: expected a finite number, got inf"),
+    (FIRST + "[" * 100_000, "line 2: broken or truncated JSON"),
+    ("", "expected at least one row"),
+]
+
+
+def test_broken_ndjson(tmp_path, subtests):
+    for text, message in BROKEN_NDJSON:
+        with subtests.test(message), pytest.raises(InputError, match=r"drive\.ndjson: " + re.escape(message)):
+            read_detections(write(tmp_path, ".ndjson", text))
+
+
+BROKEN_NPZ: list[tuple[dict[str, Any], str]] = [
+    ({"x": [1]}, "x: expected shape (4,) as timestamp has, got (1,)"),
+    ({"x": [[1]] * 4}, "x: expected shape (4,) as timestamp has, got (4, 1)"),
+    ({"x": ["1"] * 4}, "x: expected an array of numbers, got <U1"),
+    ({"label": [1] * 4}, "label: expected an array of strings, got int64"),
+    ({"empty": [1, 0, 0, 0]}, "empty: expected an array of booleans"),
+    ({"empty": [False] * 4}, "row 2: x: expected a finite number of metres, got nan"),
+    (
+        {"label": np.array(["a", 1, None, "b"], dtype=object)},
+        "expected NumPy's format, with plain arrays and no pickled objects",
+    ),
+]
+
+
+def test_broken_npz(tmp_path, subtests):
+    for changes, message in BROKEN_NPZ:
+        with subtests.test(message), pytest.raises(InputError, match=r"drive\.npz: " + re.escape(message)):
+            read_detections(write(tmp_path, ".npz", NPZ | changes))
+
+
+def test_npz_that_is_none(tmp_path):
+    path = write(tmp_path, ".npz")
+    whole = path.read_bytes()
+    for content in (b"", b"text", whole[:200], whole[:-30]):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"drive\.npz: expected NumPy's format, with plain arrays"):
+            read_detections(path)
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(InputError, match="got a single array"):
+        read_detections(path)
+
+
+def test_other_files(tmp_path):
+    with pytest.raises(InputError, match=r"drive\.txt: expected a file name that ends in \.csv, \.ndjson"):
+        read_detections(tmp_path / "drive.txt")
+    for suffix in (".csv", ".ndjson", ".npz"):
+        with pytest.raises(InputError, match=rf"drive\{suffix}: cannot be read: No such file"):
+            read_detections(tmp_path / f"drive{suffix}")
+    (tmp_path / "drive.csv").write_bytes(b"timestamp,x,y\n\xff\xfe")
+    with pytest.raises(InputError, match=r"drive\.csv: expected text in UTF-8"):
+        read_detections(tmp_path / "drive.csv")

@@ -199,10 +199,18 @@ def test_wrong_values_are_named_by_file_topic_message_and_field(tmp_path, subtes
                 read(path)
 
 
-def test_a_frame_that_no_transform_has_is_named(tmp_path):
+def test_transforms_that_are_none_are_named(tmp_path):
     path = example.write_mcap(tmp_path / "drive.mcap", broken(("header", "frame_id"), "lidat"))
     with pytest.raises(InputError, match=rf"{LIDAR}: message 3: unknown frame 'lidat'; did you mean 'lidar'"):
         read(path)
+    messages = deepcopy(example.drive())
+    messages[5][2]["transforms"][0]["transform"]["rotation"]["w"] = 5.0
+    with pytest.raises(InputError, match=r"/tf: message 3: transform of base_link: rotation\[0\]: expected a unit"):
+        read(example.write_mcap(tmp_path / "drive.mcap", messages))
+    back = {**example.map_to_base(0), "header": example.header(0, "base_link"), "child_frame_id": "map"}
+    messages = [*example.drive(), ("/tf", TF, {"transforms": [back]}, START)]
+    with pytest.raises(InputError, match="expected a tree of frames, got the circle"):
+        read(example.write_mcap(tmp_path / "drive.mcap", messages))
 
 
 def test_wrong_options(tmp_path, subtests):
@@ -216,20 +224,6 @@ def test_wrong_options(tmp_path, subtests):
             path = example.write_mcap(tmp_path / "drive.mcap", example.drive())
             with pytest.raises(InputError, match=message):
                 read(path, **options)
-
-
-def test_an_invalid_transform_is_named(tmp_path):
-    messages = deepcopy(example.drive())
-    messages[5][2]["transforms"][0]["transform"]["rotation"]["w"] = 5.0
-    with pytest.raises(InputError, match=r"/tf: message 3: transform of base_link: rotation\[0\]: expected a unit"):
-        read(example.write_mcap(tmp_path / "drive.mcap", messages))
-
-
-def test_a_circle_of_frames_is_refused(tmp_path):
-    back = {**example.map_to_base(0), "header": example.header(0, "base_link"), "child_frame_id": "map"}
-    messages = [*example.drive(), ("/tf", TF, {"transforms": [back]}, START)]
-    with pytest.raises(InputError, match="expected a tree of frames, got the circle"):
-        read(example.write_mcap(tmp_path / "drive.mcap", messages))
 
 
 def test_files_that_are_no_recordings(tmp_path):

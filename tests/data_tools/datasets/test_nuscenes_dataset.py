@@ -1,5 +1,6 @@
-from __future__ import annotations
+"""nuScenes as a dataset: tables, splits, truth."""
 
+import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -8,10 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_tools.datasets.nuscenes import NuScenes
+from data_tools.datasets.nuscenes import NuScenes, split_scenes
+from data_tools.datasets.nuscenes.source import read_scored_scenes
+from data_tools.metrics import nuscenes_tracking_metrics
 from saga_fg import Dataset, InputError
 from saga_fg.numerics.geometry import yaw_of
-from tests.data_tools.nuscenes_example import SAMPLES, START, Tables, box, results, tables, write_results, write_tables
+from tests.data_tools.nuscenes_example import (
+    SAMPLES,
+    START,
+    VERSION,
+    Tables,
+    annotation,
+    box,
+    results,
+    tables,
+    write_results,
+    write_tables,
+)
 
 
 def dataset(tmp_path: Path, content: Tables | None = None, found: Any = None, **options: Any) -> NuScenes:
@@ -21,7 +35,7 @@ def dataset(tmp_path: Path, content: Tables | None = None, found: Any = None, **
     return NuScenes(tmp_path, "v1.0-mini", {"lidar": path}, **options)
 
 
-def test_scene_has_times_poses_and_tokens(tmp_path: Path) -> None:
+def test_scene_has_times_poses_and_tokens(tmp_path):
     data: Dataset = dataset(tmp_path)
     scene = data.scene("scene-0103")
     assert data.scenes == ("scene-0103",)
@@ -33,7 +47,7 @@ def test_scene_has_times_poses_and_tokens(tmp_path: Path) -> None:
     assert scene.ground_truth is None
 
 
-def test_frames_hold_the_detections_of_each_sample(tmp_path: Path) -> None:
+def test_frames_hold_the_detections_of_each_sample(tmp_path):
     scene = dataset(tmp_path).scene("scene-0103")
     assert [(frame.token, frame.sensor, len(frame)) for frame in scene.frames] == [
         ("a0", "lidar", 1),
@@ -55,7 +69,7 @@ def test_frames_hold_the_detections_of_each_sample(tmp_path: Path) -> None:
     assert scene.frames[2].coordinates == "world"
 
 
-def test_velocity_may_be_unknown(tmp_path: Path) -> None:
+def test_velocity_may_be_unknown(tmp_path):
     found = results()
     for velocity in ({"velocity": None}, {"velocity": [float("nan")] * 2}, {}):
         found["a0"][0].pop("velocity", None)
@@ -64,7 +78,7 @@ def test_velocity_may_be_unknown(tmp_path: Path) -> None:
         assert np.isnan(scene.frames[0].detections.boxes.velocity).all()
 
 
-def test_two_sensors_speak_at_each_sample(tmp_path: Path) -> None:
+def test_two_sensors_speak_at_each_sample(tmp_path):
     write_tables(tmp_path)
     lidar = write_results(tmp_path / "l.json")
     camera = write_results(tmp_path / "c.json", {"a1": [box("a1")]}, {"use_camera": True})
@@ -80,9 +94,7 @@ def test_two_sensors_speak_at_each_sample(tmp_path: Path) -> None:
     assert not data.meta.use_map
 
 
-def test_sample_that_is_not_listed_gets_no_frame_and_one_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_sample_that_is_not_listed_gets_no_frame_and_one_warning(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         data = dataset(tmp_path, scenes=list(SAMPLES))
         scene = data.scene("scene-0061")
@@ -92,7 +104,7 @@ def test_sample_that_is_not_listed_gets_no_frame_and_one_warning(
     ]
 
 
-def test_ground_truth(tmp_path: Path) -> None:
+def test_ground_truth(tmp_path):
     truth = dataset(tmp_path, ground_truth=True).scene("scene-0103").ground_truth
     assert truth is not None
     assert [moment.id.tolist() for moment in truth] == [["i-car", "i-ped"], ["i-car"], ["i-car", "i-ped"]]
@@ -105,7 +117,7 @@ def test_ground_truth(tmp_path: Path) -> None:
     np.testing.assert_allclose(truth[2].boxes.velocity, [[10, 4], [1, 0]], rtol=1e-6)
 
 
-def test_no_velocity_over_a_long_gap(tmp_path: Path) -> None:
+def test_no_velocity_over_a_long_gap(tmp_path):
     content = tables()
     for k, sample in enumerate(content["sample"][:3]):
         sample["timestamp"] = START + 1_600_000 * k
@@ -159,7 +171,7 @@ BROKEN_TABLES = [
 ]
 
 
-def test_broken_table(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_broken_table(tmp_path, subtests):
     for apply, message in BROKEN_TABLES:
         with subtests.test(message):
             content = tables()
@@ -169,7 +181,7 @@ def test_broken_table(tmp_path: Path, subtests: pytest.Subtests) -> None:
             assert "\n" not in str(caught.value)
 
 
-def test_tables_that_are_missing_cut_off_or_no_tables(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_tables_that_are_missing_cut_off_or_no_tables(tmp_path, subtests):
     for table in list(tables()):
         with subtests.test(table=table):
             write_tables(tmp_path)
@@ -187,13 +199,13 @@ def test_tables_that_are_missing_cut_off_or_no_tables(tmp_path: Path, subtests: 
         NuScenes(tmp_path, "v1.0-trainval", {})
 
 
-def test_annotations_are_read_only_when_asked_for(tmp_path: Path) -> None:
+def test_annotations_are_read_only_when_asked_for(tmp_path):
     write_tables(tmp_path)
     (tmp_path / "v1.0-mini" / "sample_annotation.json").unlink()
     assert NuScenes(tmp_path, "v1.0-mini", {}).scene("scene-0103").ground_truth is None
 
 
-def test_unknown_scene_suggests_the_nearest(tmp_path: Path) -> None:
+def test_unknown_scene_suggests_the_nearest(tmp_path):
     with pytest.raises(InputError, match=r"scene\.json: unknown scene 'scene-0013'; did you mean 'scene-0103'"):
         dataset(tmp_path, scenes=["scene-0013"])
     with pytest.raises(InputError, match="unknown scene 'scene-0061'"):
@@ -216,7 +228,7 @@ BROKEN_BOXES = [
 ]
 
 
-def test_broken_box_names_file_sample_box_and_field(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_broken_box_names_file_sample_box_and_field(tmp_path, subtests):
     for values, message in BROKEN_BOXES:
         with subtests.test(message):
             found = results()
@@ -232,7 +244,7 @@ def test_broken_box_names_file_sample_box_and_field(tmp_path: Path, subtests: py
                 dataset(tmp_path, found=found)
 
 
-def test_broken_results(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_broken_results(tmp_path, subtests):
     for found, message in [
         ({"a0": [], "xyz": []}, r"sample xyz: expected samples of the tables, they hold no such sample"),
         ({"b0": []}, r"expected detections of scene scene-0103, the file lists none of its samples"),
@@ -245,7 +257,7 @@ def test_broken_results(tmp_path: Path, subtests: pytest.Subtests) -> None:
             dataset(tmp_path, found=found)
 
 
-def test_broken_result_file(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_broken_result_file(tmp_path, subtests):
     for text, message in [
         ('{"meta": {}}', "expected a field 'results'"),
         ('{"meta": 1, "results": {}}', "meta: expected an object"),
@@ -261,10 +273,125 @@ def test_broken_result_file(tmp_path: Path, subtests: pytest.Subtests) -> None:
                 NuScenes(tmp_path, "v1.0-mini", {"lidar": path})
 
 
-def test_scene_that_a_sensor_never_saw(tmp_path: Path) -> None:
+def test_scene_that_a_sensor_never_saw(tmp_path):
     write_tables(tmp_path)
     path = write_results(tmp_path / "found.json", {"a0": []})
     data = NuScenes(tmp_path, "v1.0-mini", {"lidar": path})  # no scene was asked for yet
     assert len(data.scene("scene-0103").frames) == 1
     with pytest.raises(InputError, match="expected detections of scene scene-0061"):
         data.scene("scene-0061")
+
+
+def scenes(root: Path, version: str, names: list[str], splits: object = None) -> Path:
+    folder = root / version
+    folder.mkdir()
+    (folder / "scene.json").write_text(json.dumps([{"name": name} for name in names]))
+    if splits is not None:
+        (folder / "splits.json").write_text(json.dumps(splits))
+    return root
+
+
+def test_official_mini_splits(tmp_path):
+    write_tables(tmp_path)
+    assert split_scenes(tmp_path, "v1.0-mini", "mini_val") == ("scene-0103",)
+    assert split_scenes(tmp_path, "v1.0-mini", "mini_train") == ("scene-0061",)
+
+
+def test_official_trainval_splits(tmp_path):
+    names = [f"scene-{n:04}" for n in (1, 3, 4, 12, 18, 19, 92, 110, 1059, 1073, 1074, 1110)]
+    root = scenes(tmp_path, "v1.0-trainval", names)
+    val = {name for name in names if int(name[-4:]) in (3, 12, 18, 92, 110, 1059, 1073)}
+    assert set(split_scenes(root, "v1.0-trainval", "val")) == val
+    assert set(split_scenes(root, "v1.0-trainval", "train")) == set(names) - val
+    detect = split_scenes(root, "v1.0-trainval", "train_detect")
+    assert detect == ("scene-0001", "scene-1074")
+    assert set(split_scenes(root, "v1.0-trainval", "train_track")) == set(names) - val - set(detect)
+
+
+def test_splits_of_the_test_version_and_of_ones_own(tmp_path):
+    root = scenes(tmp_path, "v1.0-test", ["scene-0077", "scene-0078"])
+    assert split_scenes(root, "v1.0-test", "test") == ("scene-0077", "scene-0078")
+    root = scenes(tmp_path, "v1.0-mini", ["a", "b", "c"], {"mine": ["c", "a", "absent"]})
+    assert split_scenes(root, "v1.0-mini", "mine") == ("a", "c")
+
+
+def test_splits_that_cannot_be_found(tmp_path, subtests):
+    root = scenes(tmp_path, "v1.0-mini", ["a"], {"mine": ["a"], "none": []})
+    for split, message in (
+        ("mini_vall", r"splits\.json: unknown split 'mini_vall'; did you mean 'mini_val'\? .*: mini_train, mini"),
+        ("train", r"split train belongs to v1\.0-trainval, the tables read are v1\.0-mini"),
+        ("none", r"expected scenes of split none, the table holds none of them"),
+    ):
+        with subtests.test(split), pytest.raises(InputError, match=message):
+            split_scenes(root, "v1.0-mini", split)
+    for content in (["a"], {"mine": "a"}, {"mine": [1]}):
+        (root / "v1.0-mini" / "splits.json").write_text(json.dumps(content))
+        with subtests.test(content=content), pytest.raises(InputError, match="expected an object of lists"):
+            split_scenes(root, "v1.0-mini", "mine")
+    with pytest.raises(InputError, match="scene mine: expected a name scene-NNNN"):
+        split_scenes(scenes(tmp_path, "v1.0-trainval", ["mine"]), "v1.0-trainval", "val")
+
+
+# A result file beside its ground truth: what is read, and what is refused
+
+
+def tracked(sample: str, track: str = "t", **changes: Any) -> dict[str, Any]:
+    """A tracked car in the official format."""
+    fields = {k: v for k, v in box(sample, velocity=[0.0, 0.0]).items() if not k.startswith(("detection", "attribute"))}
+    return fields | {"tracking_id": track, "tracking_name": "car", "tracking_score": 0.5} | changes
+
+
+def write(path: Path, results: dict[str, Any]) -> Path:
+    path.write_text(json.dumps({"meta": {"use_lidar": True}, "results": results}))
+    return path
+
+
+def content_with_rack() -> dict[str, list[dict[str, Any]]]:
+    content = tables()
+    content["category"].append({"token": "k-rack", "name": "static_object.bicycle_rack"})
+    content["instance"].append({"token": "i-rack", "category_token": "k-rack"})
+    content["sample_annotation"].append(annotation("a1", "i-rack", [20.0, 3.0, 1.0], points=0))
+    return content
+
+
+def test_truth_tracks_and_racks_of_each_sample(tmp_path):
+    root = write_tables(tmp_path, content_with_rack())
+    results = {"a0": [tracked("a0"), tracked("a0", "u")], "a1": [], "a2": [tracked("a2")], "b0": []}
+    (scored,) = read_scored_scenes(write(tmp_path / "r.json", results), root, VERSION, ["scene-0103"]).values()
+    scene = scored.tracking
+    assert [len(truth) for truth in scored.scene.ground_truth or ()] == [2, 1, 2]  # seen or not
+    assert np.diff(scene.timestamps) == pytest.approx([0.5, 0.5])
+    assert scene.ego_position.tolist() == [[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]]
+    assert scene.truth.frame.tolist() == [0, 0, 2, 2]  # the car has no point at a1, the barrier is not tracked
+    assert sorted(scene.truth.id.tolist()) == ["i-car", "i-car", "i-ped", "i-ped"]
+    assert scene.found.frame.tolist() == [0, 0, 2]
+    assert scene.found.id.tolist() == ["t", "u", "t"]
+    assert [len(racks) for racks in scene.racks] == [0, 1, 0]
+    rack = scene.racks[1]
+    assert rack.position.tolist() == [[20.0, 3.0, 1.0]]
+    assert rack.size.tolist() == [[4.0, 2.0, 1.5]]  # length, width, height
+    assert rack.yaw == pytest.approx([np.pi / 2])
+    assert nuscenes_tracking_metrics([scene]).overall.gt == 0  # all is further than 50 m from the vehicle
+
+
+def test_a_missing_sample_is_refused(tmp_path):
+    root = write_tables(tmp_path)
+    result = write(tmp_path / "r.json", {"a0": [], "a2": []})
+    with pytest.raises(InputError, match=r"r\.json: expected every sample of scene scene-0103, a1 is missing"):
+        read_scored_scenes(result, root, VERSION, ["scene-0103"])
+
+
+def test_more_than_500_boxes_are_refused(tmp_path):
+    root = write_tables(tmp_path)
+    results = {"a0": [tracked("a0", f"t{n}") for n in range(501)], "a1": [], "a2": []}
+    with pytest.raises(InputError, match="sample a0: expected at most 500 boxes"):
+        read_scored_scenes(write(tmp_path / "r.json", results), root, VERSION, ["scene-0103"])
+
+
+def test_a_broken_rack_is_named(tmp_path):
+    content = content_with_rack()
+    content["sample_annotation"][-1]["size"] = [2.0, -4.0, 1.5]
+    root = write_tables(tmp_path, content)
+    result = write(tmp_path / "r.json", {"a0": [], "a1": [], "a2": []})
+    with pytest.raises(InputError, match=r"sample_annotation\.json: scene scene-0103: size"):
+        read_scored_scenes(result, root, VERSION, ["scene-0103"])

@@ -1,7 +1,5 @@
 """Parquet and Feather files that other programs wrote: what cannot be understood is one line with the file's name."""
 
-from __future__ import annotations
-
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -26,7 +24,7 @@ def write(path: Path, columns: list[tuple[str, Any]]) -> Path:
     return path
 
 
-def test_two_columns_of_one_name_are_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_two_columns_of_one_name_are_refused(tmp_path, subtests):
     for suffix in [".parquet", ".feather"]:
         with subtests.test(suffix=suffix):
             path = write(tmp_path / f"a{suffix}", [("time", [0.0, 0.1]), ("x", X), ("x", X), ("y", X)])
@@ -34,7 +32,7 @@ def test_two_columns_of_one_name_are_refused(tmp_path: Path, subtests: pytest.Su
                 read_detections(path)
 
 
-def test_columns_of_other_types_are_named(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_columns_of_other_types_are_named(tmp_path, subtests):
     for suffix in [".parquet", ".feather"]:
         for values, message in [
             (pa.array([{"a": 1.0}, {"a": 2.0}]), "x: expected an array of numbers, got list"),
@@ -50,7 +48,7 @@ def test_columns_of_other_types_are_named(tmp_path: Path, subtests: pytest.Subte
                     read_detections(path)
 
 
-def test_columns_have_their_values_and_dates_are_text(tmp_path: Path) -> None:
+def test_columns_have_their_values_and_dates_are_text(tmp_path):
     day = date(2024, 5, 1)
     columns = [
         ("x", pa.array(X)),
@@ -64,7 +62,7 @@ def test_columns_have_their_values_and_dates_are_text(tmp_path: Path) -> None:
     assert found == {"s": ["a", "b"], "day": ["2024-05-01", None], "n": [1, None]}
 
 
-def test_a_column_that_grows_beyond_the_memory_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_column_that_grows_beyond_the_memory_is_one_line(tmp_path, monkeypatch):
     from data_tools.files import isolated_reading
 
     monkeypatch.setattr(isolated_reading, "MEMORY", 10**6)
@@ -74,7 +72,7 @@ def test_a_column_that_grows_beyond_the_memory_is_one_line(tmp_path: Path, monke
         read_detections(path)
 
 
-def test_dates_without_a_time_are_no_times(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_dates_without_a_time_are_no_times(tmp_path, subtests):
     for rows in [[date(2024, 5, 1)] * 2, [date(2024, 5, 1), date(2024, 5, 2)], ["2024-05-01"] * 2]:
         with subtests.test(rows=rows):
             path = write(tmp_path / "a.parquet", [("date", rows), ("x", X), ("y", X)])
@@ -85,7 +83,7 @@ def test_dates_without_a_time_are_no_times(tmp_path: Path, subtests: pytest.Subt
                 read_detections(path, how=how)
 
 
-def test_dates_without_a_time_are_no_times_in_text(tmp_path: Path) -> None:
+def test_dates_without_a_time_are_no_times_in_text(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,x,y\n2024-05-01,1,2\n2024-05-01,3,4\n")
     with pytest.raises(InputError, match=r"a\.csv: timestamp \(column 'time'\): expected times with the time of day"):
@@ -93,9 +91,7 @@ def test_dates_without_a_time_are_no_times_in_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rows", [["2024-05-01 00:00:00"] * 2, ["2024-05-01T00:00:00Z", "2024-05-02T00:00:00Z"]])
-def test_dates_at_midnight_alone_are_doubtful(
-    tmp_path: Path, rows: list[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_dates_at_midnight_alone_are_doubtful(tmp_path, rows, caplog):
     path = write(tmp_path / "a.parquet", [("time", rows), ("x", X), ("y", X)])
     read_detections(path)
     assert "dates have no time of day: all rows of a day are one frame" in caplog.text

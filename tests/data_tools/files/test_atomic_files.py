@@ -1,5 +1,8 @@
-from __future__ import annotations
+"""Files written whole or not at all, and files at an address."""
 
+import sys
+import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -13,7 +16,8 @@ from data_tools.files.atomic_files import (
     write_bytes,
     write_text,
 )
-from saga_fg.errors import InputError
+from data_tools.files.input_files import PROTOCOLS, expanded, local_copy, local_tree, name_of
+from saga_fg.errors import InputError, MissingExtraError
 
 
 def names(folder: Path) -> list[str]:
@@ -32,7 +36,7 @@ def fill_half(path: Path) -> None:
         raise KeyboardInterrupt
 
 
-def test_file_is_written_whole_and_replaced_whole(tmp_path: Path) -> None:
+def test_file_is_written_whole_and_replaced_whole(tmp_path):
     path = tmp_path / "out.txt"
     write_text(path, "first é")
     write_bytes(path, b"second")
@@ -40,7 +44,7 @@ def test_file_is_written_whole_and_replaced_whole(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out.txt"]
 
 
-def test_interrupted_file_leaves_the_earlier_one(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_interrupted_file_leaves_the_earlier_one(tmp_path, subtests):
     for exception in [KeyboardInterrupt, RuntimeError, SystemExit]:
         with subtests.test(exception=exception):
             path = tmp_path / "out.txt"
@@ -51,26 +55,20 @@ def test_interrupted_file_leaves_the_earlier_one(tmp_path: Path, subtests: pytes
             assert names(tmp_path) == ["out.txt"]
 
 
-def test_new_file_has_ordinary_permissions(tmp_path: Path) -> None:
+def test_new_files_have_ordinary_permissions_links_survive_and_names_have_a_greatest_length(tmp_path):
     write_text(tmp_path / "ours", "")
     (tmp_path / "plain").write_text("")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-def test_links_survive(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "target")
     write_text(tmp_path / "link", "text")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "target").read_text() == "text"
-
-
-def test_a_name_of_greatest_length(tmp_path: Path) -> None:
     write_text(tmp_path / ("n" * 255), "text")
     with pytest.raises(InputError, match="not writable"):
         write_text(tmp_path / ("n" * 256), "text")
 
 
-def test_paths_of_another_kind(tmp_path: Path) -> None:
+def test_paths_of_another_kind(tmp_path):
     with pytest.raises(InputError, match="expected the name of a file to write, this is a folder"):
         write_text(tmp_path, "x")
     with pytest.raises(InputError, match="no regular file"):
@@ -81,7 +79,7 @@ def test_paths_of_another_kind(tmp_path: Path) -> None:
         pytest.fail("the block must not run")
 
 
-def test_folder_that_is_missing_or_a_file(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_folder_that_is_missing_or_a_file(tmp_path, subtests):
     for output in [atomic_file, atomic_directory]:
         with subtests.test(output=output):
             (tmp_path / "file").write_text("")
@@ -93,7 +91,7 @@ def test_folder_that_is_missing_or_a_file(tmp_path: Path, subtests: pytest.Subte
                     pytest.fail("the block must not run")
 
 
-def test_folder_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_without_permission(tmp_path, monkeypatch):
     # permission bits do not bind root, who may well run the tests: refuse as the system would
     def refuse(self: Path, *args: object, **kwargs: object) -> None:
         raise PermissionError(13, "Permission denied", str(self))
@@ -108,13 +106,13 @@ def test_folder_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             pytest.fail("the block must not run")
 
 
-def test_full_disk_is_one_line(tmp_path: Path) -> None:
+def test_full_disk_is_one_line(tmp_path):
     with pytest.raises(InputError, match="out: not written: No space left"), atomic_file(tmp_path / "out"):
         raise OSError(28, "No space left on device")
     assert names(tmp_path) == []
 
 
-def test_directory_appears_when_complete(tmp_path: Path) -> None:
+def test_directory_appears_when_complete(tmp_path):
     final = tmp_path / "out"
     with atomic_directory(final) as folder:
         (folder / "sub").mkdir()
@@ -124,7 +122,7 @@ def test_directory_appears_when_complete(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out"]
 
 
-def test_directory_with_files_keeps_the_others(tmp_path: Path) -> None:
+def test_directory_with_files_keeps_the_others(tmp_path):
     final = tmp_path / "out"
     (final / "sub").mkdir(parents=True)
     (final / "old").write_text("old")
@@ -139,7 +137,7 @@ def test_directory_with_files_keeps_the_others(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out"]
 
 
-def test_known_files_of_an_earlier_run_go(tmp_path: Path) -> None:
+def test_known_files_of_an_earlier_run_go(tmp_path):
     final, known = tmp_path / "out", ("tracks.csv", "map/[0-9]*.ply", "linked/[0-9]*.ply", "own")
     elsewhere = tmp_path / "elsewhere"
     for name in ("out/map/0.ply", "out/map/1.ply", "out/old/0.ply", "out/tracks.csv", "out/notes", "elsewhere/0.ply"):
@@ -159,7 +157,7 @@ def test_known_files_of_an_earlier_run_go(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("exists", [True, False])
-def test_interrupted_directory_leaves_nothing(tmp_path: Path, exists: bool) -> None:
+def test_interrupted_directory_leaves_nothing(tmp_path, exists):
     final = tmp_path / "out"
     if exists:
         final.mkdir()
@@ -170,12 +168,12 @@ def test_interrupted_directory_leaves_nothing(tmp_path: Path, exists: bool) -> N
     assert not exists or (final / "old").read_text() == "old"
 
 
-def test_other_os_errors_pass(tmp_path: Path) -> None:
+def test_other_os_errors_pass(tmp_path):
     with pytest.raises(FileNotFoundError), atomic_file(tmp_path / "out"):
         (tmp_path / "elsewhere").read_text()
 
 
-def test_paths_are_checked_before_long_work(tmp_path: Path) -> None:
+def test_paths_are_checked_before_long_work(tmp_path):
     check_writable(tmp_path / "new.json")
     check_writable_folder(tmp_path / "new")
     (tmp_path / "there").mkdir()
@@ -193,7 +191,7 @@ def test_paths_are_checked_before_long_work(tmp_path: Path) -> None:
             check(path)
 
 
-def test_only_what_a_killed_write_left_is_removed(tmp_path: Path) -> None:
+def test_only_what_a_killed_write_left_is_removed(tmp_path):
     for name in (".a.csv.0123456789ab.tmp", "a.csv", ".hidden", ".a.tmp", "b.0123456789ab.tmp"):
         (tmp_path / name).touch()
     (tmp_path / ".folder.0123456789ab.tmp").mkdir()
@@ -202,3 +200,168 @@ def test_only_what_a_killed_write_left_is_removed(tmp_path: Path) -> None:
     assert (tmp_path / ".a.csv.0123456789ab.tmp").exists()
     remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"a.csv", ".hidden", ".a.tmp", "b.0123456789ab.tmp"}
+
+
+# Files by path, URL, pattern and list
+
+
+def test_a_path_is_itself_and_a_url_a_copy_that_goes_away(tmp_path):
+    pytest.importorskip("fsspec")
+    original = tmp_path / "a.csv"
+    original.write_text("x")
+    with local_copy(str(original)) as path:
+        assert path == original
+    with local_copy(f"file://{original}") as path:
+        assert (path.name, path.read_text()) == ("a.csv", "x")
+        assert path != original
+    assert not path.exists()
+    assert original.exists()
+
+
+def test_an_error_about_a_copy_names_the_url(tmp_path):
+    pytest.importorskip("fsspec")
+    (tmp_path / "a.csv").write_text("x")
+    url = f"file://{tmp_path}/a.csv"
+    with pytest.raises(InputError) as caught, local_copy(url) as path:
+        raise InputError(f"{path}: line 1: wrong")
+    assert str(caught.value) == f"{url}: line 1: wrong"
+
+
+def test_the_folder_for_temporary_files_may_be_a_link(tmp_path, monkeypatch):
+    pytest.importorskip("fsspec")
+    for name in ("data", "temporary"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "data" / "a.csv").write_text("x")
+    (tmp_path / "link").symlink_to(tmp_path / "temporary")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "link"))
+    with local_tree(f"file://{tmp_path}/data", ["*.csv"]) as folder:
+        assert (folder / "a.csv").read_text() == "x"
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+def test_names():
+    assert name_of("s3://bucket/day/a.csv") == "a.csv"
+    assert name_of("https://host/a.csv?version=2") == "a.csv"
+    assert name_of("/data/a.csv") == "a.csv"
+
+
+def test_patterns_are_sorted_and_every_file_comes_once(tmp_path):
+    for name in ("b.csv", "a.csv", "c.npz"):
+        (tmp_path / name).touch()
+    (tmp_path / "list.txt").write_text(f"# some\n\n{tmp_path}/c.npz\n{tmp_path}/*.csv\n")
+    assert expanded([f"{tmp_path}/*.csv"]) == [f"{tmp_path}/a.csv", f"{tmp_path}/b.csv"]
+    assert [Path(path).name for path in expanded([f"{tmp_path}/b.csv", f"{tmp_path}/list.txt"])] == [
+        *("b.csv", "c.npz", "a.csv")
+    ]
+    with pytest.raises(InputError, match="expected at least one file"):
+        expanded([f"{tmp_path}/*.ndjson"])
+    with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
+        expanded([f"{tmp_path}/none.txt"])
+
+
+def test_what_cannot_be_read_is_named(subtests):
+    for url, message in [
+        ("file:///nowhere/a.csv", "file:///nowhere/a.csv: cannot be read: FileNotFoundError"),
+        ("no://a/b.csv", "expected a URL"),
+    ]:
+        with subtests.test(message):
+            pytest.importorskip("fsspec")
+            with pytest.raises(InputError, match=message), local_copy(url):
+                pass
+
+
+def test_without_fsspec_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(MissingExtraError, match=r"saga-fg\[remote\]"), local_copy("s3://bucket/a.csv"):
+        pass
+
+
+def test_lists_of_files_are_read_once_and_not_in_themselves(tmp_path):
+    one, other = tmp_path / "one.txt", tmp_path / "other.txt"
+    one.write_text(f"{other}\n")
+    other.write_text(f"{one}\n")
+    with pytest.raises(InputError, match=r"one\.txt: expected a list of files, this one is in itself"):
+        expanded([str(one)])
+    other.write_text(f"{other.parent}/./other.txt\n")
+    with pytest.raises(InputError, match=r"other\.txt: expected a list of files, this one is in itself"):
+        expanded([str(one)])
+    for k in range(40):  # 2^40 paths through them
+        (tmp_path / f"{k}.txt").write_text(f"{tmp_path}/{k + 1}.txt\n{tmp_path}/./{k + 1}.txt\n")
+    (tmp_path / "40.txt").write_text(f"{tmp_path}/a.csv\n")
+    assert expanded([str(tmp_path / "0.txt")]) == [str(tmp_path / "a.csv")]
+
+
+def test_entries_that_can_be_no_files_are_refused(tmp_path, subtests):
+    path = tmp_path / "list.txt"
+    for entry, message in [
+        ("a\0b.csv", r"list\.txt: expected names without a zero byte, got 'a\\x00b\.csv'"),
+        ("[" * 5000, r"list\.txt, \[+: expected at least one file, there is none"),
+    ]:
+        with subtests.test(message):
+            path.write_text(f"{entry}\n")
+            with pytest.raises(InputError, match=message):
+                expanded([str(path)])
+
+
+def test_other_protocols_and_chains_are_refused(subtests):
+    for url, message in [
+        ("zip://a.csv::file:///nowhere/a.zip", "got zip://"),
+        ("zip://a.csv::https://localhost/a.zip", "got zip://"),
+        ("reference://a.csv", "got reference://"),
+        ("file:///a.csv::https://localhost/b", "got a chain"),
+        ("simplecache::s3://bucket/a.csv", "got simplecache::s3://"),
+        ("github://a:b@/c.csv", "got github://"),
+        ("://a.csv", "got ://"),
+    ]:
+        for read in [local_copy, lambda url: local_tree(url, ["*"]), lambda url: expanded([f"{url}*"])]:
+            with subtests.test(message):
+                with pytest.raises(InputError) as caught, ExitStack() as stack:
+                    stack.enter_context(read(url))
+                assert f"expected a URL of one protocol, one of {', '.join(PROTOCOLS)}, {message}" in str(caught.value)
+
+
+def test_what_is_not_there_is_one_line(subtests):
+    for url in ["file:///nowhere", "http://localhost:1/a", "ftp://localhost:1/a.csv"]:
+        with subtests.test(url=url):
+            pytest.importorskip("fsspec")
+            with pytest.raises((InputError, MissingExtraError)) as caught, local_copy(url):
+                pass
+            assert str(caught.value).startswith(f"{url}: ")
+            assert "\n" not in str(caught.value)
+
+
+def test_a_list_names_no_other_host_unless_it_is_given(tmp_path):
+    path = tmp_path / "list.txt"
+    path.write_text("https://data.example.org/a.csv\ns3://bucket/b.csv\n")
+    with pytest.raises(InputError) as caught:
+        expanded([str(path)])
+    assert str(caught.value) == (
+        f"{path}: https://data.example.org/a.csv: this list names another host; "
+        "if you know it: --hosts data.example.org"
+    )
+    with pytest.raises(InputError, match="--hosts bucket"):
+        expanded([str(path)], ["data.example.org"])
+    both = ["https://data.example.org/a.csv", "s3://bucket/b.csv"]
+    assert expanded([str(path)], ["data.example.org", "bucket"]) == both
+    assert expanded(["s3://bucket/c.csv", str(path)], ["data.example.org"]) == ["s3://bucket/c.csv", *both]
+
+
+def test_a_list_from_a_url_names_no_local_files(tmp_path):
+    memory = pytest.importorskip("fsspec").filesystem("memory")
+    for entry in ("/etc/passwd", "file:///etc/passwd", "a.csv", "*.csv"):
+        memory.pipe_file("/lists/one.txt", f"{entry}\n".encode())
+        with pytest.raises(InputError, match=r"memory://lists/one\.txt: .* expected URLs in a list"):
+            expanded(["memory://lists/one.txt"])
+    memory.pipe_file("/lists/one.txt", b"memory://lists/a.csv\n")
+    assert expanded(["memory://lists/one.txt"]) == ["memory://lists/a.csv"]
+    memory.store.clear()
+
+
+def test_pieces_of_a_large_file_are_put_together(tmp_path):
+    pytest.importorskip("fsspec")
+    content = bytes(range(256)) * 40_000  # more than one piece
+    (tmp_path / "large.bin").write_bytes(content)
+    with local_copy(f"file://{tmp_path}/large.bin") as path:
+        assert path.read_bytes() == content
+    with local_tree(f"file://{tmp_path}", ["*.bin", "l*"]) as folder:
+        assert (folder / "large.bin").read_bytes() == content

@@ -1,7 +1,5 @@
 """Every reader refuses files that cannot be read, or would never end, in one line that names them."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import os
@@ -86,7 +84,7 @@ HOSTILE = {
 }
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_what_is_no_file_is_refused(tmp_path, subtests):
     for make, reason in HOSTILE.items():
         inside = tmp_path / make.__name__
         inside.mkdir()
@@ -98,12 +96,12 @@ def test_what_is_no_file_is_refused(tmp_path: Path, subtests: pytest.Subtests) -
             assert str(caught.value) == f"{path}: cannot be read: {reason}"
 
 
-def test_a_name_with_a_zero_byte() -> None:
+def test_a_name_with_a_zero_byte():
     with pytest.raises(InputError, match="cannot be read: embedded null"):
         open_bytes("a\0b")
 
 
-def test_links_to_files_are_followed(tmp_path: Path) -> None:
+def test_links_to_files_are_followed(tmp_path):
     (tmp_path / "a").write_text("text")
     (tmp_path / "b").symlink_to("a")
     assert read_text(tmp_path / "b") == "text"
@@ -111,7 +109,7 @@ def test_links_to_files_are_followed(tmp_path: Path) -> None:
         assert file.read() == "text"
 
 
-def test_what_is_no_text(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_what_is_no_text(tmp_path, subtests):
     for content, got in [
         (bz2.compress(b"text"), "got a file compressed by bzip2, to be decompressed first"),
         (gzip.compress(b"text"), "got a file compressed by gzip, to be decompressed first"),
@@ -123,13 +121,13 @@ def test_what_is_no_text(tmp_path: Path, subtests: pytest.Subtests) -> None:
                 read_g2o(tmp_path / "graph.g2o")
 
 
-def test_json_that_is_broken_or_too_deep(subtests: pytest.Subtests) -> None:
+def test_json_that_is_broken_or_too_deep(subtests):
     for text in ["[" * 5000, '{"a": ' * 5000, "[1", b"\xff"]:
         with subtests.test(text=text), pytest.raises(InputError, match=r"^here: broken or truncated JSON: "):
             parsed_json(text, "here")
 
 
-def test_long_numbers_in_text_tables(tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_long_numbers_in_text_tables(tmp_path, subtests):
     for value in ["9" * 4000, "1" * 101]:
         with subtests.test(value=value):
             path = tmp_path / "poses.txt"
@@ -140,7 +138,7 @@ def test_long_numbers_in_text_tables(tmp_path: Path, subtests: pytest.Subtests) 
                 read_kitti_poses(path)
 
 
-def test_messages_show_the_begin_of_long_names() -> None:
+def test_messages_show_the_begin_of_long_names():
     told = unknown_name("scene", "a" * 10_000, ("a" * 9_999, "b"))
     assert told.startswith("unknown scene 'aaa")
     assert len(told) < 500

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scans import StaticWorld, drive, scans, street
-from data_tools.lidar import (
-    Registration,
-    RegistrationError,
-    SurfelMap,
-    observability,
-    register,
-    voxel_downsample,
-)
+from data_tools.lidar import Registration, RegistrationError, SurfelMap, observability, register, voxel_downsample
 from data_tools.lidar.registration import Undetermined
 from saga_fg.numerics.geometry import yaw_transform
 from tests.data_tools.featureless import open_field, tunnel

@@ -1,7 +1,5 @@
 """HOTA on KITTI judges what the benchmark judges: cases by hand, and trackeval's own reading of the same files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -45,14 +43,14 @@ IGNORED = {
 }
 
 
-def test_what_the_benchmark_does_not_ask_for_is_neither_found_nor_false(tmp_path: Path) -> None:
+def test_what_the_benchmark_does_not_ask_for_is_neither_found_nor_false(tmp_path):
     for case, (truth, box) in IGNORED.items():
         for found in ([], [line(0, 9, "Car", box)]):
             result = figures(tmp_path, truth, found)
             assert (result.fp, result.fn, result.hota) == (0, 0, pytest.approx(1.0)), case
 
 
-def test_a_box_with_nothing_to_excuse_it_is_false(tmp_path: Path) -> None:
+def test_a_box_with_nothing_to_excuse_it_is_false(tmp_path):
     cases: list[tuple[list[str], tuple[float, ...]]] = [
         ([line(0, 2, "Van", ELSEWHERE)], (430.0, 100.0, 510.0, 150.0)),  # beside the van
         ([line(0, -1, "DontCare", (445.0, 90.0, 490.0, 160.0))], ELSEWHERE),  # less than half of it
@@ -63,18 +61,18 @@ def test_a_box_with_nothing_to_excuse_it_is_false(tmp_path: Path) -> None:
         assert figures(tmp_path, truth, [line(0, 9, "Car", box)]).fp == 1
 
 
-def test_largely_hidden_objects_are_asked_for_and_small_ones_too(tmp_path: Path) -> None:
+def test_largely_hidden_objects_are_asked_for_and_small_ones_too(tmp_path):
     truth = [line(0, 2, "Car", ELSEWHERE, (0, 2)), line(0, 3, "Car", (600.0, 100.0, 640.0, 120.0))]
     assert figures(tmp_path, truth, []).fn == 2
 
 
-def test_persons_who_sit_go_with_pedestrians(tmp_path: Path) -> None:
+def test_persons_who_sit_go_with_pedestrians(tmp_path):
     found = [line(0, 9, "Pedestrian", ELSEWHERE)]
     for name in ("Person", "Person_sitting"):
         assert figures(tmp_path, [line(0, 2, name, ELSEWHERE)], found, "pedestrian").fp == 0
 
 
-def test_in_space_the_same_objects_are_evaluated(tmp_path: Path) -> None:
+def test_in_space_the_same_objects_are_evaluated(tmp_path):
     truth = [line(0, 1, "Car", CAR), line(0, 2, "Van", ELSEWHERE, x=10.0)]
     found = [line(0, 7, "Car", CAR, x=1.0), line(0, 9, "Car", ELSEWHERE, x=14.0)]
     both = sequence(tmp_path, truth, found)
@@ -107,7 +105,7 @@ def traffic(seed: int) -> tuple[list[str], list[str]]:
     return truth, found
 
 
-def test_figures_are_those_of_trackeval_itself(tmp_path: Path) -> None:
+def test_figures_are_those_of_trackeval_itself(tmp_path):
     sequences, true_folder, found_folder = [], tmp_path / "gt" / "label_02", tmp_path / "trackers" / "t" / "data"
     for folder in (true_folder, found_folder):
         folder.mkdir(parents=True)

@@ -1,9 +1,10 @@
-"""KITTI 3D tracking metrics: cases by hand, a plain reading of the rules, the figures of the reference evaluation."""
+"""The metrics of KITTI, and HOTA."""
 
 import functools
 import json
 import math
 import operator
+import sys
 
 import numpy as np
 import pytest
@@ -12,8 +13,11 @@ from hypothesis import strategies as st
 
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.kitti_objects import CameraBoxes, KittiObjects
-from data_tools.metrics import KittiTrackingSequence, kitti_tracking_metrics
+from data_tools.metrics import KittiTrackingSequence, SceneBoxes, hota_metrics, kitti_tracking_metrics
 from data_tools.metrics.kitti_tracking import track_scores, trajectory_counts
+from saga_fg import Boxes, InputError, MissingExtraError
+
+# KITTI 3D tracking metrics: cases by hand, a plain reading of the rules, the figures of the reference evaluation
 
 BOX = {"type": "Car", "z": 10.0, "score": math.nan, "truncated": 0, "occluded": 0, "bbox": (100, 100, 200, 200)}
 LOW = {"bbox": (100, 100, 200, 120)}
@@ -68,7 +72,7 @@ def test_counts_by_hand():
     assert (strict.tp, strict.fp, strict.fn) == (35, 26, 65)
 
 
-def test_thresholds_leave_out_what_scores_low():
+def test_neither_matched_boxes_nor_low_scores_spoil_a_threshold():
     # 50 true boxes score high, 50 low, 50 false alarms between: at low recall only the high ones are there.
     found = [(f, n, x, {"score": 1.0 if n < 2 else 0.25}) for f, n, x in CARS]
     found += [(f, 5 + n, 300.0 + 10 * n, {"score": 0.5}) for f in range(25) for n in range(2)]
@@ -77,6 +81,13 @@ def test_thresholds_leave_out_what_scores_low():
     low, high = 20, 20  # recalls up to a half are reached by the high scores
     assert f.amota == pytest.approx((low * 0.5 + high * 0.5) / 40)
     assert f.samota < 1.0
+    # Above a score of 0.5 track 1 alone is at object 0 and matches it, low in the image as it is. With all tracks,
+    # track 0 fits better, and track 1, left over, would be let pass.
+    truth = [(f, n, 50.0 * n) for f in range(40) for n in range(2)]
+    found = [(f, 0, 0.0, {"score": 0.5}) for f in range(40)] + [(f, 2, 50.0, {"score": 0.75}) for f in range(40)]
+    found += [(f, 1, 1.0, {"score": 1.0} | LOW) for f in range(10)]
+    f = figures(truth, found)
+    assert (f.tp, f.fp) == (80, 10)
 
 
 def test_boxes_that_need_not_be_found():
@@ -105,16 +116,6 @@ def test_boxes_that_need_not_match():
     ]
     f = figures(CARS + region, PERFECT + extra)
     assert f.fp == 1  # the last one lies in the region for less than half
-
-
-def test_a_box_that_matched_at_one_threshold_is_never_let_pass_later():
-    # Above a score of 0.5 track 1 alone is at object 0 and matches it, low in the image as it is. With all tracks,
-    # track 0 fits better, and track 1, left over, would be let pass.
-    truth = [(f, n, 50.0 * n) for f in range(40) for n in range(2)]
-    found = [(f, 0, 0.0, {"score": 0.5}) for f in range(40)] + [(f, 2, 50.0, {"score": 0.75}) for f in range(40)]
-    found += [(f, 1, 1.0, {"score": 1.0} | LOW) for f in range(10)]
-    f = figures(truth, found)
-    assert (f.tp, f.fp) == (80, 10)
 
 
 def test_neighbours_by_class():
@@ -151,9 +152,11 @@ def test_rounding_costs_points_only_in_the_official_value():
     assert (f.gt, f.tp, f.fp, f.fn, f.ids, f.frag) == (100, 100, 0, 0, 0, 0)
 
 
-def test_nothing_found():
+def test_nothing_found_and_no_scores():
     f = figures(CARS, [])
     assert (f.tp, f.fp, f.fn, f.mota, f.samota, f.recall, f.precision, f.ml) == (0, 0, 100, 0.0, 0.0, 0.0, 0.0, 1.0)
+    f = figures(CARS, CARS)
+    assert f.samota == pytest.approx(1.0)
 
 
 def test_sequences_are_counted_together_and_identities_are_apart():
@@ -161,11 +164,6 @@ def test_sequences_are_counted_together_and_identities_are_apart():
     other = KittiTrackingSequence(objects(*CARS), objects(*((f, n + 7, x, o) for f, n, x, o in PERFECT)))
     f = kitti_tracking_metrics([sequence, other], "car", 0.5)
     assert (f.gt, f.tp, f.ids) == (200, 200, 0)
-
-
-def test_results_without_scores():
-    f = figures(CARS, CARS)
-    assert f.samota == pytest.approx(1.0)
 
 
 def test_scores_keep_the_rounding_of_one_sum_after_the_other():
@@ -240,3 +238,70 @@ def test_agrees_with_the_reference_evaluation(recordings):
                     assert 100 * got == pytest.approx(value, abs=0.00501), (label, min_iou, name)
                 else:
                     assert got == value, (label, min_iou, name)
+
+
+# HOTA, CLEAR and Identity through trackeval: small cases worked out by hand
+
+
+def table(rows, label="car"):
+    """SceneBoxes from (frame, id, x); boxes of 4 x 2 x 1.5 m."""
+    n = len(rows)
+    return SceneBoxes(
+        np.array([row[0] for row in rows], dtype=np.int64),
+        np.array([row[1] for row in rows], dtype=str),
+        Boxes.of([label] * n, [(row[2], 0.0, 0.0) for row in rows], [(4.0, 2.0, 1.5)] * n, [0.0] * n),
+        np.zeros(n),
+    )
+
+
+CAR = table([(k, "a", 5.0 * k) for k in range(10)])
+
+
+def test_perfect_tracks_and_a_broken_one_by_hand():
+    pytest.importorskip("trackeval")
+    for similarity in ("centre", "bev_iou", "iou_3d"):
+        f = hota_metrics([(CAR, CAR)], "car", similarity)
+        assert (f.hota, f.deta, f.assa, f.loca, f.mota, f.idf1) == pytest.approx((1.0,) * 6)
+        assert (f.fp, f.fn, f.ids, f.frag) == (0, 0, 0, 0)
+    assert f.hota_at == pytest.approx(np.ones(19))
+    assert f.alpha == pytest.approx(np.arange(0.05, 0.96, 0.05))
+    pytest.importorskip("trackeval")
+    # The object is followed by two tracks, each for half of the time: every pair has TPA 5, FNA 5, FPA 0.
+    broken = table([(k, "t" if k < 5 else "u", 5.0 * k) for k in range(10)])
+    f = hota_metrics([(CAR, broken)], "car")
+    assert (f.deta, f.assa, f.hota) == pytest.approx((1.0, 0.5, np.sqrt(0.5)))
+    assert (f.ids, f.mota) == (1, 0.9)
+    assert (f.idf1, f.idp, f.idr) == pytest.approx((0.5, 0.5, 0.5))
+
+
+def test_similarity_decides_from_which_alpha_on_a_pair_counts():
+    pytest.importorskip("trackeval")
+    shifted = table([(k, "t", 5.0 * k + 0.9) for k in range(10)])
+    f = hota_metrics([(CAR, shifted)], "car", "centre", reach=4.0)
+    assert f.loca < 1.0
+    assert f.hota_at == pytest.approx((np.arange(0.05, 0.96, 0.05) < 0.775).astype(float))
+    assert f.motp == pytest.approx(0.775)
+    f = hota_metrics([(CAR, shifted)], "car", "iou_3d")
+    assert f.motp == pytest.approx(3.1 / 4.9)
+    assert hota_metrics([(CAR, shifted)], "car", "iou_3d", threshold=0.7).mota == pytest.approx(-1.0)
+
+
+def test_scenes_are_put_together_and_classes_kept_apart():
+    pytest.importorskip("trackeval")
+    nothing = table([])
+    other = table([(0, "x", 0.0)], "truck")
+    f = hota_metrics([(CAR, CAR), (CAR, nothing), (nothing, other)], "car")
+    assert (f.fn, f.fp) == (10, 0)
+    assert f.deta == pytest.approx(0.5)
+    assert f.assa == pytest.approx(1.0)
+    assert f.idr == pytest.approx(0.5)
+
+
+def test_what_hota_needs_is_named(monkeypatch):
+    with pytest.raises(InputError, match="similarity: expected one of centre, bev_iou, iou_3d"):
+        hota_metrics([(CAR, CAR)], "car", "giou")
+    with pytest.raises(InputError, match="at least one scene"):
+        hota_metrics([], "car")
+    monkeypatch.setitem(sys.modules, "trackeval", None)
+    with pytest.raises(MissingExtraError, match=r"saga-fg\[eval\]"):
+        hota_metrics([(CAR, CAR)], "car")

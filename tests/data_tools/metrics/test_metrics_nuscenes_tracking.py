@@ -1,7 +1,12 @@
-"""The nuScenes tracking metrics: cases worked out by hand, and a plain loop-by-loop reading of the definition."""
+"""The metrics of nuScenes, by hand and beside the development kit."""
 
 import math
+import os
+import sys
+from collections.abc import Sequence
 from dataclasses import fields
+from itertools import count
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,14 +14,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.metrics import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
+from data_tools.datasets.nuscenes import NuScenes, ResultMeta, split_scenes, write_tracking_results
+from data_tools.datasets.nuscenes.source import read_scored_scenes
 from data_tools.metrics import (
     NuScenesClassMetrics,
+    NuScenesTrackingMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
     SceneBoxes,
     nuscenes_tracking_metrics,
 )
 from saga_fg import Annotations, Boxes, InputError, Tracks
+from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
+
+# The nuScenes tracking metrics: cases worked out by hand, and a plain loop-by-loop reading of the definition
 
 
 def table(rows):
@@ -32,11 +44,7 @@ def scene(truth, found, frames=None, **options):
     """A scene at 2 Hz with the vehicle in the origin."""
     n = frames or 1 + max(row[0] for row in (*truth, *found))
     return NuScenesTrackingScene(
-        np.arange(n) * 0.5,
-        np.zeros((n, 2)),
-        table([(*row, 0.0)[:6] for row in truth]),
-        table(found),
-        **options,
+        np.arange(n) * 0.5, np.zeros((n, 2)), table([(*row, 0.0)[:6] for row in truth]), table(found), **options
     )
 
 
@@ -49,11 +57,7 @@ CAR = [(k, "a", "car", 10.0 + k, 0.0) for k in range(4)]
 
 def test_counts_by_hand():
     # The object is found at frames 1 and 3 by different tracks, 0.5 m off; a false alarm at frame 0.
-    found = [
-        (0, "x", "car", 40.0, 0.0, 0.9),
-        (1, "t", "car", 11.0, 0.5, 0.9),
-        (3, "u", "car", 13.0, 0.5, 0.9),
-    ]
+    found = [(0, "x", "car", 40.0, 0.0, 0.9), (1, "t", "car", 11.0, 0.5, 0.9), (3, "u", "car", 13.0, 0.5, 0.9)]
     f = figures(CAR, found)
     assert (f.gt, f.tp, f.fp, f.fn, f.ids, f.frag) == (4, 1, 1, 2, 1, 1)
     assert f.motp == pytest.approx(0.5)
@@ -84,16 +88,13 @@ def test_a_low_score_is_left_out_at_low_recall():
     assert metrics.per_class["car"].recall == 1.0
 
 
-def test_gaps_are_filled_with_the_official_weights():
+def test_gaps_of_truth_and_tracks_are_filled_with_the_official_weights():
     # Truth is unseen at frame 1, 1 / 4 of the way from x = 10 to x = 20; the official weights put it at 3 / 4.
     truth = [(0, "a", "car", 10.0, 0.0), (4, "a", "car", 20.0, 0.0)]
     found = [(1, "t", "car", 17.5, 0.0, 0.9)]
     f = figures(truth, found)
     assert (f.gt, f.tp) == (5, 1)
     assert f.motp == pytest.approx(0.0, abs=1e-6)
-
-
-def test_gaps_of_tracks_are_filled_too():
     found = [(0, "t", "car", 10.0, 0.0, 0.9), (3, "t", "car", 13.0, 0.0, 0.5)]
     f = figures(CAR, found)
     assert (f.tp, f.fn) == (4, 0)
@@ -165,16 +166,13 @@ def test_tables_from_annotations_and_tracks():
     assert len(SceneBoxes.of_tracks([])) == len(SceneBoxes.of_annotations([])) == 0
 
 
-def test_bad_tables(subtests):
+def test_bad_tables_and_scenes(subtests):
     for rows, text in [
         ([(1, "a", "car", 0, 0, 0), (0, "b", "car", 0, 0, 0)], "never decrease"),
         ([(0, "a", "car", 0, 0, 0), (1, "b", "car", 0, 0, 0), (1, "b", "car", 1, 0, 0)], r"id\[2\].*'b' occurs twice"),
     ]:
         with subtests.test(rows=rows, text=text), pytest.raises(InputError, match=text):
             table(rows)
-
-
-def test_bad_scenes():
     with pytest.raises(InputError, match="found: expected frames below 2, got 3"):
         scene([], [(3, "t", "car", 0.0, 0.0, 0.9)], frames=2)
     with pytest.raises(InputError, match="racks"):
@@ -311,3 +309,84 @@ def test_scenes_are_scored_together_and_identities_are_apart():
     assert metrics.overall.ids == 0
     assert metrics.overall.tp == 8
     assert metrics.overall.mt == 2
+
+
+# Our nuScenes tracking metrics against the official ones, run by an interpreter of their own
+
+
+@pytest.fixture(scope="session")
+def devkit() -> str:
+    python = os.environ.get(PYTHON_VARIABLE, "")
+    if not python:
+        pytest.skip(f"no official development kit: set {PYTHON_VARIABLE} to a python that has nuscenes-devkit")
+    return python
+
+
+def assert_equal(ours: NuScenesTrackingMetrics, theirs: dict[str, Any]) -> None:
+    apart = {name: value for name, value in differences(ours, theirs) if value > 1e-6}
+    assert not apart
+
+
+def test_our_figures_are_those_of_the_kit(devkit, tmp_path):
+    result = write_random_drive(tmp_path / "drive", seed=0)
+    ours = nuscenes_tracking_metrics(
+        [each.tracking for each in read_scored_scenes(result, tmp_path / "drive", VERSION).values()]
+    )
+    assert ours.overall.ids > 0
+    assert math.isnan(ours.per_class["trailer"].amota)
+    assert_equal(ours, official_figures(devkit, result, tmp_path / "drive", VERSION, "drive")[0])
+    result = tracked_simulation(tmp_path / "simulated", scenes=1)
+    outcome = parity(devkit, result, tmp_path / "simulated", VERSION, "all")
+    assert outcome["AMOTA"] > 0.3
+    assert outcome["largest difference"] <= 1e-6, outcome["where"]
+
+
+def test_a_difference_is_found():
+    ours = NuScenesTrackingMetrics(NuScenesClassMetrics(*np.arange(17.0)), per_class={}, curves={})
+    names = [field.name for field in fields(NuScenesClassMetrics)]
+    theirs = dict(zip(names, np.arange(17.0), strict=True)) | {"label_metrics": {name: {} for name in names}}
+    assert max(value for _, value in differences(ours, theirs)) == 0
+    assert dict(differences(ours, theirs | {"ids": 12.5}))["ids"] == 0.5
+    assert dict(differences(ours, theirs | {"lgd": math.nan}))["lgd"] == math.inf
+
+
+def test_a_kit_that_fails_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="expected a python that has nuscenes-devkit"):
+        official_figures(str(tmp_path / "python"), tmp_path, tmp_path, VERSION, "all")
+    with pytest.raises(InputError, match=r"the development kit failed: .*Error"):
+        official_figures(sys.executable, tmp_path, tmp_path, VERSION, "all")
+
+
+def test_a_recording(devkit, recordings, tmp_path):
+    root = recordings / "nuscenes"
+    names = split_scenes(root, VERSION, "camera")
+    dataset = NuScenes(root, VERSION, {}, names, ground_truth=True)
+    rng = np.random.default_rng(0)
+    scenes = [dataset.scene(name) for name in names]
+    tracked = [(scene, noisy_tracks(scene.ground_truth or [], rng)) for scene in scenes]
+    write_tracking_results(tmp_path / "result.json", tracked, ResultMeta(use_lidar=True))
+    ours = nuscenes_tracking_metrics(
+        [each.tracking for each in read_scored_scenes(tmp_path / "result.json", root, VERSION, names).values()]
+    )
+    assert ours.overall.ids > 0
+    assert_equal(ours, official_figures(devkit, tmp_path / "result.json", root, VERSION, "camera")[0])
+
+
+def noisy_tracks(truth: Sequence[Annotations], rng: np.random.Generator) -> list[Tracks]:
+    """The truth, shaken, a quarter of it missing, tracks broken now and then."""
+    numbers: dict[str, int] = {}
+    fresh = count()
+    frames = []
+    for k, frame in enumerate(truth):
+        rows = np.flatnonzero(rng.random(len(frame)) < 0.75)
+        names = frame.id[rows].tolist()
+        for name in names:
+            if name not in numbers or rng.random() < 0.05:
+                numbers[name] = next(fresh)
+        boxes, n = frame.boxes.select(rows), len(rows)
+        position = boxes.position + rng.normal(0, 0.4, (n, 3))
+        identity = np.array([numbers[name] for name in names], dtype=np.int64)
+        unknown = np.tile(np.eye(2), (n, 1, 1))
+        shaken = Boxes(boxes.label, position, boxes.size, boxes.yaw, boxes.velocity)
+        frames.append(Tracks(0.5 * k, identity, shaken, rng.random(n).round(1), unknown, unknown, np.zeros(n)))
+    return frames

@@ -1,12 +1,29 @@
-"""Metrics of a scene: small cases worked out by hand."""
+"""Metrics of any scene, the quality of tracks, and intervals by the bootstrap."""
 
 import math
 
 import numpy as np
 import pytest
 
-from data_tools.metrics import SceneMetrics, match_scene, scene_metrics, scene_metrics_by_label
+from data_tools.metrics import (
+    ErrorSample,
+    SceneBoxes,
+    SceneMetrics,
+    coverage,
+    difference,
+    match_scene,
+    nees,
+    paired_bootstrap,
+    ratio_of_sums,
+    scene_metrics,
+    scene_metrics_by_label,
+    track_summaries,
+    whole_tracks,
+)
 from saga_fg import Annotations, Boxes, InputError, Tracks
+from saga_fg.types.boxes import bev_iou
+
+# Metrics of a scene: small cases worked out by hand
 
 
 def truth(objects, hidden=()):
@@ -69,16 +86,13 @@ def test_counts_by_hand():
     assert math.isnan(m.velocity.rmse)
 
 
-def test_an_object_keeps_its_track_while_it_is_within_the_gate():
+def test_an_object_keeps_its_track_within_the_gate_and_through_a_gap():
     gt = [truth({"A": (0, 0)}), truth({"A": (0, 0)}), truth({"A": (0, 0)})]
     found = [tracks({1: (0, 0)}), tracks({1: (1.5, 0), 2: (0, 0)}), tracks({1: (2.5, 0), 2: (0, 0)})]
     assert scene_metrics(gt[:2], found[:2]).switches == 0
     matchings = match_scene(gt, found)
     assert [m.distance.tolist() for m in matchings] == [[0.0], [1.5], [0.0]]
     assert [m.switched.tolist() for m in matchings] == [[False], [False], [True]]
-
-
-def test_the_identity_is_remembered_through_a_gap():
     gt = [truth({"A": (0, 0)})] * 3
     found = [tracks({1: (0, 0)}), tracks({}), tracks({2: (0, 0)})]
     assert scene_metrics(gt, found).switches == 1
@@ -94,15 +108,12 @@ def test_two_objects_that_claim_one_track_share_it_out_to_the_nearer():
     assert last.switched.tolist() == [True, False]
 
 
-def test_the_assignment_makes_as_many_pairs_as_the_gate_allows():
+def test_the_assignment_makes_as_many_pairs_as_the_gate_allows_within_a_class():
     # Nearest first would pair A with 1 (distance 0.5) and leave B without a partner.
     gt = [truth({"A": (0, 0), "B": (2, 0)})]
     found = [tracks({1: (0.5, 0), 2: (-1.9, 0)})]
     pairs = match_scene(gt, found)[0]
     assert pairs.track_row.tolist() == [1, 0]
-
-
-def test_classes_match_only_their_own():
     assert scene_metrics([truth({"a": (0, 0)})], [tracks({1: (0, 0)})]).matches == 0
 
 
@@ -143,13 +154,16 @@ def test_carried_error_follows_the_track_that_last_saw_the_object():
     assert scene_metrics(gt, found).carried.values.tolist() == [3.0, 5.0]
 
 
-def test_nees_uses_the_covariance_of_the_track():
+def test_nees_uses_the_covariance_of_the_track_if_there_is_one():
     m = scene_metrics([truth({"A": (0, 0)})], [tracks({1: (1, 1)}, variance=0.5)])
     assert m.nees.values == pytest.approx([4.0])
     assert len(scene_metrics([truth({"A": (0, 0)})], [tracks({1: (1, 1)}, variance=0.0)]).nees) == 0
+    values = nees(np.ones((3, 2)), np.stack([np.zeros((2, 2)), np.diag([1.0, 0.0]), np.eye(2)]))
+    assert np.isnan(values[:2]).all()
+    assert values[2] == pytest.approx(2.0)
 
 
-def test_empty_scenes():
+def test_empty_scenes_and_moments_that_differ():
     m = scene_metrics([truth({})], [tracks({})])
     assert math.isnan(m.mota)
     assert math.isnan(m.recall)
@@ -157,8 +171,193 @@ def test_empty_scenes():
     assert pooled.objects == 0
     assert len(pooled.carried) == 0
     assert scene_metrics([], []).objects == 0
-
-
-def test_numbers_of_moments_must_agree():
     with pytest.raises(InputError, match=r"expected one entry per frame of the ground truth \(1\), got 2"):
         scene_metrics([truth({})], [tracks({}), tracks({})])
+
+
+# Ghosts and the ranking of whole tracks, by hand
+
+
+def table(*tracks, size=(4.0, 2.0, 1.5)):
+    """Tracks (id, [(frame, x, y)], score or scores, label): cars or others, of heading 0."""
+    rows = [
+        (frame, name, x, y, score, label)
+        for name, places, scores, label in tracks
+        for (frame, x, y), score in zip(places, np.broadcast_to(scores, len(places)).tolist(), strict=True)
+    ]
+    rows.sort(key=lambda row: row[0])
+    boxes = Boxes.of(
+        [row[5] for row in rows], [(row[2], row[3], 0.0) for row in rows], [size] * len(rows), [0.0] * len(rows)
+    )
+    names = np.array([row[1] for row in rows], dtype=str)
+    return SceneBoxes(np.array([row[0] for row in rows], dtype=int), names, boxes, np.array([row[4] for row in rows]))
+
+
+def drive(y, frames=range(4)):
+    return [(k, 5.0 * k, y) for k in frames]
+
+
+def car(name, y, score, frames=range(4), label="car"):
+    return name, drive(y, frames), score, label
+
+
+def summary(found, truth=None):
+    return track_summaries(whole_tracks(table() if truth is None else truth, found))["overall"]
+
+
+def test_of_two_overlapping_tracks_the_worse_is_a_ghost():
+    found = table(car("a", 0.0, 0.9), car("b", 0.5, 0.3), car("c", 20.0, 0.1))
+    tracks = whole_tracks(table(car("x", 0.0, 0.0), car("y", 20.0, 0.0)), found)
+    by_score = np.argsort(-tracks.score)
+    np.testing.assert_array_equal(tracks.ghost[by_score], [False, True, False])
+    np.testing.assert_array_equal(tracks.true[by_score], [True, False, True])  # one label is for one track
+    figures = track_summaries(tracks)
+    assert (figures["car"].tracks, figures["car"].true, figures["car"].ghosts) == (3, 2, 1)
+    assert figures["car"].ghost_share == pytest.approx(1 / 3)
+    assert figures["car"].rank_quality == pytest.approx((1 + 2 / 3) / 2)
+    assert figures["overall"] == figures["car"]
+
+
+def test_other_classes_other_frames_and_touching_boxes_make_no_ghost():
+    assert summary(table(car("a", 0.0, 0.9), car("b", 0.5, 0.3, label="truck"))).ghosts == 0
+    late = ("b", [(k + 1, 5.0 * k, 0.0) for k in range(4)], 0.3, "car")  # at the place of `a`, a frame later
+    assert summary(table(car("a", 0.0, 0.9), late)).ghosts == 0
+    assert summary(table(car("a", 0.0, 0.9), car("b", 1.7, 0.3))).ghosts == 0  # IoU 0.08
+    assert summary(table(car("a", 0.0, 0.9), car("b", 1.6, 0.3))).ghosts == 1  # IoU 0.11
+
+
+def test_ghosts_overlap_at_more_than_half_of_their_frames_and_have_the_lower_mean_score():
+    for frames, ghosts in ((range(2), 0), (range(3), 1)):
+        assert summary(table(car("a", 0.0, 0.9, frames), car("b", 0.0, 0.3))).ghosts == ghosts
+    tracks = whole_tracks(table(), table(car("a", 0.0, 0.7, range(3)), car("b", 0.0, 0.7, range(7))))
+    assert tracks.score.tolist() == [0.7, 0.7]  # to the last bit: neither is ranked before the other
+    assert tracks.ghost.tolist() == [True, False]
+    found = table(car("a", 0.0, [0.9, 0.1, 0.1, 0.1]), car("b", 0.0, 0.4))
+    assert whole_tracks(table(), found).ghost.tolist() == [True, False]
+
+
+def test_rank_quality():
+    truth = table(car("x", 0.0, 0.0), car("y", 10.0, 0.0))
+    for scores, quality in [
+        ([0.9, 0.8, 0.2, 0.1], 1.0),  # true, true, false, false
+        ([0.1, 0.2, 0.8, 0.9], (1 / 3 + 2 / 4) / 2),  # reversed
+        ([0.9, 0.2, 0.8, 0.1], (1 / 1 + 2 / 3) / 2),
+        ([0.5, 0.5, 0.5, 0.5], 0.5),  # scores that tell nothing: the share of true tracks
+    ]:
+        found = table(*(car(name, y, s) for name, y, s in zip("abcd", (0.0, 10.0, 30.0, 40.0), scores, strict=True)))
+        assert summary(found, truth).rank_quality == pytest.approx(quality)
+
+
+def test_true_tracks_match_most_boxes_of_one_class():
+    for frames, true in ((range(2), 0), (range(3), 1)):
+        assert summary(table(car("a", 1.0, 0.9)), table(car("x", 0.0, 0.0, frames))).true == true
+    found = table(car("a", 0.0, 0.9, range(2)), car("a", 0.0, 0.5, range(2, 4), label="truck"))
+    figures = track_summaries(whole_tracks(table(car("x", 0.0, 0.0)), found))
+    assert {label: (f.tracks, f.true) for label, f in figures.items()} == {
+        "overall": (2, 1),
+        "car": (1, 1),
+        "truck": (1, 0),
+    }
+
+
+def test_without_tracks_or_sizes_figures_are_undefined():
+    nothing = summary(table(), table(car("x", 0.0, 0.0)))
+    assert (nothing.tracks, nothing.true, nothing.ghosts) == (0, 0, 0)
+    assert math.isnan(nothing.ghost_share)
+    assert math.isnan(nothing.rank_quality)
+    assert math.isnan(summary(table(car("a", 0.0, 0.9))).rank_quality)
+    places = [car("a", 0.0, 0.9), car("b", 0.0, 0.3)]
+    assert summary(table(*places, size=(math.nan,) * 3)).ghosts == 0
+    assert summary(table(*places)).ghosts == 1
+
+
+def test_every_pair_is_compared():
+    """The same ghosts as from the IoU of all boxes of each frame."""
+    rng = np.random.default_rng(3)
+    rows = 400
+    key = np.sort(rng.choice(20 * 40, rows, replace=False))
+    frame, name = key // 40, key % 40
+    label = np.where(name % 2, "bus", "pedestrian")
+    size = np.where(name[:, None] % 2, (11.0, 2.9, 3.4), (0.7, 0.7, 1.8)) * rng.uniform(0.8, 1.2, (rows, 3))
+    place = np.column_stack([rng.uniform(0, np.where(name % 2, 40, 3)), rng.uniform(0, 3, rows), np.zeros(rows)])
+    boxes = Boxes.of(label, place, size, rng.uniform(-3, 3, rows))
+    found = SceneBoxes(frame, name.astype(str), boxes, rng.random(40)[name])
+    tracks = whole_tracks(table(), found)
+    over = np.zeros(rows, dtype=bool)
+    for k in range(20):
+        at = np.flatnonzero(frame == k)
+        better = found.score[None, at] > found.score[at, None]
+        same = label[None, at] == label[at, None]
+        over[at] = ((bev_iou(boxes.select(at), boxes.select(at)) > 0.1) & better & same).any(axis=1)
+    expected = sum(over[name == n].mean() > 0.5 for n in np.unique(name))
+    assert 0 < expected < len(tracks)
+    assert tracks.ghost.sum() == expected
+
+
+# Bootstrap over scenes and consistency figures
+
+
+def test_totals_are_pooled_and_a_constant_factor_is_found_exactly():
+    rng = np.random.default_rng(1)
+    b = [ErrorSample(rng.rayleigh(1.0, size=50)) for _ in range(8)]
+    a = [ErrorSample(0.7 * sample.values) for sample in b]
+    interval = paired_bootstrap([s.square_sums for s in a], [s.square_sums for s in b])
+    assert interval.estimate == pytest.approx(-0.3)
+    assert (interval.low, interval.high) == pytest.approx((-0.3, -0.3))
+    interval = paired_bootstrap([[90.0, 100.0], [0.0, 1.0]], [[50.0, 100.0], [1.0, 1.0]], ratio_of_sums, difference)
+    assert interval.estimate == pytest.approx(90 / 101 - 51 / 101)
+
+
+def test_the_interval_covers_as_often_as_it_says():
+    rng = np.random.default_rng(2)
+    hits = 0
+    for k in range(200):
+        common = rng.normal(size=30)
+        a, b = common + 0.5 + rng.normal(0, 0.3, 30), common
+        sums = [np.stack([x, np.ones(30)], axis=1) for x in (a, b)]
+        interval = paired_bootstrap(*sums, ratio_of_sums, difference, confidence=0.9, draws=500, seed=k)
+        hits += interval.low <= 0.5 <= interval.high
+    assert 0.82 <= hits / 200 <= 0.96
+
+
+def test_the_seed_decides_and_draws_without_data_are_left_out():
+    sums = np.random.default_rng(3).uniform(1, 2, size=(2, 9, 2))
+    first = paired_bootstrap(*sums)
+    assert first == paired_bootstrap(*sums)
+    assert first != paired_bootstrap(*sums, seed=1)
+    assert "[" in str(first)
+    interval = paired_bootstrap([[0.0, 0.0], [4.0, 4.0]], [[0.0, 0.0], [1.0, 4.0]])
+    assert interval.estimate == interval.low == interval.high == pytest.approx(1.0)
+    nothing = paired_bootstrap([[0.0, 0.0]], [[0.0, 0.0]])
+    assert np.isnan(nothing.low)
+
+
+def test_bad_input(subtests):
+    for a, b, confidence, text in [
+        ([[1.0, 2.0]], [[1.0, 2.0], [1.0, 2.0]], 0.95, "b: expected shape"),
+        (np.empty((0, 2)), np.empty((0, 2)), 0.95, "at least one scene"),
+        ([[1.0, 2.0]], [[1.0, 2.0]], 1.0, "confidence"),
+    ]:
+        with subtests.test(a=a, b=b, confidence=confidence, text=text), pytest.raises(InputError, match=text):
+            paired_bootstrap(a, b, confidence=confidence)
+
+
+def test_nees_of_consistent_estimates_lies_in_its_band():
+    rng = np.random.default_rng(4)
+    L = rng.normal(size=(500, 2, 2))
+    covariance = L @ np.swapaxes(L, 1, 2) + 0.1 * np.eye(2)
+    error = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(500, 2)))
+    values = nees(error, covariance)
+    assert abs(values.mean() - 2) < 4 * np.sqrt(4 / 500)  # chi-squared with 2 degrees of freedom
+    assert nees(2 * error, covariance) == pytest.approx(4 * values)
+    for p in (0.5, 0.9, 0.99):
+        assert abs(coverage(values, p) - p) < 4 * np.sqrt(p * (1 - p) / 500)
+
+
+def test_error_samples_pool():
+    pooled = ErrorSample.pool([ErrorSample(np.array([3.0])), ErrorSample(np.empty(0)), ErrorSample(np.array([4.0]))])
+    assert len(pooled) == 2
+    assert pooled.rmse == pytest.approx(np.sqrt(12.5))
+    assert pooled.square_sums == (25.0, 2.0)
+    with pytest.raises(InputError):
+        ErrorSample(np.array([np.nan]))

@@ -1,13 +1,14 @@
-"""Sensors report with the statistics of their settings, within 4 standard errors of a fixed seed's draw."""
-
-from __future__ import annotations
+"""Simulated sensors, occlusion and roads."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from data_tools.simulator.road import LaneOrder, Lanes, Road, curved_road, smooth_step, smooth_step_slope
 from data_tools.simulator.sensors import (
     detect,
     detection_probability,
@@ -16,12 +17,15 @@ from data_tools.simulator.sensors import (
     points_on,
     range_drifts,
     sensor_position,
+    visible_share,
 )
 from data_tools.simulator.settings import SensorSettings, camera, far_camera, lidar, radar, sparse_lidar
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections
+
+# Sensors report with the statistics of their settings, within 4 standard errors of a fixed seed's draw
 
 POSE = yaw_transform(800.0, 400.0, 0.0, 2.0)
 CENTRED = replace(lidar(), position=(0.0, 0.0, 1.8))
@@ -47,7 +51,7 @@ def within(value: float, expected: float, standard_error: float) -> bool:
 
 
 @pytest.mark.parametrize(("sensor", "distance"), [(lidar(), 40.0), (camera(), 10.0)], ids=["lidar", "camera"])
-def test_errors_along_and_across_the_line_of_sight(sensor: SensorSettings, distance: float) -> None:
+def test_errors_along_and_across_the_line_of_sight(sensor, distance):
     sensor = replace(sensor, position=(0.0, 0.0, 1.5), clutter_rate=0.0, detection_probability=1.0, reach=1e6)
     bearing = 0.5
     place = distance * np.array([[np.cos(bearing), np.sin(bearing)]])
@@ -73,7 +77,7 @@ def test_errors_along_and_across_the_line_of_sight(sensor: SensorSettings, dista
 
 
 @pytest.mark.parametrize(("share", "distance"), [(0.25, 10.0), (0.1, 10.0), (1.0, 59.0)])
-def test_the_rate_of_misses(share: float, distance: float) -> None:
+def test_the_rate_of_misses(share, distance):
     sensor = replace(CENTRED, clutter_rate=0.0)
     angle = np.linspace(0, 2 * np.pi, 50, endpoint=False)
     boxes = cars(distance * np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -85,7 +89,7 @@ def test_the_rate_of_misses(share: float, distance: float) -> None:
     assert within(count / 10_000, p, math.sqrt(p * (1 - p) / 10_000) + 1e-12)
 
 
-def test_the_rate_of_clutter_and_where_it_falls() -> None:
+def test_the_rate_of_clutter_and_where_it_falls():
     sensor = replace(camera(), position=(0.0, 0.0, 1.5), clutter_rate=2.5)
     found = detections(sensor, Boxes.empty(), frames=4000)
     counts = np.array([len(d) for d in found])
@@ -98,7 +102,7 @@ def test_the_rate_of_clutter_and_where_it_falls() -> None:
     assert within(near, 0.25, math.sqrt(0.25 * 0.75 / len(distance)))  # evenly over the area
 
 
-def test_nothing_is_seen_outside_the_field_of_view() -> None:
+def test_nothing_is_seen_outside_the_field_of_view():
     sensor = replace(camera(), position=(0.0, 0.0, 1.5), clutter_rate=0.0, detection_probability=1.0, reach=1e6)
     half = sensor.field_of_view / 2
     bearing = np.array([0.0, half - 0.05, -half + 0.05, half + 0.05, -half - 0.05, np.pi])
@@ -110,7 +114,7 @@ def test_nothing_is_seen_outside_the_field_of_view() -> None:
     assert not any(map(len, detections(sensor, far, frames=20)))
 
 
-def test_scores_tell_true_from_false_but_not_always() -> None:
+def test_scores_tell_true_from_false_but_not_always():
     sensor = camera()
     boxes = cars(np.array([[15.0, 0.0], [30.0, 5.0]]))
     true = np.concatenate([d.score for d in detections(replace(sensor, clutter_rate=0.0), boxes)])
@@ -122,7 +126,7 @@ def test_scores_tell_true_from_false_but_not_always() -> None:
     assert 0.85 < better < 0.999  # area under the ROC curve
 
 
-def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes() -> None:
+def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes():
     sensor = replace(radar(), position=(0.0, 0.0, 0.5), clutter_rate=0.0, detection_probability=1.0, reach=1e6)
     bearing, noise = 0.5, sensor.range_rate_noise
     assert noise is not None
@@ -136,7 +140,7 @@ def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes() ->
     assert np.abs(np.concatenate([d.range_rate for d in false])).max() < 6 * noise
 
 
-def test_points_on_an_object_fall_with_the_square_of_the_distance() -> None:
+def test_points_on_an_object_fall_with_the_square_of_the_distance():
     boxes = Boxes.of(
         ["car"] * 2, [[20.0, 0.0, 0.8], [40.0, 0.0, 0.8]], np.tile([4.5, 1.8, 1.6], (2, 1)), [0.0, np.pi / 2]
     )
@@ -144,7 +148,7 @@ def test_points_on_an_object_fall_with_the_square_of_the_distance() -> None:
     assert n == pytest.approx([1.8 * 1.6 / 20**2 / 2e-4, 0.5 * 4.5 * 1.6 / 40**2 / 2e-4])  # from behind, from the side
 
 
-def test_a_camera_sees_a_person_where_a_lidar_has_too_few_points() -> None:
+def test_a_camera_sees_a_person_where_a_lidar_has_too_few_points():
     boxes = Boxes.of(
         ["pedestrian", "truck"], [[55.0, 0.0, 0.9], [55.0, 0.0, 1.8]], [[0.65, 0.65, 1.72], [8.0, 2.5, 3.4]], [0.0, 0.0]
     )
@@ -153,7 +157,7 @@ def test_a_camera_sees_a_person_where_a_lidar_has_too_few_points() -> None:
     assert detection_probability(far_camera(), np.zeros(3), boxes, np.ones(2))[0] > 0.7
 
 
-def test_range_drifts_are_of_their_deviation_and_last_for_their_time() -> None:
+def test_range_drifts_are_of_their_deviation_and_last_for_their_time():
     time = np.arange(0, 40, 0.1)
     drift = range_drifts(replace(camera(), range_drift=0.03), time, 2000, np.random.default_rng(0))
     assert drift.std(axis=1) == pytest.approx(np.full(len(time), 0.03), rel=0.1)
@@ -162,7 +166,7 @@ def test_range_drifts_are_of_their_deviation_and_last_for_their_time() -> None:
     assert not range_drifts(camera(), time, 3, np.random.default_rng(0)).any()
 
 
-def test_no_frame_comes_in_an_outage() -> None:
+def test_no_frame_comes_in_an_outage():
     time = np.arange(0, 5000, 0.1)
     left = outside_outages(replace(lidar(), outage_interval=10.0), time, np.random.default_rng(0))
     assert np.isin(left, time).all()
@@ -170,3 +174,160 @@ def test_no_frame_comes_in_an_outage() -> None:
     gaps = np.diff(left)
     assert ((gaps < 0.11) | ((gaps > 0.95) & (gaps < 3.2))).mean() > 0.998  # two outages may follow at once
     assert outside_outages(lidar(), time, np.random.default_rng(0)) is time
+
+
+# Visible shares on cases one can work out by hand
+
+EYE = np.array([0.0, 0.0, 2.0])
+
+
+def box(x: float, y: float, length: float = 4.0, width: float = 2.0, height: float = 1.5, yaw: float = 0.0) -> Boxes:
+    return Boxes.of(["car"], [[x, y, height / 2]], [[length, width, height]], [yaw], [[0.0, 0.0]])
+
+
+def share(*boxes: Boxes, rays: int = 400) -> float:
+    """Visible share of the first box, seen past the others."""
+    return float(visible_share(EYE, Boxes.concatenate(boxes), np.array([0]), rays)[0])
+
+
+def test_what_is_seen_is_what_nothing_before_it_hides():
+    assert share(box(20, 3)) == 1.0
+    assert visible_share(EYE, box(20, 3), np.empty(0, dtype=np.int64)).shape == (0,)
+    assert share(box(20, 0), box(30, 0, height=4.0), box(20, 3, height=4.0), box(-10, 0, height=4.0)) == 1.0
+    assert share(box(20, 0), box(10, 0, length=0.5, width=4.0, height=3.0)) == 0.0
+
+
+def test_half_of_the_azimuth_behind_a_wall_is_half_the_object():
+    thin = box(20, 0, length=0.01, width=2.0)  # fills the azimuths of -1 m to 1 m at 20 m
+    wall = box(10, 5.0, length=0.01, width=10.0, height=3.0)  # from 0 m to the left
+    assert share(thin, wall) == pytest.approx(0.5, abs=0.01)
+    quarter = box(10, 5.25, length=0.01, width=10.0, height=3.0)  # from 0.25 m, which at 20 m is 0.5 m
+    assert share(thin, quarter) == share(thin, quarter, quarter) == pytest.approx(0.75, abs=0.01)
+    right = box(10, -5.25, length=0.01, width=10.0, height=3.0)
+    assert share(thin, quarter, right) == pytest.approx(0.5, abs=0.01)
+
+
+def test_occluders_throw_shadows_by_their_height_and_place():
+    """An eye 2 m up sees the ground at 20 m past an edge 1 m high at 10 m: half of 1 m is hidden at 15 m."""
+    low = box(10, 0, length=0.01, width=6.0, height=1.0)
+    assert share(box(15, 0, length=0.01, height=1.0), low) == pytest.approx(0.5, abs=0.01)
+    assert share(box(19.9, 0, length=0.01, height=1.0), low) == pytest.approx(0.99, abs=0.01)
+    assert share(box(10.1, 0, length=0.01, height=1.0), low) == pytest.approx(0.01, abs=0.01)
+    assert share(box(40, 0, length=0.01, height=1.0), low) == 1.0
+    high = box(10, 0, length=0.01, width=20.0, height=2.01)
+    assert share(box(60, 0, height=1.5), high) == 0.0
+    assert share(box(60, 0, height=4.0), high) == pytest.approx((4.0 - (2 + 0.01 * 58 / 10)) / 4.0, abs=0.01)
+    truck = box(0, 2.0, length=12.0, width=2.5, height=3.5)
+    assert share(box(0, 8), truck) == 0.0
+    assert share(box(15, 6), truck) == 0.0
+    assert share(box(0, -8), truck) == 1.0
+    assert share(truck, box(0, 8)) == 1.0
+
+
+@settings(max_examples=50, deadline=None)
+@given(turn=st.floats(-np.pi, np.pi), seed=st.integers(0, 1000))
+def test_turning_the_whole_world_changes_nothing_and_more_boxes_hide_more(turn, seed):
+    rng = np.random.default_rng(seed)
+    n = 10
+    places = rng.uniform(-40, 40, (n, 2))
+    places += 4.0 * np.sign(places)
+    boxes = Boxes.of(
+        ["car"] * n,
+        np.column_stack([places, np.full(n, 0.75)]),
+        np.column_stack([rng.uniform(2, 10, n), rng.uniform(1, 3, n), rng.uniform(1, 4, n)]),
+        rng.uniform(-3, 3, n),
+        np.zeros((n, 2)),
+    )
+    c, s = np.cos(turn), np.sin(turn)
+    turned = boxes.transformed(np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+    rows = np.arange(n)
+    shares = visible_share(EYE, boxes, rows, 100)
+    assert ((shares >= 0) & (shares <= 1)).all()
+    assert visible_share(EYE, turned, rows, 100) == pytest.approx(shares, abs=0.03)
+    fewer = visible_share(EYE, boxes.select(rows[:-2]), rows[:-2], 100)
+    assert (fewer >= shares[:-2] - 1e-9).all()
+
+
+# Roads and lanes: arc length, headings and metric agree with finite differences of positions
+
+
+def winding_road() -> Road:
+    return curved_road(600.0, [(200.0, 1.0, 200.0), (420.0, -0.8, 150.0)], np.array([700.0, -300.0]), 0.4)
+
+
+def test_roads_turn_by_their_bends_and_run_on_straight():
+    road = winding_road()
+    s = np.linspace(0, 600, 2001)
+    step = np.diff(road.position(s, np.zeros_like(s)), axis=0)
+    assert np.linalg.norm(step, axis=1) == pytest.approx(np.full(2000, 0.3), rel=1e-3)
+    assert road.heading_at(np.array(0.0)) == pytest.approx(0.4)
+    assert road.heading_at(np.array(300.0)) == pytest.approx(1.4, abs=1e-6)
+    assert road.heading_at(np.array(600.0)) == pytest.approx(0.6, abs=1e-6)
+    assert np.abs(road.curvature).max() == pytest.approx(2 * 0.8 / 150, rel=1e-3)
+    road = winding_road()
+    ahead = road.position(np.array([600.0, 650.0]), np.array([2.0, 2.0]))
+    assert ahead[1] - ahead[0] == pytest.approx(50 * np.array([np.cos(0.6), np.sin(0.6)]), abs=1e-6)
+    x = np.linspace(-0.2, 1.2, 1401)
+    assert smooth_step(np.array([-1.0, 0.0, 0.5, 1.0, 2.0])) == pytest.approx([0, 0, 0.5, 1, 1])
+    assert np.gradient(smooth_step(x), x) == pytest.approx(smooth_step_slope(x), abs=2e-3)
+
+
+@settings(max_examples=50)
+@given(s=st.floats(20, 580), d=st.floats(-12, 12), slope=st.floats(-0.3, 0.3), sign=st.sampled_from([1, -1]))
+def test_heading_and_metric_are_those_of_the_path(s, d, slope, sign):
+    lanes = Lanes(winding_road(), np.array([d]), np.array([sign]))
+    lane = np.zeros(2, dtype=np.int64)
+    h = 0.5
+    along = np.array([s - h, s + h])
+    offset = np.array([d - h * slope, d + h * slope])
+    position, _ = lanes.pose(lane, along, offset, np.full(2, slope))
+    _, heading = lanes.pose(lane[:1], np.array([s]), np.array([d]), np.array([slope]))
+    metric = lanes.metric(lane[:1], np.array([s]), np.array([d]), np.array([slope]))
+    chord = position[1] - position[0]
+    assert np.linalg.norm(chord) / (2 * h) == pytest.approx(metric[0], rel=5e-3)
+    direction = np.array([np.cos(heading[0]), np.sin(heading[0])])
+    assert direction @ chord / np.linalg.norm(chord) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_an_on_ramp_approaches_its_place_beside_the_road():
+    lanes = Lanes(
+        curved_road(600.0, [], np.zeros(2), 0.0),
+        np.array([-2.0, -5.5, 2.0]),
+        np.array([1, 1, -1]),
+        ending=1,
+        end=400.0,
+        opening=300.0,
+        approach=25.0,
+        approach_length=100.0,
+    )
+    s = np.array([100.0, 200.0, 250.0, 300.0, 390.0])
+    d, slope = lanes.lateral(np.ones(5, dtype=np.int64), s)
+    assert d == pytest.approx([-30.5, -30.5, -18.0, -5.5, -5.5])
+    assert slope[[0, 3, 4]] == pytest.approx([0, 0, 0])
+    h = 1e-4
+    after, _ = lanes.lateral(np.array([1]), np.array([250.0 + h]))
+    assert slope[2] == pytest.approx((after[0] - d[2]) / h, rel=1e-3)
+    none = np.array([-1, -1, -1])
+    assert lanes.neighbour(np.array([0, 1, 2]), 1).tolist() == [1, -1, -1]
+    assert lanes.neighbour(np.array([0, 1, 2]), -1).tolist() == [-1, 0, -1]
+    assert not lanes.may_change(np.array([0, 1, 2]), none, np.full(3, 350.0)).any()
+    assert not lanes.may_change(np.array([0]), np.array([1]), np.array([350.0]))[0]  # nobody enters a lane that ends
+    assert lanes.may_change(np.array([1, 1]), np.array([0, 0]), np.array([350.0, 250.0])).tolist() == [True, False]
+
+
+@given(st.data())
+def test_neighbours_are_those_of_a_plain_search(data):
+    n = data.draw(st.integers(0, 12))
+    s = np.array(data.draw(st.lists(st.integers(0, 900), min_size=n, max_size=n, unique=True)), dtype=np.float64)
+    lane = np.array(data.draw(st.lists(st.integers(0, 2), min_size=n, max_size=n)), dtype=np.int64)
+    also = np.array(data.draw(st.lists(st.integers(-1, 2), min_size=n, max_size=n)), dtype=np.int64)
+    also = np.where(also == lane, -1, also)
+    order = LaneOrder.by_position(s, np.stack([lane, also], axis=1))
+    target = np.array(data.draw(st.lists(st.integers(-1, 2), min_size=n, max_size=n)), dtype=np.int64)
+    ahead, behind = order.ahead(target, s), order.behind(target, s)
+    for i in range(n):
+        there = [j for j in range(n) if target[i] >= 0 and target[i] in (lane[j], also[j])]
+        front = [j for j in there if s[j] > s[i]]
+        rear = [j for j in there if s[j] < s[i]]
+        assert ahead[i] == (min(front, key=lambda j: s[j]) if front else -1)
+        assert behind[i] == (max(rear, key=lambda j: s[j]) if rear else -1)

@@ -1,15 +1,11 @@
-"""Every estimator, one suite: equal to the textbook, beyond the programs of `saga_fg.conformance`.
-
-Figures (`docs/model.md`): means agree with the textbook to 1e-9 posterior
-standard deviations, covariances to 1e-9 relative in the Frobenius norm. Where a measurement is better than what was
-known before by nearly as much as double precision has digits, these are lost, and the test allows for as many.
-"""
+"""Every estimator gives the textbook's answers, in any order, and consistent ones."""
 
 import dataclasses
 
 import gtsam
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from factors import SolverSettings
 from saga_fg import Edges, SagaError, SceneGraph
@@ -26,20 +22,25 @@ from saga_fg.conformance.programs import (
     Predict,
     TextbookEstimator,
     Update,
+    interaction_edges,
     new_nodes,
+    node_table,
     random_graph,
     random_program,
     run,
 )
-from saga_fg.estimators import BatchSolver, JointKalmanFilter, Measurements
+from saga_fg.estimators import BatchSolver, GraphFilter, JointKalmanFilter, Measurements
 from saga_fg.graph import SceneFactorGraph
 from saga_fg.graph.variables import node_key
 from saga_fg.model.discretisation import discretise
+from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.turning import KnownCourses
 from tests.saga_fg.estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
 from tests.saga_fg.every_estimator import ESTIMATORS, maker
 from tests.saga_fg.graph_keys import newest_key
 from tests.saga_fg.road_scenes import road_program
+
+# Every estimator, one suite: equal to the textbook, beyond the programs of `saga_fg.conformance`
 
 SMOOTHERS = [kind for kind in ESTIMATORS if hasattr(maker(kind.values[0])(), "smoothed")]
 
@@ -310,3 +311,178 @@ def test_the_suite_would_notice():
     for kind in (Forgetful, Sloppy):
         with pytest.raises(AssertionError):
             in_step(program, kind())
+
+
+# Every estimator is indifferent to order, to coupling where there is none, and to a snapshot between
+
+
+def permuted(operation, rng):
+    """Return the operation with its nodes in another order."""
+    if isinstance(operation, Add):
+        order = rng.permutation(len(operation.nodes))
+        return Add(operation.nodes[order], operation.means[order], operation.covariances[order])
+    if isinstance(operation, Marginalise):
+        return Marginalise(rng.permutation(operation.nodes))
+    if isinstance(operation, Update):
+        m = operation.measurements
+        order = rng.permutation(len(m))
+        return Update(Measurements(m.nodes[order], m.z[order], m.H[order], m.R[order]))
+    graph = operation.transition.graph
+    order = rng.permutation(len(graph))
+    place = np.argsort(order)
+    groups = tuple(
+        Edges(g.interaction, place[g.target], place[g.source], g.rate, g.A_self, g.A_other, g.b) for g in graph.edges
+    )
+    types = tuple(graph.types[k] for k in order)
+    return Predict(discretise(SceneGraph(graph.nodes[order], types, groups), operation.transition.dt))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_order_in_which_nodes_are_told_does_not_matter(make, seed):
+    rng = np.random.default_rng(seed)
+    program = random_program(rng, moments=6)
+    one, likelihoods = run(program, make())
+    other, same_likelihoods = run([permuted(operation, rng) for operation in program], make())
+    nodes = one.nodes
+    assert sorted(other.nodes.tolist()) == sorted(nodes.tolist())
+    assert same_likelihoods == pytest.approx(likelihoods, rel=1e-9, nan_ok=True)
+    P = one.joint_covariance(nodes)
+    assert np.linalg.norm(other.joint_covariance(nodes) - P) <= 1e-9 * np.linalg.norm(P)
+    assert np.abs(other.joint_mean(nodes) - one.joint_mean(nodes)).max() <= 1e-9 * np.sqrt(np.diag(P)).max()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_rate_zero_is_independent_filters_exactly(make, seed):
+    """Together or each alone: the same digits, and no correlation between any two.
+
+    iSAM2 solves when it is told something, so that others change how often; its digits are the same to rounding.
+    """
+    rng = np.random.default_rng(seed)
+    program = random_program(rng, moments=6, max_rate=0.0)
+    together, _ = run(program, make())
+    rounding = 1e-11 if isinstance(together, GraphFilter) else 0.0
+    for node in together.nodes.tolist():
+        alone, _ = run([part for part in (only(operation, node) for operation in program) if part], make())
+        assert np.allclose(alone.mean([node]), together.mean([node]), rtol=rounding, atol=rounding)
+        assert np.allclose(alone.covariance([node]), together.covariance([node]), rtol=rounding, atol=rounding)
+    P = together.joint_covariance(together.nodes)
+    blocks = np.zeros_like(P)
+    start = 0
+    for node in together.nodes.tolist():
+        own = together.covariance([node])[0]
+        blocks[start : start + len(own), start : start + len(own)] = own
+        start += len(own)
+    assert np.array_equal(P, blocks)
+
+
+def only(operation, node):
+    """Return the part of an operation on one node; None if it has none."""
+    if isinstance(operation, Predict):
+        graph = operation.transition.graph  # type: ignore[attr-defined]
+        rows = np.flatnonzero(graph.nodes == node)
+        if len(rows) == 0:
+            return None
+        return Predict(discretise(SceneGraph([node], (graph.types[rows[0]],)), operation.transition.dt))  # type: ignore[attr-defined]
+    if isinstance(operation, Update):
+        m = operation.measurements
+        rows = np.flatnonzero(m.nodes == node)
+        return Update(Measurements(m.nodes[rows], m.z[rows], m.H[rows], m.R[rows])) if len(rows) else None
+    rows = np.flatnonzero(np.asarray(operation.nodes) == node)
+    if len(rows) == 0:
+        return None
+    if isinstance(operation, Marginalise):
+        return Marginalise(np.array([node]))
+    return Add(operation.nodes[rows], operation.means[rows], operation.covariances[rows])
+
+
+def test_continuing_from_a_snapshot_is_bit_identical(make):
+    estimator = make()
+    program = random_program(np.random.default_rng(21), moments=9)
+    middle = len(program) // 2
+    run(program[:middle], estimator)
+    state = estimator.snapshot()
+    before = estimator.joint_mean(estimator.nodes), estimator.joint_covariance(estimator.nodes)
+    run(program[middle:], estimator)
+    first = estimator.nodes, estimator.joint_mean(estimator.nodes), estimator.joint_covariance(estimator.nodes)
+    for again in (estimator, make()):
+        again.restore(state)
+        assert np.array_equal(again.joint_mean(again.nodes), before[0])
+        assert np.array_equal(again.joint_covariance(again.nodes), before[1])
+        run(program[middle:], again)
+        second = again.nodes, again.joint_mean(again.nodes), again.joint_covariance(again.nodes)
+        for a, b in zip(first, second, strict=True):
+            assert np.array_equal(a, b)
+
+
+# The covariances mean what they say: NEES on data drawn from the model itself
+
+RUNS = 200
+TYPES = (CAR, CAR, BUS, CAR, BUS, CAR)
+
+
+def drawn_graph(rng):
+    """Edges and their rates, sampled anew for every interval."""
+    nodes = node_table(rng, TYPES)
+    edges = [
+        *interaction_edges(rng, nodes, SharedVelocity(), 0.4, 3.0),
+        *interaction_edges(rng, nodes, CarFollowing(headway=0.3), 0.2, 3.0),
+    ]
+    return SceneGraph(nodes.id, nodes.types, tuple(edges))
+
+
+def misjudged(graph, factor):
+    """The graph with all rates multiplied."""
+    groups = tuple(
+        Edges(g.interaction, g.target, g.source, factor * g.rate, g.A_self, g.A_other, g.b) for g in graph.edges
+    )
+    return SceneGraph(graph.nodes, graph.types, groups)
+
+
+def root(P):
+    """A with A A^T = P, of a matrix that may be singular to within rounding."""
+    values, vectors = np.linalg.eigh(P)
+    return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def error_squared(rng, factor, steps=4):
+    """NEES at the end of a run whose truth obeys the model, in a filter whose rates are off by `factor`."""
+    estimator, truth = JointKalmanFilter(), []
+    for node, node_type in enumerate(TYPES):
+        mean, deviation = rng.normal(size=node_type.dim) * 5, np.full(node_type.dim, 2.0)
+        estimator.add([node], mean[None], np.diag(deviation**2)[None])
+        truth.append(mean + deviation * rng.normal(size=node_type.dim))
+    x = np.concatenate(truth)
+    offsets = np.concatenate([[0], np.cumsum([t.dim for t in TYPES])])
+    for _ in range(steps):
+        graph, dt = drawn_graph(rng), float(rng.uniform(0.1, 0.8))
+        transition = discretise(graph, dt)
+        estimator.predict(discretise(misjudged(graph, factor), dt))
+        x = transition.F_matrix @ x + transition.b + root(transition.Q_matrix.toarray()) @ rng.normal(size=len(x))
+        for kind in (CAR, BUS):
+            seen = [node for node, t in enumerate(TYPES) if t is kind and rng.random() < 0.6]
+            if seen:
+                at = offsets[seen][:, None] + np.arange(2)
+                z = x[at] + 0.3 * rng.normal(size=at.shape)
+                estimator.update(Measurements(seen, z, np.eye(2, kind.dim), 0.09 * np.eye(2)))
+    nodes = np.arange(len(TYPES))
+    error = x - estimator.joint_mean(nodes)
+    return float(error @ np.linalg.solve(estimator.joint_covariance(nodes), error))
+
+
+def mean_nees(factor):
+    """Over all runs, per degree of freedom; and the band in which 99.9 % of such means lie."""
+    freedom = RUNS * sum(t.dim for t in TYPES)
+    total = sum(error_squared(np.random.default_rng(run), factor) for run in range(RUNS))
+    return total / freedom, chi2.ppf([0.0005, 0.9995], freedom) / freedom
+
+
+def test_on_data_of_the_model_the_filter_is_consistent():
+    value, (low, high) = mean_nees(factor=1.0)
+    assert low <= value <= high
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.5])
+def test_with_rates_that_are_wrong_it_is_not(factor):
+    """Neglecting the interactions, or taking them for half as strong again, is noticed."""
+    value, (low, high) = mean_nees(factor)
+    assert not low <= value <= high

@@ -98,10 +98,7 @@ BAD = {
         lambda e: e.predict(transition(IDS).graph),
         "transition: expected Transition, got SceneGraph",
     ),
-    "update: no measurements": (
-        lambda e: e.update(([4], [[0.0, 0.0]])),
-        "measurements: expected Measured",
-    ),
+    "update: no measurements": (lambda e: e.update(([4], [[0.0, 0.0]])), "measurements: expected Measured"),
     "restore: no snapshot": (lambda e: e.restore((1, 2, 3.0)), "state: expected .*State, got tuple"),
     "update: unknown node": (lambda e: e.update(measured([4, 99])), "node 99 is not in the estimator"),
     "update: unknown node in the second kind": (
@@ -125,10 +122,7 @@ BAD = {
     "covariance: unknown node": (lambda e: e.covariance([99]), "node 99 is not in the estimator"),
     "covariance: mixed sizes": (lambda e: e.covariance([4, 8]), "expected states of equal size"),
     "joint mean: unknown node": (lambda e: e.joint_mean([4, 99]), "node 99 is not in the estimator"),
-    "joint covariance: unknown node": (
-        lambda e: e.joint_covariance([4, 99]),
-        "node 99 is not in the estimator",
-    ),
+    "joint covariance: unknown node": (lambda e: e.joint_covariance([4, 99]), "node 99 is not in the estimator"),
     "joint covariance: ids that are no integers": (lambda e: e.joint_covariance(["4"]), "nodes: expected"),
 }
 

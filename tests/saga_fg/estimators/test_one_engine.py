@@ -1,24 +1,37 @@
-"""One engine: what is tied is solved by the graph alone, what is alone by the Kalman kernels; objects pass between."""
+"""One engine behind all estimators: the same answers, its tolerances and its steps."""
 
 import copy
 import pickle
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 import pytest
 
+from factors import ResidualFactors, Vector, gaussian_factor, residual_factor
 from factors.gaussian import native_factor
-from saga_fg import Edges, NodeType, SceneGraph
+from pipelines.explaining import story
+from pipelines.serving.messages import tracks_message
+from saga_fg import Edges, InputError, NodeType, SceneGraph, Tracker, TrackerSettings
 from saga_fg.conformance.programs import CAR, Predict, TextbookEstimator, random_graph, random_program, run
-from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements, filtering
-from saga_fg.graph import OBJECT
+from saga_fg.estimators import GraphFilter, IncrementalSmoother, JointKalmanFilter, Measurements, filtering
+from saga_fg.graph import OBJECT, Additions, GraphView, NewVariable
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.motion import ConstantVelocity
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.tracking.journal import Event, Journal
+from saga_fg.types.track import Tracks
 from tests.saga_fg.estimator_scenario import Textbook, assert_newest, random_covariance, tell
 from tests.saga_fg.estimators.soak import LAGS, drive
+from tests.saga_fg.traffic_frames import run as damped_run
+from tests.saga_fg.traffic_frames import seen as damped_seen
+from tests.saga_fg.traffic_frames import straight
+
+# One engine: what is tied is solved by the graph alone, what is alone by the Kalman kernels; objects pass between
 
 JOINT_STEPS = (filtering.predict, filtering.corrected)
 
@@ -240,3 +253,243 @@ def test_where_the_tree_has_too_few_digits_the_posterior_is_eliminated_anew(fail
     engine.isam, twin._posterior, twin._tied = TreeWithoutDigits(engine.isam, failure), None, None
     np.testing.assert_allclose(twin.joint_covariance(range(4)), expected, rtol=0, atol=1e-9 * np.abs(expected).max())
     assert engine.isam.asked == 1
+
+
+# The joint filter with a tolerance: weak ties are inputs, what hardly correlates is apart, strong ties stay
+
+
+def chain(rates):
+    """Node k + 1 takes over the velocity of node k at rates[k], 1/s."""
+    n, m = len(rates) + 1, len(rates)
+    A = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (m, 1, 1))
+    edges = Edges("shared velocity", np.arange(1, n), np.arange(m), np.array(rates), -A, A, np.zeros((m, 4)))
+    return SceneGraph.of(np.arange(n), CAR, [edges])
+
+
+def filters(n, tolerance):
+    rng = np.random.default_rng(n)
+    means = rng.normal(scale=5.0, size=(n, 4))
+    found = JointKalmanFilter(), JointKalmanFilter(tolerance=tolerance)
+    for estimator in found:
+        estimator.add(np.arange(n), means, np.tile(np.diag([0.3, 0.3, 1.0, 1.0]), (n, 1, 1)))
+    return found
+
+
+def size_of_components(estimator):
+    return np.bincount(estimator.posterior().partition.label).tolist()
+
+
+def test_weak_ties_are_inputs_and_strong_ones_kept_whole():
+    exact, close = filters(2, 0.02)
+    transition = discretise(chain([0.05]), 0.1)
+    for estimator in (exact, close):
+        estimator.predict(transition)
+    assert size_of_components(exact) == [2]
+    assert size_of_components(close) == [1, 1]
+    np.testing.assert_allclose(close.mean([0, 1]), exact.mean([0, 1]), atol=1e-12)
+    np.testing.assert_allclose(close.covariance([0, 1]), exact.covariance([0, 1]), atol=1e-12)
+    exact, close = filters(2, 0.02)
+    for estimator in (exact, close):
+        estimator.predict(discretise(chain([2.0]), 0.5))
+    np.testing.assert_allclose(close.joint_covariance([0, 1]), exact.joint_covariance([0, 1]), atol=1e-12)
+
+
+@pytest.mark.parametrize(("tolerance", "apart"), [(0.005, False), (0.02, True), (0.05, True)])
+def test_long_runs_stay_near_the_exact_filter_and_their_covariances_hold(tolerance, apart):
+    """Ties of many strengths come and go; errors are a few times the tolerance, in standard deviations."""
+    rng, n = np.random.default_rng(3), 24
+    exact, close = filters(n, tolerance)
+    errors = []
+    for _ in range(40):
+        rates = np.where(rng.random(n - 1) < 0.5, rng.uniform(0.0, 0.3, n - 1), 0.0)
+        transition = discretise(chain(rates), 0.2)
+        seen = np.flatnonzero(rng.random(n) < 0.8)
+        z = exact.mean(seen)[:, :2] + rng.normal(scale=0.3, size=(len(seen), 2))
+        for estimator in (exact, close):
+            estimator.predict(transition)
+            estimator.update(Measurements(seen, z, np.eye(2, 4), 0.1 * np.eye(2)))
+        P = close.covariance(np.arange(n))
+        assert (np.linalg.eigvalsh(P) > 0).all()
+        sigma = np.sqrt(np.diagonal(exact.covariance(np.arange(n)), axis1=1, axis2=2))
+        errors.append((close.mean(np.arange(n)) - exact.mean(np.arange(n))) / sigma)
+    assert np.sqrt(np.mean(np.square(errors))) < 2 * tolerance
+    assert (len(size_of_components(close)) > len(size_of_components(exact))) == apart
+
+
+def test_a_tolerance_that_is_no_correlation_is_refused(subtests):
+    for bad in [-0.1, 1.0, np.nan]:
+        with subtests.test(bad=bad), pytest.raises(InputError, match="tolerance"):
+            JointKalmanFilter(tolerance=bad)
+
+
+def test_components_keep_to_their_size_and_the_strongest_ties():
+    """Of a chain of six every second tie is weaker: pairs go by the others."""
+    close = JointKalmanFilter(max_component=2)
+    close.add(np.arange(6), np.zeros((6, 4)), np.tile(np.eye(4), (6, 1, 1)))
+    close.predict(discretise(chain([2.0, 0.5, 2.0, 0.5, 2.0]), 0.2))
+    P = close.joint_covariance(np.arange(6)).reshape(6, 4, 6, 4)
+    tied = np.abs(P).max(axis=(1, 3)) > 0
+    np.testing.assert_array_equal(tied, np.kron(np.eye(3), np.ones((2, 2))))
+
+
+def test_room_for_all_is_exact():
+    rng, n = np.random.default_rng(5), 12
+    exact, close = JointKalmanFilter(), JointKalmanFilter(max_component=n)
+    for estimator in (exact, close):
+        estimator.add(np.arange(n), np.zeros((n, 4)), np.tile(np.eye(4), (n, 1, 1)))
+    for _ in range(8):
+        transition = discretise(chain(rng.uniform(0.0, 2.0, n - 1)), 0.2)
+        z = rng.normal(size=(n, 2))
+        for estimator in (exact, close):
+            estimator.predict(transition)
+            estimator.update(Measurements(np.arange(n), z, np.eye(2, 4), 0.1 * np.eye(2)))
+    np.testing.assert_allclose(close.joint_covariance(np.arange(n)), exact.joint_covariance(np.arange(n)), atol=1e-10)
+    np.testing.assert_allclose(close.joint_mean(np.arange(n)), exact.joint_mean(np.arange(n)), atol=1e-10)
+
+
+# Graphs on which full steps overshoot, and graphs that nothing settles: damped steps, and results that say so
+
+DAMPED_CAR = NodeType("car", ConstantVelocity(0.5))
+H, R = np.eye(2, 4), 0.01 * np.eye(2)
+
+
+@dataclass
+class Uphill:
+    """x = 5, with a Jacobian of the wrong sign: every step leads away, and the shorter it is, the less."""
+
+    nodes: Sequence[int]
+    until: float = np.inf
+    name: str = "uphill"
+    asked: list[float] = field(default_factory=list)
+
+    def factors(self, view: GraphView) -> Additions:
+        self.asked.append(view.time)
+        now = view.now(OBJECT)
+        mine = [now[node] for node in self.nodes if node in now and view.time <= self.until]
+        return Additions(factors=[self._factor(one.key, one.dim) for one in mine])
+
+    def _factor(self, key: int, dim: int) -> ResidualFactors:
+        return residual_factor((key,), (Vector(dim),), self._residual, 1e-4 * np.eye(1), self._jacobian)
+
+    def _residual(self, x: FloatArray) -> FloatArray:
+        return x[:1] - 5.0
+
+    def _jacobian(self, x: FloatArray) -> list[FloatArray]:
+        return [-np.eye(1, len(x))]
+
+
+class Squares:
+    """x^2 = -1 with a weak prior of 0.3, between whose sides full steps jump; and a variable apart from that."""
+
+    name = "squares"
+
+    def factors(self, view: GraphView) -> Additions:
+        if view.epoch:
+            return Additions()
+        a, b = view.key(OBJECT, 1), view.key(OBJECT, 2)
+        new = [NewVariable(OBJECT, 1, np.array([1.0])), NewVariable(OBJECT, 2, np.array([7.0]))]
+        one = np.eye(1)
+        square = residual_factor((a,), (Vector(1),), lambda x: x**2 + 1, one)
+        cosine = residual_factor((b,), (Vector(1),), lambda x: np.sin(x - 7.5), one)
+        return Additions(new, [square, gaussian_factor([a], [one], [0.3], 4 * one), cosine])
+
+
+def filtered(provider: Uphill, steps: int = 3, lag: float = 0.0) -> GraphFilter:
+    """Two cars apart from each other, 1 at 0 m and 2 at 20 m, both seen in every frame."""
+    estimator = GraphFilter([provider], lag)
+    estimator.add([1, 2], [[0.0, 0, 1, 0], [20.0, 0, 1, 0]], np.stack([np.diag([1.0, 1.0, 0.5, 0.5])] * 2))
+    for k in range(1, steps + 1):
+        estimator.predict(discretise(SceneGraph.of([1, 2], DAMPED_CAR, []), 0.1))
+        estimator.update(Measurements([1, 2], [[0.1 * k, 0.0], [20 + 0.1 * k, 0.0]], H, R))
+        estimator.set_frame(None, np.zeros(2))
+        estimator.ask_providers()
+    return estimator
+
+
+def test_damped_steps_settle_what_full_steps_jump_over():
+    smoother = IncrementalSmoother([Squares()], lag=None)
+    smoother.step(0.0)
+    assert smoother.unsettled == frozenset()
+    assert smoother.solution().converged
+    a, b = (smoother.state(key)[0] for key in sorted(smoother.graph().variables))  # type: ignore[index]
+    assert 2 * a * (a**2 + 1) + (a - 0.3) / 4 == pytest.approx(0.0, abs=1e-3)
+    assert b == pytest.approx(7.5, abs=1e-6)
+
+
+def test_only_the_variables_that_still_move_have_not_settled(caplog):
+    estimator = filtered(Uphill([1]))
+    assert estimator.unsettled.tolist() == [1]
+    smoother = estimator._smoother
+    assert {smoother.graph().variables[key].id for key in smoother.unsettled} == {1}
+    assert not smoother.solution().converged
+    assert "has not settled" in caplog.text
+    assert estimator.mean([2])[0, 0] == pytest.approx(20.3, abs=0.1)
+    assert abs(estimator.mean([1])[0, 0]) < 1  # at the best point, not where another step led
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.25])
+def test_what_has_not_settled_is_not_better_known_than_predicted(lag):
+    provider = Uphill([1])
+    estimator = filtered(provider, lag=lag)
+    later = discretise(SceneGraph.of([1, 2], DAMPED_CAR, []), 0.1)
+    estimator.predict(later)
+    predicted = estimator.joint_covariance([1, 2])
+    estimator.update(Measurements([1, 2], [[0.4, 0.0], [20.4, 0.0]], H, R))
+    estimator.ask_providers()
+    assert estimator.unsettled.tolist() == [1]
+    reported = estimator.joint_covariance([1, 2])
+    assert np.linalg.eigvalsh((reported - predicted)[:4, :4])[0] > -1e-9
+    assert np.linalg.eigvalsh(reported)[0] > 0
+    assert reported[4, 4] < 0.8 * predicted[4, 4]  # the other one is measured as ever
+    _, P = estimator.planar_marginals([1], np.array([[0, 1, 2, 3]]))
+    np.testing.assert_allclose(P[0], reported[:4, :4])
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.25])
+def test_the_graph_has_what_has_not_settled_where_the_filter_has_it(lag):
+    estimator = filtered(Uphill([1]), lag=lag)
+    graph = estimator.graph()
+    newest = graph.of(OBJECT, graph.epoch)
+    assert len(estimator._independent.layout.nodes) == 1
+    for node in (1, 2):
+        np.testing.assert_allclose(graph.state(newest[node].key), estimator.mean([node])[0], atol=1e-9)
+    latest = estimator.smoothed()[-1]
+    np.testing.assert_allclose(latest.x.mean, estimator.mean([1, 2]).ravel(), atol=1e-9)
+
+
+def test_what_has_settled_is_said_again_and_after_a_restart():
+    estimator = filtered(Uphill([1]))
+    state = pickle.loads(pickle.dumps(estimator.snapshot()))
+    other = GraphFilter([Uphill([1])])
+    other.restore(state)
+    assert other.unsettled.tolist() == estimator.unsettled.tolist() == [1]
+    np.testing.assert_allclose(other.covariance([1, 2]), estimator.covariance([1, 2]), rtol=1e-9)
+    estimator = filtered(Uphill([1], until=0.1), steps=1)
+    assert estimator.unsettled.tolist() == [1]
+    estimator.marginalise([1])
+    assert estimator.unsettled.tolist() == []
+    assert filtered(Uphill([]), steps=5).unsettled.tolist() == []
+
+
+def tracked(estimator: str, events: list[Event]) -> list[Tracks]:
+    """Two cars; the factor is on the first track."""
+    settings = TrackerSettings(estimator=estimator)
+    tracker = Tracker(settings, observer=Journal(settings, events.append), providers=[Uphill([1])])
+    truth = straight([[10.0, 0.0], [10.0, 30.0]], [[5.0, 0.0], [5.0, 0.0]])
+    return damped_run(tracker, damped_seen(np.random.default_rng(0), truth, 0.1 * np.arange(6)))
+
+
+def test_tracks_and_journal_say_which_have_not_settled():
+    events: list[Event] = []
+    last = tracked("isam2", events)[-1]
+    assert dict(zip(last.id.tolist(), last.settled.tolist(), strict=True))[1] is False
+    assert last.settled.sum() == len(last) - 1
+    assert [track.settled for track in last] == last.settled.tolist()
+    assert last.select(last.settled).settled.all()
+    told = [event for event in events if event["event"] == "unsettled"]
+    assert told
+    assert {event["track"] for event in told} == {1}
+    lines = story([event | {"scene": "a"} for event in events if event.get("track") == 1])
+    assert any("not settled: the solver found no minimum" in line for line in lines)
+    message = tracks_message(last)["tracks"]
+    assert [row["id"] for row in message if row.get("settled") is False] == [1]

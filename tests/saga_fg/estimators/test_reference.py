@@ -113,7 +113,7 @@ def test_the_problems_have_new_and_leaving_nodes():
     assert any(rows < columns for rows, columns in shapes)
 
 
-def test_a_scalar_by_hand():
+def test_a_scalar_by_hand_and_one_moment():
     """Prior N(1, 4), z = 3 with variance 4: the posterior is halfway, its variance half."""
     x, likelihood = kalman_update(Gaussian(np.ones(1), 4 * np.eye(1)), np.array([3.0]), np.eye(1), 4 * np.eye(1))
     assert x.mean == pytest.approx([2.0])
@@ -121,8 +121,5 @@ def test_a_scalar_by_hand():
     assert likelihood == pytest.approx(-0.5 * (4 / 8 + np.log(8) + np.log(2 * np.pi)))
     moved = kalman_predict(x, np.array([[2.0]]), np.array([-1.0]), 0.5 * np.eye(1))
     assert (moved.mean[0], moved.covariance[0, 0]) == pytest.approx((3.0, 8.5))
-
-
-def test_one_moment_is_smoothed_already():
     x = Gaussian(np.ones(2), np.eye(2))
     assert rts_smooth([x], [], []) == [x]

@@ -25,13 +25,10 @@ def run(code, cwd, **environment):
     return done.stdout.strip(), done.stderr
 
 
-def test_numba_can_be_switched_off_and_kernels_are_plain_python():
+def test_numba_is_imported_at_the_first_kernel_and_can_be_switched_off():
+    assert run("import sys, saga_fg, saga_fg.tracking.tracker; print('numba' in sys.modules)", ROOT)[0] == "False"
     out, said = run(LABELS + "; import sys; print('numba' in sys.modules)", ROOT, NUMBA_DISABLE_JIT="1")
     assert (out.split("\n"), said) == (["[0 1 0]", "False"], "")
-
-
-def test_numba_is_imported_at_the_first_kernel_alone():
-    assert run("import sys, saga_fg, saga_fg.tracking.tracker; print('numba' in sys.modules)", ROOT)[0] == "False"
 
 
 def test_a_read_only_installation_keeps_its_kernels_in_the_cache_of_the_user(tmp_path):
@@ -59,14 +56,11 @@ def in_one_line(code, **environment):
     return out
 
 
-def test_a_numba_that_cannot_be_imported_is_one_clear_line(tmp_path):
+def test_what_cannot_be_compiled_is_one_clear_line(tmp_path):
     (tmp_path / "numba.py").write_text("raise ImportError('Numba needs NumPy 2.2 or less')")
     out = in_one_line(LABELS, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
     assert out.startswith("Numba cannot be imported: Numba needs NumPy 2.2 or less")
     assert "pip install" in out
-
-
-def test_a_kernel_that_does_not_compile_is_one_clear_line(tmp_path):
     code = "from saga_fg.kernels.compilation import kernel; kernel('f')(lambda x: x.nothing)(1.0)"
     out = in_one_line(code, NUMBA_CACHE_DIR=str(tmp_path))
     assert out.startswith("kernel <lambda>: Numba ")

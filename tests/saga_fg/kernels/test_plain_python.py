@@ -13,8 +13,7 @@ from pipelines.config import load_config
 from saga_fg.kernels import compilation
 from saga_fg.kernels.compilation import Kernel
 from tests.saga_fg.estimator_scenario import random_scenario
-from tests.saga_fg.kernels.test_filtering import played
-from tests.saga_fg.kernels.test_tracks import random_frames, tracked
+from tests.saga_fg.kernels.test_kernels import played, random_frames, tracked
 
 compared: Counter[str] = Counter()
 

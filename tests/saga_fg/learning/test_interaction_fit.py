@@ -41,13 +41,15 @@ def test_the_known_rate_is_found_again_and_lowers_errors_on_other_recordings():
     assert last_error(other, fitted.rules) < 0.9 * last_error(other, ())
 
 
-def test_the_stronger_the_prior_the_nearer_the_template():
+def test_templates_pull_and_are_left_out_where_their_classes_do_not_occur():
     sample = gaps_of(1, pairs=2)
     away = [
         abs(math.log(fit_interactions(sample, SETTINGS, (FOLLOW,), 4, prior).rules[0].rate / FOLLOW.rate))
         for prior in (0.02, 0.4, 10.0)
     ]
     assert away[0] > away[1] > away[2]
+    walking = Neighbours(SharedVelocity(), classes=("pedestrian",))
+    assert fit_interactions(gaps_of(1, pairs=1), SETTINGS, (FOLLOW, walking), iterations=1).rules[0].classes[0] == "car"
 
 
 def test_a_search_can_begin_where_another_ended():
@@ -100,11 +102,6 @@ def test_all_finite_rates_and_widths_of_rules_are_parameters():
     first, second = parameters.valued(parameters.start + math.log(2))
     assert (first.rate, first.gap_scale, second.path_scale) == pytest.approx((0.6, 40.0, 4.0))
     assert (first.max_gap, second.gap_scale) == (FOLLOW.max_gap, math.inf)
-
-
-def test_rules_of_classes_that_do_not_occur_are_left_out():
-    walking = Neighbours(SharedVelocity(), classes=("pedestrian",))
-    assert fit_interactions(gaps_of(1, pairs=1), SETTINGS, (FOLLOW, walking), iterations=1).rules[0].classes[0] == "car"
 
 
 def test_learning_from_nothing_is_an_error():

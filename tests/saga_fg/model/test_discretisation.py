@@ -1,5 +1,6 @@
 """Discretisation: the classical one without edges, second order against the joint exponential, stable for any dt."""
 
+import dataclasses
 from itertools import product
 
 import numpy as np
@@ -21,9 +22,11 @@ from saga_fg.conformance.programs import (
     random_graph,
     random_types,
 )
-from saga_fg.model.discretisation import discretise
+from saga_fg.model.discretisation import Blocks, Transition, discretise
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 from saga_fg.model.stability import joint_generator
+
+# Discretisation: the classical one without edges, second order against the joint exponential, stable for any dt
 
 seeds = st.integers(0, 2**32 - 1)
 intervals = st.one_of(st.floats(1e-9, 1e3), st.sampled_from([0.0, 1e-9, 1e-3, 0.1, 1.0, 1e3]))
@@ -101,18 +104,18 @@ def test_rate_zero_is_exactly_no_edges(seed, dt):
         assert np.array_equal(a, b)
 
 
-def test_no_nodes():
+def test_no_nodes_and_intervals_that_are_none(subtests):
     transition = discretise(SceneGraph([], ()), 0.5)
     F, b, Q = dense(transition)
     assert F.shape == Q.shape == (0, 0)
     assert b.shape == (0,)
     assert joint_generator(SceneGraph([], ()))[0].shape == (0, 0)
-
-
-def test_an_interval_that_is_none_is_refused(subtests):
     for dt in [-0.1, np.nan, np.inf, -np.inf, 1e13, 1e300]:
         with subtests.test(dt=dt), pytest.raises(InputError, match="dt: expected a finite number of seconds from 0"):
             discretise(SceneGraph.of([0], CAR), dt)
+    empty = discretise(SceneGraph([], ()), 1.0)
+    assert empty.F_matrix.shape == (0, 0)
+    assert empty.nodes.tolist() == []
 
 
 # with edges, against the exponential of the joint generator
@@ -395,3 +398,46 @@ def test_a_disturbed_queue_finds_its_formation_again(subtests):
             assert np.abs(later).max() < 1e-6 + 1e-8 * dt
             along = in_order_of_components(graph, ("x", "y", "vx", "vy"), F)
             assert np.isfinite(along).all()
+
+
+# Transitions are checked where they are made, by hand or from a graph
+
+GRAPH = SceneGraph([4, 9, 2], (CAR, BUS, CONE))
+TRANSITION = discretise(GRAPH, 0.5)
+
+
+def blocks(row, values):
+    return Blocks(np.array([row]), np.array([row]), np.asarray(values, dtype=float)[None])
+
+
+def test_blocks_are_where_their_nodes_are():
+    assert TRANSITION.nodes.tolist() == [4, 9, 2]
+    assert TRANSITION.offsets.tolist() == [0, 4, 10, 12]
+    F = TRANSITION.F_matrix.toarray()
+    assert F.shape == (12, 12)
+    assert F[0, 2] == 0.5
+    assert F[4, 8] == pytest.approx(0.125)
+    assert np.array_equal(F[10:, 10:], np.eye(2))
+    assert TRANSITION.Q_matrix.toarray()[10:, 10:] == pytest.approx(0.01 * np.eye(2))
+
+
+def test_parts_that_do_not_fit_are_refused(subtests):
+    for parts, message in [
+        ({"b": np.zeros(11)}, r"transition over 0.5 s: b: expected 12 entries, got shape \(11,\)"),
+        ({"b": np.full(12, np.nan)}, "transition over 0.5 s: b: expected finite numbers"),
+        ({"F": (blocks(0, np.eye(6)),)}, "F: blocks of size 6 x 6 do not fit the states of their nodes"),
+        ({"F": (blocks(0, np.full((4, 4), np.nan)),)}, "F: expected finite numbers"),
+        ({"Q": TRANSITION.Q[:-1]}, "Q: expected one block for each of 3 nodes"),
+        ({"Q": TRANSITION.Q + TRANSITION.Q[:1]}, "Q: expected one block for each of 3 nodes"),
+        ({"Q": (blocks(0, np.full((4, 4), np.inf)), *TRANSITION.Q[1:])}, "Q: expected finite numbers"),
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            dataclasses.replace(TRANSITION, **parts)
+
+
+def test_dynamics_that_explode_within_the_interval_are_refused():
+    edges = Edges("repulsion", [0], [1], [1.0], [5.0 * np.eye(4)], np.zeros((1, 4, 4)), np.ones((1, 4)))
+    graph = SceneGraph.of([1, 2], CAR, [edges])
+    assert isinstance(discretise(graph, 1.0), Transition)
+    with pytest.raises(InputError, match=r"transition over 1000 s: .*: expected finite numbers"):
+        discretise(graph, 1000.0)

@@ -1,4 +1,4 @@
-"""Edge rules: who is coupled with whom, and how strongly."""
+"""Rules of edges: who interacts with whom."""
 
 from dataclasses import replace
 
@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from saga_fg import InputError
+from saga_fg import ConstantVelocity, InputError, NodeType
+from saga_fg.conformance.programs import BUS, CAR, CONE
+from saga_fg.kernels.edges import pairs_ahead
 from saga_fg.model.edge_rules import (
     SPREAD,
     UNSEEN_ACCELERATION,
@@ -17,8 +19,12 @@ from saga_fg.model.edge_rules import (
     build_graph,
     traffic_rules,
 )
-from saga_fg.numerics.geometry import yaw_transform
-from tests.saga_fg.model.drawn_traffic import bend, edges, joined, leaders, random_traffic, straight, table
+from saga_fg.model.interactions import SHARP, CarFollowing, Paths, SharedVelocity
+from saga_fg.model.nonlinear_interactions import IntelligentDriver, SmoothDriver
+from saga_fg.numerics.geometry import Polylines, yaw_transform
+from tests.saga_fg.model.drawn_traffic import bend, edges, joined, leaders, random_traffic, straight, table, with_path
+
+# Edge rules: who is coupled with whom, and how strongly
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -138,34 +144,32 @@ def test_a_leader_is_taken_from_the_own_lane_though_another_car_is_nearer(road):
     assert {k: found[k] for k in (5, 6, 7)} == {5: 4, 6: 5, 7: 6}
 
 
-def test_a_car_in_the_next_lane_hardly_leads_and_one_two_lanes_away_never():
+def test_nobody_follows_who_is_in_another_lane_class_or_direction():
     near = Following().pairs(table([(0, 0), (15, 3.5)], 0.0))
     assert near.rate.max(initial=0) < 0.02 * Following().rate
     assert len(Following().pairs(table([(0, 0), (15, 7.0)], 0.0)).target) == 0
-
-
-def test_nobody_follows_oncoming_crossing_or_distant_traffic():
     oncoming = table([(0, 0), (15, 0)], [0.0, np.pi])
     crossing = table([(0, 0), (15, 0)], [0.0, np.pi / 2])
     distant = table([(0, 0), (41, 0)], 0.0)
     for nodes in (oncoming, crossing, distant):
         assert len(Following().pairs(nodes).target) == 0
-
-
-def test_only_the_named_classes_follow():
     nodes = table(*straight(3), label=["car", "pedestrian", "truck"])
     assert leaders(Following().pairs(nodes)) == {2: 0}
     assert leaders(Following(classes=("pedestrian", "truck")).pairs(nodes)) == {2: 1}
     assert len(Following(classes=()).pairs(nodes).target) == 0
 
 
-def test_the_rate_falls_with_distance_offset_and_turn():
+def test_the_rate_falls_with_distance_offset_and_turn_across_the_seam():
     def rate(x, y, heading):
         return float(Following().pairs(table([(0, 0), (x, y)], [0.0, heading])).rate.max(initial=0))
 
     rates = [rate(10, 0, 0), rate(20, 0, 0), rate(20, 1, 0), rate(20, 1, -0.3)]
     assert rates == sorted(rates, reverse=True)
     assert rate(20, 20 * np.tan(0.15), 0.3) == pytest.approx(np.exp(-20 / 20 - (0.3 / 0.4) ** 2 / 2))
+    nodes = table([(0, 0), (5, 0)], [np.pi - 0.05, -np.pi + 0.05])
+    assert Neighbours(speed_scale=np.inf).pairs(nodes).rate == pytest.approx(
+        0.3 * np.exp(-((5 / 8) ** 2 + (0.1 / 0.4) ** 2) / 2)
+    )
 
 
 # neighbours
@@ -187,13 +191,6 @@ def test_neighbours_are_pulled_at_the_rate_of_the_kernels(seed):
             squares = (apart / 8.0) ** 2 + (turn / 0.4) ** 2 + (difference / 3.0) ** 2
             expected.setdefault(i, {})[j] = pytest.approx(0.3 * np.exp(-squares / 2))
     assert edges(rule.pairs(nodes)) == expected
-
-
-def test_headings_are_compared_across_the_seam():
-    nodes = table([(0, 0), (5, 0)], [np.pi - 0.05, -np.pi + 0.05])
-    assert Neighbours(speed_scale=np.inf).pairs(nodes).rate == pytest.approx(
-        0.3 * np.exp(-((5 / 8) ** 2 + (0.1 / 0.4) ** 2) / 2)
-    )
 
 
 @given(seeds, st.integers(0, 5))
@@ -259,3 +256,191 @@ def test_rates_are_continuous_in_whether_a_vehicle_between_moves(leading, exists
     assert led(certain) == pytest.approx(led(abs(certain - 1e-9)), abs=1e-8)
     assert led(certain)[0] == pytest.approx(led(1 - certain)[0]), "who leads from beyond depends on its existence alone"
     assert (led(certain)[0] == 0) == (exists == 1)
+
+
+# From edge rules, shipped and of users, to a graph
+
+
+class Ring:
+    """A user's rule: everybody is pulled by the next one, and the last by the first."""
+
+    interaction = SharedVelocity()
+
+    def __init__(self, rate=0.5):
+        self.rate = rate
+
+    def pairs(self, nodes):
+        n = len(nodes)
+        return Pairs(np.arange(n), (np.arange(n) + 1) % n, np.full(n, self.rate))
+
+
+class Fixed:
+    interaction = SharedVelocity()
+
+    def __init__(self, target, source, rate):
+        self.chosen = (target, source, rate)
+
+    def pairs(self, nodes):
+        return self.chosen
+
+
+def test_a_graph_of_several_rules_groups_edges_by_the_types_of_their_ends():
+    nodes = table(*straight(4), types=(CAR, BUS, BUS, CAR))
+    graph = build_graph(nodes, (Following(), Ring()))
+    assert graph.nodes.tolist() == [100, 101, 102, 103]
+    assert graph.edge_count == 3 + 4
+    for group in graph.edges:
+        assert len({(graph.types[i], graph.types[j]) for i, j in zip(group.target, group.source, strict=True)}) == 1
+        assert group.interaction in ("CarFollowing", "SharedVelocity")
+        following = group.interaction == "CarFollowing"
+        law = CarFollowing() if following else SharedVelocity()
+        assert np.array_equal(group.A_other, law.triples(nodes, group.target, group.source).A_other)
+
+
+@given(seeds)
+def test_rules_see_the_nodes_that_interact_alone(seed):
+    rng = np.random.default_rng(seed)
+    nodes, rules = random_traffic(rng), (Following(), Neighbours(), Following(SmoothDriver()))
+    nodes = replace(nodes, outline={3: np.zeros((2, 2)), 7: np.ones((2, 2))}, unseen=rng.uniform(size=len(nodes)))
+    interacting = rng.random(len(nodes)) < 0.6
+    some = nodes.select(np.flatnonzero(interacting))
+    assert some.id[list(some.outline)].tolist() == nodes.id[[k for k in (3, 7) if interacting[k]]].tolist()
+    whole = build_graph(nodes, rules, explained_noise=1.0, interacting=interacting)
+    part = build_graph(some, rules, explained_noise=1.0)
+    assert whole.nodes.tolist() == nodes.id.tolist()
+    assert (whole.diffusion_scale[~interacting] == 1).all()
+    assert np.array_equal(whole.diffusion_scale[interacting], part.diffusion_scale)
+    for ours, theirs in zip((*whole.edges, *whole.nonlinear), (*part.edges, *part.nonlinear), strict=True):
+        for end in ("target", "source"):
+            assert whole.nodes[getattr(ours, end)].tolist() == part.nodes[getattr(theirs, end)].tolist()
+        assert vars(ours)["rate"].tolist() == vars(theirs)["rate"].tolist()
+
+
+def test_weak_edges_and_edges_between_types_that_do_not_fit_are_left_out():
+    nodes = table(*straight(3))
+    assert build_graph(nodes, (Ring(rate=1e-4),)).edge_count == 0
+    assert build_graph(nodes, (Ring(rate=1e-4),), min_rate=0).edge_count == 3
+    mixed = table(*straight(3), types=(CAR, CONE, CAR))
+    graph = build_graph(mixed, (Ring(),))
+    assert [(g.target.tolist(), g.source.tolist()) for g in graph.edges] == [([2], [0])]
+
+
+def test_what_interactions_explain_is_noise_no_more():
+    nodes = table(*straight(3))
+    plain = build_graph(nodes, (Following(), Ring(rate=0.5)))
+    assert plain.diffusion_scale.tolist() == [1.0, 1.0, 1.0]
+    explained = build_graph(nodes, (Following(), Ring(rate=0.5)), explained_noise=2.0)
+    total = np.zeros(3)
+    for group in plain.edges:
+        np.add.at(total, group.target, group.rate)
+    assert explained.diffusion_scale == pytest.approx(np.exp(-2.0 * total))
+    assert build_graph(nodes, (), explained_noise=2.0).diffusion_scale.tolist() == [1.0, 1.0, 1.0]
+    assert (build_graph(nodes, (Ring(rate=1e6),), explained_noise=1e6).diffusion_scale > 0).all()
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_too_few_nodes_for_an_edge(n):
+    nodes = table(*straight(n))
+    for rule in (Following(), Neighbours()):
+        assert len(rule.pairs(nodes).target) == 0
+    graph = build_graph(nodes, (Following(), Neighbours(), Ring()))
+    assert (len(graph), graph.edge_count) == (n, 0)
+
+
+def test_types_may_be_equal_and_rules_return_lists():
+    again = NodeType("car", ConstantVelocity(acceleration_noise=1.5))
+    graph = build_graph(table(*straight(3), types=(CAR, again, CAR)), (Following(),))
+    assert graph.edge_count == 2
+    assert build_graph(table(*straight(3)), (Fixed([0], [1], [0.5]),)).edge_count == 1
+
+
+def test_a_users_rule_that_makes_no_sense_is_named(subtests):
+    for chosen, message in [
+        (([0, 3], [1, 1], [0.5, 0.5]), "edge rule Fixed: target: row 3 is outside 3 nodes"),
+        (([0], [-1], [0.5]), "edge rule Fixed: source: row -1 is outside 3 nodes"),
+        (([0], [1, 2], [0.5]), "edge rule Fixed: source: expected 1 entries, got 2"),
+        (([0.0], [1], [0.5]), "edge rule Fixed: target: expected a list of integers"),
+        (([0], [1], [np.nan]), r"edge rule Fixed: rate\[0\]: expected a finite number"),
+        (([0], [1], [0.5, 0.5]), r"edge rule Fixed: rate: expected shape \(1,\)"),
+        (([1], [1], [0.5]), "edges of SharedVelocity: node row 1 has an edge to itself"),
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            build_graph(table(*straight(3)), (Fixed(*chosen),))
+
+
+# Leaders and gaps along the predicted path of a node
+
+
+def round_the_corner():
+    """A car before a left turn of 12 m radius, one round it, and one straight on."""
+    places, headings = bend(8, 12.0, gap=-4.0)
+    nodes = table([(0.0, 0.0), places[5], (20.0, 0.0)], [0.0, headings[5], 0.0])
+    return nodes, places, headings
+
+
+def test_the_leader_is_the_nearest_on_the_path_that_is_predicted():
+    nodes, places, headings = round_the_corner()
+    rule = Following(SharedVelocity(), gap_scale=np.inf)
+    assert leaders(rule.pairs(nodes)) == {0: 2}
+    assert leaders(rule.pairs(with_path(nodes, 0, places, headings))) == {0: 1}
+
+
+def test_a_straight_path_is_no_path():
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        nodes = random_traffic(rng)
+        nodes = replace(nodes, heading=np.zeros(len(nodes)))
+        on = nodes.position[4] + np.arange(0.0, 60.0, 3.0)[:, None] * np.array([1.0, 0.0])
+        rule = Following(SharedVelocity())
+        assert edges(rule.pairs(nodes)).get(4, {}) == pytest.approx(
+            edges(rule.pairs(with_path(nodes, 4, on, np.zeros(20)))).get(4, {})
+        )
+
+
+@pytest.mark.parametrize("law", [CarFollowing(time_constant=2.0, headway=1.0), IntelligentDriver(headway=1.0)])
+def test_laws_take_the_gap_along_the_path(law):
+    """At the estimate, the acceleration is that behind a leader straight ahead, as far away as this one on the path."""
+    nodes, places, headings = round_the_corner()
+    nodes = with_path(nodes, 0, places, headings)
+    ahead = nodes.along(np.array([0]), np.array([1])).ahead[0]
+    assert ahead == pytest.approx(20.0, abs=0.5)
+
+    def acceleration(nodes):
+        triples = law.triples(nodes, np.array([0]), np.array([1]))
+        x, other = (np.concatenate([nodes.position[k], nodes.velocity[k]]) for k in (0, 1))
+        return (triples.A_self[0] @ x + triples.A_other[0] @ other + triples.b[0])[2:]
+
+    straight_on = table([(0.0, 0.0), (ahead, 0.0), (60.0, 0.0)], 0.0)
+    assert acceleration(nodes) == pytest.approx(acceleration(straight_on), abs=1e-9)
+    step = 0.1 * np.array([[0.0, 0.0], [np.cos(headings[5]), np.sin(headings[5])], [0.0, 0.0]])
+    further = replace(nodes, position=nodes.position + step)
+    triples = law.triples(nodes, np.array([0]), np.array([1]))
+    change = triples.A_other[0][2:, :2] @ step[1]
+    if isinstance(law, CarFollowing):  # a gap closes in proportion, and the wanted one is the present one
+        assert change == pytest.approx([0.1 / law.time_constant, 0.0], rel=0.1, abs=1e-3)
+    else:
+        assert change == pytest.approx(acceleration(further) - acceleration(nodes), rel=0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_place_beside_a_path_is_left_out(seed):
+    rng = np.random.default_rng(seed)
+    bend = rng.normal(scale=rng.choice([0.01, 0.1, 0.5]), size=20)
+    heading = rng.uniform(-3, 3) + np.concatenate([[0.0], np.cumsum(bend)])
+    places = np.concatenate([np.zeros((1, 2)), np.cumsum(3 * np.stack([np.cos(heading), np.sin(heading)], 1)[1:], 0)])
+    none = np.zeros((1, len(places)))
+    paths = Paths(np.array([0]), places[None], heading[None], none, none, *np.zeros((2, 1)))
+    others = rng.uniform(-70, 70, (2000, 2))
+    at = Polylines.from_points(list(paths.position)).feet(np.zeros(2000, dtype=np.int64), others)
+    beside = (at.s > 0) & (np.abs(at.e) < 3.6)
+    path, able = np.full(2001, -1), np.ones(2001, dtype=bool)
+    path[0], follows, every = 0, ~able, np.concatenate([places[:1], others])
+    follows[0] = True
+    cones = paths.cones(3.6)
+    _, source = pairs_ahead(every, np.zeros(2001), follows, able, 200.0, 3.6, 0.1, path, places[:1], *cones, SHARP)
+    kept = np.zeros(2000, dtype=bool)
+    kept[source - 1] = True
+    assert beside.any()
+    assert kept[beside].all()
+    if np.abs(np.cumsum(bend)).max() < 0.3:
+        assert kept.mean() < 0.4

@@ -1,15 +1,37 @@
-"""Interaction functions: their triples are the written law, and the law knows no place and no direction."""
+"""Interactions, linear and nonlinear."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from benchmarks.sampled_traffic import Interaction
+from factors import Vector
+from factors.manifolds import central_differences
+from saga_fg import InputError
 from saga_fg.conformance.programs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
+from saga_fg.model import nonlinear_interactions
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_rules import Following, build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
+from saga_fg.model.nonlinear_interactions import (
+    HIDDEN_VEHICLE_GAP,
+    MAX_DECELERATION,
+    STOP_TIME,
+    IntelligentDriver,
+    SmoothDriver,
+    SocialForce,
+    smooth_acceleration,
+)
+from saga_fg.model.stability import require_stable
+from saga_fg.model.stop_lines import DriverStopping, RedLight
 from saga_fg.numerics.geometry import yaw_transform
+from tests.saga_fg.road_scenes import queue, table
+
+# Interaction functions: their triples are the written law, and the law knows no place and no direction
 
 seeds = st.integers(0, 2**32 - 1)
 pairs_of_types = st.tuples(st.sampled_from(MOVING), st.sampled_from(MOVING))
@@ -97,8 +119,8 @@ def test_the_law_is_the_same_at_every_place_and_in_every_direction(interaction, 
     there, R = moved(nodes, turn, np.array(shift))
     p, v = rng.normal(size=(2, 2)) * 30, rng.normal(size=(2, 2)) * 10
     felt = []
-    for table, positions, velocities in ((nodes, p, v), (there, p @ R.T + np.array(shift), v @ R.T)):
-        A_self, A_other, b = (part[0] for part in interaction.triples(table, target, source))
+    for boxes, positions, velocities in ((nodes, p, v), (there, p @ R.T + np.array(shift), v @ R.T)):
+        A_self, A_other, b = (part[0] for part in interaction.triples(boxes, target, source))
         x_i, x_j = (state(t, positions[k], velocities[k]) for k, t in enumerate(types))
         felt.append((A_self @ x_i + A_other @ x_j + b)[types[0].index(("vx", "vy"))])
     assert np.allclose(R @ felt[0], felt[1], atol=1e-8)
@@ -163,3 +185,159 @@ def test_shared_velocity_takes_the_acceleration_of_the_follower_not_that_of_the_
     at = TRAM.index(("ax", "ay"))
     assert triples.A_self[0][np.ix_(at, at)] == pytest.approx(-np.eye(2))
     assert not triples.A_other[0][at].any()
+
+
+# Interaction functions of the running graph: what drivers and pedestrians do
+
+
+def test_gaps_close_up_to_what_is_wanted_and_nobody_drives_backwards():
+    driver = IntelligentDriver()
+    v, s, w = np.array([8.0, 10.0, 6.0]), np.array([15.0, 30.0, 20.0]), np.array([8.0, 9.0, 6.5])
+    np.testing.assert_allclose(smooth_acceleration(driver, v, s, w).value, driver.alone(v, s, w).value, atol=0.02)
+    assert smooth_acceleration(driver, np.array(15.0), np.array(0.1), np.array(0.0)).value > -MAX_DECELERATION - 0.01
+    law, x = Interaction(SmoothDriver()), np.array([0.0, 0.0, 3.0, 0.0])
+    for _ in range(100):
+        x = law.predict(x, [np.array([5.5, 0.0, 0.0, 0.0])], 0.1)
+    assert 0.0 < x[0] < 2.0
+    assert abs(x[2]) < 0.05
+    law, leader = Interaction(SmoothDriver()), np.array([100.0, 0.0, 8.0, 0.0])
+    x = np.array([20.0, 0.0, 8.0, 0.0])
+    for _ in range(1200):
+        x, leader = law.predict(x, [leader], 0.1), leader + np.array([0.8, 0.0, 0.0, 0.0])
+    assert x[2] == pytest.approx(8.0, abs=0.05)
+    assert 8.0 < leader[0] - x[0] - float(SmoothDriver.alone) < 14.0
+    for gap in (2.5, 5.0, 30.0):
+        assert value(DRIVER.following, 0, gap, 0) == 0
+        assert value(DRIVER.stopping, 0, gap) == 0
+    assert value(DRIVER.following, 0, 5.0, 2.0) > 0.5
+
+
+def test_pedestrians_push_each_other_away_and_stacks_are_the_same():
+    law, rng = Interaction(SocialForce()), np.random.default_rng(0)
+    x, others = rng.normal(size=(5, 4)), [rng.normal(size=(5, 4)) for _ in range(2)]
+    together = law.predict(x, others, 0.2)
+    for k in range(5):
+        np.testing.assert_allclose(law.predict(x[k], [other[k] for other in others], 0.2), together[k])
+    here, there = np.zeros(4), np.array([0.5, 0.0, 0.0, 0.0])
+    assert law.predict(here, [there], 0.1)[2] < 0 < law.predict(there, [here], 0.1)[2]
+    assert np.isfinite(law.predict(here, [here], 0.1)).all()
+    assert law.predict(here, [], 0.1).tolist() == here.tolist()
+
+
+PIECES = np.array([[-5.0, 0.0, 0.0, 1.0], [0.0, 1.0, 4.0, 0.0]])  # a wall with a corner
+GIVEN = {
+    "driver": (SmoothDriver(), np.array(4.0)),
+    "standing": (SmoothDriver(IntelligentDriver(headway=0.5)), np.array(9.0)),
+    "wall": (SocialForce(), PIECES),
+}
+
+
+@pytest.mark.parametrize("name", GIVEN)
+def test_accelerations_and_their_derivatives(name):
+    """Beside a wall, past its ends, behind its corner; next to a leader."""
+    (law, given), rng = GIVEN[name], np.random.default_rng(2)
+    own, other = 4 * rng.normal(size=(40, 4)), rng.normal(size=(40, 4))
+    stacked = np.broadcast_to(given, (40, *given.shape))
+    _, by_own, by_other = law.accelerations(own, other, stacked)  # type: ignore[attr-defined]
+    expected = central_differences(
+        lambda a, b: law.accelerations(a, b, stacked).value,  # type: ignore[attr-defined]
+        [own, other],
+        [Vector(4)] * 2,
+    )
+    np.testing.assert_allclose(by_own, expected[0], atol=1e-6 * max(1.0, np.abs(by_own).max()))
+    np.testing.assert_allclose(by_other, expected[1], atol=1e-6 * max(1.0, np.abs(by_own).max()))
+
+
+def test_a_wall_pushes_along_its_normal_and_from_its_end(monkeypatch):
+    monkeypatch.setattr(nonlinear_interactions, "FALLOFF", 5.0)
+    at, still = np.array([[-2.5, 2.5, 0, 0], [7.0, -4.0, 0, 0]]), np.zeros((2, 4))
+    a = SocialForce().accelerations(at, still, np.stack([PIECES, PIECES])).value
+    normal = np.array([-1.0, 5.0]) / np.sqrt(26)
+    np.testing.assert_allclose(a[0] / np.hypot(*a[0]), normal, atol=1e-7)  # the farther piece acts by e^-17
+    np.testing.assert_allclose(a[1] / np.hypot(*a[1]), [0.6, -0.8], atol=1e-12)
+    assert np.hypot(*a[1]) == pytest.approx(2.0 * np.exp((0.6 - 5.0) / 5.0))
+
+
+# The Intelligent Driver Model as an interaction: its law, its derivatives, and what drivers do not do
+
+DRIVER = IntelligentDriver(free_speed=14.0, headway=1.2, acceleration=1.5, deceleration=2.0)
+speeds, gaps = st.floats(0, 16), st.floats(0.6, 80)
+
+
+def value(function, *arguments):
+    return float(function(*(np.array([float(x)]) for x in arguments)).value[0])
+
+
+def derivatives(found):
+    return np.array([float(part[0]) for part in found[1:]])
+
+
+@given(v=speeds, s=gaps, w=speeds)
+def test_derivatives_are_those_of_the_law(v, s, w):
+    found = DRIVER.following(*(np.array([x]) for x in (v, s, w)))
+    eps = 1e-6
+    steps = np.eye(3) * eps
+    low, high = ([value(DRIVER.following, *(np.array([v, s, w]) + sign * e)) for e in steps] for sign in (-1, 1))
+    centre = np.full(3, value(DRIVER.following, v, s, w))
+    one_sided = np.stack([centre - low, high - centre]) / eps
+    assume(np.allclose(*one_sided, atol=1e-3))  # not at a corner of the law
+    assert np.allclose(derivatives(found), one_sided.mean(axis=0), atol=2e-3)
+
+
+@given(v=st.floats(0.5, 13.5))
+def test_in_equilibrium_nobody_accelerates(v):
+    gap = (DRIVER.standstill_gap + v * DRIVER.headway) / math.sqrt(1 - (v / DRIVER.free_speed) ** 4)
+    assert value(DRIVER.alone, v, gap, v) == pytest.approx(0, abs=1e-9)
+    assert value(DRIVER.alone, v, gap - 0.5, v) < 0 < value(DRIVER.alone, v, gap + 0.5, v)
+
+
+@given(v=speeds, s=gaps, w=speeds)
+def test_drivers_brake_within_limits_and_never_backwards(v, s, w):
+    braking = -value(DRIVER.alone, v, s, w)
+    assert braking <= MAX_DECELERATION + 1e-9
+    assert braking <= v / STOP_TIME + 1e-9
+
+
+@given(v=speeds, w=speeds, s=st.floats(7, 80))
+def test_nobody_speeds_up_into_a_gap_with_room_for_another(v, w, s):
+    assert value(DRIVER.following, v, s, w) <= w - v + 1e-9
+    assert value(DRIVER.stopping, v, s) <= 0
+    close = HIDDEN_VEHICLE_GAP - 0.1
+    assert value(DRIVER.following, v, close, w) == value(DRIVER.alone, v, close, w)
+
+
+def test_a_queue_comes_to_a_halt_before_the_line():
+    """Step by step along the graph, as in a prediction: all stand at last, in order, none beyond the line."""
+    rules = [
+        RedLight(interaction=DriverStopping(driver=DRIVER), reaction_deceleration=0.0, full_deceleration=1e-3),
+        Following(interaction=DRIVER, gap_scale=math.inf, max_gap=80.0, parked=True),
+    ]
+    nodes = queue()
+    state = np.concatenate([np.concatenate([nodes.position, nodes.velocity], axis=1)[:4].ravel(), nodes.position[4]])
+    for _ in range(120):
+        moving = state[:16].reshape(4, 4)
+        rows = [("car", *x[:2], x[2], 0.0, 4) for x in moving] + [("stop_line", 0, 1.75, 0, 0, 0)]
+        now = table(rows, np.array([0, 0, 0, 0, 1.0]), nodes.outline)
+        step = discretise(build_graph(now, rules), 0.25)
+        state = step.F_matrix @ state + step.b
+    x, v = state[:16].reshape(4, 4)[:, 0], state[:16].reshape(4, 4)[:, 2]
+    assert np.all(np.abs(v) < 0.1)
+    assert -6 < x[0] + 2 < -1
+    assert np.all((x[:2] - x[1:3] - 4 > 1) & (x[:2] - x[1:3] - 4 < 5))
+    assert -6 < x[3] + 2 < -1
+
+
+def test_neither_its_double_nor_a_trailer_counts_as_led():
+    rows = [("car", 0, 0, 8, 0, 5), ("car", 2, 0, 8, 0, 5), ("car", 20, 0, 8, 0, 5)]
+    led = Following(interaction=DRIVER, min_separation=0.8).pairs(table(rows))
+    assert dict(zip(led.target.tolist(), led.source.tolist(), strict=True)) == {0: 2, 1: 2}
+    # Its gap to its truck is none that a driver keeps.
+    rows = [("truck", 0, 0, 8, 0, 8), ("trailer", -8.5, 0, 8, 0, 7), ("car", -25, 0, 8, 0, 5)]
+    led = Following(interaction=DRIVER, towed=("trailer",)).pairs(table(rows))
+    assert dict(zip(led.target.tolist(), led.source.tolist(), strict=True)) == {2: 1}
+
+
+def test_the_law_is_stable_and_its_settings_are_checked():
+    require_stable([Following(interaction=DRIVER, rate=1.0)])
+    with pytest.raises(InputError, match="headway"):
+        IntelligentDriver(headway=0.0)

@@ -12,7 +12,7 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.modes import Mixture, ModeTable, Stationary, mode_dynamics
 from saga_fg.model.turning import CoordinatedTurn
-from tests.saga_fg.model.test_nonlinear_motion import BACK_ENDS
+from tests.saga_fg.model.test_motion import BACK_ENDS
 
 LINEAR = Mixture((Stationary(), ConstantVelocity(2.0)), dwell_time=3.0)
 TURNING = Mixture((Stationary(), ConstantVelocity(0.5), CoordinatedTurn(0.5)), dwell_time=3.0)
@@ -147,12 +147,16 @@ def test_a_node_without_edges_is_predicted_as_by_the_textbooks_interacting_multi
         assert np.linalg.norm(P - C) < 1e-8 * np.linalg.norm(C)
 
 
-def test_modes_are_told_apart_by_what_is_seen():
+def test_modes_are_told_apart_by_what_is_seen_and_their_settings_checked():
     t = 0.1 * np.arange(60)
     stands, straight = np.zeros((60, 2)), np.stack([8 * t, 0 * t], axis=1)
     turns = 16 * np.stack([np.sin(0.5 * t), 1 - np.cos(0.5 * t)], axis=1)
     weights = [tracked(JointKalmanFilter(), TURNING, path).weight[0] for path in (stands, straight, turns)]
     assert np.argmax(weights, axis=1).tolist() == [0, 1, 2]
+    with pytest.raises(InputError, match="at least two"):
+        Mixture((Stationary(),))
+    with pytest.raises(InputError, match="dwell_time"):
+        Mixture(dwell_time=0.0)
 
 
 def test_one_measurement_weighs_modes_by_bayes():
@@ -239,10 +243,3 @@ def test_late_measurements_split_the_interval_of_a_mixture():
         smoother.update(Measurements([0], [[0.5, 0.2]], H[:, :4], 0.04 * np.eye(2)), time=0.2)
     np.testing.assert_allclose(parted.mean([0]), whole.mean([0]), atol=1e-10)
     np.testing.assert_allclose(parted.covariance([0]), whole.covariance([0]), atol=1e-10)
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(InputError, match="at least two"):
-        Mixture((Stationary(),))
-    with pytest.raises(InputError, match="dwell_time"):
-        Mixture(dwell_time=0.0)

@@ -1,13 +1,9 @@
-"""Every shipped law, motion and measurement of objects is smooth: it and its gradient are continuous, and bounded.
+"""Laws of interaction are smooth, and platoons stable."""
 
-Laws and motions are found in the packages: one that is added later is tested with its defaults. Measurement models
-need arguments; one that is not in `MEASUREMENTS` fails a test.
-"""
-
-from __future__ import annotations
-
+import dataclasses
 import importlib
 import inspect
+import math
 import pkgutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,18 +17,22 @@ from hypothesis import strategies as st
 
 import factors
 import saga_fg.model
-from factors import (
-    FactorError,
-    Radar,
-    Range,
-    RangeBearing,
-    RangeRate,
-    Vector,
-    relative_factors,
-)
+from factors import FactorError, Radar, Range, RangeBearing, RangeRate, Vector, relative_factors
 from factors.manifolds import central_differences, wrap_angles
 from factors.measurement import soft_distance
+from pipelines.config import TrackConfig
+from pipelines.configuration import read_settings, write_settings
+from saga_fg import InputError
+from saga_fg.learning import TEMPLATE
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_rules import Following, Neighbours, build_graph
+from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, velocity_triples
+from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.nonlinear_interactions import FALLOFF, RADII, STRENGTH, SmoothDriver, SocialForce
+from saga_fg.model.stability import LearnedInteractions, highest_rate, require_stable
+from saga_fg.tracking import TrackerSettings
+
+# Every shipped law, motion and measurement of objects is smooth: it and its gradient are continuous, and bounded
 
 DISTANCES = np.array([0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-3, 0.1, 0.3, 1.0, 5.0])  # m
 LIPSCHITZ = 1e5  # of gradients, per m or m/s: drivers at 20 m/s who pass through others need half of it
@@ -171,10 +171,12 @@ CASES = {
 }
 
 
-def test_laws_motions_and_models_are_found():
+def test_laws_are_found_by_name_and_written_and_read_again():
     assert {"SmoothDriver", "SocialForce", "CoordinatedTurn"} <= CASES.keys()
     found = set(shipped(factors, "predict", "jacobian")) - {type(case.model) for case in MEASUREMENTS.values()}
     assert not found, "a model without a case in MEASUREMENTS"
+    learned = LearnedInteractions(learned_from="two recordings", edges=TEMPLATE, explained_noise=0.5)
+    assert read_settings(LearnedInteractions, write_settings(learned)) == learned
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -241,10 +243,14 @@ def test_values_do_not_jump_from_where_they_are(name, data):
     np.testing.assert_allclose(case.value(x + dx) - before, linear, atol=1e-12 * (1 + np.abs(before).max()))
 
 
-def test_two_at_one_place_do_not_push_each_other_and_slow_ones_do_not_brake():
+def test_two_at_one_place_do_not_push_and_a_bearing_of_the_sensor_itself_is_refused():
     here = np.array([[1.0, 2.0, 0.5, 0.1]])
     for law in (SocialForce(), SmoothDriver()):
         assert (law.accelerations(here, here, law.alone[None]).value == 0).all()
+    # No bearing is continuous there.
+    for model in (RangeBearing(2), Radar(4)):
+        with pytest.raises(FactorError, match="a bearing has no derivative"):
+            model.jacobian(np.zeros(model.state_dim))
 
 
 def test_soft_distances_are_exact_beyond_their_width_and_never_below_the_distance():
@@ -282,8 +288,103 @@ def test_walls_do_not_depend_on_how_they_are_cut_or_padded():
     np.testing.assert_allclose(one.value, two.value, atol=0.04)
 
 
-def test_a_bearing_of_the_sensor_itself_is_refused():
-    """No bearing is continuous there."""
-    for model in (RangeBearing(2), Radar(4)):
-        with pytest.raises(FactorError, match="a bearing has no derivative"):
-            model.jacobian(np.zeros(model.state_dim))
+# Edge rules that would drive objects apart are refused, alone and together
+
+CONVOY = CarFollowing(time_constant=1.0)
+
+
+def test_rules_are_tried_as_often_and_together_as_nodes_may_meet_them():
+    rule = Neighbours(CONVOY, rate=0.3, max_degree=1)
+    require_stable([rule])
+    with pytest.raises(InputError, match=r"edges\[0\]: expected stable steps, .* up to 1\.8 1/s, the highest sum"):
+        require_stable([dataclasses.replace(rule, max_degree=6)])
+    rule = Neighbours(CONVOY, rate=1.0, max_degree=1)
+    require_stable([rule])
+    with pytest.raises(InputError, match=r"edges\[0\], edges\[1\]: expected stable steps, .* up to 2 1/s"):
+        require_stable([rule, rule])
+    one = Neighbours(CONVOY, rate=1.0, max_degree=1)
+    apart = [dataclasses.replace(one, classes=(name,)) for name in ("car", "bus")]
+    require_stable(apart)
+
+
+def test_the_configuration_names_the_rules():
+    text = "tracker: {{edges: [{{kind: attached}}], max_step: {step}}}"
+    assert read_settings(TrackConfig, text.format(step=0.25), "mine.yaml").tracker.max_step == 0.25
+    with pytest.raises(InputError, match=r"mine\.yaml: tracker: edges\[0\]: expected stable steps"):
+        read_settings(TrackConfig, text.format(step=1.0), "mine.yaml")
+    with pytest.raises(InputError, match=r"edges\[0\], edges\[1\]: expected stable"):
+        TrackerSettings(edges=(Neighbours(CONVOY, rate=0.25), Neighbours(CONVOY, rate=0.25)))
+
+
+@settings(max_examples=15)
+@given(
+    st.integers(0, 1000),
+    st.floats(0.01, 3.0),
+    st.floats(0.5, 10.0) | st.just(math.inf),
+    st.sampled_from([0.1, 0.5, 1.0]),
+)
+def test_what_is_let_pass_does_not_grow_on_scattered_nodes(seed, rate, tau, dt):
+    """Crowds of nodes, each with many neighbours: not only the pairs that were tried."""
+    rules = (Neighbours(CarFollowing(tau), rate=rate), Neighbours(SharedVelocity(), rate=rate))
+    try:
+        require_stable(rules)
+    except InputError:
+        return
+    rng = np.random.default_rng(seed)
+    n = 8
+    heading = rng.uniform(-0.4, 0.4, n)
+    velocity = 5 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    car = NodeType("car", ConstantVelocity(1.0))
+    position = rng.uniform(0, 12, (n, 2))
+    names = np.full(n, "car")
+    nodes = NodeTable(np.arange(n), names, (car,) * n, position, velocity, heading, np.full(n, 4.0), np.ones(n))
+    F = discretise(build_graph(nodes, rules), dt).F_matrix.toarray()
+    assert np.abs(np.linalg.eigvals(F)).max() < 1 + 1e-3
+
+
+def test_highest_rates_are_sums_over_the_edges_of_a_node():
+    assert highest_rate(Neighbours(rate=0.5, max_degree=3)) == 1.5
+    assert highest_rate(Following(rate=0.7)) == 0.7
+
+
+# The file of learned interactions, and the rules that may stand in it
+
+
+def test_a_mistake_in_the_file_is_named(subtests):
+    for text, message in [
+        ("version: 2", "version: expected 1"),
+        ("format: something", "format: expected one of"),
+        ("edges: [{kind: following, rate: 50.0}]", r"edges\[0\].rate: expected at most 20 1/s, got 50"),
+        ("edges: [{kind: neighbours, rate: -1.0}]", "rate: expected a finite number >= 0"),
+        (
+            "edges: [{kind: neighbours, interaction: {kind: car_following, time_constant: 0.1}, rate: 5.0}]",
+            r"edges\[0\]: expected stable steps, what two nodes .* grows by the factor",
+        ),
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            read_settings(LearnedInteractions, text, "mine.yaml")
+
+
+def test_dynamics_that_run_away_are_refused():
+    @dataclasses.dataclass(frozen=True)
+    class Flight:
+        """Nodes flee: the velocity grows."""
+
+        needs = ((), ())
+
+        def triples(self, nodes, target, source):
+            return velocity_triples(nodes, target, source, by_velocity=np.eye(2))
+
+    with pytest.raises(InputError, match=r"edges\[0\]: expected stable dynamics"):
+        LearnedInteractions(edges=(Neighbours(Flight(), rate=1.0),))
+
+
+@settings(max_examples=30)
+@given(
+    st.floats(0.001, 20),
+    st.sampled_from([SharedVelocity(), SharedVelocity(True)]),
+    st.floats(0.5, 1e3) | st.just(math.inf),
+)
+def test_shipped_interactions_are_stable_at_every_rate(rate, interaction, tau):
+    for rule in (Neighbours(interaction, rate=rate), Following(CarFollowing(tau), rate=rate)):
+        LearnedInteractions(edges=(rule,))

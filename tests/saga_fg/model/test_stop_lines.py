@@ -65,13 +65,16 @@ def test_a_belief_is_predicted_over_any_interval_alike(belief, dt, parts):
     assert np.allclose(signals.predicted(p, 1e4), signals.stationary, atol=1e-6)
 
 
-def test_colours_change_in_their_order():
+def test_beliefs_change_in_the_order_of_colours_and_mix():
     signals = SignalSettings(red_duration=10, amber_duration=3, green_duration=12)
     red = signals.predicted(np.array([[1.0, 0, 0, 0]]), 0.01)[0]
     assert red[STATES.index("starting")] == pytest.approx(0.001, rel=0.01)
     assert red[STATES.index("amber")] + red[STATES.index("green")] < 1e-5
     assert np.allclose(signals.stationary, np.array([10, 3, 1.5, 12]) / 26.5)
     assert np.allclose(colours(signals.stationary), np.array([10, 3, 13.5]) / 26.5)
+    beliefs = np.array([[0.3, 0.1, 0.2, 0.4], [0.5, 0.2, 0.0, 0.3], [0.1, 0.1, 0.1, 0.7]])
+    assert np.allclose(SignalSettings().closed(beliefs), [0.4, 0.7, 0.2])
+    assert np.allclose(SignalSettings().open(beliefs), [0.4, 0.3, 0.7])
 
 
 @given(accuracy=st.floats(0.4, 0.999), colour=st.sampled_from(range(3)))
@@ -87,12 +90,6 @@ def test_reports_of_a_colour_persuade_as_bayes_says(accuracy, colour):
     for _ in range(100):  # whatever was believed, another colour can still be learnt
         belief = colour_updated(belief, other, accuracy)
     assert colours(belief).argmax() == other
-
-
-def test_the_belief_mixes():
-    beliefs = np.array([[0.3, 0.1, 0.2, 0.4], [0.5, 0.2, 0.0, 0.3], [0.1, 0.1, 0.1, 0.7]])
-    assert np.allclose(SignalSettings().closed(beliefs), [0.4, 0.7, 0.2])
-    assert np.allclose(SignalSettings().open(beliefs), [0.4, 0.3, 0.7])
 
 
 # the stop line
@@ -123,7 +120,7 @@ def test_stopping_is_the_even_deceleration_to_the_line(turn, speed, gap):
         assert np.allclose(A_other[2:, axis], -by_p, atol=1e-5)
 
 
-def test_a_red_light_stops_the_first_of_each_lane():
+def test_a_red_light_stops_the_first_who_can_stop():
     target, source, rate = RedLight().pairs(queue())
     assert sorted(target.tolist()) == [0, 3]
     assert source.tolist() == [4, 4]
@@ -132,9 +129,6 @@ def test_a_red_light_stops_the_first_of_each_lane():
     acceleration = pull(queue(), RedLight())
     assert acceleration[0, 0] == pytest.approx(-(10**2) / (2 * (30 - 2 - 3)))
     assert np.allclose(acceleration[[1, 2, 4]], 0)
-
-
-def test_who_cannot_stop_goes_on_and_the_next_one_stops():
     rows = [("car", -8, 0, 12, 0, 4), ("car", -30, 0, 12, 0, 4), ("stop_line", 0, 0, 0, 0, 0)]
     nodes = table(rows, np.array([0, 0, 1.0]), {2: np.array([[0, 1.75], [0, -1.75]])})
     assert RedLight().pairs(nodes).target.tolist() == [1]
@@ -163,16 +157,13 @@ def open_line(rows, weight=1.0):
     return replace(nodes, open=np.append(np.zeros(len(rows)), weight))
 
 
-def test_an_open_line_lets_the_first_vehicle_go():
+def test_an_open_line_lets_the_first_go_and_who_has_crossed_speed_up():
     rule = GreenLight()
     queue = [("car", -5, 0, 0, 0, 4), ("car", -12, 0, 0, 0, 4)]
     assert pull(open_line(queue), rule)[:2, 0] == pytest.approx([2.0, 0.0])
     assert pull(open_line(queue, 0.3), rule)[0, 0] == pytest.approx(0.6)
     assert pull(open_line([("car", -5, 0, 6, 0, 4)]), rule)[0, 0] == pytest.approx(0.8)
     assert len(rule.pairs(open_line([("car", -5, 0, 12, 0, 4)])).target) == 0  # nobody is slowed down
-
-
-def test_who_has_crossed_an_open_line_still_speeds_up():
     rule = GreenLight()
     rows = [("car", 6, 0, 5, 0, 4), ("car", -3, 0, 4, 0, 4)]
     assert pull(open_line(rows), rule)[:2, 0] == pytest.approx([1.0, 1.2])
@@ -291,16 +282,13 @@ def test_lanes_pull_alike_at_every_place_and_in_every_direction(turn, x, y):
     assert np.allclose(R @ here, there, atol=1e-6)
 
 
-def test_who_leaves_a_lane_is_let_go():
+def test_who_leaves_a_lane_or_is_pushed_out_by_cones_is_let_go():
     straight = {1: np.array([[-50.0, 0.0], [50.0, 0.0]])}
     rows = [("car", 0, 1.0, 10, 0.2, 4), ("lane", 0, 0, 0, 0, 0)]
     leaving = InLane().pairs(table(rows, np.zeros(2), straight, {1: 3.5}))
     assert leaving.rate[0] < 0.1
     rows[0] = ("car", 0, 2.5, 10, 0, 4)
     assert len(InLane().pairs(table(rows, np.zeros(2), straight, {1: 3.5})).target) == 0
-
-
-def test_who_is_pushed_out_of_a_lane_by_cones_does_not_keep_it():
     rows = [("car", 0, 0, 10, 0, 4), ("lane", 0, 0, 0, 0, 0)]
     rows += [("traffic_cone", 10 + 5 * k, -2 + k, 0, 0, 0.4) for k in range(5)]
     nodes = table(rows, np.zeros(7), {1: np.array([[-50.0, 0.0], [50.0, 0.0]])}, {1: 3.5})
@@ -319,12 +307,9 @@ def test_cones_push_aside_whose_lane_they_close():
     assert np.allclose(acceleration[1:], 0)
 
 
-def test_the_push_is_to_where_the_edge_is_just_cleared():
+def test_cones_push_to_where_the_edge_is_just_cleared_on_either_side():
     """Looking 15 m ahead, at the second cone, which is at y = -1: the way aside there is clearance - 1."""
     assert pull(taper(), ConeLine())[0, 1] == pytest.approx(CONE_RATE * (CLEARANCE - 1) / PREVIEW)
-
-
-def test_cones_on_the_left_push_to_the_right():
     nodes = taper()
     mirrored = table([(str(nodes.label[k]), *(nodes.position[k] * (1, -1)), 10.0 * (k < 2), 0, 4) for k in range(7)])
     assert np.allclose(pull(mirrored, ConeLine()) * (1, -1), pull(nodes, ConeLine()))
@@ -345,15 +330,12 @@ def test_the_car_beside_knows_that_cones_push_another_into_its_lane():
 # trailers and riders
 
 
-def test_attached_is_the_nearest_that_touches_and_goes_along():
+def test_attached_is_the_nearest_that_touches_and_feels_changes_alone():
     rows = [("truck", 0, 0, 10, 0, 7), ("trailer", -8.5, 0, 10, 0, 8), ("truck", -9, 3.5, 10, 0, 7)]
     target, source, _ = Attached().pairs(table(rows))
     assert sorted(zip(target.tolist(), source.tolist(), strict=True)) == [(0, 1), (1, 0)]
     rows[1] = ("trailer", -8.5, 0, 2, 0, 8)
     assert all(rate < 0.01 for rate in Attached().pairs(table(rows)).rate)
-
-
-def test_a_couple_that_moves_as_one_feels_nothing_and_a_change_of_one_moves_the_other():
     nodes = table([("truck", 0, 0, 10, 0, 7), ("trailer", -8.5, 0, 10, 0, 8)])
     assert np.allclose(pull(nodes, Attached()), 0)
     A_self, A_other, b = (part[0] for part in RigidCoupling().triples(nodes, np.array([1]), np.array([0])))
@@ -371,10 +353,7 @@ def test_a_stop_line_looks_where_traffic_goes():
 
 def test_a_map_that_makes_no_sense_is_refused(subtests):
     for make, message in [
-        (
-            lambda: RoadMap((), (StopLine("a", (0, 1), (0, 0), "b"),)),
-            "there is no traffic light 'b'",
-        ),
+        (lambda: RoadMap((), (StopLine("a", (0, 1), (0, 0), "b"),)), "there is no traffic light 'b'"),
         (lambda: RoadMap((TrafficLight("a", (0, 0)), TrafficLight("a", (1, 1)))), "'a' occurs twice"),
         (lambda: StopLine("a", (0, 1), (0, 1), "b"), "two different ends"),
         (lambda: Lane("a", ((0, 0),)), "at least two points"),

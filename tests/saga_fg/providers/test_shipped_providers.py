@@ -1,7 +1,5 @@
 """Shipped factor providers in a running graph: they err as they say, and refuse what makes no sense."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -62,7 +60,7 @@ def first(planar: bool, start: StartSettings) -> Pose:
 
 
 @pytest.mark.parametrize("planar", [True, False])
-def test_odometry_gps_and_landmarks_err_as_they_say(planar: bool) -> None:
+def test_odometry_gps_and_landmarks_err_as_they_say(planar):
     start = StartSettings(START, 0.5, 0.1, 0.03, planar)
     sigmas = [0.05, 0.03, 0.01] if planar else [0.005, 0.005, 0.01, 0.05, 0.03, 0.03]
     P = [0.25, 0.25, 0.01] if planar else [0.0009, 0.0009, 0.01, 0.25, 0.25, 0.25]
@@ -88,7 +86,7 @@ def test_odometry_gps_and_landmarks_err_as_they_say(planar: bool) -> None:
     assert [str(one) for one in smoother.graph().variables.values()] == ["point 3", "vehicle 0 at 2.40 s"]
 
 
-def test_a_recording_solved_as_a_whole_takes_them_as_well() -> None:
+def test_a_recording_solved_as_a_whole_takes_them_as_well():
     start = StartSettings(START, 0.5, 0.1, 0.03, planar=True)
     C, step, rng = np.diag([0.0025, 0.0009, 0.0001]), gtsam.Pose2(1.0, 0.0, 0.05), np.random.default_rng(0)
     online, batch = (
@@ -110,7 +108,7 @@ def test_a_recording_solved_as_a_whole_takes_them_as_well() -> None:
         assert np.abs(way / np.sqrt(np.diag(batch.covariance(key)))).max() < 1e-3
 
 
-def test_inertial_samples_find_velocity_and_biases() -> None:
+def test_inertial_samples_find_velocity_and_biases():
     start = StartSettings((0.0, 0.0, 0.0), 0.1, 0.05, 0.02, planar=False)
     imu, h = Imu(start, start_velocity_deviation=1.0), 0.02
     scores = []
@@ -143,7 +141,7 @@ def test_inertial_samples_find_velocity_and_biases() -> None:
     assert (spread < [0.095, 0.095, 0.03, 0.0095, 0.0095, 0.0095]).all(), spread
 
 
-def test_a_vehicle_without_samples_goes_straight_on() -> None:
+def test_a_vehicle_without_samples_goes_straight_on():
     imu = Imu(StartSettings((0.0, 0.0, 0.3), planar=False), start_velocity=(4.0, 1.0, 0.0))
     smoother = IncrementalSmoother([imu])
     for k in range(11):
@@ -154,7 +152,7 @@ def test_a_vehicle_without_samples_goes_straight_on() -> None:
     assert np.sqrt(smoother.covariance(now(smoother, EGO_VELOCITY))[0, 0]) > 3.0
 
 
-def test_an_increment_is_shared_out_over_the_epochs_it_covers() -> None:
+def test_an_increment_is_shared_out_over_the_epochs_it_covers():
     step, C = gtsam.Pose2(2.0, 0.1, 0.3), np.diag([0.04, 0.01, 1e-4])
     ends = []
     for epochs in (1, 4):
@@ -170,7 +168,7 @@ def test_an_increment_is_shared_out_over_the_epochs_it_covers() -> None:
     assert np.sqrt(np.diag(ends[1][1])) == pytest.approx(np.sqrt(np.diag(ends[0][1])), rel=0.25)
 
 
-def test_a_fix_far_off_is_gated_or_given_up(subtests: pytest.Subtests) -> None:
+def test_a_fix_far_off_is_gated_or_given_up(subtests):
     for gps, heeds in [(Gps(), False), (Gps(gate=1), True), (Gps(gate=1, outlier_scale=2), False)]:
         with subtests.test(gps=gps, heeds=heeds):
             smoother = IncrementalSmoother([Odometry(StartSettings((0.0, 0.0, 0.0))), gps])
@@ -181,7 +179,7 @@ def test_a_fix_far_off_is_gated_or_given_up(subtests: pytest.Subtests) -> None:
             assert (abs(smoother.state(now(smoother, EGO_POSE)).x()) > 1.0) == heeds  # type: ignore[attr-defined]
 
 
-def test_the_antenna_says_where_the_vehicle_points() -> None:
+def test_the_antenna_says_where_the_vehicle_points():
     smoother = IncrementalSmoother([Odometry(StartSettings((0.0, 0.0, 0.0))), Gps(0.01, antenna=(2.0, 0.0, 1.5))])
     smoother.step(0.0, frame=frame(0, EgoMeasurements(gps=GpsFix([2.0, 0.0]))))
     loose = IncrementalSmoother([Odometry(StartSettings((0.0, 0.0, 0.0))), Gps(0.01)])
@@ -213,7 +211,7 @@ class Parked:
         return Additions([NewVariable(OBJECT, 1, state, label=self.label)], [start, seen])
 
 
-def test_what_stands_is_held_until_it_drives_off() -> None:
+def test_what_stands_is_held_until_it_drives_off():
     speeds = {}
     for label in ("barrier", "car"):
         smoother = IncrementalSmoother([Parked(label), StationaryObjects()])
@@ -227,7 +225,7 @@ def test_what_stands_is_held_until_it_drives_off() -> None:
     assert standing[-1] == pytest.approx(5.0, abs=1.0), "it drives"
 
 
-def test_vehicles_keep_to_a_lane_that_the_map_has_too_far_left() -> None:
+def test_vehicles_keep_to_a_lane_that_the_map_has_too_far_left():
     """The map is off by 0.6 m: three cars that are seen well tell so, and a fourth, seen badly, is held to the lane."""
     lane = Lane("main", ((100.0, 50.6), (400.0, 50.6)), 4.0)
     settings = TrackerSettings(estimator="isam2", edges=(), classes={"default": ClassSettings(motion=STEADY)})
@@ -261,7 +259,7 @@ IMU = ImuSamples([0.1], [[0, 0, 9.81]], [[0, 0, 0]])
 LEFT_HANDED = np.diag([1.0, -1.0, 1.0])
 
 
-def test_measurements_and_settings_that_make_no_sense(subtests: pytest.Subtests) -> None:
+def test_measurements_and_settings_that_make_no_sense(subtests):
     for make, message in [
         (lambda: GpsFix([np.nan, 0.0]), r"gps\[0\]: expected a finite number, got nan"),
         (lambda: GpsFix([1.0]), "gps: expected a place of 2 or 3 coordinates, got 1"),
@@ -294,7 +292,7 @@ def test_measurements_and_settings_that_make_no_sense(subtests: pytest.Subtests)
 SPACE = StartSettings((0.0, 0.0, 0.0), planar=False)
 
 
-def test_what_does_not_fit_is_one_error_and_the_smoother_goes_on(subtests: pytest.Subtests) -> None:
+def test_what_does_not_fit_is_one_error_and_the_smoother_goes_on(subtests):
     for providers, ego, message in [
         (
             [Odometry()],

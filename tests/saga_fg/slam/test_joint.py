@@ -1,17 +1,36 @@
-"""Path of the vehicle and objects around it, together."""
+"""Objects and the vehicle's way in one graph."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from saga_fg import Boxes, Detections, Frame, InputError
+from factors import prior_factor
+from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg.graph import EGO_VELOCITY, LANDMARK, Additions, GraphView, NewVariable
 from saga_fg.model.landmarks import PoleLandmark
+from saga_fg.model.motion import ConstantVelocity, NodeType
+from saga_fg.model.sensor import NoiseModel
+from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
-from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise, estimate_jointly
-from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
-from saga_fg.slam.joint.record import record_epochs
+from saga_fg.slam.joint import (
+    JointSettings,
+    OdometryIncrements,
+    OdometryNoise,
+    OnlineEstimator,
+    estimate_jointly,
+    estimate_online,
+)
+from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities, with_identities
+from saga_fg.slam.joint.graph import motion_factors, new_streams
+from saga_fg.slam.joint.record import RecordedDetections, RecordedEpoch, RecordedObjects, record_epochs
+from saga_fg.tracking import AssociationSettings, ClassSettings
+from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.landmark import Observation
-from tests.saga_fg.ego_drive import drive, new_tracker
+from tests.saga_fg.ego_drive import NOISE, drive, new_tracker
+
+# Path of the vehicle and objects around it, together
 
 POOR = OdometryNoise(scale=0.02, bias=0.005)
 
@@ -26,6 +45,28 @@ def worse(odometry, rng, scale=0.02, bias=-0.004):
     return OdometryIncrements(odometry.timestamps, steps)
 
 
+def frame_at(time, pose, boxes):
+    """What a vehicle sees of boxes of the world."""
+    detections = Detections(boxes.transformed(inverse_transform(pose)), np.full(len(boxes), 0.9))
+    return Frame(time, "lidar", detections, np.eye(4), "ego")
+
+
+def off_path(estimate, poses):
+    """Distances of estimated poses from the true ones, m."""
+    return np.linalg.norm((estimate - poses)[:, :2, 3], axis=1)
+
+
+def seen_poles(poses, rng, noise=0.05):
+    """Places of five poles, and observations of those near each pose."""
+    poles = np.column_stack([np.arange(4.0, 40, 8), np.tile([6.0, -6.0, 7.0], 2)[:5], np.full(5, 1.0)])
+    kind, seen = PoleLandmark(), []
+    for pose in poses:
+        local = (inverse_transform(pose) @ np.column_stack([poles, np.ones(5)]).T).T[:, :3]
+        local[:, :2] += rng.normal(0, noise, (5, 2))
+        seen.append([Observation(kind, z, noise**2 * np.eye(2)) for z in local if np.hypot(*z[:2]) < 20])
+    return poles[:, :2], seen
+
+
 @pytest.fixture(scope="module")
 def solved():
     frames, odometry, poses, cars = drive()
@@ -36,8 +77,7 @@ def solved():
 
 def test_objects_that_stand_correct_the_odometry(solved):
     reported, poses, _, estimate = solved
-    alone = np.linalg.norm((reported.path(poses[0]) - poses)[:, :2, 3], axis=1)
-    joint = np.linalg.norm((estimate.world_T_ego - poses)[:, :2, 3], axis=1)
+    alone, joint = (off_path(found, poses) for found in (reported.path(poses[0]), estimate.world_T_ego))
     assert estimate.converged
     assert joint.max() < alone.max() / 2
     assert estimate.errors[-1, 0] == pytest.approx(0.02, abs=3 * estimate.slow_errors.scale)
@@ -73,11 +113,16 @@ def test_objects_lie_where_they_are_beside_the_vehicle(solved):
     assert (np.linalg.eigvalsh(P) > 0).all()
 
 
-def test_with_no_objects_the_odometry_remains():
+def test_without_objects_or_with_one_seen_once_the_odometry_remains():
     frames, odometry, poses, _ = drive(n=10, parked=0, moving=0)
     estimate = estimate_jointly(frames, odometry, new_tracker, start=poses[0])
     np.testing.assert_allclose(estimate.world_T_ego, poses, atol=1e-6)
     assert all(len(objects.id) == 0 for objects in estimate.objects)
+    frames, odometry, poses, _ = drive(n=1)
+    record = record_epochs(frames, poses, odometry, new_tracker())
+    assert all(
+        (p == 0).all() for p in stationary_probabilities(record, poses, SlowErrors(0.01, 0.01, 0.01), JointSettings())
+    )
 
 
 def test_what_stands_is_told_from_what_drives():
@@ -100,8 +145,7 @@ def test_who_walks_far_away_does_not_stand():
     frames = []
     for time, pose in zip(t, poses, strict=True):
         boxes = Boxes.of(["pedestrian", "car"], [[20.0 + time, 45.0, 1.0], [20.0, -8.0, 1.0]])
-        ahead = boxes.transformed(inverse_transform(pose))
-        frames.append(Frame(time, "lidar", Detections(ahead, np.full(2, 0.9)), np.eye(4), "ego"))
+        frames.append(frame_at(time, pose, boxes))
     record = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker())
     p = stationary_probabilities(record, poses, SlowErrors.at_start(JointSettings(POOR)), JointSettings(POOR))
     middle = record[len(record) // 2]
@@ -121,8 +165,7 @@ def test_a_car_far_away_is_taken_for_parked_only_beside_cars_that_are():
             near = [[5.0 + 6 * k + speed * time, 4.0 * (-1) ** k, 1.0] for k in range(6)]
             places = np.array([*near, [60.0 + 0.4 * time, 30.0, 1.0]])
             places[:, :2] += 0.1 * rng.normal(size=(7, 2))
-            detections = Detections(Boxes.of(["car"] * 7, places).transformed(inverse_transform(pose)), np.full(7, 0.9))
-            frames.append(Frame(time, "lidar", detections, np.eye(4), "ego"))
+            frames.append(frame_at(time, pose, Boxes.of(["car"] * 7, places)))
         settings = JointSettings(POOR)
         record = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker())
         p = stationary_probabilities(record, poses, SlowErrors.at_start(settings), settings)
@@ -137,9 +180,7 @@ def test_a_queue_that_creeps_does_not_pass_for_parked():
     poses = np.stack([yaw_transform(5.0 * s) for s in t])
     frames = []
     for time, pose in zip(t, poses, strict=True):
-        ahead = Boxes.of(["car", "car"], [[45.0 + 1.2 * time, 0.0, 1.0], [8.0, 6.0, 1.0]])
-        detections = Detections(ahead.transformed(inverse_transform(pose)), np.full(2, 0.9))
-        frames.append(Frame(time, "lidar", detections, np.eye(4), "ego"))
+        frames.append(frame_at(time, pose, Boxes.of(["car"] * 2, [[45.0 + 1.2 * time, 0.0, 1.0], [8.0, 6.0, 1.0]])))
     record, settings = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker()), JointSettings(POOR)
     slow = SlowErrors.at_start(settings)
     batch, online = (stationary_probabilities(record, poses, slow, settings, online)[-1] for online in (False, True))
@@ -148,14 +189,6 @@ def test_a_queue_that_creeps_does_not_pass_for_parked():
     assert batch[parked] > 0.9
     assert online[creeps] < 0.5
     assert online[parked] > 0.8
-
-
-def test_nothing_is_said_of_an_object_seen_once():
-    frames, odometry, poses, _ = drive(n=1)
-    record = record_epochs(frames, poses, odometry, new_tracker())
-    assert all(
-        (p == 0).all() for p in stationary_probabilities(record, poses, SlowErrors(0.01, 0.01, 0.01), JointSettings())
-    )
 
 
 def test_frames_and_odometry_must_fit():
@@ -181,16 +214,244 @@ def test_odometry_is_put_together_and_apart():
 def test_poles_correct_the_odometry_where_nothing_else_stands():
     frames, odometry, poses, _ = drive(n=25, parked=0, moving=0)
     reported = worse(odometry, np.random.default_rng(2))
-    rng = np.random.default_rng(3)
-    poles = np.column_stack([np.arange(4.0, 40, 8), np.tile([6.0, -6.0, 7.0], 2)[:5], np.full(5, 1.0)])
-    kind, seen = PoleLandmark(), []
-    for pose in poses:
-        local = (inverse_transform(pose) @ np.column_stack([poles, np.ones(5)]).T).T[:, :3]
-        local[:, :2] += rng.normal(0, 0.05, (5, 2))
-        seen.append([Observation(kind, z, 0.05**2 * np.eye(2)) for z in local if np.hypot(*z[:2]) < 20])
+    _, seen = seen_poles(poses, np.random.default_rng(3))
     estimate = estimate_jointly(frames, reported, new_tracker, JointSettings(POOR), poses[0], seen)
-    alone = np.linalg.norm((reported.path(poses[0]) - poses)[:, :2, 3], axis=1)
-    joint = np.linalg.norm((estimate.world_T_ego - poses)[:, :2, 3], axis=1)
+    alone, joint = (off_path(found, poses) for found in (reported.path(poses[0]), estimate.world_T_ego))
     assert joint.max() < min(0.2, alone.max() / 3)
     with pytest.raises(InputError, match="landmarks: expected observations at 25 times, got 24"):
         estimate_jointly(frames, reported, new_tracker, landmarks=seen[1:])
+
+
+# The vehicle, landmarks and objects online: what a window loses against the batch, and what it must not
+
+SETTINGS = JointSettings(POOR)
+
+
+def rms(found, poses):
+    return np.sqrt(np.mean(off_path(found, poses) ** 2))
+
+
+def test_a_window_of_seconds_is_nearly_the_batch():
+    frames, odometry, poses, _ = drive(n=35)
+    reported = worse(odometry, np.random.default_rng(1))
+    batch = estimate_jointly(frames, reported, new_tracker, SETTINGS, poses[0])
+    online = estimate_online(frames, reported, OnlineEstimator(new_tracker(), 2.0, SETTINGS, start=poses[0]))
+    alone = rms(reported.path(poses[0]), poses)
+    assert rms(online.newest, poses) < alone / 3
+    assert rms(online.settled, poses) < max(1.5 * rms(batch.world_T_ego, poses), 0.15)
+    assert len(online.settled) == len(frames)
+    P = online.covariances[-1]
+    np.testing.assert_allclose(np.sqrt(np.diag(P)), np.sqrt(np.diag(batch.pose_covariances[-1])), rtol=0.1)
+    errors = np.array([inverse_transform(f) @ p for f, p in zip(online.newest, poses, strict=True)])
+    planar = np.stack([errors[:, 1, 0], errors[:, 0, 3], errors[:, 1, 3]], axis=1)
+    squares = [e @ np.linalg.solve(P[2:5, 2:5], e) for e, P in zip(planar, online.covariances, strict=True)]
+    assert np.mean(squares[5:]) < chi2.ppf(0.999, 3)
+
+
+def test_variables_of_providers_leave_the_window_with_their_epoch():
+    frames, odometry, poses, _ = drive(n=12)
+    estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS, start=poses[0], providers=[_Speeds()])
+    for k, frame in enumerate(frames):
+        estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
+    graph, window = estimator._window._smoother.graph(), estimator._window.record
+    assert all(graph.of(EGO_VELOCITY, now.epoch) for now in window)
+    assert not any(graph.of(EGO_VELOCITY, k) for k in range(window[0].epoch))
+
+
+class _Speeds:
+    """A variable of its own at every epoch."""
+
+    name = "speeds"
+
+    def factors(self, view: GraphView) -> Additions:
+        assert view.frame is not None
+        prior = prior_factor(view.key(EGO_VELOCITY, 0), np.zeros(3), np.eye(3))
+        return Additions([NewVariable(EGO_VELOCITY, 0, np.zeros(3))], [prior])
+
+
+def test_what_leaves_the_window_stays_in_the_prior():
+    """In a nearly linear problem a short window gives the newest pose and covariance of a long one."""
+    frames, odometry, poses, _ = drive(n=14, parked=0, moving=3)
+    reported = worse(odometry, np.random.default_rng(2))
+    linear = replace(SETTINGS, outlier_scale=np.inf, moving_speed={DEFAULT: 1e-6})  # nobody stands, no robust loss
+    _, seen = seen_poles(poses, np.random.default_rng(4))
+    short, long = (
+        estimate_online(frames, reported, OnlineEstimator(new_tracker(), lag, linear, start=poses[0]), seen)
+        for lag in (0.5, 60.0)
+    )
+    sigma = np.sqrt(np.diag(long.covariances[-1]))[3:5]
+    assert (np.abs((short.newest - long.newest)[-1, :2, 3]) < 0.1 * sigma).all()
+    np.testing.assert_allclose(short.covariances[-1], long.covariances[-1], rtol=0.02, atol=1e-6)
+
+
+def test_landmarks_are_told_apart_and_leave_with_the_window():
+    frames, odometry, poses, _ = drive(n=30, parked=0, moving=0)
+    reported = worse(odometry, np.random.default_rng(2))
+    poles, seen = seen_poles(poses, np.random.default_rng(3))
+    estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS, start=poses[0])
+    online = estimate_online(frames, reported, estimator, seen)
+    graph = estimator._window._smoother.graph()
+    left = [graph.state(one.key) for one in graph.of(LANDMARK, None).values()]
+    assert 0 < len(left) < len(poles)
+    assert max(np.linalg.norm(poles - place, axis=1).min() for place in left) < 0.5
+    assert rms(online.newest, poses) < rms(reported.path(poses[0]), poses) / 3
+
+
+def test_every_moment_settles_once_and_the_window_holds_the_lag():
+    frames, odometry, poses, _ = drive(n=9)
+    estimator, times = OnlineEstimator(new_tracker(), 0.6, SETTINGS, start=poses[0]), []
+    for k, frame in enumerate(frames):
+        step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
+        assert step.newest.timestamps.tolist() == [frame.timestamp]
+        if step.settled is not None:
+            times += step.settled.timestamps.tolist()
+        assert frame.timestamp - estimator.window().timestamps[0] < 0.6 + 0.2 + 1e-9
+    times += estimator.window().timestamps.tolist()
+    np.testing.assert_allclose(times, [frame.timestamp for frame in frames])
+    assert estimator.window().object_covariances(0).shape[1:] == (4, 4)
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(InputError, match="lag: expected a finite number"):
+        OnlineEstimator(new_tracker(), -1.0)
+    estimator = OnlineEstimator(new_tracker(), 1.0)
+    with pytest.raises(InputError, match="expected a frame before"):
+        estimator.window()
+    frames, odometry, _, _ = drive(n=3)
+    estimator.step(frames[1])
+    with pytest.raises(InputError, match="expected one after"):
+        estimator.step(frames[0], np.eye(4))
+    with pytest.raises(InputError, match="expected observations at 3 times, got 1"):
+        estimate_online(frames, odometry, OnlineEstimator(new_tracker(), 1.0), [()])
+
+
+def test_a_motion_that_is_none_does_not_reach_the_graph(subtests):
+    for motion, covariance, message in [
+        (None, None, "a_T_b: expected the motion since the last frame"),
+        (np.full((4, 4), np.nan), None, "expected a finite number"),
+        (2 * np.eye(4), None, "a_T_b: expected a rigid"),
+        (np.eye(4), -np.eye(6), "covariance"),
+    ]:
+        with subtests.test(message):
+            frames, odometry, *_ = drive(n=3)
+            estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS)
+            estimator.step(frames[0])
+            with pytest.raises(InputError, match=message):
+                estimator.step(frames[1], motion, covariance)
+            estimator.step(frames[1], odometry.a_T_b[0])  # and leaves the estimator as it was
+            assert len(estimator.window().world_T_ego) == 2
+
+
+# Uncertain identity and motion of objects beside a vehicle whose path is estimated
+
+MIXTURES_POOR = JointSettings(OdometryNoise(scale=0.02, bias=0.005))
+
+
+def epoch(z: list[list[float]], names: list[int], labels: tuple[str, ...]) -> RecordedEpoch:
+    """Detections at `z` of the objects `names`, in order."""
+    node_type = NodeType("car", ConstantVelocity())
+    objects = RecordedObjects(np.arange(len(labels)), (node_type,) * len(labels), labels)
+    places = np.column_stack([z, np.zeros(len(z))])
+    R, ones = np.tile(0.01 * np.eye(2), (len(z), 1, 1)), np.ones(len(z))
+    seen = RecordedDetections(np.array(names), places, R, ones, np.arange(len(z)))
+    return RecordedEpoch(0, 0.0, np.eye(4), objects, seen, None)
+
+
+def test_a_detection_is_of_the_object_that_it_fits():
+    pose = yaw_transform(5.0, 2.0, 0.0, 0.3)
+    places = np.array([[10.0, 0.0], [10.0, 0.5], [10.0, 5.0]]) @ pose[:2, :2].T + pose[:2, 3]
+    seen = [[10.0, 0.0], [10.0, 0.25], [10.0, 5.0]]
+    p = with_identities(epoch(seen, [0, 1, 2], ("car",) * 3), pose, places, 5000.0).seen.probability
+    assert p[0] > 0.75
+    assert 0.45 < p[1] < 0.55  # between two
+    assert p[2] > 0.999
+    others = with_identities(epoch(seen, [0, 1, 2], ("car", "pedestrian", "car")), pose, places, 5000.0)
+    assert (others.seen.probability > 0.99).all()  # rivals are of one class
+    wrong = with_identities(epoch([[10.0, 5.0]], [0], ("car",) * 3), pose, places, np.inf).seen.probability
+    assert wrong[0] == 0.01  # but it is not without information
+    clutter = with_identities(epoch([[13.0, 0.0]], [0], ("car",)), pose, places[:1], 5000.0).seen.probability
+    assert clutter[0] == 0.01
+
+
+def test_a_wrong_association_does_not_bend_the_path():
+    """Two parked cars in one line are taken for each other for a second, as if both had jumped."""
+    frames, odometry, poses, _ = drive(n=40, parked=6, moving=0)
+
+    class Confused(Tracker):
+        """Exchanges the two first objects for five frames."""
+
+        @property
+        def assignment(self):  # type: ignore[no-untyped-def]
+            found = super().assignment
+            ids = found.id.copy()
+            if 10 <= self._count < 15:
+                a, b = (np.flatnonzero(found.id == name) for name in np.unique(found.id)[:2])
+                ids[a], ids[b] = found.id[b], found.id[a]
+            return replace(found, id=ids)
+
+        def step(self, frame: Frame):  # type: ignore[no-untyped-def]
+            self._count = getattr(self, "_count", -1) + 1
+            return super().step(frame)
+
+    def confused() -> Tracker:
+        noise = {"default": NoiseModel(position=NOISE)}
+        settings = TrackerSettings(
+            {"default": ClassSettings()}, edges=(), association=AssociationSettings(clutter_area=5000.0)
+        )
+        return Confused(settings, {"default": Sensor(noise=noise)})
+
+    right, wrong = (estimate_jointly(frames, odometry, new, MIXTURES_POOR, poses[0]) for new in (new_tracker, confused))
+    off = [off_path(one.world_T_ego, poses).max() for one in (right, wrong)]
+    assert off[1] < off[0] + 0.1
+    seen = [now.seen.probability for now in wrong._record]
+    assert all((p[:2] < 0.1).all() for p in seen[10:15])
+    online = OnlineEstimator(confused(), 3.0, MIXTURES_POOR, start=poses[0])
+    for k, frame in enumerate(frames):
+        step = online.step(frame, odometry.a_T_b[k - 1] if k else None)
+    assert np.linalg.norm((step.newest.world_T_ego[-1] - poses[-1])[:2, 3]) < off[0] + 0.3
+
+
+def test_objects_say_how_probably_they_are_stationary():
+    frames, odometry, poses, cars = drive(parked=6, moving=2)
+    estimate = estimate_jointly(frames, odometry, new_tracker, MIXTURES_POOR, poses[0])
+    middle = estimate.objects[len(poses) // 2]
+    nearest = np.linalg.norm(middle.position[:, None] - cars[len(poses) // 2][None], axis=2).argmin(axis=1)
+    np.testing.assert_array_equal(middle.stationary > 0.5, nearest < 6)
+    online = OnlineEstimator(new_tracker(), 3.0, MIXTURES_POOR, start=poses[0])
+    for k, frame in enumerate(frames):
+        last = online.step(frame, odometry.a_T_b[k - 1] if k else None).newest.objects[-1]
+    assert (last.stationary > 0.5).sum() >= 3
+    assert (last.stationary[np.hypot(*last.velocity.T) > 3] < 0.1).all()
+
+
+def convoy(common: float, n: int = 40) -> tuple[list[Frame], OdometryIncrements, np.ndarray]:
+    """Frames of a vehicle at constant speed and of eight cars ahead that all brake with `common`, m/s^2."""
+    t, rng = 0.2 * np.arange(n), np.random.default_rng(0)
+    poses = np.stack([yaw_transform(15.0 * s) for s in t])
+    frames = []
+    for time, pose in zip(t, poses, strict=True):
+        x = np.linspace(15, 60, 8) + 15 * time - common * time**2 / 2
+        places = np.column_stack([x, np.tile([-3.5, 0.0, 3.5, 7.0], 2), np.ones(8)])
+        places[:, :2] += NOISE * rng.normal(size=(8, 2))
+        boxes = Boxes.of(["car"] * 8, places, np.tile([4.0, 2, 1.5], (8, 1)), np.zeros(8))
+        frames.append(frame_at(time, pose, boxes))
+    return frames, OdometryIncrements.of(t, poses), poses
+
+
+def test_traffic_that_brakes_as_one_does_not_bend_the_path():
+    frames, odometry, poses = convoy(common=1.5)
+    record = record_epochs(frames, poses, odometry, new_tracker())
+    assert [len(new_streams(now)) for now in record[3:6]] == [1, 1, 1]
+    assert len(motion_factors(record[5])) == 8 + 1
+    estimate = estimate_jointly(frames, odometry, new_tracker, MIXTURES_POOR, poses[0])
+    assert off_path(estimate.world_T_ego, poses).max() < 0.5
+
+
+def test_nonlinear_motion_is_refused():
+    frames, odometry, poses, _ = drive(n=4, parked=1, moving=1)
+
+    def turning() -> Tracker:
+        return Tracker(TrackerSettings({"default": ClassSettings(motion=CoordinatedTurn())}, edges=()))
+
+    with pytest.raises(InputError, match="expected linear motion"):
+        estimate_jointly(frames, odometry, turning, MIXTURES_POOR, poses[0])

@@ -1,16 +1,24 @@
-"""Landmarks: every type behind the protocol, their filter, and association."""
+"""Landmarks: laws, providers of one's own, and the page on them."""
 
-from __future__ import annotations
+import re
+import subprocess
+import sys
+from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 
+from factors import Robust
 from saga_fg import InputError
+from saga_fg.estimators import BatchSolver, IncrementalSmoother
+from saga_fg.graph import GraphError, SceneFactorGraph, ask_all
 from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PointLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.mapping import LocalMap, associate
+from saga_fg.slam.mapping import LandmarkObservations, LocalMap, MeasuredMotion, associate, landmark_key, pose_key
 from saga_fg.types.landmark import LandmarkType, Observation
+
+# Landmarks: every type behind the protocol, their filter, and association
 
 KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark(), LineLandmark()]
 POLE = np.diag([0.1, 0.1]) ** 2
@@ -34,7 +42,7 @@ def some_observation(kind: LandmarkType, rng: np.random.Generator) -> FloatArray
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: f"{kind.name} from {kind.pose.dim} dimensions")
-def test_a_landmark_stands_where_its_first_observation_says(kind: LandmarkType) -> None:
+def test_a_landmark_stands_where_its_first_observation_says(kind):
     rng = np.random.default_rng(0)
     k, d = kind.pose.dim, kind.variable.dim
     local = LocalMap(some_pose(kind, rng), 0.01 * np.eye(k))
@@ -64,27 +72,21 @@ def seen(*places: tuple[float, float]) -> list[Observation]:
     return [Observation(PoleLandmark(), np.array([x, y, 0.0]), POLE) for x, y in places]
 
 
-def test_each_landmark_is_matched_once_and_by_the_likeliest() -> None:
+def test_each_landmark_is_matched_once_by_the_likeliest_of_its_type():
     local = poles_at(np.array([[10.0, 2.0], [10.0, -2.0]]), drift=0.1)
     pairs = associate(local, seen((10.05, -1.9), (10.4, -2.3), (10.0, 2.1)))
     assert {row: pair.landmark for row, pair in pairs.items()} == {0: 2, 2: 1}
-
-
-def test_landmarks_of_another_type_are_no_candidates() -> None:
     local = poles_at(np.array([[10.0, 2.0]]), drift=0.1)
     point = Observation(PointLandmark(dim=3), np.array([10.0, 2.0, 0.5]), 0.01 * np.eye(3))
     assert associate(local, [point]) == {}
 
 
-def test_pairs_that_contradict_each_other_are_not_taken_together() -> None:
+def test_contradictions_and_badly_known_poses_match_nothing():
     """Both move by more than a common shift can explain: one to the left, one to the right."""
     local = poles_at(np.array([[10.0, 4.0], [10.0, -4.0]]), drift=0.5)
     assert [len(associate(local, seen(one))) for one in ((10.0, 4.6), (10.0, -4.6))] == [1, 1]
     assert len(associate(local, seen((10.0, 4.6), (10.0, -4.6)))) == 1
     assert len(associate(local, seen((10.0, 4.4), (10.0, -3.6)))) == 2
-
-
-def test_where_the_pose_is_badly_known_a_lone_landmark_is_not_matched() -> None:
     places = np.array([[10.0, 2.0]])
     assert len(associate(poles_at(places, 0.3), seen((10.3, 2.0)))) == 1
     assert len(associate(poles_at(places, 8.0), seen((10.3, 2.0)))) == 0
@@ -94,7 +96,7 @@ def ahead(metres: float, turn: float = 0.0) -> FloatArray:
     return np.asarray(gtsam.Pose2(metres, 0.0, turn).matrix())
 
 
-def test_a_filter_of_some_landmarks_is_that_of_all_marginalised() -> None:
+def test_a_filter_of_some_landmarks_is_that_of_all_marginalised():
     rng = np.random.default_rng(0)
     places = rng.uniform(-20, 20, (6, 2))
     everything = LocalMap(np.eye(3), np.diag([1e-2, 1e-2, 1e-4]))
@@ -115,7 +117,7 @@ def test_a_filter_of_some_landmarks_is_that_of_all_marginalised() -> None:
     np.testing.assert_allclose(local.pose.matrix(), everything.pose.matrix(), atol=1e-12)
 
 
-def test_what_cannot_be_is_refused(subtests: pytest.Subtests) -> None:
+def test_what_cannot_be_is_refused(subtests):
     for make, message in [
         (lambda: Observation(PoleLandmark(), [1, 2, np.nan], np.eye(2)), "observed pole"),
         (lambda: Observation(PoleLandmark(), [1, 2, 3], np.eye(3)), "covariance of a pole"),
@@ -126,3 +128,89 @@ def test_what_cannot_be_is_refused(subtests: pytest.Subtests) -> None:
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             make()  # type: ignore[operator]
+
+
+# Poses by measured motions and what is seen from them, as providers of a running graph, in both back ends
+
+OWN_Q = np.diag([0.01, 0.01, 0.02, 0.1, 0.05, 0.05]) ** 2
+OWN_POLE, OWN_R = PoleLandmark(), 0.1**2 * np.eye(2)
+POLES = np.array([[4.0, 5.0, 1.0], [9.0, -4.0, 1.0], [15.0, 6.0, 1.0]])
+STEP = gtsam.Pose3(gtsam.Rot3.Yaw(0.1), np.array([2.0, 0.0, 0.0]))
+
+
+def drive() -> tuple[list[MeasuredMotion], LandmarkObservations]:
+    """Seven poses, from the last four of which all poles are seen, with wrong values to begin with."""
+    rng, true = np.random.default_rng(0), gtsam.Pose3()
+    motions, seen = [MeasuredMotion(np.eye(4), 1e-6 * np.eye(6))], dict[int, list[tuple[int, Observation]]]()
+    for k in range(1, 7):
+        motions.append(MeasuredMotion(STEP.retract(rng.normal(0, np.sqrt(np.diag(OWN_Q)))).matrix(), OWN_Q))
+        true = true.compose(STEP)
+        if k > 2:
+            z = [true.transformTo(place) + np.append(rng.normal(0, 0.1, 2), 0.0) for place in POLES]
+            seen[k] = [(n, Observation(OWN_POLE, one, OWN_R)) for n, one in enumerate(z)]
+    return motions, LandmarkObservations(seen, {n: place[:2] + 0.5 for n, place in enumerate(POLES)})
+
+
+def test_epochs_at_once_one_by_one_and_as_a_whole_are_the_same():
+    together, single, whole = IncrementalSmoother(lag=None), IncrementalSmoother(lag=None), BatchSolver()
+    motions, observations = drive()
+    together.steps([(float(k), [motion, observations]) for k, motion in enumerate(motions)])
+    for k, motion in enumerate(motions):
+        whole.step(float(k), [motion, observations])
+        now = {k: observations.seen[k]} if k in observations.seen else {}
+        single.step(float(k), [motion, LandmarkObservations(now, observations.start)])
+    keys = [pose_key(6), *map(landmark_key, range(3))]
+    exact = whole.joint_covariance(keys)
+    for smoother in (together, single):
+        assert smoother.state(pose_key(6)).equals(whole.state(pose_key(6)), 1e-6)  # type: ignore[attr-defined]
+        P = smoother.joint_covariance(keys)
+        np.testing.assert_allclose(P, exact, atol=1e-6)
+        np.testing.assert_allclose(smoother.joint_covariance(keys, rough=True), P, rtol=1e-5, atol=1e-9)
+    for mark, place in zip(observations.landmarks(whole.solve(), 5), POLES, strict=True):
+        off = mark.state - place[:2]
+        assert off @ np.linalg.solve(mark.covariance, off) < 14
+        assert not mark.confirmed
+
+
+def test_a_loss_lets_an_outlier_go():
+    motions, observations = drive()
+    seen = {
+        **observations.seen,
+        5: [*observations.seen[5], (0, Observation(OWN_POLE, np.array([30.0, 30.0, 0.0]), OWN_R))],
+    }
+    places = []
+    for robust in (None, Robust("geman-mcclure", 3.0)):
+        graph = SceneFactorGraph()
+        for k, motion in enumerate(motions):
+            graph.advance(float(k))
+            ask_all([motion, LandmarkObservations(seen, observations.start, robust)], graph)
+        places.append(BatchSolver(graph=graph).state(landmark_key(0)))
+    plain, kept = (float(np.linalg.norm(place - POLES[0, :2])) for place in places)  # type: ignore[operator]
+    assert kept < 0.6 * plain
+
+
+def test_no_covariance_is_known_of_a_recording_that_is_solved_as_a_whole():
+    class Asks:
+        name = "asks"
+
+        def factors(self, view):  # type: ignore[no-untyped-def]
+            view.covariance(pose_key(0))
+
+    graph = SceneFactorGraph()
+    graph.advance(0.0)
+    with pytest.raises(GraphError, match="no marginal is known"):
+        ask_all([MeasuredMotion(np.eye(4), np.eye(6)), Asks()], graph)
+
+
+# The page "How to add a landmark" runs as printed, top to bottom
+
+PAGE = Path(__file__).parents[3] / "docs" / "guides" / "add-a-landmark.md"
+
+
+def test_page_runs():
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 5
+    done = subprocess.run([sys.executable, "-c", "\n".join(blocks)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    assert done.stdout.count("traffic sign {") == 5
+    assert "traffic sign observed as [10.0, 4.0, 2.0], which its type cannot read" in done.stdout

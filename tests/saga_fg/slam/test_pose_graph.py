@@ -1,6 +1,4 @@
-"""Pose graphs: the optimum does not depend on the guess, and its covariances are honest."""
-
-from __future__ import annotations
+"""Pose graphs, running ones, and certificates of their optima."""
 
 from dataclasses import replace
 from itertools import product
@@ -11,19 +9,41 @@ import pytest
 
 from factors import Robust, pose
 from saga_fg import InputError
-from saga_fg.slam.pose_graph import chordal_poses, factor_graph, nearest_rotations, optimise_poses, pose_values
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.slam.pose_graph import (
+    ChordalCost,
+    LandmarkObservations,
+    PointLandmarks,
+    PoseGraph,
+    PosePriors,
+    chordal_minimum,
+    chordal_poses,
+    factor_graph,
+    nearest_rotations,
+    optimise_poses,
+    pose_values,
+)
+from saga_fg.slam.pose_graph.certificate import descend, lowest_eigenvalue, nearest_frames, rounded_rotations
+from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
 from tests.saga_fg.loops import loop, moved
 
+# Pose graphs: the optimum does not depend on the guess, and its covariances are honest
 
-def test_the_chordal_start_is_exact_without_noise(subtests: pytest.Subtests) -> None:
+
+def test_the_chordal_start_is_of_rotations_and_exact_without_noise(subtests):
     for dim, seed in product([2, 3], range(3)):
         with subtests.test(dim=dim, seed=seed):
             graph, true = loop(dim, seed)
             exact = replace(graph, first_T_second=np.linalg.inv(true[graph.first]) @ true[graph.second])
             np.testing.assert_allclose(chordal_poses(exact), true, atol=1e-9)
+    matrices = np.random.default_rng(0).normal(size=(20, 3, 3))
+    R = nearest_rotations(matrices)
+    np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0)
+    np.testing.assert_allclose(nearest_rotations(3.0 * R), R, atol=1e-12)
 
 
-def test_a_worthless_guess_leads_to_the_optimum_near_the_truth(subtests: pytest.Subtests) -> None:
+def test_a_worthless_guess_leads_to_the_optimum_near_the_truth(subtests):
     for dim, seed in product([2, 3], range(3)):
         with subtests.test(dim=dim, seed=seed):
             graph, true = loop(dim, seed)
@@ -37,7 +57,7 @@ def test_a_worthless_guess_leads_to_the_optimum_near_the_truth(subtests: pytest.
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_covariances_cover_the_errors(dim: int) -> None:
+def test_covariances_cover_the_errors(dim):
     normalised = []
     for seed in range(8):
         graph, true = loop(dim, seed, noise=0.01)
@@ -49,7 +69,7 @@ def test_covariances_cover_the_errors(dim: int) -> None:
     assert 0.6 < np.mean(normalised) < 1.6  # 1 on average; poses of one graph err together
 
 
-def test_a_robust_loss_takes_the_harm_out_of_false_loop_closures() -> None:
+def test_a_robust_loss_takes_the_harm_out_of_false_loop_closures():
     graph, true = loop(2, seed=1)
     false = graph.first_T_second.copy()
     closures = np.flatnonzero(np.abs(graph.second - graph.first) > 1)[::6]
@@ -63,15 +83,7 @@ def test_a_robust_loss_takes_the_harm_out_of_false_loop_closures() -> None:
     assert errors[1] < 0.2 * errors[0]
 
 
-def test_nearest_rotations_are_rotations() -> None:
-    matrices = np.random.default_rng(0).normal(size=(20, 3, 3))
-    R = nearest_rotations(matrices)
-    np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(R), 1.0)
-    np.testing.assert_allclose(nearest_rotations(3.0 * R), R, atol=1e-12)
-
-
-def test_parts_without_connection_are_named() -> None:
+def test_parts_without_connection_are_named():
     graph, _ = loop(2, seed=0)
     keep = (graph.first != 20) & (graph.second != 20)
     apart = replace(
@@ -86,7 +98,7 @@ def test_parts_without_connection_are_named() -> None:
         optimise_poses(apart)
 
 
-def test_what_does_not_fit_together_is_refused(subtests: pytest.Subtests) -> None:
+def test_what_does_not_fit_together_is_refused(subtests):
     for change, message in [
         ({"ids": np.zeros(36, dtype=int)}, "unique ids"),
         ({"first": np.full(59, 99)}, "first: expected rows"),
@@ -98,3 +110,256 @@ def test_what_does_not_fit_together_is_refused(subtests: pytest.Subtests) -> Non
             graph, _ = loop(2, seed=0)
             with pytest.raises(InputError, match=message):
                 replace(graph, **change)
+
+
+# A pose graph that grows: its estimate, and the ways along its measurements
+
+
+def squares(rounds: int) -> RunningPoseGraph:
+    """A drive round a square, 1 m a step, by exact odometry."""
+    graph = RunningPoseGraph(np.eye(3))
+    for _ in range(4 * rounds):
+        graph.append(moved(2, np.array([[np.pi / 4, np.pi / 4, np.pi / 2]]))[0], 1e-4 * np.eye(3))
+    return graph
+
+
+def test_the_shortest_way_takes_the_least_of_parallel_measurements():
+    graph = RunningPoseGraph(np.eye(3))
+    for _ in range(4):
+        graph.append(moved(2, np.array([[1.0, 0, 0]]))[0], 1e-4 * np.eye(3))
+    assert graph.distances(0) == pytest.approx([0, 1, 2, 3, 4])
+    step = moved(2, np.array([[1.0, 0, 0]]))[0]
+    shorter = moved(2, np.array([[0.5, 0, 0]]))[0]
+    graph.close([Measured(1, 2, step, np.eye(3)), Measured(3, 2, np.linalg.inv(shorter), np.eye(3))])
+    assert graph.distances(0) == pytest.approx([0, 1, 2, 2.5, 3.5])
+    assert graph.distances(4) == pytest.approx([3.5, 2.5, 1.5, 1, 0])
+
+
+def test_loops_are_closed_and_a_false_one_is_left_out_at_the_end():
+    graph = squares(3)
+    graph.close([Measured(row, row + 4, np.eye(3), 1e-4 * np.eye(3)) for row in range(8)])
+    np.testing.assert_allclose(graph.poses[4], np.eye(3), atol=1e-6)
+    graph.close([Measured(0, 10, moved(2, np.array([[8.0, 0, 0]]))[0], 1e-4 * np.eye(3))])
+    agreed = graph.settled()
+    assert agreed.kept.tolist() == [True] * 20 + [False]
+    np.testing.assert_allclose(agreed.graph.world_T_pose[8], np.eye(3), atol=1e-6)
+
+
+def test_a_pose_alone_is_settled():
+    graph = RunningPoseGraph(np.eye(3))
+    assert graph.distances(0).tolist() == [0]
+    assert len(graph.settled().graph) == 1
+
+
+# The proof of the global minimum of the chordal cost, and the way to it from a bad local one
+
+
+def ring(dim: int, poses: int = 20, seed: int = 0) -> PoseGraph:
+    """One round of equal turns, each pose measured from the one before, the first from the last."""
+    k = 3 * (dim - 1)
+    turn = slice(2, 3) if dim == 2 else slice(0, 3)
+    step, variance = np.zeros(k), np.full(k, 1e-2)
+    step[0 if dim == 2 else 3], step[2] = 1.0, 2 * np.pi / poses
+    variance[turn] = 1e-4
+    measured = moved(dim, step + 0.01 * np.random.default_rng(seed).normal(size=(poses, k)))
+    first = np.arange(poses)
+    information = np.tile(np.diag(1 / variance), (poses, 1, 1))
+    return PoseGraph.of_measurements(np.arange(poses), first, (first + 1) % poses, measured, information)
+
+
+def twice_round(dim: int, poses: int = 20) -> FloatArray:
+    """Poses whose headings go round twice on the way."""
+    T, angle = np.tile(np.eye(dim + 1), (poses, 1, 1)), 4 * np.pi * np.arange(poses) / poses
+    T[:, 0, 0] = T[:, 1, 1] = np.cos(angle)
+    T[:, 1, 0], T[:, 0, 1] = np.sin(angle), -np.sin(angle)
+    return T
+
+
+def test_a_staircase_that_ends_early_has_a_bound_and_no_proof(monkeypatch):
+    graph, start = ring(2, poses=60), twice_round(2, poses=60)
+    whole = chordal_minimum(graph, start)
+    monkeypatch.setattr("saga_fg.slam.pose_graph.certificate._MOST_WORK", 1)
+    early = chordal_minimum(graph, start)
+    assert whole.certified
+    assert not early.certified
+    assert early.bound <= whole.cost < early.cost
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_cost_is_the_sum_over_measurements(dim):
+    graph, true = loop(dim, seed=2)
+    T, covariance = graph.first_T_second, np.linalg.inv(graph.information)
+    kappa = (1.0 if dim == 2 else 1.5) / np.trace(covariance[:, graph.rotation, graph.rotation], axis1=1, axis2=2)
+    tau = dim / np.trace(covariance[:, graph.translation, graph.translation], axis1=1, axis2=2)
+    R, t = true[:, :dim, :dim], true[:, :dim, dim]
+    turned = R[graph.second] - R[graph.first] @ T[:, :dim, :dim]
+    shifted = t[graph.second] - t[graph.first] - (R[graph.first] @ T[:, :dim, dim:])[:, :, 0]
+    expected = (kappa * (turned**2).sum(axis=(1, 2)) + tau * (shifted**2).sum(axis=1)).sum()
+    assert ChordalCost.of(graph).at(true) == pytest.approx(expected, rel=1e-9)
+
+
+def seen_from_outside(dim: int, noise: float, seed: int = 0) -> tuple[PoseGraph, FloatArray, FloatArray]:
+    """A loop with priors on two poses and four points, each seen from every third pose; the true poses and points."""
+    graph, true = loop(dim, seed=seed)
+    true, k, rng = np.linalg.inv(true[3]) @ true, 3 * (dim - 1), np.random.default_rng(seed)
+    points = true[[0, 5, 10, 15], :dim, dim] + rng.normal(size=(4, dim))
+    pose, landmark = (each.ravel() for each in np.meshgrid(np.arange(0, len(graph), 3), np.arange(4)))
+    R, t = true[pose, :dim, :dim], true[pose, :dim, dim]
+    z = (R.swapaxes(1, 2) @ (points[landmark] - t)[:, :, None])[:, :, 0] + noise * rng.normal(size=(len(pose), dim))
+    information = np.tile(np.diag(np.arange(1.0, dim + 1)), (len(pose), 1, 1))
+    seen = LandmarkObservations("point", pose, landmark, z, information)
+    priors = PosePriors(np.array([3, 9]), true[[3, 9]], np.tile(100 * np.eye(k), (2, 1, 1)))
+    landmarks = PointLandmarks(1000 + np.arange(4), (seen,), np.full((4, dim), np.nan))
+    return replace(graph, priors=priors).with_landmarks(landmarks), true, points
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_points_and_priors_are_part_of_the_cost(dim):
+    graph, true, points = seen_from_outside(dim, noise=0.2)
+    (seen,) = graph.landmarks.observations  # type: ignore[union-attr]
+    T = true[seen.pose]
+    off = points[seen.landmark] - T[:, :dim, dim] - (T[:, :dim, :dim] @ seen.z[:, :, None])[:, :, 0]
+    tau = dim / np.trace(np.linalg.inv(seen.information), axis1=1, axis2=2)
+    frame = np.concatenate([true, np.eye(dim + 1)[None]])  # at which the priors agree
+    expected = ChordalCost.of(replace(graph, landmarks=None, priors=None)).at(true) + (tau * (off**2).sum(axis=1)).sum()
+    assert ChordalCost.of(graph).at(frame, points) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_graph_with_points_and_priors_is_certified_in_the_frame_of_the_priors(dim):
+    graph, true, _ = seen_from_outside(dim, noise=0.05)
+    away = np.eye(dim + 1)
+    away[:dim, dim] = 50.0
+    optimised = optimise_poses(graph.at(away @ graph.world_T_pose), certify=True)
+    assert optimised.chordal is not None
+    assert optimised.chordal.certified
+    assert optimised.errors["chordal minimum"] == pytest.approx(optimised.error, rel=1e-6)
+    for poses in (optimised.chordal.world_T_pose, chordal_poses(graph)):
+        assert np.abs((poses - true)[:, :dim, dim]).max() < 0.5
+    assert optimised.landmarks is not None
+
+
+def test_landmarks_seen_by_bearings_are_refused_by_name():
+    graph, _, _ = seen_from_outside(2, noise=0.0)
+    (seen,) = graph.landmarks.observations  # type: ignore[union-attr]
+    bearing = np.arctan2(seen.z[:, 1], seen.z[:, 0])[:, None]
+    seen = LandmarkObservations("bearing", seen.pose, seen.landmark, bearing, np.ones((len(bearing), 1, 1)))
+    other = graph.with_landmarks(replace(graph.landmarks, observations=(seen,)))  # type: ignore[type-var]
+    with pytest.raises(InputError, match=r"landmark 1000: expected a point.* the chordal cost knows no bearing"):
+        optimise_poses(other, certify=True)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_positions_are_eliminated_at_their_best(dim):
+    graph, true = loop(dim, seed=0)
+    cost, rng = ChordalCost.of(graph), np.random.default_rng(1)
+    Y = true[:, :dim, :dim].swapaxes(1, 2).reshape(-1, dim)
+    poses = true.copy()
+    poses[:, :dim, dim] = cost.best_positions(Y)
+    least = float((Y * cost.times(Y)).sum())
+    assert least == pytest.approx(cost.at(poses), rel=1e-9)
+    for _ in range(5):
+        other = poses.copy()
+        other[1:, :dim, dim] += 0.1 * rng.normal(size=(len(graph) - 1, dim))
+        assert cost.at(other) > least
+
+
+def test_the_minimum_is_proven_and_no_other_poses_are_below_the_bound(subtests):
+    for dim, seed in product([2, 3], range(3)):
+        with subtests.test(dim=dim, seed=seed):
+            graph, true = loop(dim, seed)
+            minimum = chordal_minimum(graph, chordal_poses(graph))
+            cost = ChordalCost.of(graph)
+            assert minimum.certified
+            assert minimum.bound <= minimum.cost <= cost.at(true)
+            assert minimum.cost == pytest.approx(cost.at(minimum.world_T_pose), rel=1e-9)
+            np.testing.assert_allclose(minimum.world_T_pose[0], graph.world_T_pose[0], atol=1e-9)
+            rng, k = np.random.default_rng(seed), 3 * (dim - 1)
+            for scale in (0.01, 0.1, 1.0):
+                assert cost.at(true @ moved(dim, scale * rng.normal(size=(len(true), k)))) > minimum.bound
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_bad_local_minimum_is_told_and_left(dim):
+    graph, start = ring(dim), twice_round(dim)
+    cost = ChordalCost.of(graph)
+    stuck = descend(cost, start[:, :dim, :dim].swapaxes(1, 2))
+    lowest = lowest_eigenvalue(cost, stuck.Y)
+    assert stuck.cost + dim * len(graph) * lowest.value < 0.5 * stuck.cost
+    assert lowest.direction is not None
+    minimum, known = chordal_minimum(graph, start), chordal_minimum(graph, chordal_poses(graph))
+    assert stuck.cost > 1000 * known.cost
+    assert minimum.cost == pytest.approx(known.cost, rel=1e-6)
+    assert minimum.certified
+    assert known.certified
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_lowest_eigenvalue_is_that_of_the_dense_matrix(dim):
+    graph = ring(dim)
+    cost, n = ChordalCost.of(graph), len(graph)
+    for start in (twice_round(dim), chordal_poses(graph)):
+        Y = descend(cost, start[:, :dim, :dim].swapaxes(1, 2)).Y
+        Q = cost.times(np.eye(n * dim))
+        product = (Q @ Y.reshape(-1, dim)).reshape(Y.shape) @ Y.swapaxes(1, 2)
+        S = Q.copy()
+        for i in range(n):
+            block = slice(i * dim, (i + 1) * dim)
+            S[block, block] -= (product[i] + product[i].T) / 2
+        dense = np.linalg.eigvalsh((S + S.T) / 2)[0]
+        assert lowest_eigenvalue(cost, Y).value == pytest.approx(min(dense, 0.0), rel=1e-2, abs=1e-6)
+
+
+def test_frames_of_more_dimensions_are_rounded_to_rotations():
+    rng = np.random.default_rng(0)
+    R = nearest_frames(rng.normal(size=(8, 3, 3)))
+    R = R * np.linalg.det(R)[:, None, None]
+    lift = nearest_frames(rng.normal(size=(1, 3, 5)))[0]
+    rounded = rounded_rotations(R @ lift)
+    np.testing.assert_allclose(np.linalg.det(rounded), 1.0)
+    np.testing.assert_allclose(rounded[1:] @ rounded[0].T, R[1:] @ R[0].T, atol=1e-9)
+
+
+def test_a_graph_in_pieces_cannot_be_certified():
+    graph = ring(2)
+    apart = PoseGraph(
+        graph.ids,
+        graph.world_T_pose,
+        graph.first[:10],
+        graph.second[:10],
+        graph.first_T_second[:10],
+        graph.information[:10],
+    )
+    with pytest.raises(InputError, match="expected measurements that connect it"):
+        optimise_poses(apart, certify=True)
+
+
+def test_other_starts_are_tried_beside_proven_poses_only_where_they_are_better():
+    graph, _ = loop(2, seed=1)
+    far = optimise_poses(graph.at(twice_round(2, poses=len(graph))), certify=True)
+    assert far.chordal is not None
+    assert far.chordal.certified
+    assert set(far.errors) == {"chordal minimum"}
+    assert optimise_poses(graph).chordal is None
+    there = optimise_poses(graph.at(far.world_T_pose), certify=True)
+    assert there.error <= far.error * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_measurements_that_all_agree_cost_nothing(dim):
+    graph, true = loop(dim, seed=0)
+    exact = replace(graph, first_T_second=np.linalg.inv(true[graph.first]) @ true[graph.second])
+    minimum = chordal_minimum(exact, chordal_poses(exact))
+    assert (minimum.cost, minimum.bound, minimum.gap) == (0.0, 0.0, 0.0)
+    assert minimum.certified
+
+
+def test_the_whole_way_is_bounded():
+    graph, start = ring(2, poses=60), twice_round(2, poses=60)
+    cost = ChordalCost.of(graph)
+    Y = start[:, :2, :2].swapaxes(1, 2)
+    for most in (1, 5, 20):
+        short = descend(cost, Y, most)
+        assert short.products <= most + 1
+        bound = short.cost + 2 * len(graph) * lowest_eigenvalue(cost, short.Y).value  # holds where the way ended, too
+        assert bound <= chordal_minimum(graph, chordal_poses(graph)).cost * (1 + 1e-9)

@@ -1,7 +1,5 @@
 """Incremental SLAM in submaps: against the whole graph solved at once, far from the start, with loops and providers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -88,7 +86,7 @@ def sigmas(estimate: np.ndarray, other: np.ndarray, covariances: np.ndarray) -> 
     return np.array([np.sqrt(x @ np.linalg.solve(P, x)) for x, P in zip(off, covariances, strict=True)])
 
 
-def test_the_end_is_the_minimum_of_all_measurements() -> None:
+def test_the_end_is_the_minimum_of_all_measurements():
     drive = Drive(square(150))
     graph = started(drive, SubmapSettings(length=15.0))
     assert len(drive.into(graph, range(150))) == 4
@@ -101,7 +99,7 @@ def test_the_end_is_the_minimum_of_all_measurements() -> None:
     assert np.sqrt(np.mean(truth[1:] ** 2) / 6) < 1.5
 
 
-def test_while_running_submaps_say_nearly_what_their_measurements_do() -> None:
+def test_while_running_submaps_say_nearly_what_their_measurements_do():
     drive = Drive(square(150))
     settings = SubmapSettings(length=15.0, confirm_after=1, robust_scale=100.0, relinearise_above=1e-3)
     graph = started(drive, settings)
@@ -113,7 +111,7 @@ def test_while_running_submaps_say_nearly_what_their_measurements_do() -> None:
     np.testing.assert_allclose(graph.covariance(), found.covariances[-1], rtol=0.05, atol=3e-6)
 
 
-def test_one_submap_is_the_whole_graph_at_every_moment() -> None:
+def test_one_submap_is_the_whole_graph_at_every_moment():
     drive = Drive(square(40))
     settings = SubmapSettings(length=100.0, confirm_after=1, relinearise_above=1e-4)
     graph = started(drive, settings)
@@ -124,7 +122,7 @@ def test_one_submap_is_the_whole_graph_at_every_moment() -> None:
             assert sigmas(graph.poses(), found.world_T_pose, found.covariances).max() < 1e-3
 
 
-def test_a_graph_stays_small_and_landmarks_keep_their_numbers() -> None:
+def test_a_graph_stays_small_and_landmarks_keep_their_numbers():
     drive = Drive(square(200))
     graph = started(drive, SubmapSettings(length=10.0))
     sizes = []
@@ -142,7 +140,7 @@ def test_a_graph_stays_small_and_landmarks_keep_their_numbers() -> None:
     assert np.median(off) < 0.3
 
 
-def test_far_from_the_start_association_is_the_same() -> None:
+def test_far_from_the_start_association_is_the_same():
     near, far = Drive(square(60)), Drive(yaw_transform(5000.0, -5000.0) @ square(60))
     graphs = [started(near), started(far)]
     for drive, graph in zip((near, far), graphs, strict=True):
@@ -151,7 +149,7 @@ def test_far_from_the_start_association_is_the_same() -> None:
     assert numbers[0] == numbers[1]
 
 
-def test_fronts_in_one_plane_are_walls_of_their_own() -> None:
+def test_fronts_in_one_plane_are_walls_of_their_own():
     def seen(x: float, d: float) -> Observation:
         return Observation(WALL, [0, -1, 0, d], np.diag([3e-3, 3e-3, 0.02]) ** 2, [[x - 3, d, 0], [x + 3, d, 2]])
 
@@ -163,7 +161,7 @@ def test_fronts_in_one_plane_are_walls_of_their_own() -> None:
     assert graph.observations()[-2].landmark == 3
 
 
-def test_a_loop_moves_submaps_as_a_whole() -> None:
+def test_a_loop_moves_submaps_as_a_whole():
     drive = Drive(square(330), 0, POOR, landmarks=False)  # once round, and on
     graph = started(drive, SubmapSettings(length=20.0))
     drive.into(graph, range(330))
@@ -187,7 +185,7 @@ def test_a_loop_moves_submaps_as_a_whole() -> None:
         graph.close_loops([LoopClosure(3, 3, seen, Q)])
 
 
-def test_a_loop_that_is_none_names_its_ends(subtests: pytest.Subtests) -> None:
+def test_a_loop_that_is_none_names_its_ends(subtests):
     for motion, covariance, message in [
         (np.eye(3), Q, r"first_T_second: expected shape \(4, 4\), got \(3, 3\)"),
         (2 * np.eye(4), Q, "first_T_second: expected a rigid 4 x 4 transform"),
@@ -200,7 +198,7 @@ def test_a_loop_that_is_none_names_its_ends(subtests: pytest.Subtests) -> None:
             LoopClosure(2, 5, motion, covariance)
 
 
-def test_fixes_of_gps_hold_through_closed_submaps() -> None:
+def test_fixes_of_gps_hold_through_closed_submaps():
     poses, rng = square(120), np.random.default_rng(1)
     drive = Drive(poses, 0, POOR, landmarks=False)
     frames = [
@@ -235,7 +233,7 @@ class Held:
         return Additions(factors=[pose_prior_factor(pose.key, yaw_transform(20.0, 5.0), 1e-6 * np.eye(6))])
 
 
-def test_a_provider_acts_at_once_and_at_the_end() -> None:
+def test_a_provider_acts_at_once_and_at_the_end():
     drive = Drive(square(80), 0, POOR, landmarks=False)
     graph = started(drive, SubmapSettings(length=15.0), [Held()])
     drive.into(graph, range(80))
@@ -243,7 +241,7 @@ def test_a_provider_acts_at_once_and_at_the_end() -> None:
         assert np.linalg.norm(poses[50, :2, 3] - [20.0, 5.0]) < 0.1
 
 
-def test_a_keyframe_that_is_refused_leaves_the_graph_as_it_was() -> None:
+def test_a_keyframe_that_is_refused_leaves_the_graph_as_it_was():
     drive = Drive(square(6))
     graph = started(drive)
     drive.into(graph, range(3))
@@ -279,7 +277,7 @@ def looping(Q: np.ndarray = POOR, turn: float = 0.0) -> tuple[Drive, SubmapGraph
     return drive, graph, loops
 
 
-def test_a_false_loop_does_not_bend_the_map() -> None:
+def test_a_false_loop_does_not_bend_the_map():
     _, graph, loops = looping()
     assert len(loops) >= 4
     clean = graph.finish()
@@ -291,7 +289,7 @@ def test_a_false_loop_does_not_bend_the_map() -> None:
     np.testing.assert_allclose(spoilt.world_T_pose, clean.world_T_pose, atol=0.02)
 
 
-def test_drift_beyond_the_noise_does_not_cost_loops() -> None:
+def test_drift_beyond_the_noise_does_not_cost_loops():
     drive, graph, _ = looping(Q, turn=1e-3)  # twice its deviation, always in one direction
     found = graph.finish()
     assert found.loops.kept.all()

@@ -7,13 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from saga_fg.smoothing import (
-    StateTable,
-    constant_sizes,
-    quality_of,
-    scalar_readings,
-    smooth_walks,
-)
+from saga_fg.smoothing import StateTable, constant_sizes, quality_of, scalar_readings, smooth_walks
 from saga_fg.smoothing.boxes import weighted_medians
 
 
@@ -85,9 +79,4 @@ def test_objects_do_not_mix_and_rows_may_repeat() -> None:
 
 def test_quality_needs_score_and_precision() -> None:
     P = np.array([0.01, 0.01, 0.25, 4.0])[:, None, None] * np.eye(2)
-    assert quality_of(np.array([0.9, 0.3, 0.9, 0.9]), P).tolist() == [
-        "high",
-        "medium",
-        "medium",
-        "low",
-    ]
+    assert quality_of(np.array([0.9, 0.3, 0.9, 0.9]), P).tolist() == ["high", "medium", "medium", "low"]

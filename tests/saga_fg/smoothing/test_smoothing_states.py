@@ -53,8 +53,7 @@ def test_an_object_alone_is_smoothed_as_by_the_textbook() -> None:
     states = smooth_states(evidence, np.zeros(12, dtype=np.int64), lifespans, ObjectMotion(V[None], CLASSES))
 
     prior = Gaussian(
-        np.concatenate([evidence.boxes.position[0, :2], [0, 0]]),
-        np.diag([UNKNOWN_POSITION**2] * 2 + [25.0] * 2),
+        np.concatenate([evidence.boxes.position[0, :2], [0, 0]]), np.diag([UNKNOWN_POSITION**2] * 2 + [25.0] * 2)
     )
     H, node_type = np.eye(4)[:2], NodeType("object", CLASSES["default"].motion)
     x, filtered, predicted, F = prior, [], [], []

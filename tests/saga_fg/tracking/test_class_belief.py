@@ -96,13 +96,10 @@ def test_a_class_without_a_row_is_reported_rightly_as_often_as_the_others():
     assert chance == pytest.approx({"truck": 0.85, "car": 0.075, "bus": 0.075})
 
 
-def test_without_tables_nothing_is_confused():
+def test_groups_are_chains_of_confusions_and_without_tables_there_are_none():
     confused = ConfusedClasses.of({"lidar": Sensor(), "camera": Sensor(confusion={"car": {"car": 1.0}})}, {})
     assert len(confused) == 0
     assert [n.tolist() for n in confused.numbers(np.array(["car", "bus"]), np.array(["bus"]))] == [[0, 1], [1]]
-
-
-def test_groups_are_chains_of_confusions():
     rows = {"pedestrian": {"pedestrian": 8.0, "bicycle": 2.0}, "bicycle": {"bicycle": 9.0, "motorcycle": 1.0}}
     confused = ConfusedClasses.of({"lidar": Sensor(confusion=rows)}, {})
     (number,) = confused.numbers(np.array(["pedestrian", "car", "motorcycle", "bicycle"]))

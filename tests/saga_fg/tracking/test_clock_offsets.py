@@ -1,7 +1,5 @@
 """Wrong clocks among right ones: they shut out their own sensor only, and are corrected by objects in common."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from itertools import product
@@ -55,23 +53,17 @@ FAULTS = {
 }
 
 
-def test_one_wrong_clock_of_three_leaves_the_others_alone(subtests):
+def test_majorities_and_steadiness_say_which_clock_is_right(subtests):
     for (name, fault), radar, wrong in product(FAULTS.items(), [5.0, 15.0, 20.0], ["radar", "lidar"]):
         with subtests.test(name, radar=radar, wrong=wrong):
             used, verdicts = shares({**RATES, "radar": radar}, wrong, fault)
             assert min(used.values()) >= 0.99
             assert not {"set_ahead", "set_back"} & set(verdicts), "the tracks of the others would be deleted"
-
-
-def test_a_correct_majority_sets_the_clock_back(subtests):
-    """The clock is wrong from its first frame, which may be the first of all."""
+    # The clock is wrong from its first frame, which may be the first of all.
     for offset, wrong in product([1.0, -1.0, 8.0, 3600.0, -3600.0], ["radar", "lidar"]):
         with subtests.test(offset=offset, wrong=wrong):
             used, _ = shares({**RATES, "radar": 15.0}, wrong, lambda t, k, by=offset: t + by, start=0.0)
             assert min(used.values()) == 1.0
-
-
-def test_of_two_the_one_that_kept_its_step_goes_on(subtests):
     for offset, rate in product([1.0, 8.0, -8.0, 3600.0], [5.0, 20.0]):
         with subtests.test(offset=offset, rate=rate):
             used, _ = shares({"lidar": 10.0, "radar": rate}, "radar", lambda t, k, by=offset: t + by)
@@ -191,13 +183,10 @@ def test_of_two_sensors_the_one_heard_first_is_right():
     assert clocks["camera"].corrected == pytest.approx(0.2, abs=0.02)
 
 
-def test_right_clocks_are_left_alone():
+def test_right_clocks_are_left_alone_and_a_single_one_is_not_compared():
     clocks = tracked("", 0.0)[0].sensor_times
     assert [each.corrected for each in clocks.values()] == [0.0] * 3
     assert max(abs(each.offset) for each in clocks.values()) < 0.02
-
-
-def test_a_single_sensor_is_not_compared():
     tracker = tracked("", 0.0, sensors=("lidar",))[0]
     assert tracker.snapshot().shared.seen == ()
     assert list(tracker.sensor_times) == ["lidar"]

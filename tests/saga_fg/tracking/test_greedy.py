@@ -52,14 +52,11 @@ def test_the_strongest_detection_chooses_first():
     assert dict(zip(tracks.boxes.position[:, 0].tolist(), tracks.id.tolist(), strict=True)) == {0.1: 2, 1.0: 1}
 
 
-def test_each_class_has_its_own_reach_and_its_own_tracks():
+def test_each_class_has_a_reach_of_its_own_or_the_default_one():
     tracker = GreedyTracker()
     tracker.step(frame(0.0, [(0, 0), (50, 0)], label=["car", "pedestrian"]))
     tracks = tracker.step(frame(0.1, [(2, 0), (52, 0), (2, 1)], label=["car", "pedestrian", "pedestrian"]))
     assert tracks.id.tolist() == [1, 3, 4]
-
-
-def test_a_class_without_a_reach_of_its_own_has_the_default_one():
     for reach, expected in (({"default": 1.0}, 2), ({"car": 1.0}, 1)):
         tracker = GreedyTracker(GreedySettings(max_distance=reach))
         tracker.step(frame(0.0, [(0, 0)], label="tram"))

@@ -1,15 +1,24 @@
-"""One table of tracks: all columns, those of sub-tables too, are selected, appended and copied together."""
+"""The table of tracks: evidence of sensors, existence, and objects that one detection stands for."""
 
-from __future__ import annotations
-
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from saga_fg import Tracker
+from pipelines.config import load_config
+from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
+from saga_fg.kernels.components import existences
+from saga_fg.model.sensor import FieldOfView, NoiseModel
 from saga_fg.numerics.arrays import Columns
-from saga_fg.tracking.track_table import TrackTable
-from tests.saga_fg.traffic_frames import frame
+from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, unresolved
+from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
+from saga_fg.tracking.track_table import PRIOR_LOGIT, SensorEvidence, TrackTable
+from saga_fg.tracking.tracker_state import LIFETIME
+from tests.saga_fg.traffic_frames import NAN, frame, run
+
+# One table of tracks: all columns, those of sub-tables too, are selected, appended and copied together
 
 
 def table(*x: float) -> TrackTable:
@@ -56,3 +65,360 @@ def test_an_empty_table_takes_tracks():
     empty.sensors = sensors
     for name, column in arrays(empty.append(tracks)).items():
         np.testing.assert_array_equal(column, arrays(tracks)[name])
+
+
+# Several sensors' words about one track: what they add up to, and when they count as a confirmation
+
+NONE = np.empty(0, dtype=np.int64)
+
+
+def logit(p):
+    return np.log(p / (1 - p))
+
+
+def updated(evidence, sensor, now, seen=(), p=(), missed=None, chance=0.8, n=1):
+    missed = np.zeros(n, dtype=bool) if missed is None else np.array(missed)
+    evidence.update(sensor, now, np.array(seen, dtype=np.int64), np.array(p, dtype=float), missed, np.full(n, chance))
+
+
+def initiated(p=0.6, sensor="lidar", now=0.0):
+    return SensorEvidence.empty().initiated(sensor, np.atleast_1d(p), now)
+
+
+def test_log_odds_of_sensors_add_up_over_the_prior():
+    evidence = initiated(0.6)
+    assert evidence.probability(0.0, 0.2) == pytest.approx([0.6])
+    updated(evidence, "lidar", 0.1, [0], [0.3])
+    assert evidence.probability(0.1, 0.2) == pytest.approx([0.3])
+    evidence = initiated(0.6)
+    updated(evidence, "camera", 0.05, [0], [0.7])
+    assert logit(evidence.probability(0.05, 0.2)) == pytest.approx([logit(0.6) + logit(0.7) - PRIOR_LOGIT])
+    evidence = initiated(0.6)
+    updated(evidence, "camera", 0.05, missed=[True], chance=0.8)
+    assert logit(evidence.probability(0.05, 0.2)) == pytest.approx([logit(0.6) + np.log(0.2)])
+
+
+def test_sensors_that_saw_before_or_fall_silent_are_heard_rightly():
+    evidence = initiated(0.6)
+    updated(evidence, "camera", 0.05, [0], [0.7])
+    before = evidence.probability(0.05, 0.2)
+    updated(evidence, "camera", 0.1, missed=[True])
+    assert evidence.probability(0.1, 0.2) == pytest.approx(before)
+    evidence = initiated([0.6, 0.6], now=0.0)
+    updated(evidence, "camera", 1.0, [1], [0.6], n=2)
+    assert evidence.detected_by_others("lidar", 1.0, 0.2).tolist() == [False, True]
+    assert evidence.detected_by_others("camera", 1.0, 0.2).tolist() == [False, False]
+    evidence = initiated([0.6, 0.6])
+    assert evidence.look("camera", np.array([True, False])).tolist() == [True, True]
+    assert evidence.look("camera", np.array([False, False])).tolist() == [True, True]  # of the LiDAR
+    assert evidence.look("lidar", np.array([True, False])).tolist() == [True, False]
+
+
+def test_words_count_for_a_while_only_and_none_without_a_detection():
+    evidence = initiated(0.6)
+    updated(evidence, "camera", 1.0, missed=[True])
+    assert np.isnan(evidence.probability(1.0, 0.2)).all()
+    evidence = initiated(0.9)
+    updated(evidence, "camera", 1.0, [0], [0.5])
+    assert evidence.probability(1.0, 0.2) == pytest.approx([0.5])
+
+
+def test_the_order_in_which_sensors_speak_does_not_matter():
+    a, b = initiated([0.6, 0.4]), initiated([0.6, 0.4])
+    words = [("camera", [0], [0.7], [False, True]), ("radar", [1], [0.8], [True, False])]
+    for evidence, order in ((a, words), (b, words[::-1])):
+        for sensor, seen, p, missed in order:
+            updated(evidence, sensor, 0.1, seen, p, missed, n=2)
+    assert a.probability(0.1, 0.2) == pytest.approx(b.probability(0.1, 0.2))
+
+
+def test_confirmed_by_a_second_sensor_or_by_repetition():
+    evidence = initiated([0.6, 0.6, 0.6])
+    updated(evidence, "lidar", 0.1, [1], [0.6], n=3)
+    updated(evidence, "camera", 0.1, [0], [0.6], n=3)
+    assert evidence.confirmed(3).tolist() == [True, False, False]
+    updated(evidence, "lidar", 0.2, [1], [0.6], n=3)
+    assert evidence.confirmed(3).tolist() == [True, True, False]
+
+
+def test_tracks_that_end_take_their_evidence_with_them():
+    evidence = initiated([0.6, 0.4, 0.2])
+    evidence = evidence.select(np.array([False, True, True]))
+    new = evidence.initiated("camera", np.array([0.9]), 0.0)
+    evidence = evidence.append(new)
+    assert evidence.probability(0.0, 0.2) == pytest.approx([0.4, 0.2, 0.9])
+
+
+def test_the_steadiest_sensor_speaks_for_a_track():
+    evidence = initiated([0.6, 0.6])
+    for k in range(1, 5):
+        updated(evidence, "lidar", k / 10, [0], [0.6], missed=[False, True], n=2)
+        updated(evidence, "camera", k / 10, [1], [0.6], missed=[True, False], n=2)
+    hits, opportunities = evidence.best_hits()
+    assert hits.tolist() == [5, 4]
+    assert opportunities.tolist() == [5, 4]
+
+
+def test_a_car_behind_outlives_an_outage_of_the_lidar_while_the_camera_looks_ahead():
+    ahead = Sensor(field_of_view=FieldOfView(min_azimuth=-0.5, max_azimuth=0.5))
+    classes = {"default": ClassSettings(max_deviation=20.0)}
+    tracker = Tracker(TrackerSettings(classes, max_out_of_view=0.5), {"camera": ahead})
+    pose = {"world_T_ego": np.eye(4)}
+    for k in range(5):
+        tracker.step(frame(k / 10, [(-20.0, 0.0)], **pose))
+    outage = run(tracker, [frame(0.5 + k / 10, [], "camera", **pose) for k in range(20)])
+    assert [len(tracks) for tracks in outage] == [1] * 20
+
+
+# Existence by Bayes' rule, and what it makes of a track's score
+
+SETTINGS = ExistenceSettings()
+
+
+def score(probability, hits, opportunities, coasting=False, existence=0.9, settings=SETTINGS, best=0.0):
+    """Reported scores of tracks with these attributes."""
+    probability = np.atleast_1d(np.asarray(probability, dtype=float))
+    n = len(probability)
+    sensors = SensorEvidence.empty(n, ["lidar"])
+    sensors.hits[:], sensors.opportunities[:] = hits, opportunities
+    best = np.maximum(probability, best)
+    table = replace(
+        TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, sensors=sensors
+    )
+    return reported_score(table, np.arange(n), np.full(n, coasting), settings)
+
+
+def after_miss(r, p_detect, elapsed, settings):
+    none = np.empty(0, dtype=np.int64), np.empty(0)
+    missed, survival = np.ones(len(r), dtype=bool), np.exp(-elapsed / LIFETIME)
+    return existences(r, missed, p_detect, *none, survival, settings.neutral_score)
+
+
+def after_hit(r, probability, settings):
+    missed, every = np.zeros(len(r), dtype=bool), np.arange(len(r))
+    return existences(r, missed, np.zeros(len(r)), every, probability, 1.0, settings.neutral_score)
+
+
+def test_a_miss_and_a_hit_are_those_of_bayes():
+    r = np.array([0.1, 0.5, 0.9])
+    expected = r * 0.1 / (r * 0.1 + (1 - r))
+    assert after_miss(r, np.full(3, 0.9), 0.0, SETTINGS) == pytest.approx(expected)
+    assert after_miss(r, np.zeros(3), 2.0, SETTINGS) == pytest.approx(r * np.exp(-2.0 / LIFETIME)), "nobody looked"
+    r = np.array([0.2, 0.7])
+    assert after_hit(r, np.full(2, SETTINGS.neutral_score), SETTINGS) == pytest.approx(r)
+    assert (after_hit(r, np.full(2, 0.9), SETTINGS) > r).all()
+    assert (after_hit(r, np.full(2, 0.05), SETTINGS) < r).all()
+
+
+def test_scores_are_those_of_the_detections_and_of_steadiness():
+    assert score([0.4, 0.8], 1, 5) == pytest.approx([0.4, 0.8])
+    assert score([0.4, 0.8], 1, 5, coasting=True) == pytest.approx([0.36, 0.72])
+    weighted = ExistenceSettings(prior_opportunities=1.0, hit_ratio_weight=0.5)
+    counts = ((9, 9), (1, 1), (4, 9))
+    steady, new, flickering = (score(0.6, *count, settings=weighted).item() for count in counts)
+    assert steady == pytest.approx(0.6 * np.sqrt(0.9))
+    assert steady > new > flickering
+    assert score(0.05, 5, 5, best=0.9) == pytest.approx(LASTING_SHARE * 0.9)
+    assert score(0.5, 5, 5, best=0.9) == pytest.approx(0.5), "detections that are not weak are believed"
+    assert score(0.05, 5, 5, best=0.9, coasting=True) == pytest.approx(0.9 * LASTING_SHARE * 0.9)
+
+
+@pytest.mark.parametrize("family", ["kitti", "nuscenes"])
+def test_two_short_gaps_do_not_push_an_object_below_a_false_track(family):
+    config = load_config(family)
+    tracker, dt = config.new_tracker("saga"), 0.5 if family == "nuscenes" else 0.1
+    logit = {"kitti": lambda p: (np.log(p / (1 - p)) + 2.4) / 0.4, "nuscenes": lambda p: p}[family]
+    seen = [k for k in range(14) if k not in (4, 5, 9, 10)]
+    scores = {"object": [], "false": []}
+    for k in range(14):
+        places = [(0.0, 0.0)] * (k in seen) + [(40.0, 40.0)] * (k >= 9)
+        p = [0.6] * (k in seen) + [0.52] * (k >= 9)
+        detected = frame(dt * k, places)
+        detections = replace(detected.detections, score=logit(np.array(p)))
+        tracks = tracker.step(replace(detected, detections=detections))
+        near = np.hypot(*tracks.boxes.position[:, :2].T) < 10
+        scores["object"] += tracks.score[near].tolist()
+        scores["false"] += tracks.score[~near].tolist()
+    assert len(scores["object"]) == 14, "it is reported while coasting, too"
+    assert np.mean(scores["object"]) > np.mean(scores["false"])
+    assert min(scores["object"][1:]) > 0.5 * max(scores["object"]), "a gap hardly changes its rank"
+
+
+@pytest.mark.parametrize("family", ["kitti", "nuscenes"])
+@given(data=st.data())
+@settings(max_examples=20, deadline=None)
+def test_a_score_is_monotone_in_all_evidence_of_the_track(family, data):
+    """A higher probability of any detection lowers no score, then or later."""
+    count = 8
+    p = data.draw(st.lists(st.floats(0.1, 0.9), min_size=count, max_size=count), "probabilities")
+    seen = [True, True, *data.draw(st.lists(st.booleans(), min_size=count - 2, max_size=count - 2), "detected")]
+    raised = data.draw(st.sampled_from([k for k in range(count) if seen[k]]), "raised")
+    higher = [*p]
+    higher[raised] += data.draw(st.floats(0.0, 0.95 - p[raised]), "by")
+    low, high = (_scores_of_one_object(family, values, seen) for values in (p, higher))
+    assert low.keys() <= high.keys()
+    assert all(high[k] >= value - 1e-9 for k, value in low.items())
+
+
+def _scores_of_one_object(family, probability, seen):
+    """Score by frame of a stationary object, detected in some frames with these probabilities."""
+    tracker, dt = load_config(family).new_tracker("saga"), 0.5 if family == "nuscenes" else 0.1
+    scores = {}
+    for k, (p, there) in enumerate(zip(probability, seen, strict=True)):
+        value = (np.log(p / (1 - p)) + 2.4) / 0.4 if family == "kitti" else p
+        tracks = tracker.step(frame(dt * k, [(0.0, 0.0)] * there, score=value))
+        assert len(tracks) <= 1
+        if len(tracks):
+            scores[k] = float(tracks.score[0])
+    return scores
+
+
+# Second boxes of one object: tracks over others are tentative until they are known to be objects of their own
+
+SIZES = {"motorcycle": (2.1, 0.8, 1.5), "pedestrian": (0.7, 0.7, 1.8)}
+
+
+def crowd_frame(time, position, score, label="motorcycle", size=None, yaw=0.5 * np.pi):
+    """A frame of objects of one class, each with its score."""
+    n = len(position)
+    centre = np.concatenate([np.asarray(position, dtype=float).reshape(-1, 2), np.ones((n, 1))], axis=1)
+    boxes = Boxes.of(
+        np.full(n, label), centre, np.tile(SIZES[label] if size is None else size, (n, 1)), np.full(n, yaw)
+    )
+    return Frame(time, "lidar", Detections(boxes, np.broadcast_to(np.asarray(score, dtype=float), n)))
+
+
+def unresolved_settings(**values):
+    classes = {"default": ClassSettings(nms_distance=0.3, initiation_score=0.03, max_distance=2.0)}
+    return TrackerSettings(classes, edges=(), **{"tentative_score_factor": 0.1, **values})
+
+
+def doubled(rng, row, time, label, double=0.4, miss=0.1):
+    """A frame of a row of parked objects: some are missed, of some there is a second box 0.5 m beside the first."""
+    seen = row[rng.random(len(row)) > miss]
+    second = seen[rng.random(len(seen)) < double] + [0.5, 0.0]
+    position = np.concatenate([seen, second]) + 0.08 * rng.normal(size=(len(seen) + len(second), 2))
+    score = np.concatenate([rng.uniform(0.5, 0.8, len(seen)), rng.uniform(0.3, 0.6, len(second))])
+    return crowd_frame(time, position, score, label)
+
+
+def counted_tracks(label, spacing, seed):
+    """Mean number of tracks that count, over and above the objects that are detected; of a row of 8 for 15 s."""
+    row, rng = np.stack([spacing * np.arange(8), np.zeros(8)], axis=1), np.random.default_rng(seed)
+    association = AssociationSettings(clutter_area=3000.0)
+    tracker = Tracker(unresolved_settings(association=association, stationary_share=0.5))
+    excess = []
+    for k in range(30):
+        frame = doubled(rng, row, 0.5 * k, label)
+        objects = len(np.unique(np.abs(frame.detections.boxes.position[:, 0, None] - row[:, 0]).argmin(axis=1)))
+        tracks = tracker.step(frame)
+        excess.append(((tracks.score > 0.2) & (tracks.coasting <= 0)).sum() - objects)
+    return np.mean(excess[5:])
+
+
+@pytest.mark.parametrize(("label", "spacing"), [("motorcycle", 1.2), ("pedestrian", 1.3)])
+def test_in_a_crowd_most_second_boxes_make_no_track_that_counts(monkeypatch, label, spacing):
+    excess = np.mean([counted_tracks(label, spacing, seed) for seed in range(5)])
+    monkeypatch.setattr(unresolved, "OVERLAP", 2.0)
+    without = np.mean([counted_tracks(label, spacing, seed) for seed in range(5)])
+    assert excess < 0.8 * without, (excess, without)
+
+
+@pytest.mark.parametrize(("label", "spacing"), [("motorcycle", 0.7), ("pedestrian", 0.6)])
+def test_objects_that_stand_close_together_all_count_after_a_while(label, spacing):
+    row, rng = np.stack([spacing * np.arange(8), np.zeros(8)], axis=1), np.random.default_rng(0)
+    tracker = Tracker(unresolved_settings())
+    for k in range(30):
+        tracks = tracker.step(crowd_frame(0.5 * k, row + 0.05 * rng.normal(size=row.shape), 0.7, label))
+    assert len(tracks) == 8
+    assert (tracks.score > 0.2).sum() >= 7
+
+
+def test_a_second_box_is_tentative_until_seen_twice_beside_the_first():
+    tracks = Tracker(unresolved_settings()).step(crowd_frame(0.0, [(0.5, 0.0), (0.0, 0.0)], [0.5, 0.8]))
+    assert tracks.score.tolist() == [pytest.approx(0.05), pytest.approx(0.8)]
+    tracker = Tracker(unresolved_settings())
+    run(tracker, [crowd_frame(0.1 * k, [(0.0, 0.0)], 0.8) for k in range(5)])
+    both = [tracker.step(crowd_frame(0.5 + 0.1 * k, [(0.0, 0.0), (0.7, 0.0)], 0.6)) for k in range(4)]
+    assert [tracks.score[1] for tracks in both] == [pytest.approx(s) for s in (0.06, 0.06, 0.6, 0.6)]
+    tracker = Tracker(unresolved_settings())
+    run(tracker, [crowd_frame(0.1 * k, [(0.0, 0.0)], 0.8) for k in range(5)])
+    both = [tracker.step(crowd_frame(0.5 + 0.1 * k, [(0.0, 0.0), (0.4, 0.0)], 0.6)) for k in range(6)]
+    assert all(tracks.score[1] == pytest.approx(0.06) for tracks in both)
+
+
+def test_an_object_that_walks_away_from_another_counts_from_there_on():
+    tracker = Tracker(unresolved_settings())
+    scores = []
+    for k in range(8):
+        tracks = tracker.step(crowd_frame(0.1 * k, [(0.0, 0.0), (0.35 + 0.08 * k, 0.0)], [0.8, 0.6], "pedestrian"))
+        scores.append(tracks.score[1])
+    assert scores[0] == pytest.approx(0.06)
+    assert scores[-1] == pytest.approx(0.6)
+
+
+def test_a_second_box_is_matched_to_what_the_others_leave():
+    tracker = Tracker(unresolved_settings())
+    run(tracker, [crowd_frame(0.1 * k, [(0.0, 0.0)], 0.8) for k in range(10)])
+    tracker.step(crowd_frame(1.0, [(0.0, 0.0), (0.5, 0.0)], [0.8, 0.6]))
+    tracks = tracker.step(crowd_frame(1.1, [(0.4, 0.0)], 0.7))  # nearer to the second one
+    assert tracker.assignment.id.tolist() == [1]
+    assert dict(zip(tracks.id.tolist(), tracks.coasting.tolist(), strict=True))[2] == pytest.approx(0.1)
+
+
+def test_a_miss_counts_against_a_track_where_the_surer_one_is_detected():
+    tracker = Tracker(unresolved_settings(existence=ExistenceSettings(delete_below=0.0)))
+    run(tracker, [crowd_frame(0.1 * k, [(0.0, 0.0)], 0.8) for k in range(10)])
+    tracker.step(crowd_frame(1.0, [(0.0, 0.0), (0.7, 0.0)], 0.6))
+    left = []
+    for k, seen in enumerate(([(0.0, 0.0)], [(0.0, 0.0)], [(0.0, 0.0)], [], [(0.0, 0.0), (0.7, 0.0)])):
+        tracker.step(crowd_frame(1.1 + 0.1 * k, seen, 0.6))
+        left.append(tracker._state.table.unresolved.tolist())
+    alone, most = unresolved.ALONE, unresolved.MAX_FRAMES
+    expected = [unresolved.FRAMES + alone, most, most, most, most - 1]
+    assert left == [[0.0, frames] for frames in expected]
+
+
+def test_rough_positions_or_no_tentative_tracks_change_what_a_second_box_is():
+    rough = {"lidar": Sensor(noise={"default": NoiseModel(position=0.7)})}
+    tracks = Tracker(unresolved_settings(), rough).step(crowd_frame(0.0, [(0.0, 0.0), (0.5, 0.0)], [0.8, 0.6]))
+    assert tracks.score.tolist() == [pytest.approx(0.8), pytest.approx(0.6)]
+    tracker = Tracker(unresolved_settings(tentative_score_factor=0.0))
+    history = run(tracker, [crowd_frame(0.1 * k, [(0.0, 0.0), (0.4, 0.0)], [0.8, 0.6]) for k in range(5)])
+    assert [tracks.id.tolist() for tracks in history] == [[1]] * 5
+
+
+@pytest.mark.parametrize("unknown", [{"size": (NAN, NAN, NAN)}, {"yaw": NAN}])
+def test_boxes_of_unknown_extent_are_objects_of_their_own(unknown):
+    tracks = Tracker(unresolved_settings()).step(crowd_frame(0.0, [(0.0, 0.0), (0.5, 0.0)], [0.8, 0.6], **unknown))
+    assert tracks.score.tolist() == [pytest.approx(0.8), pytest.approx(0.6)]
+
+
+def test_other_classes_may_overlap():
+    boxes = crowd_frame(0.0, [(0.0, 0.0), (0.0, 0.4)], [0.8, 0.6]).detections
+    labels = np.array(["motorcycle", "pedestrian"])
+    frame = Frame(
+        0.0,
+        "lidar",
+        Detections(
+            Boxes(labels, *(getattr(boxes.boxes, n) for n in ("position", "size", "yaw", "velocity"))), boxes.score
+        ),
+    )
+    assert Tracker(unresolved_settings()).step(frame).score.tolist() == [pytest.approx(0.8), pytest.approx(0.6)]
+
+
+@pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
+def test_a_track_is_reported_from_its_nth_hit_on(estimator):
+    frames = [crowd_frame(0.1 * k, [(0.0, 0.0)], 0.8) for k in range(4)]
+    tracker = Tracker(unresolved_settings(min_hits=3, tentative_score_factor=0.0, estimator=estimator))
+    assert [len(tracks) for tracks in run(tracker, frames)] == [0, 0, 1, 1]
+
+
+def test_a_copy_keeps_what_is_unresolved():
+    tracker = Tracker(unresolved_settings())
+    tracker.step(crowd_frame(0.0, [(0.0, 0.0), (0.7, 0.0)], [0.8, 0.6]))
+    other = Tracker(unresolved_settings())
+    other.restore(tracker.snapshot())
+    for k in (1, 2):
+        frame = crowd_frame(0.1 * k, [(0.0, 0.0), (0.7, 0.0)], [0.8, 0.6])
+        assert tracker.step(frame).score.tolist() == other.step(frame).score.tolist()

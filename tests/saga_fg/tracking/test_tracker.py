@@ -72,11 +72,15 @@ def test_the_filter_is_better_than_the_detections_and_knows_how_good_it_is():
     assert 0.3 < mean_square / np.mean(claimed) < 1.7
 
 
-def test_a_measured_velocity_is_taken_in():
+def test_velocities_are_taken_in_or_unknown_along_the_heading():
     first = Tracker().step(frame(0.0, [(0, 0)], velocity=(7.0, -1.0)))
     assert first.boxes.velocity[0] == pytest.approx([7.0, -1.0])
     ignoring = Tracker(sensors={"lidar": Sensor(use_velocity=False)}).step(frame(0.0, [(0, 0)], velocity=(7.0, -1.0)))
     assert ignoring.boxes.velocity[0].tolist() == [0.0, 0.0]
+    known = Tracker().step(frame(0.0, [(0, 0)], yaw=np.pi / 2)).velocity_covariance[0]
+    assert known == pytest.approx(np.diag([1.0, 25.0]), abs=1e-12)
+    unknown = Tracker().step(frame(0.0, [(0, 0)], yaw=NAN)).velocity_covariance[0]
+    assert unknown == pytest.approx(25.0 * np.eye(2))
 
 
 def test_what_was_not_measured_does_no_harm(subtests):
@@ -91,13 +95,6 @@ def test_what_was_not_measured_does_no_harm(subtests):
                 assert np.isnan(history[-1].boxes.yaw).all()
             if "size" in unknown:
                 assert np.isnan(history[-1].boxes.size).all()
-
-
-def test_an_unmeasured_velocity_is_unknown_along_the_heading_and_small_across():
-    known = Tracker().step(frame(0.0, [(0, 0)], yaw=np.pi / 2)).velocity_covariance[0]
-    assert known == pytest.approx(np.diag([1.0, 25.0]), abs=1e-12)
-    unknown = Tracker().step(frame(0.0, [(0, 0)], yaw=NAN)).velocity_covariance[0]
-    assert unknown == pytest.approx(25.0 * np.eye(2))
 
 
 # initiation, coasting, deletion
@@ -121,7 +118,7 @@ def test_weak_detections_start_no_track_but_keep_one_alive():
     assert unusable.coasting == pytest.approx([0.1])
 
 
-def test_a_track_coasts_is_no_longer_reported_and_dies():
+def test_tracks_coast_die_and_are_found_again_in_time():
     tracker = Tracker(settings(max_coasting=1.0, report_coasting=0.55))
     run(tracker, [frame(t, [(10 * t, 0)]) for t in np.arange(0, 1.05, 0.1)])
     coasting = [tracker.step(frame(1.0 + t, [])) for t in np.arange(0.1, 1.25, 0.1)]
@@ -131,9 +128,6 @@ def test_a_track_coasts_is_no_longer_reported_and_dies():
     assert coasting[3].boxes.position[0, :2] == pytest.approx([14.0, 0.0], abs=0.3)
     assert coasting[3].position_covariance[0, 0, 0] > coasting[0].position_covariance[0, 0, 0]
     assert tracker.step(frame(2.3, [(23, 0)])).id.tolist() == [2], "a dead track came back"
-
-
-def test_an_object_seen_again_in_time_keeps_its_id():
     tracker = Tracker(settings(max_coasting=1.0))
     run(tracker, [frame(t, [(10 * t, 0)]) for t in np.arange(0, 1.05, 0.1)])
     run(tracker, [frame(t, []) for t in np.arange(1.1, 1.75, 0.1)])
@@ -177,28 +171,22 @@ def test_how_often_nobody_looks_does_not_matter_to_belief():
     assert scores[1] == pytest.approx(scores[0])
 
 
-def test_a_confirmed_track_outlives_misses():
+def test_belief_reports_tracks_and_keeps_them_alive():
     for score, alive in ((0.95, 1), (0.3, 0)):
         tracker = Tracker(settings(max_deviation=20.0, confirm_above=0.9))
         tracker.step(frame(0.0, [(0, 0)], score=score))
         assert len(run(tracker, [frame(t, []) for t in np.arange(0.1, 1.0, 0.1)])[-1]) == alive
-
-
-def test_only_believed_tracks_are_reported():
     tracker = Tracker(settings(report_above=0.7))
     assert len(tracker.step(frame(0.0, [(0, 0)], score=0.5))) == 0
     assert tracker.step(frame(0.1, [(0, 0)], score=0.5)).id.tolist() == [1]
 
 
-def test_frames_without_detections():
+def test_frames_without_detections_and_after_a_long_time():
     tracker = Tracker()
     for t in (0.0, 0.1, 9.0):
         assert len(tracker.step(frame(t, []))) == 0
     assert tracker.step(frame(9.1, [(1, 1)])).id.tolist() == [1]
     assert tracker.step(frame(9.2, [])).coasting == pytest.approx([0.1])
-
-
-def test_a_thousand_seconds_later():
     tracker = Tracker()
     for t in (0.0, 0.1):
         tracker.step(frame(t, [(5 * t, 0), (10 + 5 * t, 0)], velocity=(5, 0)))
@@ -248,14 +236,11 @@ def test_constant_velocity_and_constant_acceleration_side_by_side():
     assert {(4, 6), (6, 4)} <= pairs
 
 
-def test_an_unknown_sensor_is_the_default_one():
+def test_unknown_sensors_are_the_default_one_and_unknown_ranges_add_no_noise():
     noisy = {"default": Sensor(noise={"default": NoiseModel(position=2.0)})}
     sonar = Tracker(sensors=noisy).step(frame(0.0, [(0, 0)], "sonar")).position_covariance[0]
     assert sonar == pytest.approx(4.0 * np.eye(2))
     assert Tracker().step(frame(0.0, [(0, 0)], "sonar")).position_covariance[0] == pytest.approx(0.09 * np.eye(2))
-
-
-def test_without_a_pose_the_range_is_unknown_and_adds_no_noise():
     sensor = {"lidar": Sensor(noise={"default": NoiseModel(position=0.3, range_noise=0.01)})}
     anywhere = Tracker(sensors=sensor).step(frame(0.0, [(1e6, 1e6)])).position_covariance[0]
     assert anywhere == pytest.approx(0.09 * np.eye(2))
@@ -316,12 +301,9 @@ def test_a_turned_world_turns_the_tracks():
         assert back.velocity == pytest.approx(a.boxes.velocity, abs=1e-6)
 
 
-def test_the_same_frames_give_the_same_tracks_to_the_last_bit():
+def test_the_same_frames_in_any_order_of_detections_give_the_same_tracks():
     first, second = run(Tracker(), traffic()), run(Tracker(), traffic())
     assert [columns(t) for t in first] == [columns(t) for t in second]
-
-
-def test_the_order_of_detections_does_not_matter_but_for_new_ids():
     frames = traffic()
     reversed_later = [frames[0], *(Frame(f.timestamp, f.sensor, f.detections.select([2, 1, 0])) for f in frames[1:])]
     agree(run(Tracker(), frames), run(Tracker(), reversed_later), tolerance=1e-9)

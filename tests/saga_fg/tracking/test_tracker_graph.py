@@ -1,13 +1,28 @@
-"""The tracker and its graph: what the edges are good for, and what happens without."""
+"""The tracker with its graph: edges, estimators, several sensors on one place, states that are kept."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from saga_fg import ConstantVelocity, Detections, Frame, InputError, Tracker, TrackerSettings
+from saga_fg import (
+    ConstantAcceleration,
+    ConstantVelocity,
+    Curvilinear,
+    Detections,
+    Frame,
+    InputError,
+    Sensor,
+    Tracker,
+    TrackerSettings,
+)
 from saga_fg.model.edge_rules import Following, Neighbours, Pairs
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
+
+# The tracker and its graph: what the edges are good for, and what happens without
 
 PATIENT = {
     "classes": {"default": ClassSettings(motion=ConstantVelocity(1.0), max_deviation=np.inf)},
@@ -64,8 +79,7 @@ def test_without_edges_every_object_has_its_own_filter_exactly():
     together = run(Tracker(classical), frames)
     for k in range(3):
         alone = run(
-            Tracker(classical),
-            [Frame(f.timestamp, f.sensor, f.detections.select([k]), f.world_T_ego) for f in frames],
+            Tracker(classical), [Frame(f.timestamp, f.sensor, f.detections.select([k]), f.world_T_ego) for f in frames]
         )
         for all_of_them, one in zip(together, alone, strict=True):
             mine = all_of_them.select(all_of_them.id == k + 1)
@@ -184,3 +198,190 @@ def test_a_group_that_braked_unseen_keeps_its_identities_by_its_shape():
     for estimator in ("kalman", "isam2", "fixed-lag"):
         before, after = braking_behind_a_wall("graph", estimator)
         assert after == before == [1, 2, 3, 4, 5]
+
+
+# The tracker on each estimator: the same tracks; and on the fixed-lag smoother, late frames where they belong
+
+CLASSES = {
+    "car": ClassSettings(motion=ConstantVelocity(1.0), gate=1 - 1e-7),
+    "truck": ClassSettings(motion=ConstantAcceleration(0.5, fading_time=3.0), gate=1 - 1e-7),
+}
+SENSORS = {
+    "lidar": Sensor(noise={"default": NoiseModel(position=0.4, velocity=0.5)}),
+    "camera": Sensor(noise={"default": NoiseModel(position=0.2)}),
+}
+LABEL = ["car", "truck", "car", "car"]
+TRUTH = straight([(0, 0), (-15, 0.3), (-30, 0), (5, 40)], [(12, 0), (12, 0), (11, 0), (0, -9)])
+ESTIMATORS = ["kalman", "isam2", "fixed-lag"]
+
+
+def tracker(estimator="kalman", **values):
+    """Without bounds, so that all estimators are exact."""
+    return Tracker(TrackerSettings(CLASSES, estimator=estimator, tolerance=0.0, **values), SENSORS)
+
+
+def traffic(seed, late=0.0):
+    """Frames in order of time; and in order of arrival, the camera's `late` s after they were taken."""
+    rng = np.random.default_rng(seed)
+    heading = [0.0, 0.0, 0.0, -np.pi / 2]
+    lidar = seen(rng, TRUTH, np.arange(0, 4, 0.1), noise=0.3, label=LABEL, yaw=heading, velocity=TRUTH(1) - TRUTH(0))
+    camera = seen(rng, TRUTH, np.arange(1.03, 3.4, 0.08), noise=0.15, sensor="camera", label=LABEL, yaw=heading)
+    gone = [f for f in lidar if f.timestamp < 3.45]
+    lost = [frame(f.timestamp, TRUTH(f.timestamp)[:3], label=LABEL[:3]) for f in lidar if f.timestamp >= 3.45]
+    arrivals = [(f.timestamp, f) for f in [*gone, *lost]] + [(f.timestamp + late, f) for f in camera]
+    in_order = sorted((f for _, f in arrivals), key=lambda f: f.timestamp)
+    return in_order, [f for _, f in sorted(arrivals, key=lambda arrival: arrival[0])]
+
+
+def agree(first, second, tolerance):
+    assert first.id.tolist() == second.id.tolist()
+    assert second.boxes.label.tolist() == first.boxes.label.tolist()
+    for name in ("position", "velocity"):
+        assert getattr(second.boxes, name) == pytest.approx(getattr(first.boxes, name), abs=tolerance)
+    for name in ("position_covariance", "velocity_covariance"):
+        assert getattr(second, name) == pytest.approx(getattr(first, name), rel=tolerance, abs=tolerance)
+    assert second.coasting == pytest.approx(first.coasting, abs=1e-9)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS[1:])
+def test_every_estimator_gives_the_same_tracks(estimator, subtests):
+    """New tracks, a deletion, two sensors, two motion models, frames as late as the filters take."""
+    for edges in [(), TrackerSettings().edges]:
+        with subtests.test(edges=edges):
+            in_order, _ = traffic(0)
+            reference, other = tracker(edges=edges), tracker(estimator, edges=edges)
+            for f in in_order:
+                agree(reference.step(f), other.step(f), 1e-8)
+
+
+@pytest.mark.parametrize("delay", [0.07, 0.9])
+def test_a_smoother_takes_late_frames_as_if_they_had_come_in_time(delay):
+    """States of independent objects, and so with frozen edges, do not depend on the order of arrival."""
+    in_order, arriving = traffic(2, delay)
+    prompt, late, without = (tracker("fixed-lag", edges=(), lag=2.0) for _ in range(3))
+    run(prompt, in_order)
+    run(late, arriving)
+    run(without, [f for f in arriving if f.sensor == "lidar"])
+    assert late.late_frames == 0
+    agree(prompt.tracks(4.5), late.tracks(4.5), 1e-8)
+    assert np.abs(prompt.tracks(4.5).boxes.position - without.tracks(4.5).boxes.position).max() > 0.01
+
+
+def test_how_late_a_frame_may_be_is_the_smoothers_lag():
+    smoother, filtering = tracker("fixed-lag", edges=(), lag=2.0), tracker(edges=(), lag=2.0)
+    for t in (smoother, filtering):
+        run(t, traffic(3)[0])
+        t.step(frame(2.2, TRUTH(2.2)[:3], "camera", label=LABEL[:3]))
+    assert (smoother.late_frames, filtering.late_frames) == (0, 1)
+    smoother.step(frame(1.5, TRUTH(1.5)[:3], "camera", label=LABEL[:3]))
+    assert smoother.late_frames == 1
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_late_frames_of_objects_born_since(estimator):
+    t = tracker(estimator, edges=())
+    t.step(frame(0.0, [(50, 50)]))
+    t.step(frame(1.0, [(50, 50), (0, 0)], velocity=(10.0, 0.0)))
+    tracks = t.step(frame(0.8, [(50, 50), (-2, 0)], "camera"))
+    assert tracks.id.tolist() == [1, 2]
+    assert tracks.boxes.position[1, 0] == pytest.approx(0.0, abs=0.1)
+
+
+def test_an_estimator_that_is_none_is_refused():
+    expected = "estimator: expected one of kalman, isam2, fixed-lag, or MODULE:NAME, got 'kallman'"
+    with pytest.raises(InputError, match=expected):
+        TrackerSettings(estimator="kallman")
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS[1:])
+def test_every_estimator_takes_the_same_turns(estimator, subtests):
+    """Two that turn, one behind the other, of which one is not detected at last."""
+    for edges in [(), TrackerSettings().edges]:
+        with subtests.test(edges=edges):
+            rng, rate, speed = np.random.default_rng(5), 0.3, 8.0
+            classes = {
+                label: replace(of_class, motion=Curvilinear(turn_time=1.5)) for label, of_class in CLASSES.items()
+            }
+            settings = TrackerSettings(classes, edges=edges)
+            reference, other = (Tracker(replace(settings, estimator=name), SENSORS) for name in ("kalman", estimator))
+            for t in np.arange(0, 4, 0.1):
+                angle = rate * t - np.array([0.0, 0.4])
+                place = speed / rate * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
+                z, there = place + 0.1 * rng.normal(size=(2, 2)), slice(2 if t < 3 else 1)
+                seen_now = frame(t, z[there], label=LABEL[there], yaw=angle[there])
+                agree(reference.step(seen_now), other.step(seen_now), 1e-8)
+            assert any(reference.graph.motions), "turns were recorded"
+            assert np.isclose(np.hypot(*reference.tracks(4.5).boxes.velocity[0]), speed, atol=1.0)
+
+
+# Several sensors at once: who may start a track, what scores add up to, and sensors that fall silent
+
+WEAK = {"camera": Sensor(initiation="confirmed", noise={"default": NoiseModel(position=0.5)})}
+TENTHS = np.arange(0, 2, 0.1)
+
+
+def independent(**values):
+    return TrackerSettings(edges=(), **values)
+
+
+def test_a_weak_sensor_needs_repeated_evidence_or_another_sensor():
+    tracker = Tracker(independent(), WEAK)
+    reported = [len(t) for t in run(tracker, [frame(t, (10.0, 0.0), "camera") for t in TENTHS[:6]])]
+    assert reported == [0, 0, 1, 1, 1, 1]
+    tracker = Tracker(independent(tentative_score_factor=0.25), WEAK)
+    scores = [t.score.tolist() for t in run(tracker, [frame(t, (10.0, 0.0), "camera", score=0.8) for t in TENTHS[:3]])]
+    assert scores == [[pytest.approx(0.2)], [pytest.approx(0.2)], [pytest.approx(0.8)]]
+    tracker = Tracker(independent(), WEAK)
+    frames = [frame(0.0, (10.0, 0.0), "camera"), frame(0.05, (10.0, 0.0), "lidar"), frame(0.1, (10.0, 0.0), "camera")]
+    assert [t.id.tolist() for t in run(tracker, frames)] == [[], [1], [1]]
+    assert len(Tracker(independent(), WEAK).step(frame(0.0, (10.0, 0.0), "lidar"))) == 1
+
+
+def test_what_two_sensors_see_scores_higher_than_what_one_of_them_misses():
+    both, one = (10.0, 0.0), (10.0, 20.0)
+    tracker = Tracker(independent(), {"camera": Sensor()})
+    tracks = run(tracker, [frame(0.0, [both, one], "lidar", score=0.6), frame(0.02, both, "camera", score=0.6)])[-1]
+    near = np.argsort(tracks.boxes.position[:, 1])
+    assert tracks.score[near[0]] > 0.7
+    assert tracks.score[near[1]] < 0.5
+
+
+@pytest.mark.parametrize("method", ["kalman", "fixed-lag"])
+def test_tracks_live_on_the_other_sensor_while_one_is_out(method):
+    rng = np.random.default_rng(4)
+    truth = straight([(5.0, -3.0), (5.0, 3.0)], [(8.0, 0.0), (9.0, 0.5)])
+    lidar = [f for f in seen(rng, truth, np.arange(0, 8, 0.1)) if not 2.0 < f.timestamp < 5.0]
+    camera = seen(rng, truth, np.arange(0.03, 8, 0.08), noise=0.4, sensor="camera")
+    tracker = Tracker(independent(estimator=method), WEAK)
+    history = run(tracker, sorted(lidar + camera, key=lambda f: f.timestamp))
+    assert all(sorted(t.id.tolist()) == [1, 2] for t in history)
+    last = history[-1]
+    order = np.argsort(last.id)
+    assert last.boxes.position[order, :2] == pytest.approx(truth(last.timestamp), abs=0.4)
+
+
+# A tracker goes on from a snapshot as if nothing had happened in between
+
+
+def assert_same(a, b, tolerance):
+    for x, y in zip(a, b, strict=True):
+        assert x.timestamp == y.timestamp
+        np.testing.assert_array_equal(x.id, y.id)
+        np.testing.assert_allclose(x.boxes.position, y.boxes.position, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(x.position_covariance, y.position_covariance, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(x.score, y.score, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(("estimator", "tolerance"), [("kalman", 0.0), ("isam2", 1e-9), ("fixed-lag", 1e-9)])
+def test_going_on_from_a_snapshot(estimator, tolerance):
+    cars = straight([[0, 0], [12, 0], [24, 0], [0, 4]], [[10, 0], [10, 0], [10, 0], [6, 0]])
+    frames = seen(np.random.default_rng(0), cars, np.arange(40) / 10)
+    settings = TrackerSettings(estimator=estimator)
+    tracker = Tracker(settings)
+    run(tracker, frames[:20])
+    snapshot = tracker.snapshot()
+    expected = run(tracker, frames[20:])
+    for again in (tracker, Tracker(settings), tracker):  # the same one, a fresh one, and once more
+        again.restore(snapshot)
+        assert_same(run(again, frames[20:]), expected, tolerance)
+    assert any(len(tracks) for tracks in expected)

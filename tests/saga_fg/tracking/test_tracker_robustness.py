@@ -1,7 +1,5 @@
 """Nothing that a sensor sends stops a tracker: steps are transactions, states stay in bounds, numbers are judged."""
 
-from __future__ import annotations
-
 import copy
 import logging
 import pickle
@@ -284,7 +282,7 @@ def test_a_wrong_range_rate_changes_nothing(estimator, rate):
 # what is no frame, and copies
 
 
-def test_what_is_no_frame_is_refused(subtests):
+def test_what_are_no_frames_or_detections_is_refused(subtests):
     for make in [Tracker, GreedyTracker]:
         for nothing in [None, [], [Detection("car", (0, 0, 0))], np.zeros((3, 2))]:
             with (
@@ -292,6 +290,10 @@ def test_what_is_no_frame_is_refused(subtests):
                 pytest.raises(InputError, match=f"frame: expected Frame, got {type(nothing).__name__}"),
             ):
                 make().step(nothing)
+    assert len(Detections.of(Detection("car", (k, 0, 0)) for k in range(3))) == 3
+    for rows in [np.zeros((3, 2)), [(0, 0, 0)], [None], 7, None]:
+        with subtests.test(rows=rows), pytest.raises(InputError, match="detections: expected a list of Detection"):
+            Detections.of(rows)
 
 
 def test_settings_and_sensors_of_another_type_are_named(subtests):
@@ -309,21 +311,11 @@ def test_settings_and_sensors_of_another_type_are_named(subtests):
                     make().restore("state.json")
 
 
-def test_a_list_of_detections_may_be_any_iterable():
-    assert len(Detections.of(Detection("car", (k, 0, 0)) for k in range(3))) == 3
-
-
 @pytest.mark.parametrize("timestamp", [10**400, 10**5000, "a", None, [1.0]], ids=lambda t: type(t).__name__)
 def test_times_that_are_none_are_refused(timestamp):
     for ask in (lambda: Frame(timestamp, "lidar", Detections.empty()), lambda: Tracker().tracks(timestamp)):
         with pytest.raises(InputError, match="timestamp: expected a finite number of seconds"):
             ask()
-
-
-def test_what_are_no_detections_is_refused(subtests):
-    for rows in [np.zeros((3, 2)), [(0, 0, 0)], [None], 7, None]:
-        with subtests.test(rows=rows), pytest.raises(InputError, match="detections: expected a list of Detection"):
-            Detections.of(rows)
 
 
 @pytest.mark.parametrize(

@@ -61,32 +61,23 @@ def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
     assert (apart < 2.6).all()
 
 
-def test_points_are_forgotten():
+def test_points_are_forgotten_whether_somebody_moves_or_not():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
     trails.update(passing([(100.0, 0.0)], 0.0, 60.5, [3]), 60.5)
     assert known(trails).time.min() >= 0.5
-
-
-def test_points_are_forgotten_while_nobody_moves():
     trails = along(*arc(np.arange(-20, 0, 2.0)))
     trails.update(passing(np.empty((0, 2)), 0.0), 1000.0)
     assert len(known(trails)) == 0
     assert path(trails).weight.max() == 0.0
-
-
-def test_without_a_memory_nothing_is_remembered():
     assert len(along(*arc(np.arange(-20, 0, 2.0)), settings=TrafficSettings()).left) == 0
 
 
-def test_a_path_goes_round_the_bend_of_earlier_traffic():
+def test_a_path_goes_round_the_bend_of_earlier_traffic_or_beside_it():
     found = path(along(*arc(np.arange(-20, 40, 1.0))))
     expected, heading = arc(-10 + STEP * np.arange(11))
     assert found.position[0] == pytest.approx(expected, abs=0.6)
     assert found.heading[0] == pytest.approx(heading, abs=0.12)
     assert found.weight.min() > 0.4
-
-
-def test_a_vehicle_beside_the_trail_stays_beside_it():
     found = path(along(*arc(np.arange(-20, 40, 1.0))), position=(-10.0, 1.0))
     radius = np.hypot(*(found.position[0, 5:] - [0.0, RADIUS]).T)
     assert radius == pytest.approx(np.full(6, RADIUS - 1.0), abs=0.6)
@@ -109,9 +100,11 @@ def test_without_trails_a_path_keeps_its_own_bend_which_fades():
     assert (np.diff(turns) < 0).all()
 
 
-def test_ones_own_trail_leads_one_nowhere():
+def test_nobody_is_led_by_his_own_trail_or_oncoming_lanes():
     trails = along(*arc(np.arange(-20, 40, 1.0)), ids=5)
     assert path(trails, track=np.array([5])).weight.max() == 0.0
+    found = path(of_map(BEND), heading=np.pi)
+    assert found.heading[0] == pytest.approx(np.full(11, np.pi))
 
 
 def test_a_path_knows_the_speed_of_earlier_traffic():
@@ -156,12 +149,9 @@ def test_a_path_follows_a_lane_without_any_traffic_and_at_no_speed():
     assert found.weight.max() == 0.0
 
 
-def test_a_path_goes_on_along_the_next_lane():
+def test_a_path_goes_on_along_the_next_lane_or_straight_on():
     whole, parted = path(of_map(BEND)), path(of_map(BEND[:6], BEND[5:]))
     assert parted.position[0] == pytest.approx(whole.position[0], abs=0.3)
-
-
-def test_where_a_lane_ends_the_path_goes_straight_on():
     found = path(of_map(STRAIGHT_ON[:6]), steps=10)
     assert found.heading[0] == pytest.approx(np.zeros(11), abs=1e-9)
     assert found.position[0, -1] == pytest.approx([-10 + 10 * STEP, 0.0])
@@ -174,12 +164,7 @@ def test_at_a_fork_a_path_takes_the_lane_that_it_turns_with(curvature, bends):
     assert (abs(found.heading[0, -1]) < 0.4) != bends
 
 
-def test_oncoming_lanes_lead_nobody():
-    found = path(of_map(BEND), heading=np.pi)
-    assert found.heading[0] == pytest.approx(np.full(11, np.pi))
-
-
-def test_lanes_are_known_once_and_not_at_a_reach_of_zero():
+def test_lanes_are_known_once_and_replaced_by_their_names():
     traffic = of_map(BEND)
     known = traffic.lanes
     traffic.add_lanes(named_lane(BEND))
@@ -187,18 +172,15 @@ def test_lanes_are_known_once_and_not_at_a_reach_of_zero():
     off = Traffic(TrafficSettings(reach=0.0))
     off.add_lanes(named_lane(BEND))
     assert len(off.lanes) == 0
-
-
-def named_lane(centre):
-    return (Lane("lane-0", tuple(map(tuple, np.asarray(centre).tolist()))),)
-
-
-def test_a_corrected_lane_replaces_the_one_of_its_name():
     traffic, moved = of_map(STRAIGHT_ON, BEND + np.array([0.0, 30.0])), STRAIGHT_ON + np.array([0.0, 1.2])
     traffic.add_lanes(named_lane(moved))
     of_it = traffic.lanes.points.position[traffic.lanes.points.position[:, 1] < 10]
     assert (of_it[:, 1] == 1.2).all()
     assert len(np.unique(traffic.lanes.points.id)) == 2
+
+
+def named_lane(centre):
+    return (Lane("lane-0", tuple(map(tuple, np.asarray(centre).tolist()))),)
 
 
 def test_lanes_are_indexed_once_and_what_finds_them_is_no_part_of_a_state():
@@ -247,13 +229,10 @@ def driven(settings, follower=3.0, hidden=2.0, gap=2.5, seed=0):
     return trackers, [np.hypot(*(tracks.boxes.position[1, :2] - truth)) for tracks in reported]
 
 
-def test_a_hidden_car_follows_the_path_of_earlier_traffic_round_a_bend():
+def test_a_hidden_car_follows_the_path_and_heading_of_earlier_traffic():
     off = replace(ON, traffic=TrafficSettings(), classes={"default": replace(CAR, motion=Curvilinear())})
     with_trails, without = np.mean([driven((ON, off), seed=seed)[1] for seed in range(3)], axis=0)
     assert with_trails < 0.4 * without
-
-
-def test_its_heading_goes_with_it():
     (tracker,), _ = driven((ON,))
     assert tracker.tracks(0.0).boxes.yaw[1] == pytest.approx(arc(np.array(-20.0 + SPEED * 4.5))[1], abs=0.2)
 

@@ -1,6 +1,7 @@
-"""Boxes: columns checked once, moved between frames, cut and joined."""
+"""Boxes, and how they overlap."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -10,6 +11,9 @@ from hypothesis.extra.numpy import arrays
 
 from saga_fg import Boxes, InputError
 from saga_fg.numerics.geometry import inverse_transform, wrap_angle, yaw_transform
+from saga_fg.types.boxes import bev_iou, iou_3d, paired_bev_iou, paired_iou_3d, touching_pairs
+
+# Boxes: columns checked once, moved between frames, cut and joined
 
 NAN = float("nan")
 COLUMNS = ("label", "position", "size", "yaw", "velocity")
@@ -43,16 +47,13 @@ def same(a, b, **tolerance):
     return True
 
 
-def test_what_is_left_out_is_unknown():
+def test_no_boxes_and_what_is_left_out():
     boxes = Boxes.of(["car"], [(1, 2, 3)])
     assert len(boxes) == 1
     assert boxes.position.tolist() == [[1.0, 2.0, 3.0]]
     assert np.isnan(boxes.size).all()
     assert np.isnan(boxes.yaw).all()
     assert np.isnan(boxes.velocity).all()
-
-
-def test_no_boxes():
     for boxes in (Boxes.empty(), Boxes.of([], []), Boxes.of([], [], [], [], []), Boxes.concatenate([])):
         assert len(boxes) == 0
         assert [getattr(boxes, name).shape for name in COLUMNS] == [(0,), (0, 3), (0, 3), (0,), (0, 2)]
@@ -107,15 +108,12 @@ def test_a_transform_and_its_inverse_leave_the_boxes(boxes, x, y, yaw):
     assert np.array_equal(there.size, boxes.size, equal_nan=True)
 
 
-def test_a_transform_turns_heading_and_velocity_with_the_box():
+def test_transforms_turn_headings_and_velocities():
     boxes = Boxes.of(["car"], [(2, 0, 0)], yaw=[0.1], velocity=[(3, 1)])
     turned = boxes.transformed(yaw_transform(x=10.0, yaw=np.pi / 2))
     assert turned.position[0] == pytest.approx([10, 2, 0])
     assert turned.yaw[0] == pytest.approx(0.1 + np.pi / 2)
     assert turned.velocity[0] == pytest.approx([-1, 3])
-
-
-def test_a_velocity_known_in_one_direction_only_is_unknown_after_a_turn():
     boxes = Boxes.of(["car"], [(0, 0, 0)], velocity=[(3, NAN)])
     assert np.isnan(boxes.transformed(yaw_transform(yaw=0.3)).velocity).all()
 
@@ -153,3 +151,148 @@ def test_joining_and_cutting_again(parts):
         assert same(joined.select(slice(start, start + len(part))), part)
         start += len(part)
     assert len(joined) == start
+
+
+# Overlap of oriented boxes: known cases, laws, and a plain polygon clipping as reference
+
+
+def box(x=0.0, y=0.0, z=0.0, length=4.0, width=2.0, height=1.5, yaw=0.0):
+    return Boxes.of(["car"], [(x, y, z)], [(length, width, height)], [yaw])
+
+
+def clipped(polygon, clip):
+    """Area of two convex polygons' intersection (Sutherland and Hodgman), counter-clockwise lists of points."""
+    for p, q in zip(clip, clip[1:] + clip[:1], strict=True):
+        side = [(q[0] - p[0]) * (v[1] - p[1]) - (q[1] - p[1]) * (v[0] - p[0]) for v in polygon]
+        kept = []
+        for n, v in enumerate(polygon):
+            w, s, t = polygon[(n + 1) % len(polygon)], side[n], side[(n + 1) % len(polygon)]
+            if s >= 0:
+                kept.append(v)
+            if (s > 0 > t) or (s < 0 < t):
+                kept.append((v[0] + (w[0] - v[0]) * s / (s - t), v[1] + (w[1] - v[1]) * s / (s - t)))
+        polygon = kept
+        if not polygon:
+            return 0.0
+    return area(polygon)
+
+
+def area(polygon):
+    return sum(p[0] * q[1] - p[1] * q[0] for p, q in zip(polygon, polygon[1:] + polygon[:1], strict=True)) / 2
+
+
+def corner_lists(boxes):
+    return [[tuple(map(float, c)) for c in footprint] for footprint in boxes.corners()]
+
+
+boxes = st.builds(
+    box,
+    x=st.floats(-4, 4),
+    y=st.floats(-4, 4),
+    z=st.floats(-1, 1),
+    length=st.floats(0.3, 8),
+    width=st.floats(0.3, 4),
+    height=st.floats(0.3, 3),
+    yaw=st.one_of(st.floats(-7, 7), st.sampled_from([0.0, math.pi / 2, -math.pi, math.pi / 4, 1e-9, 1e-12])),
+)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        (box(), box(), 1.0),
+        (box(yaw=0.7), box(yaw=0.7), 1.0),
+        (box(yaw=0.7), box(yaw=0.7 + math.pi), 1.0),
+        (box(yaw=0.3), box(yaw=0.3 + 1e-13), 1.0),
+        (box(), box(x=4.0), 0.0),  # side by side, an edge shared
+        (box(), box(x=2.0), 4 / 12),
+        (box(), box(yaw=math.pi / 2), 4 / 12),
+        (box(), box(length=2.0, width=1.0), 0.25),  # one inside the other
+        (box(), box(x=1.0, y=0.5, length=2.0, width=1.0), 0.25),  # inside, sharing a corner
+        (box(length=2, width=2), box(length=2, width=2, yaw=math.pi / 4), 1 / math.sqrt(2)),  # octagon 8 (sqrt 2 - 1)
+        (box(), box(x=100.0), 0.0),
+    ],
+)
+def test_known_footprints(a, b, expected):
+    assert bev_iou(a, b) == pytest.approx(np.array([[expected]]), abs=1e-10)
+    assert paired_bev_iou(a, b) == pytest.approx(np.array([expected]), abs=1e-10)
+
+
+def test_known_volumes_overlap_and_unknown_ones_nothing():
+    assert iou_3d(box(), box(z=0.75)) == pytest.approx(1 / 3)
+    assert iou_3d(box(), box(z=1.5)) == pytest.approx(0.0)
+    assert iou_3d(box(), box(z=2.0)) == 0.0
+    assert iou_3d(box(), box(height=0.5)) == pytest.approx(1 / 3)
+    unknown = Boxes.of(["car"], [(0, 0, 0)])
+    for function in (bev_iou, iou_3d):
+        assert function(unknown, box()).tolist() == [[0.0]]
+        assert function(Boxes.empty(), box()).shape == (0, 1)
+        assert function(box(), Boxes.empty()).shape == (1, 0)
+
+
+@given(boxes, boxes)
+def test_equals_polygon_clipping(a, b):
+    (pa,), (pb,) = corner_lists(a), corner_lists(b)
+    common = clipped(pa, pb)
+    union = area(pa) + area(pb) - common
+    assert paired_bev_iou(a, b)[0] == pytest.approx(common / union, abs=1e-8)
+    low = max(a.position[0, 2] - a.size[0, 2] / 2, b.position[0, 2] - b.size[0, 2] / 2)
+    high = min(a.position[0, 2] + a.size[0, 2] / 2, b.position[0, 2] + b.size[0, 2] / 2)
+    common *= max(0.0, high - low)
+    volume = area(pa) * a.size[0, 2] + area(pb) * b.size[0, 2] - common
+    assert paired_iou_3d(a, b)[0] == pytest.approx(common / volume, abs=1e-8)
+
+
+@given(boxes, boxes)
+def test_symmetric_and_bounded(a, b):
+    for function in (paired_bev_iou, paired_iou_3d):
+        value = function(a, b)[0]
+        assert value == pytest.approx(function(b, a)[0], abs=1e-9)
+        assert 0.0 <= value <= 1.0 + 1e-12
+
+
+@given(boxes, boxes, st.floats(-1000, 1000), st.floats(-1000, 1000), st.floats(-5, 5), st.floats(-4, 4))
+def test_does_not_depend_on_the_frame(a, b, x, y, z, yaw):
+    T = yaw_transform(x, y, z, yaw)
+    for function in (bev_iou, iou_3d):
+        moved = function(a.transformed(T), b.transformed(T))
+        assert moved == pytest.approx(function(a, b), abs=1e-7)
+
+
+@given(boxes)
+def test_a_box_is_identical_to_itself(a):
+    for function in (paired_bev_iou, paired_iou_3d):
+        assert function(a, a)[0] == pytest.approx(1.0, abs=1e-9)
+
+
+@given(boxes, boxes)
+def test_equals_sampling(a, b):
+    rng = np.random.default_rng(0)
+    points = a.position[0, :2] + rng.uniform(-0.5, 0.5, (4000, 2)) @ np.diag(a.size[0, :2]) @ rotation(a.yaw[0]).T
+    local = (points - b.position[0, :2]) @ rotation(b.yaw[0])
+    share = np.mean((np.abs(local) <= b.size[0, :2] / 2).all(axis=1))
+    size_a, size_b = np.prod(a.size[0, :2]), np.prod(b.size[0, :2])
+    iou = paired_bev_iou(a, b)[0]
+    common = iou / (1 + iou) * (size_a + size_b)
+    assert common / size_a == pytest.approx(share, abs=5 * 0.5 / math.sqrt(4000))
+
+
+def rotation(yaw):
+    return np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+
+
+def test_all_pairs_are_the_pairs_one_by_one():
+    rng = np.random.default_rng(1)
+
+    def crowd(n):
+        return Boxes.of(
+            ["car"] * n, rng.uniform(-10, 10, (n, 3)) * [1, 1, 0.1], rng.uniform(0.5, 5, (n, 3)), rng.uniform(-4, 4, n)
+        )
+
+    a, b = crowd(30), crowd(40)
+    rows, columns = (g.ravel() for g in np.meshgrid(range(30), range(40), indexing="ij"))
+    for function, paired in ((bev_iou, paired_bev_iou), (iou_3d, paired_iou_3d)):
+        matrix = function(a, b)
+        assert matrix.ravel() == pytest.approx(paired(a.select(rows), b.select(columns)), abs=1e-12)
+        assert (matrix > 0).sum() > 10
+    assert len(touching_pairs(a, b)[0]) < 1200

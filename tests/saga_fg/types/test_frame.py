@@ -1,14 +1,21 @@
-"""Detections and frames: a table and its rows are the same thing; what is wrong is named."""
+"""Frames, tracks, scenes and road maps."""
 
 import dataclasses
+import itertools
+import math
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from saga_fg import Boxes, Detection, Detections, Frame, InputError
-from saga_fg.numerics.geometry import yaw_transform
+from saga_fg import Annotations, Boxes, Detection, Detections, Frame, InputError, Scene, Tracks
+from saga_fg.numerics.geometry import Polylines, direction_at, feet, yaw_transform
+from saga_fg.types.dataset import LabelledObjects
+from saga_fg.types.road_map import Lane, LanesAcross, StopLine
+from saga_fg.types.track import KNOWN_SPEED_DEVIATION, known_velocities
+
+# Detections and frames: a table and its rows are the same thing; what is wrong is named
 
 NAN = float("nan")
 metres = st.floats(-1e4, 1e4)
@@ -51,13 +58,10 @@ def test_selected_rows(rows, data):
     assert len(table.select(slice(0, 1))) == 1
 
 
-def test_an_empty_table():
+def test_an_empty_table_and_one_that_moves():
     assert len(Detections.empty()) == len(Detections.of([])) == 0
     assert list(Detections.empty()) == []
     assert len(Detections.empty().transformed(yaw_transform(1.0))) == 0
-
-
-def test_scores_stay_when_the_boxes_move():
     table = Detections.of([Detection("car", (1, 0, 0), score=-3.5)]).transformed(yaw_transform(10, 0, 0, np.pi))
     assert table.score.tolist() == [-3.5]
     assert table.boxes.position[0] == pytest.approx([9, 0, 0])
@@ -114,3 +118,246 @@ def test_a_frame_keeps_what_it_is_given():
     assert frame.world_T_ego.shape == (4, 4)
     assert not frame.world_T_ego.flags.writeable
     assert (len(frame), frame.token) == (0, "abc")
+
+
+# Tables of tracks
+
+
+def table(n=2, **columns):
+    good = {
+        "timestamp": 1.0,
+        "id": np.arange(n) + 7,
+        "boxes": Boxes.of(["car"] * n, np.arange(3.0 * n).reshape(n, 3), velocity=np.ones((n, 2))),
+        "score": np.linspace(0, 1, n),
+        "position_covariance": np.stack([k * np.eye(2) for k in range(n)]) if n else np.empty((0, 2, 2)),
+        "velocity_covariance": np.ones((n, 2, 2)),
+        "coasting": np.zeros(n),
+    }
+    return Tracks(**(good | columns))
+
+
+def test_velocities_of_a_large_deviation_are_unknown():
+    P = np.array([s**2 * np.eye(2) for s in (0.1, KNOWN_SPEED_DEVIATION, 2.1, np.nan)])
+    known = known_velocities(np.ones((4, 2)), P)
+    assert np.isfinite(known).all(axis=1).tolist() == [True, True, False, True]
+
+
+def test_rows_of_the_table():
+    tracks = table()
+    assert len(tracks) == 2
+    second = list(tracks)[1]
+    assert (second.id, second.label, second.position, second.score) == (8, "car", (3.0, 4.0, 5.0), 1.0)
+    assert second.velocity == (1.0, 1.0)
+    assert second.position_covariance.tolist() == [[1.0, 0.0], [0.0, 1.0]]
+    assert type(second.id) is int
+    assert type(second.coasting) is float
+
+
+def test_tables_of_tracks_are_selected_read_only_and_may_be_empty():
+    tracks = table(3)
+    for rows in ([2, 0], np.array([2, 0])):
+        assert tracks.select(rows).id.tolist() == [9, 7]
+    chosen = tracks.select(np.array([False, True, False]))
+    assert chosen.timestamp == 1.0
+    assert chosen.id.tolist() == [8]
+    assert chosen.position_covariance[0].tolist() == np.eye(2).tolist()
+    assert len(tracks.select([])) == 0
+    assert tracks.select(slice(1, None)).id.tolist() == [8, 9]
+    empty = Tracks.empty(3.0)
+    assert (len(empty), empty.timestamp, list(empty)) == (0, 3.0, [])
+    assert len(table(0)) == 0
+    assert not table().score.flags.writeable
+    assert not table().position_covariance.flags.writeable
+
+
+def test_wrong_columns_are_named(subtests):
+    for columns, message in [
+        ({"id": [1, 1]}, "id: expected unique ids, 1 occurs more than once"),
+        ({"id": [1]}, "id: expected 2 entries, got 1"),
+        ({"id": [0.5, 1.5]}, "id: expected a list of integers"),
+        ({"score": [0.5, np.nan]}, r"score\[1\]: expected a finite number"),
+        ({"score": [0.5]}, r"score: expected shape \(2,\)"),
+        ({"position_covariance": np.ones((2, 3, 3))}, r"position_covariance: expected shape \(2, 2, 2\)"),
+        ({"velocity_covariance": np.full((2, 2, 2), np.inf)}, r"velocity_covariance\[0, 0, 0\]: expected a finite"),
+        ({"coasting": [0.0]}, r"coasting: expected shape \(2,\)"),
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            table(**columns)
+
+
+# Scenes and annotations: times run forwards, columns fit, and what does not is named with its scene
+
+
+def annotations(ids=("a", "b"), visible=(True, False)):
+    return Annotations(np.array(ids), Boxes.of(["car"] * 2, np.zeros((2, 3))), np.array(visible))
+
+
+def scene(**columns):
+    good = {
+        "name": "crossing",
+        "timestamps": [0.0, 0.5, 1.0],
+        "world_T_ego": np.stack([yaw_transform(k) for k in range(3)]),
+        "tokens": ("", "", ""),
+        "frames": [Frame(t, s, Detections.empty()) for t, s in ((0.0, "lidar"), (0.0, "camera"), (0.7, "lidar"))],
+    }
+    return Scene(**(good | columns))
+
+
+def test_a_scene_knows_its_sensors_and_length_even_if_empty():
+    assert scene().sensors == ("camera", "lidar")
+    assert len(scene()) == 3
+    assert not scene().timestamps.flags.writeable
+    assert scene(ground_truth=[annotations()] * 3).ground_truth is not None
+    empty = scene(timestamps=[], world_T_ego=[], tokens=(), frames=[])
+    assert len(empty) == 0
+    assert empty.sensors == ()
+
+
+def test_a_wrong_scene_is_refused(subtests):
+    for columns, message in [
+        ({"timestamps": [0.0, 0.5, 0.5]}, r"scene crossing: timestamps\[2\]: expected increasing times, time repeats"),
+        ({"timestamps": [0.0, 1.0, 0.5]}, r"scene crossing: timestamps\[2\]: .* time runs backwards at 0.500000 s"),
+        ({"timestamps": [0.0, np.nan, 1.0]}, r"timestamps\[1\]: expected a finite number, got nan"),
+        ({"timestamps": [[0.0, 0.5, 1.0]]}, r"timestamps: expected shape \(any,\)"),
+        ({"world_T_ego": np.tile(np.eye(4), (2, 1, 1))}, r"world_T_ego: expected shape \(3, 4, 4\)"),
+        ({"world_T_ego": np.tile(2 * np.eye(4), (3, 1, 1))}, r"scene crossing: world_T_ego\[0\]: expected a rigid"),
+        ({"tokens": ("",)}, "scene crossing: tokens: expected 3 entries, got 1"),
+        ({"ground_truth": []}, "scene crossing: ground_truth: expected 3 entries, got 0"),
+        (
+            {"frames": [Frame(t, "lidar", Detections.empty()) for t in (0.5, 0.4)]},
+            r"scene crossing: frames\[1\]: expected frames in order of time, 0.400000 s comes late",
+        ),
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            scene(**columns)
+
+
+def test_annotations_keep_their_columns():
+    truth = annotations()
+    assert len(truth) == 2
+    assert truth.visible.tolist() == [True, False]
+    assert len(Annotations(np.array([]), Boxes.empty(), np.array([]))) == 0
+
+
+def test_wrong_annotations_are_refused(subtests):
+    for ids, visible, message in [
+        (("a", "a"), (True, True), "id: expected unique object ids"),
+        (("a",), (True, True), "id: expected 2 entries, got 1"),
+        ((1, 2), (True, True), "id: expected a list of strings"),
+        (("a", "b"), (True,), "visible: expected 2 booleans"),
+        (("a", "b"), (1, 0), "visible: expected 2 booleans, got int64"),
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            annotations(ids, visible)
+
+
+# Labelled objects as one table, and their places between labels
+
+
+def labelled_scene(truth: bool = True) -> Scene:
+    """Object `b` moves by 1 m a step of 0.5 s, `a` is labelled in the first and the last moment alone."""
+    time = np.array([0.0, 0.5, 1.0, 2.5])
+    moments = []
+    for k in range(4):
+        ids = ["b"] if k in (1, 2) else ["b", "a"]
+        boxes = Boxes.of(
+            ["car", "bus"][: len(ids)], [[k, 0.0, 0.0], [10.0, k, 0.0]][: len(ids)], [[4, 2, 1.5]] * len(ids)
+        )
+        moments.append(Annotations(np.array(ids), boxes, np.ones(len(ids), dtype=bool)))
+    return Scene("s", time, np.tile(np.eye(4), (4, 1, 1)), ("",) * 4, (), tuple(moments) if truth else None)
+
+
+def test_the_table_has_all_objects_at_all_moments():
+    objects = LabelledObjects.from_scene(labelled_scene())
+    assert objects.id.tolist() == ["a", "b"]
+    assert objects.label.tolist() == ["bus", "car"]
+    assert objects.length.tolist() == [4, 4]
+    assert objects.position[:, 1, 0].tolist() == [0, 1, 2, 3]
+    assert np.isnan(objects.position[1:3, 0]).all()
+    assert np.isnan(objects.heading).all()
+
+
+def test_places_between_labels_are_on_a_line_where_these_are_near():
+    objects = LabelledObjects.from_scene(labelled_scene())
+    np.testing.assert_allclose(objects.at(0.25)[1], [0.5, 0])
+    np.testing.assert_allclose(objects.at(0.5)[1], [1, 0])
+    np.testing.assert_allclose(objects.at(2.5)[0], [10, 3])
+    for time in (-0.1, 0.25, 2.0, 2.6):  # before, not labelled next, too far apart, after
+        assert np.isnan(objects.at(time)[0]).all()
+    assert np.isnan(objects.at(2.0)).all()
+
+
+def test_a_scene_without_ground_truth_is_refused():
+    with pytest.raises(InputError, match="scene s: expected ground truth"):
+        LabelledObjects.from_scene(labelled_scene(truth=False))
+
+
+# Lanes across stop lines, and feet on many polylines at once
+
+STRAIGHT = Lane("straight", ((-50.0, 0.0), (20.0, 0.0)), width=4.0)
+ASIDE = Lane("aside", ((-50.0, 3.0), (0.0, 3.0), (20.0, 5.0)), width=4.0)
+BACK = Lane("back", ((20.0, 0.0), (-50.0, 0.0)))
+LINE = StopLine("line", (0.0, 5.0), (0.0, -2.0), "light")
+FAR = StopLine("far", (200.0, 2.0), (200.0, -2.0), "light")
+NOWHERE = StopLine("nowhere", (0.0, 90.0), (0.0, 86.0), "light")
+
+
+def test_feet_on_many_polylines_are_those_on_each():
+    rng = np.random.default_rng(0)
+    lines = [np.cumsum(rng.uniform(0.5, 3.0, (k, 2)), axis=0) for k in (2, 7, 3)]
+    places = rng.uniform(-3, 15, (60, 2))
+    line = rng.integers(0, 3, 60)
+    found = Polylines.from_points(lines).feet(line, places)
+    for k, each in enumerate(lines):
+        mine = line == k
+        for column, alone in zip(found, feet(each, places[mine]), strict=True):
+            np.testing.assert_allclose(column[mine], alone, atol=1e-12)
+        brute = min_distance(each, places[mine])
+        inside = (found.s[mine] > 0) & (found.s[mine] < np.hypot(*np.diff(each, axis=0).T).sum())
+        np.testing.assert_allclose(np.hypot(*(found.point - places)[mine].T)[inside], brute[inside], atol=2e-3)
+
+
+def min_distance(line: np.ndarray, places: np.ndarray) -> np.ndarray:
+    s = np.linspace(0, 1, 2000)[:, None]
+    points = np.concatenate([a + s * (b - a) for a, b in itertools.pairwise(line)])
+    return np.hypot(*np.moveaxis(places[:, None] - points, -1, 0)).min(axis=1)
+
+
+def test_a_direction_turns_evenly_from_piece_to_piece():
+    corner = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]])
+    angle = [math.atan2(y, x) for x, y in direction_at(corner, np.array([-5.0, 5.0, 10.0, 15.0, 40.0]))]
+    assert angle == pytest.approx([0, 0, math.pi / 4, math.pi / 2, math.pi / 2])
+
+
+def test_lanes_that_cross_in_the_direction_of_travel_are_found():
+    across = LanesAcross.from_lanes((STRAIGHT, BACK, ASIDE), (LINE, FAR, NOWHERE))
+    assert len(across.centre) == 2  # nothing crosses a line against its direction
+    pairs = list(zip(across.line.tolist(), across.lane.tolist(), across.s.tolist(), strict=True))
+    assert [pair[:2] for pair in pairs] == [(0, 0), (0, 1), (1, 0)]  # a lane runs on straight beyond its end
+    assert [pair[2] for pair in pairs] == pytest.approx([50, 50, 250])
+    assert across.e[:2] == pytest.approx([1.5, -1.5])
+
+
+def test_a_line_that_was_moved_is_crossed_elsewhere():
+    across = LanesAcross.from_lanes((STRAIGHT,), (LINE, FAR))
+    moved = across.placed(np.array([100.0, 0.0]), np.array([[2.0, 0.5], [0.0, 0.0]]), np.array([7, 9]))
+    assert moved.line.tolist() == [7, 9]
+    assert moved.s == pytest.approx([52, 250])
+    assert moved.e == pytest.approx([2.0, 0.0])
+    rows, pairs = moved.crossings(np.array([9, 8, 7, 9]))
+    assert (rows.tolist(), pairs.tolist()) == ([0, 2, 3], [1, 0, 1])
+    there = moved.inside(
+        np.array([[-110.0, 1.0], [-110.0, 2.5], [-160.0, 0.0], [-90.0, 1.0]]), np.tile([1.0, 0], (4, 1))
+    )
+    assert there.vehicle.tolist() == [0, 3]  # within the width, and on the lane
+    assert there.feet.s == pytest.approx([40, 60])
+    assert there.feet.e == pytest.approx([1, 1])
+    assert len(moved.inside(np.array([[-110.0, 1.0]]), np.array([[-1.0, 0.0]])).vehicle) == 0
+
+
+def test_there_may_be_nothing():
+    for lanes, lines in (((), ()), ((STRAIGHT,), ()), ((), (LINE,))):
+        across = LanesAcross.from_lanes(lanes, lines)
+        assert len(across.line) == 0
+        assert len(across.inside(np.zeros((3, 2)), np.zeros((3, 2))).vehicle) == 0
+        assert len(across.crossings(np.array([0, 0]))[0]) == 0

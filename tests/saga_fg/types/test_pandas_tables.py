@@ -1,7 +1,5 @@
 """Tables of pandas in and out, and the one-line tracker."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import warnings
@@ -21,7 +19,7 @@ def table(**more):
     return pd.DataFrame(rows).assign(**more)
 
 
-def test_all_columns_become_detections() -> None:
+def test_all_columns_become_detections():
     rows = pd.DataFrame(
         {
             "x": [1.0, 2.0], "y": [3.0, 4.0], "z": [0.5, None], "length": [4.0, None], "width": [2.0, 1.0],
@@ -41,7 +39,7 @@ def test_all_columns_become_detections() -> None:
     assert len(Detections.from_pandas(rows[:0])) == 0
 
 
-def test_frames_come_in_order_of_time_and_by_sensor() -> None:
+def test_frames_come_in_order_of_time_and_by_sensor():
     rows = table(sensor=["lidar", "camera"] * 12).sample(frac=1, random_state=1)
     moments = list(moments_of_table(rows))
     assert len(moments) == 24
@@ -50,7 +48,7 @@ def test_frames_come_in_order_of_time_and_by_sensor() -> None:
     assert all(len(found) == 1 for _, _, found in moments)
 
 
-def test_times_of_pandas_are_seconds() -> None:
+def test_times_of_pandas_are_seconds():
     start = pd.Timestamp("2024-05-01 12:00:00")
     for unit in ("s", "ns"):
         times = table().assign(timestamp=lambda t: (start + pd.to_timedelta(t.timestamp, unit="s")).dt.round("100ms"))
@@ -60,13 +58,13 @@ def test_times_of_pandas_are_seconds() -> None:
         assert first == pytest.approx(start.timestamp())
 
 
-def test_a_row_without_a_place_is_a_moment_without_detections() -> None:
+def test_a_row_without_a_place_is_a_moment_without_detections():
     rows = pd.concat([table(), pd.DataFrame({"timestamp": [5.0], "x": [None], "y": [None]})])
     *_, (time, _, found) = moments_of_table(rows)
     assert (time, len(found)) == (5.0, 0)
 
 
-def test_a_table_is_tracked_in_one_line() -> None:
+def test_a_table_is_tracked_in_one_line():
     tracks = saga_fg.track(table(label="car"))
     assert sorted(tracks.id.unique()) == [1, 2]
     assert tracks.timestamp.min() == pytest.approx(0.1)  # from the second detection on
@@ -80,7 +78,7 @@ def test_a_table_is_tracked_in_one_line() -> None:
     pd.testing.assert_frame_equal(now.to_pandas(), tracks[-2:].reset_index(drop=True))
 
 
-def test_tables_that_cannot_be_used_are_refused(subtests: pytest.Subtests) -> None:
+def test_tables_that_cannot_be_used_are_refused(subtests):
     for rows, message in [
         ([1, 2], r"expected a pandas.DataFrame, got list"),
         (pd.DataFrame({"t": [1.0], "x": [1.0]}), r"expected the columns timestamp, y as well, there are t, x"),
@@ -91,7 +89,7 @@ def test_tables_that_cannot_be_used_are_refused(subtests: pytest.Subtests) -> No
             saga_fg.track(rows)
 
 
-def test_a_value_is_named_by_its_column_and_row(subtests: pytest.Subtests) -> None:
+def test_a_value_is_named_by_its_column_and_row(subtests):
     for column, value, message in [
         ("x", np.inf, r"^x: row 500: expected a finite number of at most 1e\+09, got inf"),
         ("y", 1e12, r"^y: row 500: expected a finite number of at most 1e\+09, got 1e\+12|1000000000000"),
@@ -111,7 +109,7 @@ def test_a_value_is_named_by_its_column_and_row(subtests: pytest.Subtests) -> No
                 saga_fg.track(rows)
 
 
-def test_what_is_probably_wrong_is_warned_of(subtests: pytest.Subtests) -> None:
+def test_what_is_probably_wrong_is_warned_of(subtests):
     for columns, message in [
         ({"label": "car", "score": 87.0}, r"scores are not from 0 to 1: 100% .* look like percent; expected 0 to 1"),
         ({"label": "car", "score": -2.5}, r'Sensor\(score="logit"\)'),
@@ -127,7 +125,7 @@ def test_what_is_probably_wrong_is_warned_of(subtests: pytest.Subtests) -> None:
             saga_fg.track(table(**columns))
 
 
-def test_headings_of_a_compass_are_warned_of_with_and_without_velocities() -> None:
+def test_headings_of_a_compass_are_warned_of_with_and_without_velocities():
     angle = np.linspace(0, 6, 60)
     x, y = 20 * np.sin(angle), -20 * np.cos(angle)
     turning = pd.DataFrame({"timestamp": angle / 0.5, "label": "car", "x": x, "y": y, "yaw": np.pi / 2 - angle})
@@ -139,25 +137,22 @@ def test_headings_of_a_compass_are_warned_of_with_and_without_velocities() -> No
             saga_fg.track(rows.assign(yaw=angle))
 
 
-def test_usual_tables_are_not_warned_of() -> None:
+def test_usual_tables_are_not_warned_of():
     saga_fg.track(table(label=["car", "dog"] * 12, score=[0.0, 1.0] * 12, yaw=[6.28, -6.28] * 12))
     saga_fg.track(table(label="car", score=3.0), sensors={"default": saga_fg.Sensor(score="logit")})
     saga_fg.track(table())
     saga_fg.track(table(label="DRONE"), saga_fg.TrackerSettings(edges=()))
 
 
-def test_without_pandas_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pandas_is_imported_when_asked_for_and_named_where_missing(monkeypatch):
+    code = "import sys, saga_fg; saga_fg.track, saga_fg.Tracks; assert 'pandas' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'saga-fg\[pandas\]'"):
         Tracks.empty(0.0).to_pandas()
 
 
-def test_pandas_is_not_imported_before() -> None:
-    code = "import sys, saga_fg; saga_fg.track, saga_fg.Tracks; assert 'pandas' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_notebooks_show_tables() -> None:
+def test_notebooks_show_tables():
     many = Detections.of([Detection("<car>", (k, 2.0, 0.0)) for k in range(30)])
     shown = many._repr_html_()
     assert "30 detections" in shown
@@ -170,7 +165,7 @@ def test_notebooks_show_tables() -> None:
     assert f"{len(tracks)} tracks at 0.200 s" in tracks._repr_html_()
 
 
-def test_tracks_and_detections_are_printed_as_tables_of_one_width() -> None:
+def test_tracks_and_detections_are_printed_as_tables_of_one_width():
     detections = Detections.from_pandas(table(label=["car", "pedestrian"] * 12))
     tracks = saga_fg.Tracker().step(saga_fg.Frame(0.0, "lidar", detections))
     for shown in (detections, tracks):
@@ -181,7 +176,7 @@ def test_tracks_and_detections_are_printed_as_tables_of_one_width() -> None:
         assert "nan" not in str(shown)
 
 
-def test_a_tracker_says_what_it_holds() -> None:
+def test_a_tracker_says_what_it_holds():
     tracker = Tracker(saga_fg.TrackerSettings(min_hits=3), {"radar": saga_fg.Sensor()})
     assert repr(tracker).startswith("Tracker(0 tracks; ")
     tracker.step(Frame(1.5, "radar", Detections.of([Detection("car", (0.0, 0.0, 0.0))])))

@@ -1,9 +1,6 @@
 """Each finding: data that raise it, and data like it that must not."""
 
-from __future__ import annotations
-
 import numpy as np
-import pytest
 
 from data_tools.datasets.detection_files import TableImport
 from saga_fg import Boxes, Detections, Frame
@@ -36,7 +33,7 @@ def option(finding: Finding | None) -> str | None:
     return None if finding is None else TableImport().option_for(finding.mend, {"length": "len", "width": "wid"})
 
 
-def test_headings_in_degrees(subtests: pytest.Subtests) -> None:
+def test_headings_in_degrees(subtests):
     for yaw, found in [
         (RNG.uniform(0, 360, 60), "--units angle=deg"),
         (RNG.uniform(-180, 180, 60), "--units angle=deg"),
@@ -51,7 +48,7 @@ def test_headings_in_degrees(subtests: pytest.Subtests) -> None:
             assert option(headings_in_degrees(yaw)) == found
 
 
-def test_headings_against_motion(subtests: pytest.Subtests) -> None:
+def test_headings_against_motion(subtests):
     direction = RNG.uniform(-np.pi, np.pi, 100)
     speed = np.where(np.arange(100) < 80, 5.0, 0.0)
     velocity = speed[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
@@ -78,7 +75,7 @@ def test_headings_against_motion(subtests: pytest.Subtests) -> None:
             assert option(headings_against_motion(np.full(len(yaw), label), yaw, v, unit)) == found
 
 
-def test_velocities_between_frames_are_those_of_objects_that_cannot_be_mistaken() -> None:
+def test_velocities_between_frames_are_those_of_objects_that_cannot_be_mistaken():
     v = np.array([[8.0, 0.0], [0.0, 5.0], [-3.0, 1.0]])
     start = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 60.0]])
     time, label = np.repeat(np.arange(5) * 0.2, 3), np.tile(["car", "car", "truck"], 5)
@@ -90,7 +87,7 @@ def test_velocities_between_frames_are_those_of_objects_that_cannot_be_mistaken(
     assert np.isnan(velocities_between_frames(time, np.full(15, "car"), crowd)).all()
 
 
-def test_scores_beyond_one(subtests: pytest.Subtests) -> None:
+def test_scores_beyond_one(subtests):
     for score, what in [
         (RNG.uniform(5, 99, 60), "percent"),
         (RNG.normal(0, 4, 60), "logits"),
@@ -104,7 +101,7 @@ def test_scores_beyond_one(subtests: pytest.Subtests) -> None:
             assert finding is None or f"look like {what}" in finding.what
 
 
-def test_length_below_width(subtests: pytest.Subtests) -> None:
+def test_length_below_width(subtests):
     for label, size, found in [
         ("car", (1.9, 4.5, 1.6), True),
         ("REGULAR_VEHICLE", (1.9, 4.5, 1.6), True),
@@ -118,7 +115,7 @@ def test_length_below_width(subtests: pytest.Subtests) -> None:
             assert option(finding) == ("--columns length=wid,width=len" if found else None)
 
 
-def test_unlikely_sizes(subtests: pytest.Subtests) -> None:
+def test_unlikely_sizes(subtests):
     for label, size, unit in [
         ("car", (4500.0, 1900.0, 1600.0), "mm"),
         ("car", (450.0, 190.0, 160.0), "cm"),
@@ -134,7 +131,7 @@ def test_unlikely_sizes(subtests: pytest.Subtests) -> None:
             assert found == (None if unit is None else f"--units length={unit}")
 
 
-def test_within_a_metre() -> None:
+def test_within_a_metre():
     frame = np.repeat(np.arange(20), 5)
     position = RNG.uniform(0, 100, (100, 3))
     assert within_a_metre(frame, position) is None
@@ -149,7 +146,7 @@ def test_within_a_metre() -> None:
     assert within_a_metre(np.arange(100), lonely) is None  # one parked object
 
 
-def test_far_too_fast(subtests: pytest.Subtests) -> None:
+def test_far_too_fast(subtests):
     for label, speed, found in [
         ("car", 100.0, True),
         ("pedestrian", 15.0, True),
@@ -164,7 +161,7 @@ def test_far_too_fast(subtests: pytest.Subtests) -> None:
             assert far_too_fast(np.full(60, label), velocity) is None
 
 
-def test_strange_time_steps(subtests: pytest.Subtests) -> None:
+def test_strange_time_steps(subtests):
     for step, found in [
         (100.0, "ms"),
         (5e5, "ms"),
@@ -182,7 +179,7 @@ def test_strange_time_steps(subtests: pytest.Subtests) -> None:
                 assert finding is None or option(finding) == f"--units time={found}"
 
 
-def test_a_long_pause_is_no_strange_step() -> None:
+def test_a_long_pause_is_no_strange_step():
     time = np.r_[np.arange(20) * 0.1, 500 + np.arange(20) * 0.1]
     assert strange_time_steps(time, np.full(40, "lidar")) is None
     finding = strange_time_steps(np.arange(20) * 1e-5, np.full(20, "lidar"))
@@ -204,7 +201,7 @@ def drive(coordinates: str, start: float, speed: float = 10.0, traffic: float = 
     return frames
 
 
-def test_ego_taken_for_world(subtests: pytest.Subtests) -> None:
+def test_ego_taken_for_world(subtests):
     for frames, found in [
         (drive("ego", 0.0), True),  # it moves with the vehicle
         (drive("ego", 3000.0, 0.0), True),  # it stands far away from all of it
@@ -220,7 +217,7 @@ def test_ego_taken_for_world(subtests: pytest.Subtests) -> None:
             assert option(finding) == ("--coordinates ego" if found else None)
 
 
-def test_a_sample_has_all_doubts_and_none_where_scores_are_declared() -> None:
+def test_a_sample_has_all_doubts_and_none_where_scores_are_declared():
     frames = drive("world", 0.0)
     assert findings_of(Sample.from_frames(frames)) == []
     logits = [Frame(f.timestamp, "lidar", Detections(f.detections.boxes, np.full(30, -2.0))) for f in frames]
@@ -229,7 +226,7 @@ def test_a_sample_has_all_doubts_and_none_where_scores_are_declared() -> None:
     assert findings_of(Sample.from_frames([])) == []
 
 
-def test_names_of_classes(subtests: pytest.Subtests) -> None:
+def test_names_of_classes(subtests):
     for name, ours in [
         ("REGULAR_VEHICLE", "car"),
         ("LARGE_VEHICLE", "truck"),
@@ -250,7 +247,7 @@ def test_names_of_classes(subtests: pytest.Subtests) -> None:
             assert usual_class(name) == ours
 
 
-def test_rules_that_meet_no_class() -> None:
+def test_rules_that_meet_no_class():
     finding = idle_rules({"car", "pedestrian"}, {"REGULAR_VEHICLE", "PERSON", "dog"})
     assert finding is not None
     assert option(finding) == "--classes PERSON=pedestrian,REGULAR_VEHICLE=car"
@@ -264,7 +261,7 @@ def test_rules_that_meet_no_class() -> None:
     assert usual_classes(["car", "Van", "dog"], {"car"}) == {"Van": "car"}
 
 
-def test_settings_without_data() -> None:
+def test_settings_without_data():
     finding = settings_without_data("tracker.classes", {"Pedestrian", "car"}, {"pedestrian", "car"})
     assert finding is not None
     assert finding.text() == (

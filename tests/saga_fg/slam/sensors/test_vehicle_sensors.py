@@ -1,7 +1,5 @@
 """Sensors of the vehicle in a running graph: a drive through a tunnel, jumps, gaps, wrong places, and time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -35,7 +33,7 @@ class Vehicle:
     rate: np.ndarray
 
     @classmethod
-    def drive(cls, seconds: float = 8.0) -> Vehicle:
+    def drive(cls, seconds: float = 8.0) -> "Vehicle":
         t = np.arange(0, seconds, H)
         acceleration, rate = 1.5 * np.sin(0.9 * t), 0.3 * np.sin(0.7 * t)
         speed = 8.0 + np.cumsum(acceleration) * H
@@ -130,20 +128,20 @@ def run(
     return Run(smoother, buffer, np.array(truth), np.array(path))
 
 
-def test_through_a_tunnel_the_other_sensors_carry_the_pose() -> None:
+def test_through_a_tunnel_the_other_sensors_carry_the_pose():
     alone = run((), blind=(3.0, 6.5)).errors.max()
     assert alone > 6.0
     for sensors, most in ((("wheels",), 1.0), (("imu",), 1.0), (("wheels", "imu"), 0.6), (("gps",), 3.0)):
         assert run(sensors, blind=(3.0, 6.5)).errors.max() < most, sensors
 
 
-def test_the_batch_finds_the_same() -> None:
+def test_the_batch_finds_the_same():
     sensors = ("gps", "imu", "wheels")
     online, whole = (run(sensors, blind=(1.0, 2.0), batch=batch, seconds=3.0) for batch in (False, True))
     np.testing.assert_allclose(online.path, whole.path, atol=2e-3)
 
 
-def test_a_jump_of_a_kilometre_neither_crashes_nor_pulls() -> None:
+def test_a_jump_of_a_kilometre_neither_crashes_nor_pulls():
     found = run(("gps", "wheels"), jump=lambda time: 1000.0 if 3 < time < 4 else 0.0)
     assert found.errors.max() < 1.0
     assert found.misfits(("gps", "wheels"), SETTINGS) == {}
@@ -152,7 +150,7 @@ def test_a_jump_of_a_kilometre_neither_crashes_nor_pulls() -> None:
     assert "gps: " in forever.misfits(("gps",), SETTINGS)["gps"]
 
 
-def test_a_gap_of_the_samples_is_bridged_and_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_gap_of_the_samples_is_bridged_and_said(caplog):
     found = run(("imu",), imu_gap=(3.0, 4.5))
     assert "imu: no measurements for 0.20 s before 3.20 s" in caplog.text
     assert caplog.text.count("no measurements") == 1
@@ -160,7 +158,7 @@ def test_a_gap_of_the_samples_is_bridged_and_said(caplog: pytest.LogCaptureFixtu
     assert found.misfits(("imu",), SETTINGS) == {}
 
 
-def test_sensors_anywhere_on_the_vehicle_and_poses_of_another_sensor() -> None:
+def test_sensors_anywhere_on_the_vehicle_and_poses_of_another_sensor():
     placed = SensorSettings(
         replace(SETTINGS.gps, antenna=(-1.0, 0.5, 1.2)),
         replace(IMU, mounted=(0.5, -0.3, 0.4, 0.1, -0.2, 1.2)),
@@ -175,7 +173,7 @@ def test_sensors_anywhere_on_the_vehicle_and_poses_of_another_sensor() -> None:
     assert np.abs(bias.vector()[3:]).max() < 0.005
 
 
-def test_a_sensor_in_another_place_is_named(subtests: pytest.Subtests) -> None:
+def test_a_sensor_in_another_place_is_named(subtests):
     for sensor, true in [
         ("gps", SensorSettings(replace(SETTINGS.gps, antenna=(4.0, -4.0, 1.0)), IMU, SETTINGS.wheels)),
         ("imu", SensorSettings(SETTINGS.gps, replace(IMU, mounted=(0, 0, 0, 0.3, 0, 0)), SETTINGS.wheels)),
@@ -189,7 +187,7 @@ def test_a_sensor_in_another_place_is_named(subtests: pytest.Subtests) -> None:
             assert run(("gps", "imu", "wheels"), batch=True).misfits(("gps", "imu", "wheels"), SETTINGS) == {}
 
 
-def test_places_are_estimated_if_asked() -> None:
+def test_places_are_estimated_if_asked():
     true = SensorSettings(
         replace(SETTINGS.gps, antenna=(0.6, -0.4, 1.0), deviation=0.2, height_deviation=0.2),
         replace(IMU, mounted=(0.0, 0.0, 0.0, 0.02, -0.03, 0.05)),
@@ -207,7 +205,7 @@ def test_places_are_estimated_if_asked() -> None:
     np.testing.assert_allclose(found.static(WHEELS), [1.0], atol=0.01)
 
 
-def test_measurements_come_in_order_of_time() -> None:
+def test_measurements_come_in_order_of_time():
     buffer = SensorBuffer()
     buffer.add_imu(1.0, np.zeros(3), np.zeros(3))
     with pytest.raises(InputError, match=r"imu: expected a time after 1\.0+ s, got 0\.9"):
@@ -225,7 +223,7 @@ def test_measurements_come_in_order_of_time() -> None:
         sensor_providers(SETTINGS, ["radar"], np.eye(4))
 
 
-def test_a_gap_after_the_first_sample_is_not_filled() -> None:
+def test_a_gap_after_the_first_sample_is_not_filled():
     buffer = SensorBuffer()
     buffer.take(0.0)
     for time in (1.0, 1.1, 1.9, 2.0):  # 0.8 s without samples
@@ -239,7 +237,7 @@ def test_a_gap_after_the_first_sample_is_not_filled() -> None:
     assert buffer.take(1.4).wheels.dt == pytest.approx(0.1 + 0.5 + 0.1)
 
 
-def test_a_buffer_gives_each_pose_what_came_since_the_one_before() -> None:
+def test_a_buffer_gives_each_pose_what_came_since_the_one_before():
     buffer = SensorBuffer()
     buffer.take(0.0)
     for k in range(1, 11):

@@ -1,0 +1,298 @@
+"""Recorded traffic as worlds of its own."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.recording_sets import recording_set
+from benchmarks.recordings.crossings import LENGTH, LINE, RULES, simulated_crossings
+from benchmarks.recordings.ngsim import ngsim_windows
+from benchmarks.recordings.openacc import openacc_platoons
+from benchmarks.recordings.sensed import sensed_scene, true_scene
+from benchmarks.recordings.sources import Ngsim
+from benchmarks.recordings.traffic import RecordedTraffic, Recordings
+from data_tools.simulator.settings import SensorSettings, SimulatorSettings
+from pipelines.config import load_config
+from pipelines.learning import scenes_to_learn_from
+from pipelines.tracking import track_scene
+from saga_fg.errors import InputError
+from saga_fg.numerics.geometry import feet, on_it
+from saga_fg.types.dataset import Scene
+from tests.benchmarks.recordings.ngsim_example import crossing, rows, write_ngsim
+from tests.pipelines.command import done
+
+# Detections made from recorded traffic: viewpoints, what hides what, seeds, and colours of lights
+
+PERFECT = SensorSettings(
+    detection_probability=1.0, clutter_rate=0.0, reach=1000.0, max_range=500.0, size_noise=0.0, yaw_noise=0.0
+)
+
+
+@pytest.fixture
+def traffic(tmp_path: Path) -> RecordedTraffic:
+    return ngsim_windows(write_ngsim(tmp_path, rows(), {"A": crossing()})).read("A")
+
+
+def perfect() -> SimulatorSettings:
+    """A sensor that detects all that it sees, and truth of everything."""
+    return SimulatorSettings(sensors={"lidar": PERFECT}, annotation_range=math.inf, memory=math.inf, shortest_view=0.0)
+
+
+def visible(scene: Scene) -> dict[str, float]:
+    """Share of the moments of each vehicle at which it is visible."""
+    seen: dict[str, list[bool]] = {}
+    for truth in scene.ground_truth or ():
+        for name, is_visible in zip(truth.id.tolist(), truth.visible.tolist(), strict=True):
+            seen.setdefault(name, []).append(is_visible)
+    return {name: float(np.mean(values)) for name, values in seen.items()}
+
+
+def test_from_above_everything_is_detected_where_it_is(traffic):
+    scene = sensed_scene(traffic, "above", perfect(), seed=0)
+    assert visible(scene) == {"1": 1.0, "2": 1.0, "3": 1.0}
+    np.testing.assert_allclose(scene.timestamps, 0.1 * np.arange(12), atol=1e-9)
+    assert scene.ground_truth is not None
+    for frame, truth in zip(scene.frames, scene.ground_truth, strict=True):
+        found = frame.detections.boxes.position[np.char.find(frame.detections.boxes.label, "light") < 0]
+        apart = np.hypot(*np.moveaxis(found[:, None, :2] - truth.boxes.position[None, :, :2], -1, 0))
+        assert len(found) == len(truth) == (2 if frame.timestamp < 0.45 else 3)
+        assert apart.min(axis=0).max() < 0.6
+
+
+def test_a_vehicle_behind_another_is_hidden_from_the_road_and_not_from_a_mast(traffic):
+    low, high = (visible(sensed_scene(traffic, f"10,0,{height}", perfect(), 0)) for height in (1.0, 60.0))
+    assert high == {"1": 1.0, "2": 1.0, "3": 1.0}
+    assert low["2"] == 1.0  # stands before the truck
+    assert low["1"] == 1.0  # in the other lane
+    trailing = replace(
+        traffic,
+        vehicles=replace(
+            traffic.vehicles, size=np.where(traffic.vehicles.size[:, :1] > 7, [[4.5, 1.8, 1.5]], traffic.vehicles.size)
+        ),
+    )
+    assert visible(sensed_scene(trailing, "10,0,1", perfect(), 0))["3"] < 0.5
+
+
+def test_the_vehicle_that_carries_the_sensors_is_not_an_object_and_the_scene_lasts_as_long(traffic):
+    scene = sensed_scene(traffic, "3", perfect(), seed=0)
+    assert set(visible(scene)) == {"1", "2"}
+    assert len(scene) == 7
+    np.testing.assert_allclose(scene.world_T_ego[:, 0, 3], -30 + 0.5 * np.arange(5, 12))
+    chosen = sensed_scene(traffic, "vehicle", perfect(), seed=0)
+    assert len(chosen) == 12
+    assert set(visible(chosen)) in ({"1", "3"}, {"2", "3"})
+
+
+def test_ground_truth_alone_has_everybody_and_no_frames(traffic):
+    scene = true_scene(traffic)
+    assert not scene.frames
+    assert visible(scene) == {"1": 1.0, "2": 1.0, "3": 1.0}
+    assert scene.ground_truth is not None
+    assert [len(truth) for truth in scene.ground_truth] == [2] * 5 + [3] * 7
+
+
+def test_colours_are_reported_at_first_and_when_they_change(traffic):
+    scene = sensed_scene(traffic, "mast", perfect(), seed=0)
+    reports = {
+        round(frame.timestamp, 1): label
+        for frame in scene.frames
+        for label in frame.detections.boxes.label.tolist()
+        if label.startswith("traffic_light")
+    }
+    assert reports == {0.0: "traffic_light_red", 0.3: "traffic_light_green"}
+    assert all(frame.road_map is traffic.road_map for frame in scene.frames)
+
+
+def test_a_vehicle_that_appears_inside_another_is_tracked_with_the_rest(tmp_path):
+    inside = [f"X,A,9,{k},car,-3.2,0.1,0,0,,4.5,1.8" for k in range(4, 12)]
+    traffic = ngsim_windows(write_ngsim(tmp_path, rows() + inside, {"A": crossing()})).read("A")
+    scene = sensed_scene(traffic, "mast", perfect(), seed=0)
+    assert scene.ground_truth is not None
+    assert len(scene.ground_truth[-1]) == 4
+    tracks = track_scene(scene, load_config("traffic").new_tracker("saga")).tracks
+    assert len(tracks) == 12
+    assert all(np.isfinite(moment.boxes.position).all() for moment in tracks)
+
+
+def test_viewpoints_that_are_none_are_errors(traffic, subtests):
+    for viewpoint, message in [
+        ("roof", r"--viewpoint: A: unknown viewpoint 'roof', expected one of: mast, above, vehicle, X,Y,Z, 1, 2, 3"),
+        ("1,2", r"--viewpoint: expected X,Y,Z of finite numbers, m, Z not below 0, got '1,2'"),
+        ("1,nan,2", r"--viewpoint: expected X,Y,Z"),
+        ("1,1,-2", r"--viewpoint: expected X,Y,Z"),
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            sensed_scene(traffic, viewpoint, None, 0)
+
+
+def test_a_source_opens_chosen_windows(tmp_path):
+    write_ngsim(tmp_path, rows() + rows("B"), {"A": crossing(), "B": crossing()})
+    source = Ngsim(dataroot=str(tmp_path), scenes="B", road="map")
+    with source.open(truth=True) as dataset, source.ground_truth() as true:
+        assert dataset.scenes == true.scenes == ("B",)
+        scene = dataset.scene("B")
+        assert len(true.scene("B")) == len(scene)
+    labels = np.concatenate([frame.detections.boxes.label for frame in scene.frames])
+    assert not (np.char.find(labels, "light") >= 0).any()
+    assert scene.frames[0].road_map is not None
+    with (
+        pytest.raises(InputError, match=r"--scenes: unknown scene 'C'"),
+        Ngsim(dataroot=str(tmp_path), scenes="C").open(),
+    ):
+        pass
+
+
+# NGSIM windows and OpenACC platoons as recorded: where vehicles drive, who stops, and platoons in order
+
+
+@pytest.fixture(scope="module")
+def ngsim(recordings: Path) -> Recordings:
+    if not (recordings / "ngsim").is_dir():
+        pytest.skip("no NGSIM windows among the recordings")
+    return ngsim_windows(recordings / "ngsim")
+
+
+@pytest.fixture(scope="module")
+def openacc(recordings: Path) -> Recordings:
+    pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
+    if not (recordings / "openacc").is_dir():
+        pytest.skip("no OpenACC platoons among the recordings")
+    return openacc_platoons(recordings / "openacc")
+
+
+def test_vehicles_drive_in_the_lanes_of_the_map(ngsim):
+    traffic = ngsim.read("USA_Lanker-2_6_T-1")
+    assert traffic.road_map is not None
+    position, yaw = traffic.vehicles.position[traffic.vehicles.present], traffic.vehicles.yaw[traffic.vehicles.present]
+    inside = np.zeros(len(position), dtype=bool)
+    for lane in traffic.road_map.lanes:
+        centre = np.array(lane.centre)
+        foot = feet(centre, position)
+        along = np.cos(np.arctan2(*foot.direction.T[::-1]) - yaw) > 0.7
+        inside |= along & on_it(centre, foot.s) & (np.abs(foot.e) < lane.width / 2)
+    assert inside.mean() > 0.95
+
+
+def standing_at_lines(traffic: RecordedTraffic) -> dict[str, list[bool]]:
+    """Whether vehicles within 12 m before a line stand, by the colour that is shown."""
+    found: dict[str, list[bool]] = {"red": [], "amber": [], "green": []}
+    assert traffic.road_map is not None
+    for line in traffic.road_map.stop_lines:
+        (left, right), shown = line.ends, traffic.colours[line.light]
+        ahead, width = np.array([np.cos(line.heading), np.sin(line.heading)]), np.hypot(*(line.ends[1] - line.ends[0]))
+        across = (traffic.vehicles.position - left) @ ((right - left) / width)
+        way = (left - traffic.vehicles.position) @ ahead - traffic.vehicles.size[:, 0] / 2
+        comes = traffic.vehicles.present & (np.abs(way - 5.5) < 6.5) & (np.abs(across - width / 2) < width / 2)
+        comes &= np.cos(traffic.vehicles.yaw - line.heading) > 0.8
+        for k, n in zip(*np.nonzero(comes), strict=True):
+            found[str(shown[k])].append(bool(np.hypot(*traffic.vehicles.velocity[k, n]) < 0.5))
+    return found
+
+
+def test_vehicles_stand_at_red_and_go_at_green(ngsim):
+    stand: dict[str, list[bool]] = {"red": [], "amber": [], "green": []}
+    for name in ngsim.names:
+        if "Lanker" in name:
+            for colour, found in standing_at_lines(ngsim.read(name)).items():
+                stand[colour] += found
+    assert min(len(stand["red"]), len(stand["green"])) > 1000
+    assert np.mean(stand["red"]) > 0.85
+    assert np.mean(stand["green"]) < 0.2
+
+
+def test_dense_traffic_hides_vehicles_from_a_mast(ngsim):
+    scene = sensed_scene(ngsim.read("USA_Lanker-1_2_T-1"), "mast", None, seed=0)
+    assert scene.ground_truth is not None
+    visible = np.concatenate([truth.visible for truth in scene.ground_truth])
+    assert 0.2 < visible.mean() < 0.95
+    counts = [len(frame) for frame in scene.frames]
+    assert min(counts) > 5
+    assert scene.frames[0].road_map is not None
+
+
+def test_platoons_keep_their_order_and_plausible_gaps(openacc):
+    assert len(openacc.names) == 37
+    traffic = openacc.read("short_setting-dynamic_part4")
+    ids = traffic.vehicles.id.astype(int)
+    assert sorted(ids.tolist()) == list(range(1, 12))
+    order = np.argsort(ids)
+    position, yaw, length = (
+        traffic.vehicles.position[:, order],
+        traffic.vehicles.yaw[:, order],
+        traffic.vehicles.size[order, 0],
+    )
+    assert (length > 3).all()
+    assert (length < 6).all()
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)[:, 1:]
+    offset = position[:, :-1] - position[:, 1:]
+    assert (np.einsum("kni,kni->kn", offset, ahead) > 0).mean() > 0.98  # the track is a circle
+    gap = np.hypot(*np.moveaxis(offset, -1, 0)) - (length[1:] + length[:-1]) / 2
+    assert 5 < np.median(gap) < 25
+    moved = np.hypot(*np.moveaxis(np.diff(position, axis=0), -1, 0)) / 0.1
+    both = traffic.vehicles.present[1:, order] & traffic.vehicles.present[:-1, order]
+    speed = np.hypot(*np.moveaxis(traffic.vehicles.velocity[1:, order], -1, 0))
+    assert np.quantile(np.abs(moved - speed)[both], 0.99) < 1.5
+
+
+# Simulated crossings without signals
+
+
+@pytest.mark.parametrize("row", range(len(RULES)))
+def test_nobody_collides_and_somebody_waits(row):
+    recordings = simulated_crossings(len(RULES))
+    vehicles = recordings.read(recordings.names[row]).vehicles
+    speed = np.hypot(*np.moveaxis(vehicles.velocity, -1, 0))
+    pairs = vehicles.present[:, :, None] & vehicles.present[:, None] & ~np.eye(len(vehicles.id), dtype=bool)
+    apart = np.linalg.norm(vehicles.position[:, :, None] - vehicles.position[:, None], axis=-1)
+    assert apart[pairs].min() > 0.7 * LENGTH
+    stands = (speed < 0.3) & vehicles.present
+    assert 0.02 < stands.sum() / vehicles.present.sum() < 0.7
+    major = np.abs(np.sin(vehicles.yaw)) < 0.1
+    near = np.abs(vehicles.position).max(axis=-1) < 120 - LINE + 3
+    assert (stands & near & major).any() == (RULES[row] == "all-way")
+
+
+def test_a_name_and_a_seed_make_one_recording():
+    one, same, other = (simulated_crossings(2, seed).read("priority-0").vehicles for seed in (0, 0, 1))
+    np.testing.assert_array_equal(one.position, same.position)
+    assert one.position.shape != other.position.shape or (one.position != other.position).any()
+
+
+def test_the_middle_of_a_crossing_is_what_is_asked_for():
+    whole, middle = (recording_set("crossings", None, 1, longest=longest) for longest in (np.inf, 5.0))
+    (name,) = whole.dataset.scenes
+    assert middle.scene(name).timestamps[-1] == pytest.approx(5.0)
+    assert whole.scene(name).timestamps[-1] == pytest.approx(40.0)
+
+
+# Recorded traffic through the command and the benchmarks, on a crossing written by hand
+
+NGSIM = "benchmarks.recordings:Ngsim"
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    (tmp_path / "ngsim").mkdir()
+    write_ngsim(tmp_path / "ngsim", rows(steps=20), {"A": crossing()})
+    return tmp_path
+
+
+def test_track_and_evaluate(data):
+    root, tracks = str(data / "ngsim"), str(data / "tracks.csv")
+    run = done("track", NGSIM, "--dataroot", root, "--output", tracks)
+    assert "1 scene, 20 frames" in run.output
+    run = done("evaluate", NGSIM, tracks, "--dataroot", root)
+    assert "MOTA" in run.output
+
+
+def test_scenes_to_learn_from_have_the_carrier_as_well(data):
+    source = Ngsim(dataroot=str(data / "ngsim"), viewpoint="1")
+    scene = scenes_to_learn_from(source, load_config("traffic"), with_truth=True)["A"]
+    assert scene.ground_truth is not None
+    ids = [name for moment in scene.ground_truth for name in moment.id.tolist()]
+    assert [ids.count(name) for name in ("1", "2", "3")] == [20, 20, 15]
+    assert [len(frame) for frame in scene.frames] == [len(moment) for moment in scene.ground_truth]
+    assert {frame.sensor for frame in scene.frames} == {"lidar"}

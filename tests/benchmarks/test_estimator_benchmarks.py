@@ -1,0 +1,200 @@
+"""Benchmarks of estimators."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from benchmarks import smoothing
+from benchmarks.agreement import pairwise_agreement
+from benchmarks.app import app
+from benchmarks.estimators import Vehicles, estimators
+from benchmarks.flocks import Kind, flock
+from benchmarks.modes import FRAMES, draw, enumerated, matched
+from benchmarks.sampled_traffic import providers
+from benchmarks.settling import APART, EVADING, MIXED, NEAR, SILENT, STRAIGHT, largest_difference, sample_scene
+from benchmarks.smoothing import true_objects
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from pipelines.smoothing import load_smooth_config, smooth_known_objects
+from saga_fg.estimators import BatchSolver, IncrementalSmoother
+from saga_fg.graph import OBJECT
+from saga_fg.smoothing import gather_evidence
+
+# The estimators' benchmark in miniature: it measures what it says, and everybody is exact
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[dict[str, Any]]:
+    return [{"table": title, **row} for title, row in estimators("4,8", 2, 30.0, 4, 6)]
+
+
+def test_every_exact_estimator_is_exact(rows):
+    ours = [row for row in rows if row.get("estimator") in ("kalman", "isam2", "fixed-lag", "batch") and "case" in row]
+    assert {(row["case"], row["estimator"]) for row in ours} == {
+        *(("filter", "kalman"), ("filter", "isam2"), ("fixed lag", "fixed-lag"), ("batch", "batch"))
+    }
+    for row in ours:
+        assert row["mean"] <= row["largest"] < 1e-8
+        assert row.get("covariance", 0.0) < 1e-9
+
+
+def test_ratios_are_those_of_the_times(rows):
+    baselines = {"filter": "textbook", "batch": "textbook", "fixed lag": "GTSAM's", "running graph": "linear"}
+    cases = [row for row in rows if "case" in row]
+    for row in cases:
+        same = [r for r in cases if all(r[key] == row[key] for key in ("case", "graph", "nodes"))]
+        (base,) = [r for r in same if r["estimator"] == baselines[row["case"]]]
+        assert row["ratio"] == pytest.approx(row["ms"] / base["ms"])
+    drivers = {row["graph"] for row in cases if row["estimator"] == "intelligent driver"}
+    assert drivers == {"connected", "components"}
+
+
+def test_vehicles_drive_in_rows():
+    vehicles = Vehicles(6, 3, linear=False)
+    smoother = IncrementalSmoother([vehicles])
+    for k in range(8):
+        smoother.step(0.1 * k)
+    there = smoother.graph().of(OBJECT, 7)
+    places = np.stack([smoother.state(there[i].key)[:2] for i in range(6)])
+    assert np.abs(places - vehicles.start[:, :2] - [5.6, 0.0]).max() < 2.0
+
+
+def test_sizes_that_are_none_are_one_line_of_error(refused):
+    for sizes in ("10,many", "1", ""):
+        assert "--sizes: expected whole numbers >= 2" in refused("estimators --sizes", sizes)
+
+
+def test_flocks_are_what_their_names_say():
+    kind: Kind = "components"
+    scene = flock(kind, 20, 3, seed=1)
+    again = flock(kind, 20, 3, seed=1)
+    for frame, same in zip(scene.frames, again.frames, strict=True):
+        np.testing.assert_array_equal(frame.measurements.z, same.measurements.z)
+        (edges,) = frame.transition.graph.edges
+        assert np.bincount(edges.target, minlength=20).max() <= 4
+        assert not (edges.target == edges.source).any()
+    first, second = (frame.transition.graph.edges[0] for frame in scene.frames[:2])
+    assert first.rate.tolist()[:5] != second.rate.tolist()[:5]
+
+
+# The incremental smoother beside Levenberg-Marquardt on nonlinear scenes
+
+
+@pytest.mark.parametrize("kind", [EVADING, STRAIGHT])
+def test_two_who_cross_come_near_each_other(kind):
+    scene = sample_scene(kind, np.random.default_rng(3), frames=10)
+    apart = [np.hypot(*(one.states[0] - one.states[1])[:2]) for one in scene.frames]
+    assert apart[0] == pytest.approx(APART, abs=0.1)
+    assert min(apart) < NEAR
+
+
+def test_the_smoother_is_compared_with_the_minimum_of_the_same_graph():
+    scene = sample_scene(EVADING, np.random.default_rng(4), frames=8)
+    smoother, batch = IncrementalSmoother(providers(scene), None), BatchSolver(providers(scene))
+    for frame in scene.frames:
+        smoother.step(frame.time)
+        batch.step(frame.time)
+    assert smoother.graph().variables.keys() == batch.graph().variables.keys()
+    assert largest_difference(smoother, batch) < SILENT
+    smoother.step(99.0, [])
+    assert largest_difference(smoother, batch) < SILENT
+
+
+def test_the_command_prints_a_row_for_every_kind(tmp_path):
+    figures = tmp_path / "figures.json"
+    result = CliRunner().invoke(app, f"settling --mixed 1 --crossings 2 --frames 8 --json {figures}".split())
+    assert result.exit_code == 0, result.output
+    rows = json.loads(figures.read_text())["rows"]
+    assert [row["scenes"] for row in rows] == [MIXED, EVADING, STRAIGHT]
+    assert all(row["frames"] == 8 and 0 <= row["settled, %"] <= 100 for row in rows)
+
+
+# Moments matched node by node, beside every sequence of modes
+
+
+def test_both_are_exact_where_one_node_has_been_measured_once():
+    frames = draw(np.random.default_rng(1), 1)
+    exact, own = enumerated(frames), matched(frames)
+    np.testing.assert_allclose(own[0].mean, exact[0].mean, atol=1e-9)
+    np.testing.assert_allclose(own[0].sigma, exact[0].sigma, rtol=1e-9)
+    np.testing.assert_allclose(own[0].stands, exact[0].stands, atol=1e-9)
+    assert np.abs(own[-1].mean - exact[-1].mean).max() > 1e-6
+
+
+def test_enumeration_finds_who_stands():
+    certain = []
+    for seed in range(20):
+        frames = draw(np.random.default_rng(seed), 2)
+        speed = np.linalg.norm(frames[-1].states[:, 2:], axis=1)
+        certain += zip(speed, enumerated(frames)[-1].stands, strict=True)
+    stands = np.array([p for speed, p in certain if speed < 0.3])
+    drives = np.array([p for speed, p in certain if speed > 2])
+    assert stands.mean() > drives.mean() + 0.3
+
+
+def test_the_command_prints_a_row_for_every_number_of_nodes(tmp_path):
+    figures = tmp_path / "figures.json"
+    result = CliRunner().invoke(app, f"modes --scenes 2 --json {figures}".split())
+    assert result.exit_code == 0, result.output
+    rows = json.loads(figures.read_text())["rows"]
+    assert [(row["nodes"], row["frames"]) for row in rows] == list(FRAMES.items())
+    assert all(0 < row["means, sigma"] < 1 and row["sequences"] <= 4096 for row in rows)
+    assert [row["matched / enumerated"] for row in rows] == pytest.approx([1, 1, 1], abs=0.2)
+
+
+# The benchmark of the smoother on hidden objects: detections are given to their true objects
+
+
+def test_detections_find_their_true_objects():
+    scene = SimulatedTraffic(replace(SimulatorSettings(), duration=3.0), scenes=1, seed=4).scene("scene-0001")
+    config = load_smooth_config("simulated")
+    evidence = gather_evidence(scene.frames, scene.timestamps, config.sensors, config.tracking.tracker.classes)
+    assert scene.ground_truth is not None
+    names = sorted({str(name) for truth in scene.ground_truth for name in truth.id.tolist()})
+    object_of = true_objects(scene, evidence, names)
+    assert (object_of >= 0).mean() > 0.7  # the rest is clutter
+    states = smooth_known_objects(evidence, object_of, config.smoothing, config.tracking.of_method("kf").tracker)
+    assert set(np.unique(states.id).tolist()) == set(np.unique(object_of[object_of >= 0]).tolist())
+    last = scene.ground_truth[-1]
+    k = int(np.searchsorted(evidence.times, scene.timestamps[-1]))
+    ids = np.array([names.index(str(name)) for name in last.id[last.visible].tolist()])
+    at = states.rows_of(np.full(len(ids), k), ids)
+    error = states.mean[at, :2] + evidence.origin - last.boxes.position[last.visible, :2]
+    assert np.median(np.hypot(*error[at >= 0].T)) < 0.15
+
+
+def test_the_benchmark_compares_the_same_boxes(bench, monkeypatch):
+    short = replace(SimulatorSettings(), duration=4.0)
+    monkeypatch.setattr(smoothing, "SimulatedTraffic", lambda scenes, seed: SimulatedTraffic(short, scenes, seed))
+    (row,) = bench("smoothing --scenes 2")
+    assert row["boxes"] > 10
+    assert row["relative change"]["estimate"] == pytest.approx(row["with edges"] / row["without"] - 1)
+
+
+# Pairwise agreement of two groupings
+
+GROUPS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=20)
+
+
+def test_an_example_by_hand():
+    found = pairwise_agreement([1, 1, 1, 2, 2], [7, 7, 8, 8, 8])
+    assert found.precision == pytest.approx(2 / 4)
+    assert found.recall == pytest.approx(2 / 4)
+    assert pairwise_agreement([1, 2, 3], [1, 1, 1]).recall == 0
+    assert pairwise_agreement([], []).f1 == 1
+
+
+@given(GROUPS)
+def test_it_counts_pairs(groups):
+    a, b = (np.array([group[side] for group in groups], dtype=np.int64) for side in (0, 1))
+    upper = np.triu_indices(len(a), 1)
+    one, other = (a[:, None] == a)[upper], (b[:, None] == b)[upper]
+    found = pairwise_agreement(a, b)
+    assert found.precision == pytest.approx((one & other).sum() / one.sum() if one.any() else 1)
+    assert found.recall == pytest.approx((one & other).sum() / other.sum() if other.any() else 1)
+    assert pairwise_agreement(a, a + 100).f1 == 1

@@ -1,0 +1,277 @@
+"""Benchmarks of SLAM."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from benchmarks import joint as module
+from benchmarks.app import app
+from benchmarks.course import SimulatedCourse, revisits
+from benchmarks.joint import batch_run, joint_rows, online_run
+from benchmarks.loops import odometry_of
+from benchmarks.scans import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, ranges, simulate_scan
+from benchmarks.slam import all_in_rows, odometry_rows
+from data_tools.datasets.kitti import KittiScans
+from data_tools.lidar import deskewed
+from data_tools.pose_graphs import write_g2o
+from data_tools.simulator import simulate_scene
+from pipelines.config import load_config
+from pipelines.slam.joint import run_joint, street
+from saga_fg import InputError
+from saga_fg.numerics.geometry import transform_points, yaw_of, yaw_transform
+from saga_fg.slam.joint import JointSettings
+from saga_fg.slam.pose_graph import PoseGraph, PosePriors
+from saga_fg.types.boxes import Boxes
+from tests.saga_fg.loops import loop
+
+# `python -m benchmarks loops`: false loops, simulated courses, and what is refused before anything runs
+
+
+def spoilt(folder: Path, graph: PoseGraph, *options: str) -> tuple[int, str, str]:
+    sound, _ = loop(2, seed=0)
+    write_g2o(folder / "sound.g2o", sound)
+    write_g2o(folder / "other.g2o", graph)
+    files = [str(folder / name) for name in ("sound.g2o", "other.g2o")]
+    result = CliRunner().invoke(app, ["loops", *files, "--no-gnc", "--seeds", "1", *options])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_false_loops_are_left_out(tmp_path):
+    code, stdout, stderr = spoilt(tmp_path, loop(2, seed=1)[0], "--shares", "0.2")
+    assert code == 0, stderr
+    assert "sound, 0.2" in stdout
+    assert "other, 0.2" in stdout
+
+
+def triangle() -> PoseGraph:
+    graph, true = loop(2, seed=0)
+    first, second = np.array([0, 1, 0]), np.array([1, 2, 2])
+    return PoseGraph(
+        graph.ids[:3], true[:3], first, second, np.linalg.inv(true[first]) @ true[second], graph.information[:3]
+    )
+
+
+def with_prior() -> PoseGraph:
+    graph, true = loop(2, seed=0)
+    return replace(graph, priors=PosePriors(np.array([0]), true[:1], np.eye(3)[None]))
+
+
+def test_what_cannot_be_run_is_refused_at_the_door(tmp_path, subtests):
+    for graph, options, message in [
+        (triangle(), [], "other.g2o: expected 4 poses and a loop or more, got 3 and 1"),
+        (with_prior(), [], "other.g2o: expected a graph of poses alone, without landmarks and priors"),
+        (loop(2, seed=1)[0], ["--shares", "-1"], "--shares: expected numbers >= 0 with commas, got '-1'"),
+        (loop(2, seed=1)[0], ["--shares", "inf"], "--shares: expected numbers >= 0 with commas, got 'inf'"),
+    ]:
+        with subtests.test(message):
+            code, stdout, stderr = spoilt(tmp_path, graph, *options)
+            assert code == 2
+            assert message in stderr.replace("\n", " ")
+            assert not stdout
+
+
+def test_odometry_errs_by_one_per_cent_and_the_drift_asked_for():
+    ends = []
+    for seed in range(3):
+        course = SimulatedCourse(seed, period=0.25)
+        poses, drifted = (odometry_of(course, seed, drift) for drift in (0.0, 30.0))
+        first = revisits(course.world_T_ego)[0][0]
+        assert np.linalg.norm((drifted - poses)[first, :3, 3]) == pytest.approx(30.0)
+        ends.append(np.linalg.norm((poses - course.world_T_ego)[:, :3, 3], axis=1).max() / course.distance[-1])
+    assert 0.005 < np.median(ends) < 0.03
+
+
+def test_courses_that_cannot_be_driven_are_refused(refused, subtests):
+    for arguments, message in [
+        ("", "expected either files of pose graphs, or --courses"),
+        ("--courses a", "--courses: expected numbers >= 0 with commas, got 'a'"),
+        ("--courses 0 --drift -1", "--drift: expected numbers >= 0 with commas"),
+        ("graph.g2o --courses 0", "expected either files of pose graphs, or --courses"),
+    ]:
+        with subtests.test(message):
+            assert message in refused(f"loops {arguments}")
+
+
+# `python -m benchmarks joint`: joint against decoupled estimation, in batch and online
+
+SHORT = replace(street(), duration=2.0)
+CONFIG = load_config("simulated")
+
+
+def test_recordings_are_pooled_and_the_same_odometry_is_compared():
+    scenes = [simulate_scene(SHORT, seed, f"street {seed}") for seed in (1, 2)]
+    settings = JointSettings(passes=1)
+    rows = list(joint_rows(scenes, [0], partial(batch_run, config=CONFIG, settings=settings, poles=True)))
+    paths = [row for title, row in rows if "path, m" in row]
+    assert [row["recording"] for row in paths] == ["street 1", "street 2"]
+    for scene, row in zip(scenes, paths, strict=True):
+        errors = run_joint(scene, CONFIG, settings, "lidar", 0).errors()
+        assert (row["ATE, m: decoupled"], row["joint"]) == (errors["odometry"].ate, errors["joint"].ate)
+        assert np.isfinite(row["ATE with poles"])
+    change = next(row["change"] for _, row in rows if row.get("error") == "joint against decoupled")
+    squares = np.square([(row["joint"], row["ATE, m: decoupled"]) for row in paths]).sum(axis=0)
+    assert change.estimate == pytest.approx(np.sqrt(squares[0] / squares[1]) - 1)
+
+
+def test_online_objects_are_scored_where_both_report_them():
+    scenes = [simulate_scene(replace(SHORT, duration=3.0), seed, f"street {seed}") for seed in (1, 2)]
+    rows = list(joint_rows(scenes, [0], partial(online_run, config=CONFIG, settings=JointSettings(), lag=1.0)))
+    paths = [row for title, row in rows if title == "error of the vehicle's path"]
+    for scene, row in zip(scenes, paths, strict=True):
+        errors = run_joint(scene, CONFIG, JointSettings(), "lidar", 0, lag=1.0).errors()
+        assert (row["ATE, m: decoupled"], row["ATE, m: joint"]) == (errors["odometry"].ate, errors["online"].ate)
+    objects = [row for title, row in rows if title.startswith("RMSE")]
+    assert {row["method"] for row in objects} == {"decoupled", "joint"}
+    for row in objects:
+        assert row["pairs"] > 5
+        assert 0 < row["world velocity, m/s"] < 5
+        assert 0 < row["ego position, m"] < 1
+    squares = {
+        name: sum(row["pairs"] * row["world position, m"] ** 2 for row in objects if row["method"] == name)
+        for name in ("decoupled", "joint")
+    }
+    change = next(row for _, row in rows if row.get("objects") == "moving")
+    expected = np.sqrt(squares["joint"] / squares["decoupled"]) - 1
+    assert change["world position, m"].estimate == pytest.approx(expected)
+    with pytest.raises(InputError, match="expected ground truth"):
+        online_run(replace(scenes[0], ground_truth=None), 0, CONFIG, JointSettings(), 1.0)
+
+
+def test_options_go_together_and_one_thing_is_asked_for_at_a_time(refused):
+    assert "expected both --dataroot and --detections" in refused("joint --dataroot somewhere")
+    assert "--online: expected without --poles" in refused("joint --online --poles")
+    assert "expected one of --dataroot, --landmarks and --dense" in refused("slam --landmarks 120 --dense 3")
+
+
+def test_the_command_prints_the_changes(bench, monkeypatch):
+    monkeypatch.setattr(module, "street", lambda parked: SHORT)
+    compared = {row.get("compared") for row in bench("joint --scenes 2")}
+    assert {"joint against decoupled", "joint against held"} <= compared
+
+
+# The simulated LiDAR: ranges as geometry says, noise as asked for, skew that de-skew takes away
+
+NOTHING = Boxes.empty()
+WORLD = StaticWorld(
+    Boxes.of(["car"], [(10.0, 0.0, 1.0)], [(4.0, 2.0, 2.0)], [np.pi / 2], [(0.0, 0.0)]),
+    np.array([[0.0, 5.0, 0.5, 3.0]]),
+)
+
+
+def test_ranges_are_those_of_geometry():
+    for direction, expected in [
+        ((1.0, 0.0, 0.0), 9.0),  # the car, turned: its side is 1 m before its centre
+        ((0.0, 1.0, 0.0), 4.5),  # the pole
+        ((0.0, 0.0, -1.0), 1.5),  # the ground
+        ((0.0, 0.6, 0.8), np.inf),  # over the pole
+        ((-1.0, 0.0, 0.0), np.inf),
+    ]:
+        ((distance,),) = ranges(WORLD, np.array([[0.0, 0.0, 1.5]]), np.array([[direction]]))
+        assert distance == pytest.approx(expected)
+
+
+def test_scans_repeat_with_their_seed_and_have_the_noise_asked_for():
+    settings = ScannerSettings(noise=0.05)
+    pose = yaw_transform(z=2.0)
+    world = StaticWorld(NOTHING, np.empty((0, 4)))
+    a, b, c = (simulate_scan(world, pose, np.random.default_rng(seed), settings) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(a.points, b.points)
+    assert not np.array_equal(a.points, c.points)
+    distance = np.linalg.norm(a.points, axis=1)
+    elevation = np.arcsin(a.points[:, 2] / distance)
+    assert np.std(distance - 2.0 / np.sin(-elevation)) == pytest.approx(0.05, rel=0.05)
+
+
+def test_deskewed_points_lie_where_things_are():
+    velocity = np.array([0.0, 0.0, 0.5, 10.0, 0.0, 0.0])
+    pose = yaw_transform(1.0, -1.0, 1.5, 0.2)
+    scan = simulate_scan(WORLD, pose, np.random.default_rng(0), ScannerSettings(noise=1e-4), velocity)
+    points = transform_points(pose, deskewed(scan, velocity).points)
+    at_pole = points[(np.hypot(points[:, 0], points[:, 1] - 5) < 1) & (points[:, 2] > 0.2)]
+    assert len(at_pole) > 50
+    np.testing.assert_allclose(np.hypot(at_pole[:, 0], at_pole[:, 1] - 5), 0.5, atol=2e-3)
+
+
+def test_poles_and_courses_that_are_none_are_refused():
+    with pytest.raises(InputError, match=r"poles: expected shape \(any, 4\)"):
+        StaticWorld(NOTHING, np.zeros((1, 3)))
+    with pytest.raises(InputError, match="length > 0 m"):
+        SimulatedCourse(0, length=0.0)
+
+
+# The simulated course: a closed drive that comes back to three stretches, and repeats with its seed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_three_stretches_are_passed_again_in_both_directions(seed):
+    course = SimulatedCourse(seed, period=0.25)
+    poses = course.world_T_ego
+    runs = revisits(poses)
+    assert len(runs) == 3
+    assert 1500.0 < course.lap < 2300.0
+    headings, places = yaw_of(poses[:, :3, :3]), poses[:, :2, 3]
+    facing = []
+    for first, last in runs:
+        rows = np.arange(first, last)
+        old = [np.argmin(np.linalg.norm(places[: row - 40] - places[row], axis=1)) for row in rows]
+        facing.append(np.cos(headings[rows] - headings[old]))
+    assert min(each.min() for each in facing[:2]) < -0.9
+    assert np.median(facing[-1]) > 0.9  # the next lap
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert 0.9 < steps.min() < steps.max() < 2.01  # 4 to 8 m/s
+
+
+def test_a_lap_closes_scans_repeat_and_cars_leave_and_come():
+    course = SimulatedCourse(3, length=5000.0)
+    assert len(course) > 6000
+    one, other = (course.world_T_ego[np.searchsorted(course.distance, lap * course.lap + 30.0)] for lap in (0, 1))
+    np.testing.assert_allclose(one, other, atol=1.0)
+    np.testing.assert_array_equal(course[40].points, SimulatedCourse(3, length=200.0)[40].points)
+    assert course[40].points[:, 2].min() == pytest.approx(-SENSOR_HEIGHT, abs=0.15)
+    assert len(course[-1]) > 5000
+    town = SimulatedCourse(0, length=10.0).town
+    before, after = (len(town.at(time).boxes) for time in (0.0, 2.0))
+    assert before < len(town.world.boxes)
+    assert after < len(town.world.boxes)
+
+
+# `python -m benchmarks slam`: odometry beside KISS-ICP, cost of scans all in, and of landmarks
+
+
+def test_both_are_measured_on_the_same_scans():
+    pytest.importorskip("kiss_icp", reason="kiss-icp comes with the extra bench")
+    rows = [row for _, row in odometry_rows(SimulatedScans(2, 20))]
+    assert [(row["scans"], row["method"]) for row in rows] == [
+        (case, name) for case in ("as recorded", "de-skewed") for name in ("saga-fg", "kiss-icp")
+    ]
+    for row in rows:
+        assert np.isfinite(row["RPE, m per 10 m"])
+        assert 0 < row["residual, mm"] < 100
+        assert row["ms a scan"] > 0
+    assert rows[2]["RPE, m per 10 m"] < 0.05
+
+
+def test_the_command_on_recorded_scans(bench, recordings):
+    kitti = recordings / "kitti"
+    assert len(KittiScans(kitti, "0000")) == 90
+    rows = bench("slam --scans 20 --no-kiss", "--dataroot", str(kitti))
+    assert [row["scans"] for row in rows if row.get("method") == "saga-fg"] == ["as recorded", "de-skewed"]
+    assert any(row["table"] == "SLAM all in, CPU time" for row in rows)
+
+
+def test_scans_are_counted_and_timed():
+    (_, cost), *_ = all_in_rows(SimulatedScans(0, 6))
+    assert (cost["scans"], cost["submaps"]) == (6, 1)
+    assert cost["points a scan"] > 1000
+    assert np.isfinite([cost["ms a scan"], cost["keyframe"], cost["longest"], cost["at the end, s"]]).all()
+
+
+def test_a_map_of_landmarks_is_measured_while_it_grows(bench):
+    *parts, whole = bench("slam --landmarks 60")
+    assert whole["landmarks"] == parts[-1]["landmarks of the map"] == 60
+    assert whole["F1 over pairs"] == 1.0
+    assert max(part["in the local Gaussian"] for part in parts) < 45

@@ -1,0 +1,298 @@
+"""`saga-fg evaluate` and `saga-fg demo`."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from data_tools.datasets.nuscenes import read_scored_scenes
+from data_tools.metrics import SceneMetrics, nuscenes_tracking_metrics
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings
+from pipelines.cli import app
+from pipelines.config import load_config
+from pipelines.demo import METHODS, Comparison, compare, comparison_table, hardest_moment, run_demo
+from pipelines.report import scene_of_run
+from pipelines.report.scenes import latest_detections
+from pipelines.view import SceneView, draw_scene, picture
+from saga_fg import InputError, Scene
+from saga_fg.numerics.geometry import inverse_transform, transform_points
+from tests.data_tools.kitti_example import write_sequence
+from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
+from tests.pipelines.command import done, refused
+
+# `saga-fg evaluate`: figures of results, as tables and as JSON
+
+
+def evaluate(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, ["evaluate", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A random drive in the nuScenes layout, with tracks in result.json."""
+    root = tmp_path_factory.mktemp("random") / "drive"
+    write_random_drive(root, seed=0)
+    return root
+
+
+def test_nuscenes_figures_are_those_of_the_metrics(drive, tmp_path):
+    file = tmp_path / "figures.json"
+    (tmp_path / "plots").mkdir()
+    (tmp_path / "plots" / "calibration.png").write_text("of an earlier run")
+    result = done(
+        "evaluate",
+        "nuscenes",
+        drive / "result.json",
+        "--dataroot",
+        drive,
+        "--split",
+        "drive",
+        "--json",
+        file,
+        "--plots",
+        tmp_path / "plots",
+    )
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == {"recall.png", "errors.png"}
+    metrics = nuscenes_tracking_metrics(
+        [each.tracking for each in read_scored_scenes(drive / "result.json", drive, VERSION).values()]
+    )
+    figures = json.loads(file.read_text())
+    assert figures["scenes"] == ["scene-0", "scene-1"]
+    assert figures["overall"]["amota"] == metrics.overall.amota
+    assert figures["per_class"]["car"]["ids"] == metrics.per_class["car"].ids
+    assert figures["per_class"]["trailer"]["amota"] is None  # there is none
+    row = next(line for line in result.stdout.splitlines() if "overall" in line)
+    assert f"{metrics.overall.amota:.3f}" in row
+    assert f"{metrics.overall.amotp:.3f}" in row
+
+
+def test_some_scenes_alone(drive, tmp_path):
+    file = tmp_path / "figures.json"
+    done("evaluate", "nuscenes", drive / "result.json", "--dataroot", drive, "--scenes", "scene-1", "--json", file)
+    assert json.loads(file.read_text())["scenes"] == ["scene-1"]
+
+
+def test_mistakes_are_one_line(drive):
+    for arguments, expected in [
+        (("--split", "drive", "--scenes", "scene-0"), "either --split NAME or --scenes"),
+        ((), "either --split NAME or --scenes"),
+        (("--split", "dribe"), "did you mean 'drive'"),
+        (("--split", "drive", "--json", "/nowhere/f.json"), "not writable"),
+    ]:
+        said = refused("evaluate", "nuscenes", drive / "result.json", "--dataroot", drive, *arguments)
+        assert expected in said
+        assert len(said.splitlines()) == 1
+
+
+def test_what_cannot_be_judged_is_refused(drive, tmp_path):
+    content = json.loads((drive / "result.json").read_text())
+    del content["results"]["scene-0-3"]
+    (tmp_path / "short.json").write_text(json.dumps(content))
+    said = refused("evaluate", "nuscenes", tmp_path / "short.json", "--dataroot", drive, "--split", "drive")
+    assert "scene-0-3 is missing" in said
+    said = refused(
+        "evaluate", "nuscenes", drive / "result.json", "--dataroot", drive, "--split", "drive", "--innovations"
+    )
+    assert "track with --explain" in said
+
+
+def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path):
+    pytest.importorskip("trackeval")
+    data, tracks, file = tmp_path / "data", tmp_path / "tracks.json", tmp_path / "figures.json"
+    (tmp_path / "short.yaml").write_text("duration: 6.0\nwarm_up: 5.0\n")
+    lidar = f"lidar={data / 'detections' / 'lidar.json'}"
+    of_data = ("--dataroot", data, "--split", "all", "--detections", lidar)
+    for command in (
+        ("simulate", "-o", data, "--scenes", "1", "--config", tmp_path / "short.yaml"),
+        ("track", "nuscenes", *of_data, "-o", tracks, "--explain"),
+        ("evaluate", "nuscenes", tracks, *of_data, "--hota", "--innovations", "--json", file),
+    ):
+        result = done(*command)
+    figures = json.loads(file.read_text())
+    overall = figures["errors"]["overall"]
+    assert 0 < overall["tracked"] <= overall["labels"]
+    assert 0 < overall["position"] < 1
+    assert 0 < overall["detection"] < 1
+    assert 0 < figures["calibration"]["overall"]["coverage"]["0.9"] <= 1
+    assert 0 < figures["tracks"]["overall"]["true"] < figures["tracks"]["overall"]["tracks"]
+    assert 0 < figures["tracks"]["car"]["rank_quality"] <= 1
+    assert "Whole tracks" in result.stdout
+    assert figures["hota"]["car"]["2D"]["hota"] >= figures["hota"]["car"]["3D"]["hota"] > 0.2
+    assert "HOTA, CLEAR and Identity" in result.stdout
+    assert figures["innovations"]["car"]["matches"] > 20
+
+
+def test_kitti_labels_as_results_are_perfect(tmp_path):
+    root, results, file = write_sequence(tmp_path / "kitti"), tmp_path / "results", tmp_path / "figures.json"
+    results.mkdir()
+    labels = (root / "training" / "label_02" / "0007.txt").read_text().splitlines()
+    (results / "0007.txt").write_text("".join(f"{line} 0.9\n" for line in labels if "DontCare" not in line))
+    result = done("evaluate", "kitti", results, "--dataroot", root, "--iou", "0.5,0.7", "--json", file)
+    figures = json.loads(file.read_text())
+    assert figures["sequences"] == ["0007"]
+    assert set(figures["per_class"]) == {"car"}  # a sitting person is none that counts
+    assert set(figures["per_class"]["car"]) == {"0.5", "0.7"}
+    assert figures["per_class"]["car"]["0.7"]["mota"] == 1.0
+    assert figures["errors"]["car"]["position"] == 0.0
+    assert figures["errors"]["car"]["velocity"] is None
+    assert figures["tracks"]["car"]["ghost_share"] == 0.0
+    assert figures["tracks"]["car"]["rank_quality"] == 1.0
+    assert figures["calibration"]["car"]["boxes"] == 0
+    assert "Calibration" not in result.stdout
+
+
+def test_who_sits_is_unknown_to_the_usual_evaluation(tmp_path):
+    for option, false_positives in [([], 1), (["--persons", "exempt"], 0)]:
+        folder = tmp_path / str(false_positives)
+        root, results, file = write_sequence(folder / "kitti"), folder / "results", folder / "figures.json"
+        results.mkdir()
+        labels = root / "training" / "label_02" / "0007.txt"
+        sitting = "2 5 Person 0 0 0 700 150 720 250 1.2 0.5 0.6 -3 1.6 8 0"
+        standing = "2 6 Pedestrian 0 0 0 800 150 820 250 1.8 0.5 0.6 3 1.6 8 0"
+        labels.write_text(f"{sitting}\n{standing}\n")
+        found = (line.replace("Person ", "Pedestrian ") for line in (sitting, standing))
+        (results / "0007.txt").write_text("".join(f"{line} 0.9\n" for line in found))
+        done("evaluate", "kitti", results, "--dataroot", root, "--iou", "0.5", "--json", file, *option)
+        assert json.loads(file.read_text())["per_class"]["pedestrian"]["0.5"]["fp"] == false_positives
+
+
+def test_options_that_are_none_are_named(tmp_path):
+    said = refused("evaluate", "kitti", tmp_path, "--dataroot", tmp_path, "--persons", "sitting")
+    assert "--persons: expected false or exempt, got 'sitting'" in said
+    for iou in ["half", "0", "1.5", ","]:
+        assert "--iou: expected" in refused("evaluate", "kitti", tmp_path, "--dataroot", tmp_path, "--iou", iou)
+
+
+def test_simulated_scenes_are_judged_at_every_moment(tmp_path):
+    file = tmp_path / "figures.json"
+    (tmp_path / "short.yaml").write_text("duration: 4.0\nwarm_up: 5.0\n")
+    arguments = ("--scenes", "1", "--seed", "3", "--simulator", tmp_path / "short.yaml", "--method", "kf")
+    done("evaluate", "simulated", *arguments, "--json", file)
+    figures = json.loads(file.read_text())
+    overall = figures["tracking"]["overall"]
+    assert overall["objects"] > 100
+    assert overall["objects"] == sum(f["objects"] for name, f in figures["tracking"].items() if name != "overall")
+    assert overall["objects"] == figures["errors"]["overall"]["labels"]
+    assert 0 < overall["position_rmse"] < 1
+    assert 0 < figures["tracks"]["overall"]["rank_quality"] <= 1
+    assert figures["calibration"]["overall"]["boxes"] > 50
+    assert figures["innovations"]["car"]["matches"] > 50
+    assert 0.2 < figures["innovations"]["car"]["nis"] < 5
+
+
+# The demonstration: methods on the same scenes, a picture and a page that needs no network
+
+SHORT = SimulatorSettings(duration=3.0, warm_up=5.0)
+
+
+@pytest.fixture(scope="module")
+def comparison() -> Comparison:
+    return compare(SimulatedTraffic(SHORT, scenes=2, seed=1), load_config("simulated"), METHODS)
+
+
+def test_all_methods_see_the_same_scenes(comparison):
+    assert tuple(comparison.runs) == METHODS
+    assert len({tuple(run.scene.name for run in runs) for runs in comparison.runs.values()}) == 1
+    objects = {m.objects for m in comparison.metrics.values()}
+    assert len(objects) == 1
+    assert objects.pop() > 100
+    for runs in comparison.runs.values():
+        for run in runs:
+            assert len(run.tracks) == len(run.scene)
+            assert run.frames == sum(frame.timestamp <= run.scene.timestamps[-1] for frame in run.scene.frames)
+
+
+def test_the_table_has_a_row_for_each_method(comparison):
+    table = comparison_table(comparison, "title")
+    assert [row[0] for row in table.rows] == list(METHODS)
+    assert all(len(row) == len(table.columns) for row in table.rows)
+    assert float(table.rows[2][1]) == pytest.approx(comparison.metrics["saga"].position.rmse, abs=5e-4)
+
+
+def test_a_scene_without_ground_truth_cannot_be_compared():
+    class Blind:
+        scenes = ("a",)
+
+        def scene(self, name: str) -> Scene:
+            return Scene(name, np.zeros(1), np.eye(4)[None], ("",), [])
+
+    with pytest.raises(InputError, match="scene a: expected ground truth"):
+        compare(Blind(), load_config("file"), METHODS)
+
+
+def test_the_moment_shown_has_the_most_moving_hidden_objects(comparison):
+    scene_row, moment = hardest_moment(comparison)
+    run = comparison.runs["saga"][scene_row]
+    assert run.scene.ground_truth is not None
+
+    def hidden(scene: Scene, k: int) -> int:
+        assert scene.ground_truth is not None
+        truth = scene.ground_truth[k]
+        near = np.hypot(*(truth.boxes.position[:, :2] - scene.world_T_ego[k, :2, 3]).T) < 40
+        return int((~truth.visible & near & (np.hypot(*truth.boxes.velocity.T) > 0.5)).sum())
+
+    scenes = [run.scene for run in comparison.runs["saga"]]
+    assert hidden(run.scene, moment) == max(hidden(scene, k) for scene in scenes for k in range(len(scene)))
+
+
+def test_the_picture_shows_a_moment_in_the_vehicles_frame(comparison):
+    run, k = comparison.runs["saga"][0], 10
+    report = scene_of_run({"saga": run}, (), {})
+    drawings = [each for each in draw_scene(SceneView(report)) if each.moment in (None, k)]
+    figure = picture({"one": drawings}, f"{run.scene.name}/ego")
+    (ax,) = figure.axes
+    assert ax.get_title(loc="left") == "one"
+    assert run.scene.ground_truth is not None
+    assert len(ax.patches) == 1 + len(run.scene.ground_truth[k]) + 2 * len(run.tracks[k])  # with the vehicle, ellipses
+    places = transform_points(inverse_transform(run.scene.world_T_ego[k]), run.tracks[k].boxes.position)[:, :2]
+    outlines = [patch.get_xy()[:4].mean(axis=0) for patch in ax.patches if len(patch.get_xy()) == 5]
+    gaps = np.linalg.norm(places[:, None] - np.array(outlines), axis=2)
+    np.testing.assert_allclose(gaps.min(axis=1), 0.0, atol=1e-6)
+    detections, _ = latest_detections(run.scene, {})
+    (crosses,) = (line for line in ax.lines if line.get_marker() == "x")
+    assert len(crosses.get_xdata()) == len(detections[k])
+    np.testing.assert_allclose(ax.patches[0].get_xy().mean(axis=0), [1.4, 0.0], atol=0.5)
+
+
+def test_the_demo_writes_a_picture_and_a_page(tmp_path):
+    result = run_demo(tmp_path / "out", load_config("simulated"), SHORT, scenes=1)
+    assert result.picture.read_bytes().startswith(b"\x89PNG\r\n")
+    assert result.page.read_text(encoding="utf-8").startswith("<!doctype html>")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["birds_eye.png", "index.html"]
+
+
+def test_the_command_prints_the_table(tmp_path, monkeypatch):
+    monkeypatch.setattr("pipelines.cli.start.scenario_settings", lambda scenario: SHORT)
+    result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["demo", "--output", str(tmp_path / "out"), "--scenes", "1"])
+    assert result.exit_code == 0, result.output
+    for text in ("occluded position RMSE, m", "ms per frame", *METHODS, "picture: ", "page: "):
+        assert text in result.stdout
+
+
+# The direction of the demonstration's comparison, on fixed seeds: `saga` is at least as good in every column
+
+LENGTH = 8.0  # s
+SEEDS = range(6)
+
+
+@pytest.fixture(scope="module")
+def metrics() -> Mapping[str, SceneMetrics]:
+    """Pooled over one scene of each seed."""
+    config, settings = load_config("simulated"), replace(SimulatorSettings(), duration=LENGTH)
+    found = [compare(SimulatedTraffic(settings, 1, seed), config, METHODS).metrics for seed in SEEDS]
+    return {method: SceneMetrics.pool(each[method] for each in found) for method in METHODS}
+
+
+@pytest.mark.parametrize("other", ["centerpoint", "kf"])
+def test_saga_is_at_least_as_good_in_every_column(metrics, other):
+    saga, baseline = metrics["saga"], metrics[other]
+    assert saga.mota >= baseline.mota
+    assert saga.switches <= baseline.switches
+    assert saga.carried.rmse <= baseline.carried.rmse
+    assert saga.velocity.rmse <= 1.01 * baseline.velocity.rmse  # as good, to a hundredth
+    assert saga.position.median <= baseline.position.median
+    assert saga.position.rmse <= 1.05 * baseline.position.rmse  # one wrong pair in six short scenes is 5 %

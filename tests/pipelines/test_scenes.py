@@ -1,0 +1,319 @@
+"""Scenes that are simulated, chosen and judged."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from data_tools.datasets.detection_files import read_detections
+from data_tools.simulator import SimulatedTraffic, simulate_scene
+from data_tools.simulator.settings import scenario_settings
+from pipelines.config import TrackConfig, load_config
+from pipelines.learning.gaps import GapOutcome, JudgedRun, Prediction, Run, hidden, situation_figures
+from pipelines.tracking import track_dataset, track_scene
+from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
+from saga_fg.learning.gaps import FOLLOWED, LENGTHS, SPACING, Gap, made_gaps, route_of, situations_of
+from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.road_map import RoadMap, StopLine, TrafficLight
+from tests.pipelines.command import done
+from tests.pipelines.sampled_gaps import SHORT
+
+# Scenes of more than cars as files: what is written is what was simulated, and it can be tracked
+
+
+def run(*arguments):
+    result = done(*arguments)
+    return result.output
+
+
+def test_a_red_light_scene_goes_to_files_and_back(tmp_path):
+    short = tmp_path / "short.yaml"
+    short.write_text("duration: 1.5\nwarm_up: 4.0\n")
+    out = tmp_path / "junctions"
+    assert "1 scene of 1.5 s" in run("simulate", "-o", out, "--scenario", "red-light", "--scenes", 1, "--config", short)
+    folder = out / "scene-0001"
+    settings = replace(scenario_settings("red-light"), duration=1.5, warm_up=4.0)
+    scene = SimulatedTraffic(settings, 1, 0).scene("scene-0001")
+    read = read_detections(folder / "detections.csv").scene("scene-0001")
+    assert [(frame.timestamp, frame.sensor) for frame in read.frames] == [(f.timestamp, f.sensor) for f in scene.frames]
+    for got, made in zip(read.frames, scene.frames, strict=True):
+        assert got.detections.boxes.label.tolist() == made.detections.boxes.label.tolist()
+        for name in ("position", "size", "yaw", "velocity"):
+            assert np.array_equal(
+                getattr(got.detections.boxes, name), getattr(made.detections.boxes, name), equal_nan=True
+            )
+        assert np.allclose(got.world_T_ego, made.world_T_ego)
+    assert any(label.startswith("traffic_light") for f in read.frames for label in f.detections.boxes.label.tolist())
+    with (folder / "truth.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == sum(len(moment) for moment in scene.ground_truth)
+    assert sum(int(row["visible"]) for row in rows) == sum(int(moment.visible.sum()) for moment in scene.ground_truth)
+
+    written = load_config("file", folder / "settings.yaml")
+    assert written.tracker.road_map == scene.frames[0].road_map
+    assert written.tracker.edges == load_config("heterogeneous").tracker.edges
+    tracks = tmp_path / "tracks.csv"
+    run("track", "file", folder / "detections.csv", "--config", folder / "settings.yaml", "--output", tracks)
+    assert len(tracks.read_text().splitlines()) > 10
+
+
+# Situations of hidden objects, from labels: who leads, who halts, starts, turns, and who is at red
+
+TIMES = 0.2 * np.arange(26)
+GAP = Gap(0, 5, 16, 2.0, moving=True)  # hidden from 1 to 3.2 s
+LINE = StopLine("line", (30.0, 3.0), (30.0, -3.0), "light")  # across the x axis, for those who go in its direction
+ROAD = RoadMap((TrafficLight("light", (42.0, 0.0)),), (LINE,))
+
+
+def along(x: FloatArray, y: float = 0.0) -> FloatArray:
+    return np.column_stack([x, np.full(len(TIMES), y)])
+
+
+def labelled(
+    ways: Mapping[str, FloatArray],
+    unseen: tuple[str, ...] = (),
+    colour: str | None = None,
+    road: RoadMap | None = ROAD,
+    label: str = "car",
+) -> LabelledScene:
+    """Objects by their positions (K, 2), all detected but those unseen; the hidden one is "a"."""
+    truth, frames = [], []
+    for k, time in enumerate(TIMES.tolist()):
+        step = {name: way[min(k + 1, 25)] - way[max(k - 1, 0)] for name, way in ways.items()}
+        speed = [v / (0.2 * (min(k + 1, 25) - max(k - 1, 0))) for v in step.values()]
+        yaw = [np.arctan2(v[1], v[0]) for v in step.values()]
+        position = [(*way[k], 1.0) for way in ways.values()]
+        boxes = Boxes.of([label] * len(ways), position, None, yaw, speed)
+        truth.append(Annotations(np.array(list(ways)), boxes, np.ones(len(ways), dtype=bool)))
+        detected = boxes.select(np.array([name not in unseen for name in ways]))
+        if colour is not None:
+            light = Boxes.of([f"traffic_light_{colour}"], [[42.0, 0.0, 5.0]])
+            detected = Boxes.concatenate([detected, light])
+        found = Detections(detected, np.ones(len(detected)))
+        frames.append(Frame(time, "lidar", found, road_map=road if k == 0 else None))
+    poses = np.tile(np.eye(4), (len(TIMES), 1, 1))
+    return LabelledScene.from_scene(Scene("drawn", TIMES, poses, ("",) * len(TIMES), frames, truth), {})
+
+
+def found(ways: Mapping[str, FloatArray], gap: Gap = GAP, **how: object) -> Mapping[float, frozenset[str]]:
+    return situations_of(labelled(ways, **how), gap)  # type: ignore[arg-type]
+
+
+STEADY = along(5 * TIMES)
+
+
+def test_leaders_are_ahead_on_the_way_round_bends_and_never_inside():
+    ahead = along(5 * TIMES + 12)
+    assert found({"a": STEADY, "b": ahead}) == {h: {"all", "moving", "visible leader"} for h in (1.0, 2.0)}
+    assert found({"a": STEADY, "b": ahead}, unseen=("b",))[2.0] == {"all", "moving"}
+    for other in (along(5 * TIMES + 12, 3.5), along(5 * TIMES - 12), along(5 * TIMES + 60), along(70 - 5 * TIMES)):
+        assert found({"a": STEADY, "b": other})[2.0] == {"all", "moving", "free"}
+    assert found({"a": STEADY, "b": ahead}, label="pedestrian")[2.0] == {"all", "moving"}
+    assert "free" in found({"a": STEADY, "b": along(5 * TIMES + 0.3)})[1.0]
+    angle = 0.25 * TIMES
+    a, b = (20 * np.column_stack([np.sin(s), 1 - np.cos(s)]) for s in (angle, angle + 0.7))
+    assert found({"a": a, "b": b})[2.0] == {"all", "moving", "visible leader", "turning"}
+    assert "turning" not in found({"a": a, "b": b})[1.0], "by 14 degrees then"
+
+
+def test_halting_and_starting_are_told_at_the_end():
+    braked = along(np.where(TIMES < 2.5, 5 * TIMES, 12.5))
+    assert "halting" not in found({"a": braked})[1.0]
+    assert "halting" in found({"a": braked})[2.0]
+    started = along(np.where(TIMES < 2.5, 0.0, 5 * (TIMES - 2.5)))
+    assert "starting" in found({"a": started})[2.0]
+    parked = found({"a": along(0 * TIMES)}, Gap(0, 5, 16, 2.0, moving=False))
+    assert parked[2.0] == {"all", "stationary", "free"}
+
+
+def test_at_red_is_who_comes_to_the_line_while_it_is_closed():
+    assert "at red" in found({"a": STEADY}, colour="red")[1.0]
+    assert "at red" in found({"a": along(0 * TIMES + 10)}, colour="amber")[1.0], "stands behind the line"
+    assert "at red" not in found({"a": STEADY}, colour="green")[1.0]
+    assert "at red" not in found({"a": STEADY})[1.0], "nobody told the colour"
+    assert "at red" not in found({"a": STEADY}, colour="red", road=None)[1.0], "there is no map"
+    assert "at red" not in found({"a": STEADY}, colour="red", road=RoadMap())[1.0], "nothing is in it"
+    assert "at red" not in found({"a": along(60 - 5 * TIMES)}, colour="red")[1.0], "it comes from the other side"
+    assert "at red" not in found({"a": along(5 * TIMES + 40)}, colour="red")[1.0], "it is beyond the line"
+
+
+def test_an_object_without_direction_has_no_route():
+    scene = labelled({"a": along(0 * TIMES)})
+    scene.yaw[:] = np.nan
+    assert route_of(scene, 0, 5) is None
+    assert situations_of(scene, GAP)[1.0] == {"all", "moving"}
+
+
+def test_predictions_are_judged_by_their_own_covariance():
+    scene = labelled({"a": STEADY})
+    tracks = []
+    for k, time in enumerate(TIMES.tolist()):
+        boxes = Boxes.of(["car"], [[*(STEADY[k] + [3.0 if 5 < k < 16 else 0.0, 0.0]), 1.0]], velocity=[[5.0, 0.0]])
+        wide = np.diag([4.0, 1.0])[None]
+        seen = np.array([0.0 if not 5 < k < 16 else 1.0])
+        tracks.append(Tracks(time, np.array([7]), boxes, np.ones(1), wide, wide, seen))
+    predicted = JudgedRun(scene, tracks).outcome(GAP).predicted
+    assert set(predicted) == {1.0, 2.0}
+    assert predicted[2.0].error == pytest.approx(3.0)
+    assert predicted[2.0].nees == pytest.approx(2.25)
+    assert predicted[2.0].nll == pytest.approx(1.125 + np.log(2 * np.pi * 2.0))
+
+
+def situations_run(name: str, recording: str, cluster: str, errors: list[float]) -> Run:
+    outcomes = tuple(GapOutcome({1.0: e}, {1.0: Prediction(e, e * e, e)} if np.isfinite(e) else {}) for e in errors)
+    n, at = len(errors), {1.0: frozenset({"all", "free"})}
+    gaps = (Gap(0, 5, 11, 1.0, moving=True, run=1),) * n
+    return Run(recording, cluster, name, gaps, ("car",) * n, (at,) * n, outcomes)
+
+
+def test_figures_are_paired_and_overlapping_recordings_are_one():
+    nan = float("nan")
+    ours = [
+        situations_run("saga", r, c, e)
+        for r, c, e in (("1", "1", [1.0, 1.0, nan]), ("2", "2", [1.0, 1.0]), ("3", "2", [1.0]))
+    ]
+    theirs = [
+        situations_run("kf", r, c, e)
+        for r, c, e in (("1", "1", [2.0, 2.0, 9.0]), ("2", "2", [2.0, 2.0]), ("3", "2", [2.0]))
+    ]
+    saga, kf = situation_figures([*ours, *theirs], "kf")[:2]
+    assert (saga.situation, saga.length, saga.contender, saga.gaps, saga.lost) == ("all", 1.0, "saga", 5, 1)
+    assert (kf.gaps, kf.lost, kf.error_change) == (6, 0, None)
+    assert saga.error_change is not None
+    assert saga.error_change.estimate == pytest.approx(-0.5), "over gaps that both have"
+    assert np.isnan(saga.error_change.low), "two clusters are too few for an interval"
+    assert saga.coverage == {0.5: 1.0, 0.9: 1.0}
+    assert kf.coverage == {0.5: 0.0, 0.9: pytest.approx(5 / 6)}
+    assert {f.situation for f in situation_figures([*ours, *theirs], "kf")} == {"all", "free"}
+    assert situation_figures([], "kf") == []
+
+
+# Tracking of a recorded scene: causal, at the right times, for any clocks of the sensors
+
+
+class Recorder:
+    """A tracker that notes what it is asked; the id of its one track is the number of frames it has seen."""
+
+    def __init__(self) -> None:
+        self.seen: list[float] = []
+        self.predicted: list[float] = []
+        self.sensor_times: dict[str, Any] = {}
+
+    def step(self, frame: Frame) -> Tracks:
+        self.seen.append(frame.timestamp)
+        return self._tracks(frame.timestamp)
+
+    def tracks(self, timestamp: float) -> Tracks:
+        self.predicted.append(timestamp)
+        return self._tracks(timestamp)
+
+    def _tracks(self, timestamp: float) -> Tracks:
+        boxes = Boxes.of(["car"], [[0.0, 0.0, 0.0]])
+        one = np.ones((1, 2, 2))
+        return Tracks(timestamp, np.array([len(self.seen)]), boxes, np.ones(1), one, one, np.zeros(1))
+
+
+def scene(moments: Sequence[float], frames: Sequence[float], name: str = "a") -> Scene:
+    return Scene(
+        name,
+        np.array(moments),
+        np.tile(np.eye(4), (len(moments), 1, 1)),
+        ("",) * len(moments),
+        [Frame(t, "lidar", Detections.empty()) for t in sorted(frames)],
+    )
+
+
+times = st.integers(0, 40).map(lambda k: k / 4)
+
+
+@given(st.lists(times, unique=True).map(sorted), st.lists(times))
+def test_tracks_at_a_moment_rest_on_the_frames_up_to_it_and_no_others(moments, frames):
+    tracker = Recorder()
+    run = track_scene(scene(moments, frames), tracker)
+    assert [tracks.timestamp for tracks in run.tracks] == moments
+    assert [int(tracks.id[0]) for tracks in run.tracks] == [sum(f <= t for f in frames) for t in moments]
+    assert tracker.predicted == [t for t in moments if t not in frames]
+    assert run.frames == len(tracker.seen)
+
+
+def test_every_scene_gets_a_fresh_tracker_and_counts_its_frames():
+    calls: list[tuple[str, int, int]] = []
+    track_scene(scene([0.0, 1.0], [0.0, 0.5, 1.0]), Recorder(), lambda *call: calls.append(call))
+    assert calls == [("a", 1, 3), ("a", 2, 3), ("a", 3, 3)]
+    runs = track_dataset(TwoScenes(), Recorder)
+    assert [(run.scene.name, int(run.tracks[0].id[0])) for run in runs] == [("a", 1), ("b", 1)]
+    assert [run.scene.name for run in track_dataset(TwoScenes(), Recorder, ["b"])] == ["b"]
+
+
+class TwoScenes:
+    scenes = ("a", "b")
+
+    def scene(self, name: str) -> Scene:
+        return scene([0.0], [0.0], name)
+
+
+@pytest.mark.parametrize("method", ["saga", "kf", "centerpoint"])
+def test_every_method_tracks_a_car_through_a_scene(method):
+    """10 m/s along x, seen ten times a second by one sensor, tracks wanted in between and afterwards."""
+    steps = np.arange(20) / 10
+    frames = [
+        Frame(t, "lidar", Detections(Boxes.of(["car"], [[10 * t, 0, 1]], [[4, 2, 1.5]], [0.0]), np.array([0.9])))
+        for t in steps
+    ]
+    moments = np.append(steps[10:], [1.95, 2.0])
+    whole = Scene("a", moments, np.tile(np.eye(4), (12, 1, 1)), ("",) * 12, frames)
+    run = track_scene(whole, TrackConfig().new_tracker(method))  # type: ignore[arg-type]
+    assert [len(tracks) for tracks in run.tracks] == [1] * 12
+    assert len({int(tracks.id[0]) for tracks in run.tracks}) == 1
+    position = np.array([tracks.boxes.position[0, 0] for tracks in run.tracks])
+    np.testing.assert_allclose(position, 10 * moments, atol=0.3)
+    np.testing.assert_allclose(run.tracks[-1].boxes.velocity, [[10.0, 0.0]], atol=0.5)
+
+
+def test_kf_is_the_tracker_without_edges():
+    config = TrackConfig()
+    assert config.new_tracker("saga").settings.edges  # type: ignore[attr-defined]
+    assert config.new_tracker("kf").settings.edges == ()  # type: ignore[attr-defined]
+
+
+# Made gaps hide one object among others
+
+
+def test_made_gaps_hide_one_object_among_others():
+    config = load_config("simulated")
+    traffic = LabelledScene.from_scene(simulate_scene(SHORT, seed=4), config.sensors)
+    gaps = made_gaps(traffic, passes=2, seed=0)
+    assert gaps == made_gaps(traffic, passes=2, seed=0)
+    assert {gap.run for gap in gaps} == {1, 2}
+    assert {gap.length for gap in gaps} <= set(LENGTHS)
+    still = made_gaps(traffic, passes=2, seed=0, chosen=lambda gap: not gap.moving)
+    assert not any(gap.moving for gap in still)
+    time = traffic.scene.timestamps
+    for gap in gaps:
+        assert time[gap.stop - 1] - time[gap.start] == pytest.approx(gap.length, abs=0.06)
+        assert traffic.detected[[gap.start, gap.stop], gap.row].all()
+        assert time[gap.start] >= FOLLOWED - 0.1
+    first = [gap for gap in gaps if gap.run == 1]
+    for a in first:
+        for b in first:
+            together = range(max(a.start, b.start), min(a.stop, b.stop) + 1)
+            if a is not b and together:
+                assert a.row != b.row
+                apart = traffic.position[together[0], a.row] - traffic.position[together[0], b.row]
+                assert np.hypot(*apart) >= SPACING
+    frames = hidden(traffic, first)
+    assert len(frames) == len(traffic.scene.frames)
+    without_them = LabelledScene.from_scene(replace(traffic.scene, frames=frames), config.sensors)
+    for gap in first:
+        inside = slice(gap.start + 1, gap.stop)
+        assert not without_them.detected[inside, gap.row].any()
+        assert without_them.detected[[gap.start, gap.stop], gap.row].all()
+    mine = [gap.row for gap in first]
+    others = np.delete(traffic.detected, mine, axis=1)
+    assert (np.delete(without_them.detected, mine, axis=1) == others).all()
