@@ -145,9 +145,13 @@ def without(names: tuple[str, ...], code: str, folder: Path) -> subprocess.Compl
     return python(folder, "-c", BLOCK.format(names=names) + code)
 
 
-def test_the_tracker_needs_the_numerics_alone(tmp_path):
+def test_the_tracker_needs_the_numerics_alone_and_what_needs_open3d_says_so(tmp_path):
     run = without((*OPTIONAL, "matplotlib", "typer", "rich"), LIBRARY, tmp_path)
     assert run.returncode == 0, run.stderr
+    code = "from data_tools.lidar.scan_files import load_open3d; load_open3d()"
+    run = without(OPTIONAL, code, tmp_path)
+    assert "open3d cannot be imported" in run.stderr
+    assert "pip install open3d" in run.stderr
 
 
 def test_the_command_tracks_and_reports_without_open3d(tmp_path):
@@ -162,13 +166,6 @@ def test_the_command_tracks_and_reports_without_open3d(tmp_path):
         run = without(OPTIONAL, code, tmp_path)
         assert run.returncode == 0, run.stderr
     assert (tmp_path / "page.html").is_file()
-
-
-def test_what_needs_open3d_says_so(tmp_path):
-    code = "from data_tools.lidar.scan_files import load_open3d; load_open3d()"
-    run = without(OPTIONAL, code, tmp_path)
-    assert "open3d cannot be imported" in run.stderr
-    assert "pip install open3d" in run.stderr
 
 
 def test_the_small_install_is_the_whole_without_open3d():

@@ -23,7 +23,7 @@ def label_errors(nees: np.ndarray) -> LabelErrors:
     )
 
 
-def test_calibration_follows_the_diagonal_where_covariances_are_right():
+def test_charts_follow_covariances_and_detections():
     nees = np.random.default_rng(0).chisquare(2, 4000)
     (ax,) = calibration_plot(label_errors(nees)).axes
     line = next(line for line in ax.lines if str(line.get_label()).startswith("car"))
@@ -31,9 +31,6 @@ def test_calibration_follows_the_diagonal_where_covariances_are_right():
     (ax,) = calibration_plot(label_errors(nees / 4)).axes  # covariances too large
     assert (ax.lines[0].get_ydata() >= ax.lines[0].get_xdata()).all()
     assert len(calibration_plot(label_errors(np.full(5, np.nan))).axes[0].lines) == 1  # the diagonal alone
-
-
-def test_error_histograms_are_cumulative_and_show_the_detections():
     figure = error_histograms(label_errors(np.ones(1000)))
     position, velocity, heading = figure.axes
     overall, detections = (line for line in position.lines if line.get_color() == "C0")

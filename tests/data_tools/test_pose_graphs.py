@@ -287,15 +287,12 @@ def test_landmarks_that_nobody_saw_are_left_out_with_a_warning(tmp_path, caplog)
     assert "VERTEX_XY 10 is left out, no measurement is of it (2 so)" in caplog.text
 
 
-def test_a_single_bearing_does_not_determine_a_landmark(tmp_path):
+def test_bearings_alone_determine_no_landmark_and_correlated_ones_are_not_written_as_independent(tmp_path):
     lines = [
         line for line in PLANAR_LANDMARKS.splitlines() if not line.startswith(("EDGE_BEARING_SE2_XY 2", "VERTEX_XY"))
     ]
     with pytest.raises(InputError, match="landmark 11: expected bearings that cross"):
         read_g2o(written(tmp_path, "\n".join(lines) + "\n"))
-
-
-def test_correlated_range_and_bearing_are_not_written_as_if_independent(tmp_path):
     graph = read_g2o(written(tmp_path, PLANAR_LANDMARKS))
     assert graph.landmarks is not None
     seen = list(graph.landmarks.observations)

@@ -223,16 +223,13 @@ def test_wrong_dimensions_are_refused_when_wrapped():
         nonlinear_graph([factor], {gtsam.symbol("x", 1): 3})
 
 
-def test_factors_survive_pickling(covariance):
+def test_factors_of_steps_survive_pickling_and_keep_no_view_of_the_callers_arrays(covariance):
     rng = np.random.default_rng(6)
     stacks = interaction_factors(*step(rng, 4, [4, 3, 2, 1], 2, 2, covariance))
     factors = [factor for stack in stacks for factor in stack.native()]
     graph = pickle.loads(pickle.dumps(gaussian_graph(factors)))
     for i, factor in enumerate(factors):
         np.testing.assert_array_equal(graph.at(i).augmentedJacobian(), factor.augmentedJacobian())
-
-
-def test_factors_keep_no_view_of_the_callers_arrays(covariance):
     rng = np.random.default_rng(7)
     b, Q, F = np.zeros(2), np.eye(2), np.eye(2)
     factor = interaction_factor(1, [0], [F], b, Q)

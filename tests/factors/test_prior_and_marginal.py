@@ -95,12 +95,21 @@ def test_block_covariances_are_those_of_the_dense_inverse(covariance, subtests):
                     block_covariances(graph.eliminateMultifrontal(), dims | {keys[0]: 7})
 
 
-def test_block_covariances_refuse_a_hard_constraint():
+def test_bad_priors_and_hard_constraints_are_refused(subtests):
     hard = gtsam.noiseModel.Constrained.All(2)
     graph = gtsam.GaussianFactorGraph()
     graph.push_back(gtsam.JacobianFactor(1, np.eye(2), -np.eye(2)[0], hard))
     with pytest.raises(FactorError, match="expected variance in all directions, got a hard constraint"):
         block_covariances(graph.eliminateMultifrontal(function=gtsam.EliminateQR), {1: 2})
+    for keys, means, P, message in [
+        ([1, 2], [[0.0], [0.0]], np.ones((3, 1, 1)), "expected 2 covariances, got 3"),
+        ([1, 1], [[0.0], [0.0]], np.eye(1), "occurs twice"),
+        ([1], [[0.0], [0.0]], np.eye(1), "keys: expected 2 rows"),
+        ([1, 2], [[0.0], [np.nan]], np.eye(1), r"means\[1, 0\]"),
+        ([1, 2], [0.0, 0.0], np.eye(1), "means: expected shape"),
+    ]:
+        with subtests.test(message), pytest.raises(FactorError, match=message):
+            prior_factors(keys, means, P)
 
 
 def _rows(keys, dims, key):
@@ -143,26 +152,11 @@ def test_many_factors_equal_one_by_one(seed, covariance):
         np.testing.assert_allclose(factor.augmentedJacobian(), alone.augmentedJacobian(), atol=1e-12)
 
 
-def test_bad_lists_of_priors_are_refused(subtests):
-    for keys, means, P, message in [
-        ([1, 2], [[0.0], [0.0]], np.ones((3, 1, 1)), "expected 2 covariances, got 3"),
-        ([1, 1], [[0.0], [0.0]], np.eye(1), "occurs twice"),
-        ([1], [[0.0], [0.0]], np.eye(1), "keys: expected 2 rows"),
-        ([1, 2], [[0.0], [np.nan]], np.eye(1), r"means\[1, 0\]"),
-        ([1, 2], [0.0, 0.0], np.eye(1), "means: expected shape"),
-    ]:
-        with subtests.test(message), pytest.raises(FactorError, match=message):
-            prior_factors(keys, means, P)
-
-
-def test_eliminating_nothing_or_everything(covariance):
+def test_elimination_passes_on_what_it_does_not_touch(covariance):
     rng = np.random.default_rng(0)
     graph = random_graph(rng, {1: 2, 2: 3}, covariance)
     assert marginal_factors(graph, []).size() == graph.size()
     assert marginal_factors(graph, [1, 2]).keyVector() == []
-
-
-def test_untouched_factors_are_passed_on(covariance):
     rng = np.random.default_rng(0)
     alone = prior_factor(3, rng.normal(size=2), covariance(rng, 2))
     graph = random_graph(rng, {1: 2, 2: 3}, covariance)
@@ -337,16 +331,12 @@ def test_cost_and_weight_are_gtsams(loss, scale):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_weight_is_slope_over_distance(loss):
+def test_weights_are_slopes_over_distances_and_small_residuals_cost_what_they_always_do(loss):
     robust = Robust(loss, 1.5)
     s = np.linspace(0.01, 6.0, 200) + 1e-4
     h = 1e-6
     slope = (robust.cost(s + h) - robust.cost(s - h)) / (2 * h)
     np.testing.assert_allclose(robust.weight(s) * s, slope, atol=1e-8)
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_small_residuals_cost_what_they_always_do(loss):
     s = np.array([1e-4, 1e-3])
     np.testing.assert_allclose(Robust(loss, 2.0).cost(s), s * s / 2, rtol=1e-5)
 

@@ -39,24 +39,24 @@ def commands(group: Any, path: str = "") -> Iterator[str]:
             yield f"{path}{name}"
 
 
-def test_help_shows_a_worked_example():
+def test_help_and_version():
     for command in list(commands(get_command(app))):
         result = done(*command.split(), "--help")
         assert f"    saga-fg {command}" in result.stdout
         assert "Example" in result.stdout
-
-
-def test_version_is_that_of_the_distribution():
     result = done("--version")
     assert result.stdout.startswith("saga-fg 0.")
 
 
-def test_config_prints_yaml_that_leads_to_itself(tmp_path):
+def test_config_prints_yaml_that_leads_to_itself_and_markdown(tmp_path):
     printed = saga_fg("config", "--full", "--for", "kitti").stdout
     path = tmp_path / "all.yaml"
     path.write_text(printed)
     assert saga_fg("config", "--full", "--for", "file", "--config", path).stdout == printed
     assert set(yaml.safe_load(printed)) == {"tracker", "greedy", "sensors"}
+    assert "warm_up" in yaml.safe_load(saga_fg("config", "--full", "--simulator").stdout)
+    assert "## `tracker.existence`" in saga_fg("config", "--markdown").stdout
+    assert "| `warm_up` |" in saga_fg("config", "--markdown", "--simulator").stdout
 
 
 def test_config_begins_with_five_settings_and_leads_to_all(tmp_path):
@@ -99,12 +99,6 @@ def test_what_is_asked_of_the_wrong_command_is_answered_with_the_right_one(tmp_p
     assert said == f"error: {path}: smoothing: unknown section, this is a file for `saga-fg smooth`\n"
     assert "try 'learn noise kitti'" in refused("learn", "kitti")
     assert "--detections" in refused("track", "nuscenes", "--dataroot", "x")
-
-
-def test_config_prints_the_simulators_settings_and_markdown():
-    assert "warm_up" in yaml.safe_load(saga_fg("config", "--full", "--simulator").stdout)
-    assert "## `tracker.existence`" in saga_fg("config", "--markdown").stdout
-    assert "| `warm_up` |" in saga_fg("config", "--markdown", "--simulator").stdout
 
 
 def test_an_input_error_is_one_line_and_verbose_adds_the_traceback(tmp_path):
@@ -216,14 +210,11 @@ def test_the_installed_command_runs_on_its_own(tmp_path):
 # `saga-fg docs`: pages of a clone, and addresses without one
 
 
-def test_a_clone_has_its_pages():
+def test_a_clone_has_its_pages_and_elsewhere_they_have_addresses(tmp_path):
     run = done("docs", "guides/stream")
     assert Path(run.stdout.strip()).read_text(encoding="utf-8").startswith("# ")
     with pytest.raises(InputError, match=r"unknown page 'formatz'.*formats"):
         location("formatz", PAGES)
-
-
-def test_elsewhere_they_have_addresses(tmp_path):
     if not metadata("saga-fg").get_all("Project-URL"):
         pytest.skip("the installed metadata is older than the addresses: pip install -e .")
     address = location("formats", tmp_path)

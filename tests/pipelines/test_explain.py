@@ -161,9 +161,16 @@ def test_a_moment_after_the_newest_frame_is_predicted_from(run):
     np.testing.assert_allclose(later.predictions[-1].position, tracker.predict([since]).position)
 
 
-def test_a_method_that_predicts_nothing_is_refused(run):
+def test_methods_and_tables_without_predictions_are_refused(run, tmp_path):
     with pytest.raises(InputError, match="expected a method that predicts"):
         track_scene(run.scene, CONFIG.new_tracker("centerpoint"), horizons=HORIZONS)
+    for row, why in [
+        ("0,,1,1,1", "horizon: expected a number, got none"),
+        ("0,1,1,x,1", "x: expected a number, got 'x'"),
+    ]:
+        predictions_path(tmp_path / "t.csv").write_text(f"timestamp,horizon,id,x,y\n{row}\n")
+        with pytest.raises(InputError, match=why):
+            read_predictions(tmp_path / "t.csv")
 
 
 def test_the_table_is_read_back_as_it_was_made(detections, tmp_path):
@@ -200,16 +207,6 @@ def test_other_horizons_are_refused(detections, tmp_path):
     ]:
         assert why in refused("track", "file", detections / "a.csv", "--output", tmp_path / "t.csv", *given)
         assert not (tmp_path / "t.csv").exists()
-
-
-def test_a_broken_table_is_refused(tmp_path):
-    for row, why in [
-        ("0,,1,1,1", "horizon: expected a number, got none"),
-        ("0,1,1,x,1", "x: expected a number, got 'x'"),
-    ]:
-        predictions_path(tmp_path / "t.csv").write_text(f"timestamp,horizon,id,x,y\n{row}\n")
-        with pytest.raises(InputError, match=why):
-            read_predictions(tmp_path / "t.csv")
 
 
 def test_rows_are_the_predictions_in_centimetres_about_the_start(run):

@@ -183,11 +183,17 @@ def test_tracks_are_answered_in_the_columns_of_track_files():
     assert track["coasting"] == 0
 
 
-def test_a_frame_with_a_number_is_taken_in_once():
+def test_numbered_frames_are_taken_in_once_and_a_reset_begins_anew():
     service = stream()
     first = answers(service, frame(0.0, 0), frame(0.1, 1), frame(0.1, 1), frame(0.0, 0), frame(0.1, 0, "camera"))
     assert [a["type"] for a in first] == ["tracks", "tracks", "repeat", "repeat", "tracks"]
     assert service.status()["last_seq"] == {"lidar": 1, "camera": 0}
+    service = stream()
+    before = answers(service, frame(50.0), frame(50.1))
+    assert answers(service, b'{"type": "reset"}') == [{"type": "reset"}]
+    after = answers(service, frame(3.0, x=0.0), frame(3.1, x=0.8))
+    assert before[-1]["tracks"][0]["id"] == after[-1]["tracks"][0]["id"] == 1
+    assert after[0]["timestamp"] == 3.0
 
 
 def test_held_frames_go_in_in_order_of_time():
@@ -199,15 +205,6 @@ def test_held_frames_go_in_in_order_of_time():
     assert tracked == [0, 2, 1]  # 0.5 s is the newest: those up to 0.25 s are due
     assert [a["seq"] for _, a in service.flush()] == [3, 4]
     assert service.counts["out_of_order"] == 1
-
-
-def test_reset_begins_anew():
-    service = stream()
-    before = answers(service, frame(50.0), frame(50.1))
-    assert answers(service, b'{"type": "reset"}') == [{"type": "reset"}]
-    after = answers(service, frame(3.0, x=0.0), frame(3.1, x=0.8))
-    assert before[-1]["tracks"][0]["id"] == after[-1]["tracks"][0]["id"] == 1
-    assert after[0]["timestamp"] == 3.0
 
 
 @given(st.lists(st.floats(-20, 20), max_size=40), st.floats(0, 5), st.integers(1, 5))
@@ -295,14 +292,11 @@ def test_a_request_is_answered_with_the_trackers_predictions():
     assert "yaw" not in car or len(car["yaw"]) == 2
 
 
-def test_a_request_changes_nothing():
+def test_predictions_come_with_frames_or_requests_that_change_nothing():
     plain, asked = predictions_stream(), predictions_stream()
     expected = answers(plain, *(frame(0.1 * k) for k in range(6)))
     found = answers(asked, *(line for k in range(6) for line in (frame(0.1 * k), predict([3]))))
     assert found[::2] == expected
-
-
-def test_every_frame_has_predictions_where_horizons_are_given():
     horizons = np.array([1.0, 3.0])
     for answer in answers(predictions_stream(horizons=horizons), *(frame(0.1 * k) for k in range(3))):
         assert answer["type"] == "tracks"
@@ -322,16 +316,13 @@ BAD_HORIZONS = [
 ]
 
 
-def test_other_horizons_are_refused():
+def test_what_cannot_be_predicted_is_refused():
     service = predictions_stream()
     answers(service, frame(0.0))
     for horizons, why in BAD_HORIZONS:
         (answer,) = answers(service, predict(horizons))
         assert answer["type"] == "error"
         assert why in answer["message"]
-
-
-def test_there_is_nothing_to_predict_from_before_a_frame_or_by_centerpoint():
     (early,) = answers(predictions_stream(), predict([1]))
     assert "expected a frame before" in early["message"]
     (never,) = answers(predictions_stream("centerpoint"), predict([1]))

@@ -112,7 +112,7 @@ def test_sensors_without_numbers_and_unconfirmed_numbers_fill_no_memory():
 # Numbers of frames: each frame is taken in once, and a kept state is good up to a number
 
 
-def test_what_is_held_is_known_and_not_settled():
+def test_what_is_held_is_known_and_may_come_again_once_after_a_restart():
     numbers = Numbering()
     numbers.take("a", 0)
     numbers.hold("a", 1)
@@ -120,9 +120,6 @@ def test_what_is_held_is_known_and_not_settled():
     numbers.take("a", 2)  # was younger, and went in before
     assert [numbers.known("a", n) for n in range(5)] == ["taken"] * 4 + [None]
     assert numbers.durable() == {"a": 0}
-
-
-def test_held_frames_of_a_kept_state_may_come_again_once():
     before, after = Numbering(), Numbering()
     before.take("a", 0)
     before.hold("a", 1)
@@ -221,7 +218,7 @@ def scripted(*verdicts: str, **settings: Any) -> Scripted:
     return Scripted(tracker, StreamTracker(lambda: cast(Any, tracker), StreamSettings(**settings)))
 
 
-def test_a_late_frame_is_answered_as_late_and_done_with():
+def test_late_frames_and_clocks_that_were_set_are_answered_and_counted():
     service = scripted("accepted", "late")
     assert service.kinds((5.0, 0), (1.0, 1), (1.0, 1)) == ["tracks", "late", "repeat"]
     status = service.stream.status()
@@ -229,6 +226,10 @@ def test_a_late_frame_is_answered_as_late_and_done_with():
         *(1, 1),
         *({"sensor": 1}, {"sensor": 2}),
     )
+    service = scripted("accepted", "unconfirmed", "set_ahead", "set_back")
+    *_, ahead, back = service.answers((0.0, 0), (100.0, 1), (100.1, 2), (3.0, 3))
+    assert (ahead["type"], ahead["clock"], back["clock"]) == ("tracks", "set_ahead", "set_back")
+    assert service.stream.status()["jumps"] == 2
 
 
 def test_unconfirmed_frames_are_left_out_and_never_confirm_themselves():
@@ -242,13 +243,6 @@ def test_unconfirmed_frames_are_left_out_and_never_confirm_themselves():
     assert service.kinds((0.0, 0), (1e6, 1), (1e6, 1)) == ["tracks", "unconfirmed", "unconfirmed"]
     assert service.tracker.seen == [0.0, 1e6]
     assert service.kinds((0.1, 2), (1e6, 1)) == ["tracks", "unconfirmed"]
-
-
-def test_a_clock_that_was_set_is_told_and_counted():
-    service = scripted("accepted", "unconfirmed", "set_ahead", "set_back")
-    *_, ahead, back = service.answers((0.0, 0), (100.0, 1), (100.1, 2), (3.0, 3))
-    assert (ahead["type"], ahead["clock"], back["clock"]) == ("tracks", "set_ahead", "set_back")
-    assert service.stream.status()["jumps"] == 2
 
 
 def test_reordering_follows_the_trackers_clock_over_glitches_and_gaps():

@@ -1,19 +1,21 @@
-"""Recordings smoothed as they are read: the same labels as of the whole at once, and what lasts of objects."""
-
-from __future__ import annotations
+"""Labels of long recordings in chunks, and with providers."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts, read_tracks
+from pipelines.cli import app
 from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
 from pipelines.smoothing.labelling import Identities, ObjectSummary, median_sizes
 from pipelines.smoothing.streaming import Backlog, TrackedFrame
 from saga_fg import Detections, Frame, InputError
 from tests.pipelines.command import done
+
+# Recordings smoothed as they are read: the same labels as of the whole at once, and what lasts of objects
 
 HEADER = "timestamp,label,x,y,length,width,height,yaw,score"
 
@@ -40,7 +42,7 @@ def write(path: Path, rows: list[str], header: str = HEADER) -> Path:
     return path
 
 
-def test_chunks_come_to_what_the_whole_comes_to(tmp_path: Path) -> None:
+def test_chunks_come_to_what_the_whole_comes_to(tmp_path):
     path, config = write(tmp_path / "drive.csv", drive()), load_smooth_config("file")
     whole = smooth_scene(read_detections(path).scene("drive"), config)
     (run,) = smooth_stream(
@@ -67,7 +69,7 @@ def test_chunks_come_to_what_the_whole_comes_to(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pause", ["frames without detections", "no frames", "no frames for years"])
-def test_chunks_in_which_nothing_is_seen(tmp_path: Path, pause: str) -> None:
+def test_chunks_in_which_nothing_is_seen(tmp_path, pause):
     later = 1e8 if pause == "no frames for years" else 100.0
     rows = [f"{t},car,5,5,4,2,1.5,0,0.8" for t in (*np.arange(0, 4, 0.5), *np.arange(later, later + 4, 0.5))]
     if pause == "frames without detections":
@@ -82,7 +84,7 @@ def test_chunks_in_which_nothing_is_seen(tmp_path: Path, pause: str) -> None:
     assert len(moments) == len(np.unique([row.split(",")[0] for row in rows]))
 
 
-def test_the_command_streams_several_recordings(tmp_path: Path) -> None:
+def test_the_command_streams_several_recordings(tmp_path):
     rows = [f"{name},{row}" for name in ("a", "b") for row in drive(6.0)]
     path = write(tmp_path / "two.csv", rows, f"scene,{HEADER}")
     done("smooth", "file", path, "--output", tmp_path / "out")
@@ -92,7 +94,7 @@ def test_the_command_streams_several_recordings(tmp_path: Path) -> None:
     np.testing.assert_array_equal(first, second)
 
 
-def test_parts_hold_together_what_belongs_together(tmp_path: Path) -> None:
+def test_parts_hold_together_what_belongs_together(tmp_path):
     path = write(tmp_path / "drive.csv", drive(6.0))
     whole, parts = read_detections(path).scene("drive"), list(read_scenes_in_parts(path, 10))
     assert len(parts) > 5
@@ -108,7 +110,7 @@ def test_parts_hold_together_what_belongs_together(tmp_path: Path) -> None:
         list(read_scenes_in_parts(path, scenes=["c"]))
 
 
-def test_poses_are_given_in_all_parts_or_in_none(tmp_path: Path) -> None:
+def test_poses_are_given_in_all_parts_or_in_none(tmp_path):
     rows = ["0,car,5,0,1,2,0.1", "1,car,6,0,,,"]
     path = write(tmp_path / "poses.csv", rows, "timestamp,label,x,y,ego_x,ego_y,ego_yaw")
     with pytest.raises(InputError, match="line 3: ego_x, ego_y, ego_yaw: expected in all rows or in none"):
@@ -125,7 +127,7 @@ def backlog(detections: int, seconds: int, settings: ChunkSettings) -> Backlog:
 
 
 @pytest.mark.parametrize(("detections", "ends"), [(1, [20, 40]), (10, [9, 18, 27, 36]), (1000, [5, 10, 15])])
-def test_crowds_are_cut_into_shorter_chunks(detections: int, ends: list[int]) -> None:
+def test_crowds_are_cut_into_shorter_chunks(detections, ends):
     settings = ChunkSettings(length=20.0, margin=5.0, detections=100)
     known = backlog(detections, 60, settings)
     spans = []
@@ -141,7 +143,7 @@ def test_crowds_are_cut_into_shorter_chunks(detections: int, ends: list[int]) ->
     assert last[1] == np.inf
 
 
-def test_an_object_keeps_its_name_from_chunk_to_chunk() -> None:
+def test_an_object_keeps_its_name_from_chunk_to_chunk():
     identities = Identities()
     track_of = np.array([1, 1, 2, 2, 3])
     times = np.array([0.0, 1.0, 2.0, 9.0, 9.5])
@@ -160,7 +162,7 @@ def test_an_object_keeps_its_name_from_chunk_to_chunk() -> None:
     assert names == {2: 2}
 
 
-def test_objects_that_were_one_have_names_of_their_own_when_they_part() -> None:
+def test_objects_that_were_one_have_names_of_their_own_when_they_part():
     identities, track_of, times = Identities(), np.array([9, 2]), np.array([0.0, 9.0])
     together = identities.name(np.array([9]), np.array([9, 9]), track_of, times, (0.0, 10.0))
     assert together == {9: 9}
@@ -168,7 +170,7 @@ def test_objects_that_were_one_have_names_of_their_own_when_they_part() -> None:
     assert apart == {2: 9, 9: 2}
 
 
-def test_what_lasts_of_an_object_is_gathered_over_its_chunks() -> None:
+def test_what_lasts_of_an_object_is_gathered_over_its_chunks():
     summary = ObjectSummary()
     for size, probability in ((4.0, 0.5), (4.2, 0.9), (9.0, 0.1)):
         for height in (np.nan, 1.5):
@@ -189,10 +191,96 @@ def test_what_lasts_of_an_object_is_gathered_over_its_chunks() -> None:
     assert size[0] < median_sizes([summary])[0, 0] < 4.5
 
 
-def test_many_values_are_kept_by_their_weights() -> None:
+def test_many_values_are_kept_by_their_weights():
     rng = np.random.default_rng(0)
     sizes = rng.normal([4.5, 1.8, 1.5], 0.1, (20_000, 3))
     summary = ObjectSummary()
     for part in np.split(sizes, 20):
         summary.add_detections(1000.0, part, np.ones(1000))
     np.testing.assert_allclose(median_sizes([summary])[0], np.median(sizes, axis=0), atol=1e-3)
+
+
+# Factor providers of users' own in `saga-fg smooth`: named in the configuration, or given from Python
+
+MODULE = """
+from functools import partial
+
+import numpy as np
+
+from factors import ResidualFactors
+from saga_fg.graph import OBJECT, Additions
+
+
+def crowded(origin, x):  # a wall at y = 4
+    return np.logaddexp(0.0, (x[:, 1:2] + origin[1] - 3.5) / 0.1)
+
+
+class Wall:
+    name = "wall"
+
+    def factors(self, view):
+        rows = [[one.key] for one in view.now(OBJECT).values() if one.label == "pedestrian"]
+        return Additions(factors=[ResidualFactors(rows, (4,), partial(crowded, view.origin), 0.01 * np.eye(1))])
+
+
+class Broken:
+    name = "broken"
+
+    def factors(self, view):
+        raise ValueError("no wall is known")
+"""
+
+
+@pytest.fixture
+def walkers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A pedestrian on his way to a wall, beside the module that knows of it."""
+    (tmp_path / "walls_of_this_test.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    rng = np.random.default_rng(0)
+    rows = [
+        f"drive,{0.25 * k},pedestrian,{0.1 * k + rng.normal(0, 0.05):.4f},{2 + 0.02 * k + rng.normal(0, 0.05):.4f},0.9"
+        for k in range(72)
+    ]
+    path = tmp_path / "walkers.csv"
+    path.write_text("\n".join(["scene,timestamp,label,x,y,score", *rows]) + "\n")
+    return path
+
+
+def configuration(folder: Path, provider: str) -> Path:
+    path = folder / f"{provider}.yaml"
+    path.write_text(f"smoothing:\n  providers: ['walls_of_this_test:{provider}']\n")
+    return path
+
+
+def test_a_wall_of_the_configuration_moves_the_labels(walkers):
+    arguments = ["smooth", "file", str(walkers), "-o"]
+    for more in ([], ["--config", str(configuration(walkers.parent, "Wall"))]):
+        done(*arguments, walkers.parent / f"labels{len(more)}", *more)
+    plain, walled = (
+        read_tracks(walkers.parent / folder / "labels.csv").boxes.position for folder in ("labels0", "labels2")
+    )
+    assert len(plain) == len(walled) == 72
+    assert np.allclose(plain[0], walled[0], atol=1e-3)
+    assert walled[-1, 1] < plain[-1, 1] - 0.02
+
+    run = CliRunner().invoke(
+        app, [*arguments, str(walkers.parent / "broken"), "--config", str(configuration(walkers.parent, "Broken"))]
+    )
+    assert run.exit_code != 0
+    assert "provider broken: no wall is known" in run.output
+
+
+def test_in_chunks_and_from_python_it_is_the_same(walkers):
+    from walls_of_this_test import Wall  # type: ignore[import-not-found]
+
+    config = load_smooth_config("file", configuration(walkers.parent, "Wall"))
+    parts = read_scenes_in_parts(walkers, 20)
+    (run,) = smooth_stream(parts, config, walkers.parent, chunks=ChunkSettings(length=5.0, margin=5.0))
+    streamed = run.tracks
+    scene = read_detections(walkers).scene("drive")
+    for whole in (smooth_scene(scene, config), smooth_scene(scene, load_smooth_config("file"), providers=[Wall()])):
+        assert len(list(walkers.parent.glob("000000/*.npz"))) > 1
+        assert len(streamed) == len(whole.tracks)
+        for mine, theirs in zip(streamed, whole.tracks, strict=True):
+            assert mine.id.tolist() == theirs.id.tolist()
+            np.testing.assert_allclose(mine.boxes.position, theirs.boxes.position, atol=2e-3)

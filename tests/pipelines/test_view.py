@@ -183,9 +183,12 @@ def test_broken_slam_results_are_refused(tmp_path):
         read_slam_view(tmp_path)
 
 
-def test_without_rerun_the_extra_is_named(tmp_path, monkeypatch):
+def test_missing_extras_are_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert 'pip install "saga-fg[view]"' in refused("view", "file", tmp_path / "t.csv", "--save", tmp_path / "t.rrd")
+    monkeypatch.setitem(sys.modules, "mcap_protobuf.writer", None)
+    assert 'pip install "saga-fg[mcap]"' in refused("view", "file", "tracks.csv", "--save", tmp_path / "t.mcap")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_that_cannot_be_written_to_its_end_leaves_nothing(tmp_path, monkeypatch):
@@ -429,12 +432,6 @@ def test_the_command_writes_the_file_that_the_suffix_names(tmp_path):
     ((entity,),) = (each.content.entities for each in topics["/slam/names"])
     assert [text.text for text in entity.texts] == ["pole 2"]
     assert [each.time for each in topics["/slam/pose"]] == [0, 100_000_000]
-
-
-def test_without_mcap_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mcap_protobuf.writer", None)
-    assert 'pip install "saga-fg[mcap]"' in refused("view", "file", "tracks.csv", "--save", tmp_path / "t.mcap")
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_drawing_that_fails_leaves_no_file(tmp_path, shown):

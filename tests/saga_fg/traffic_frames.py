@@ -1,8 +1,11 @@
 """Frames of made-up traffic for tests of trackers: cars with known motion, seen with known noise."""
 
-import numpy as np
+from dataclasses import replace
 
-from saga_fg import Boxes, Detections, Frame
+import numpy as np
+import pytest
+
+from saga_fg import Boxes, Detections, Frame, Tracker, Tracks
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 
 NAN = float("nan")
@@ -63,3 +66,28 @@ def columns(tracks):
             for name in ("score", "position_covariance", "velocity_covariance", "coasting")
         },
     }
+
+
+def assert_same(first, second, tolerance=1e-8, covariances=None, shift=(0.0, 0.0, 0.0)):
+    """Two tables of tracks, or lists of them, say the same; the second one's places are shifted."""
+    for a, b in zip(*([one] if isinstance(one, Tracks) else one for one in (first, second)), strict=True):
+        assert (b.timestamp, b.id.tolist()) == (pytest.approx(a.timestamp), a.id.tolist())
+        assert b.boxes.label.tolist() == a.boxes.label.tolist()
+        assert b.boxes.position - shift == pytest.approx(a.boxes.position, rel=0, abs=tolerance)
+        for name in ("velocity", "yaw", "size"):
+            expected = pytest.approx(getattr(a.boxes, name), rel=0, abs=tolerance, nan_ok=True)
+            assert getattr(b.boxes, name) == expected, name
+        relative = tolerance if covariances is None else covariances
+        for name in ("position_covariance", "velocity_covariance"):
+            assert getattr(b, name) == pytest.approx(getattr(a, name), rel=relative, abs=tolerance), name
+        assert b.score == pytest.approx(a.score, rel=0, abs=tolerance)
+        assert b.coasting == pytest.approx(a.coasting, abs=1e-9)
+
+
+def assert_estimators_agree(settings, sensors, frames, tolerance=1e-8, covariances=None):
+    """Every estimator gives the tracks of the Kalman filter, which are returned."""
+    expected = run(Tracker(settings, sensors), frames)
+    for name in ("isam2", "fixed-lag"):
+        found = run(Tracker(replace(settings, estimator=name), sensors), frames)
+        assert_same(expected, found, tolerance, covariances)
+    return expected

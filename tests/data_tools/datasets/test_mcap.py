@@ -244,14 +244,11 @@ def test_files_that_are_no_recordings(tmp_path):
         McapRecording(tmp_path / "folder")
 
 
-def test_a_recording_that_was_cut_off_is_refused(tmp_path):
+def test_recordings_that_are_cut_off_or_have_other_topics_are_refused(tmp_path):
     path = example.write_mcap(tmp_path / "drive.mcap", example.drive())
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(InputError, match=r"drive\.mcap: not readable: .*; the file may be cut off: mcap recover"):
         read(path)
-
-
-def test_topics_of_other_types_are_listed(tmp_path):
     messages = [m for m in example.drive() if m[1] == TF]
     path = example.write_mcap(tmp_path / "drive.mcap", messages)
     with pytest.raises(InputError, match=r"types that do: autoware_perception_msgs/DetectedObjects.*there are /tf"):
@@ -291,14 +288,11 @@ def test_a_bag_is_read_from_plain_tables_alone(tmp_path, subtests):
             read(path)
 
 
-def test_times_beyond_64_bits_are_named():
+def test_times_of_a_bag_that_are_none_or_beyond_64_bits_are_named(tmp_path):
     far = SimpleNamespace(seconds=2**62, nanos=0)
     with pytest.raises(InputError, match=r"time: expected nanoseconds within 64 bits"):
         nanoseconds(far)
     assert nanoseconds(SimpleNamespace(sec=-1, nanosec=1)) == 1 - 10**9
-
-
-def test_times_of_a_bag_that_are_none_are_named(tmp_path):
     path = example.write_bag(tmp_path / "drive", example.drive())
     file = next(path.glob("*.db3"))
     for time in ("1e300", "'noon'"):

@@ -341,16 +341,13 @@ def test_our_figures_are_those_of_the_kit(devkit, tmp_path):
     assert outcome["largest difference"] <= 1e-6, outcome["where"]
 
 
-def test_a_difference_is_found():
+def test_differences_and_kits_that_fail_are_found(tmp_path):
     ours = NuScenesTrackingMetrics(NuScenesClassMetrics(*np.arange(17.0)), per_class={}, curves={})
     names = [field.name for field in fields(NuScenesClassMetrics)]
     theirs = dict(zip(names, np.arange(17.0), strict=True)) | {"label_metrics": {name: {} for name in names}}
     assert max(value for _, value in differences(ours, theirs)) == 0
     assert dict(differences(ours, theirs | {"ids": 12.5}))["ids"] == 0.5
     assert dict(differences(ours, theirs | {"lgd": math.nan}))["lgd"] == math.inf
-
-
-def test_a_kit_that_fails_is_an_error(tmp_path):
     with pytest.raises(InputError, match="expected a python that has nuscenes-devkit"):
         official_figures(str(tmp_path / "python"), tmp_path, tmp_path, VERSION, "all")
     with pytest.raises(InputError, match=r"the development kit failed: .*Error"):

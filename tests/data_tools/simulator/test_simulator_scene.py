@@ -319,16 +319,13 @@ def test_hidden_objects_are_not_detected():
     assert hits[False][0] / hits[False][1] < 0.25
 
 
-def test_objects_are_remembered_for_a_while():
+def test_objects_are_remembered_for_a_while_and_glimpses_are_no_sightings():
     time = np.arange(7.0) / 2
     visible = np.array([[0, 1, 0, 0, 0, 0, 1], [1, 1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0]], dtype=np.bool_).T
     expected = np.array([[0, 1, 1, 1, 0, 0, 1], [1, 1, 1, 1, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0]], dtype=np.bool_).T
     assert np.array_equal(recently_visible(time, visible, 1.0), expected)
     assert np.array_equal(recently_visible(time, visible, 0.0), visible)
     assert recently_visible(time, visible, 9.0)[:, 0].tolist() == [False] + 6 * [True]
-
-
-def test_glimpses_are_no_sightings():
     visible = np.array([[1, 0, 1, 1, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 1, 0]], dtype=np.bool_).T
     two = np.array([[0, 0, 1, 1, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 0, 0]], dtype=np.bool_).T
     three = np.array([[0, 0, 0, 0, 0, 1, 1, 1], [0, 1, 1, 1, 0, 0, 0, 0]], dtype=np.bool_).T

@@ -190,14 +190,11 @@ def share(*boxes: Boxes, rays: int = 400) -> float:
     return float(visible_share(EYE, Boxes.concatenate(boxes), np.array([0]), rays)[0])
 
 
-def test_what_is_seen_is_what_nothing_before_it_hides():
+def test_what_is_seen_is_what_nothing_before_it_hides_half_or_whole():
     assert share(box(20, 3)) == 1.0
     assert visible_share(EYE, box(20, 3), np.empty(0, dtype=np.int64)).shape == (0,)
     assert share(box(20, 0), box(30, 0, height=4.0), box(20, 3, height=4.0), box(-10, 0, height=4.0)) == 1.0
     assert share(box(20, 0), box(10, 0, length=0.5, width=4.0, height=3.0)) == 0.0
-
-
-def test_half_of_the_azimuth_behind_a_wall_is_half_the_object():
     thin = box(20, 0, length=0.01, width=2.0)  # fills the azimuths of -1 m to 1 m at 20 m
     wall = box(10, 5.0, length=0.01, width=10.0, height=3.0)  # from 0 m to the left
     assert share(thin, wall) == pytest.approx(0.5, abs=0.01)

@@ -67,11 +67,14 @@ def in_step(program, estimator, tolerance=TOLERANCE, textbook=None):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_nodes_that_turn_agree_with_the_textbook(make, seed):
+def test_nodes_that_turn_and_scenes_of_lights_lanes_cones_and_trailers_agree_with_the_textbook(make, seed):
     """Courses with known headings and turn rates, recorded with every interval."""
     rng = np.random.default_rng(seed)
     program = random_program(rng, moments=7, kinds=(CAR, VAN, CONE))
     in_step([with_courses(rng, operation) for operation in program], make())
+    # Standing and moving nodes whose edges go between kinds, with rates that follow the belief on a light.
+    rng = np.random.default_rng(seed)
+    in_step(road_program(rng), make())
 
 
 def with_courses(rng, operation):
@@ -110,21 +113,10 @@ def test_a_thousand_seconds_without_a_word(make, seed):
 
 
 @pytest.mark.parametrize("seed", [0])
-def test_nodes_that_stand_still_for_ever(make, seed):
+def test_nodes_that_stand_still_for_ever_and_measurements_far_better_than_the_prior(make, seed):
     """Stop lines and poles have no process noise: Q is singular."""
     rng = np.random.default_rng(40 + seed)
     in_step(random_program(rng, moments=7, kinds=(CAR, POLE)), make())
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_scene_of_lights_lanes_cones_and_trailers(make, seed):
-    """Standing and moving nodes whose edges go between kinds, with rates that follow the belief on a light."""
-    rng = np.random.default_rng(seed)
-    in_step(road_program(rng), make())
-
-
-@pytest.mark.parametrize("seed", [0])
-def test_measurements_far_better_than_the_prior(make, seed):
     rng = np.random.default_rng(seed)
     prior = Add(np.array([1, 2]), rng.normal(size=(2, 4)) * 1e3, np.stack([1e6 * np.eye(4)] * 2))
     sharp = Update(Measurements(np.array([1]), np.array([[3.0, 4.0]]), np.eye(2, 4), 1e-2 * np.eye(2)))

@@ -243,13 +243,10 @@ def test_new_nodes_are_independent_and_leave_the_others_as_they_are(gaussian, su
             assert np.array_equal(new.mean, np.concatenate([x.mean, means.ravel()]))
 
 
-def test_no_new_nodes_change_nothing(gaussian):
+def test_integrating_out_leaves_the_block_of_the_others_and_no_new_nodes_change_nothing(gaussian):
     _, x = gaussian
     same = x.extended(x.layout.extended([], 4), np.empty((0, 4)), np.empty((0, 4, 4)))
     assert np.array_equal(dense(same), dense(x))
-
-
-def test_integrating_out_leaves_the_block_of_the_others(gaussian):
     _, x = gaussian
     alone = np.flatnonzero(np.bincount(x.partition.label)[x.partition.label] == 1)
     for rows in (alone, np.array([0]), np.array([1, 4, 8]), np.arange(9)):

@@ -383,7 +383,7 @@ def assert_minimum(smoother):
     return equivalent, solved
 
 
-def test_nonlinear_measurements_are_solved_by_gauss_newton():
+def test_nonlinear_measurements_are_solved_by_gauss_newton_even_if_late():
     smoother = radar_window()
     equivalent, solved = assert_minimum(smoother)
     marginals = gtsam.Marginals(equivalent.native(), solved)
@@ -392,9 +392,6 @@ def test_nonlinear_measurements_are_solved_by_gauss_newton():
         assert covariance_error(smoother.covariance([node])[0], marginals.marginalCovariance(newest[node])) < 1e-4
     last = smoother.smoothed()[-1]
     np.testing.assert_array_equal(last.mean([1, 2, 3]), smoother.mean([1, 2, 3]))
-
-
-def test_a_late_nonlinear_measurement_finds_its_place():
     punctual, late = radar_window(), radar_window()
     extra = Observations([2], [[40.0, 0.2]], RangeBearing(state_dim=4), np.diag([0.09, 1e-4]))
     late.update(extra, time=1.0)

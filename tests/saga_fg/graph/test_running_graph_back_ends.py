@@ -223,7 +223,7 @@ def state(tracks):
 
 
 @pytest.mark.parametrize("name", BACK_ENDS)
-def test_a_users_range_changes_what_the_tracker_reports(name):
+def test_a_users_range_and_the_interactions_change_what_the_tracker_reports(name):
     told, untold = run(tracker(name, Given(tape)), FRAMES)[-1], run(tracker(name), FRAMES)[-1]
     assert told.id.tolist() == untold.id.tolist()
     ranges = [np.hypot(*tracks.boxes.position[0, :2]) for tracks in (told, untold)]
@@ -231,10 +231,6 @@ def test_a_users_range_changes_what_the_tracker_reports(name):
     moved = np.abs(state(told) - state(untold)).max(axis=1)
     assert moved[1] > 1e-3, "neighbours share their velocity"
     assert moved[2] < 1e-3 * moved[1], "that one is far away"
-
-
-@pytest.mark.parametrize("name", BACK_ENDS)
-def test_taking_the_interactions_out_changes_the_estimate(name):
     together, alone = (run(tracker(name, Given(tape), edges=edges), FRAMES)[-1] for edges in (EDGES, ()))
     assert np.abs(state(together) - state(alone))[:2].max() > 1e-3
 

@@ -177,13 +177,10 @@ def test_what_is_learned_is_near_the_truth_and_better_on_other_objects(monkeypat
     assert TRUTH.acceleration_noise / 2 < learned.acceleration_noise < start.acceleration_noise / 1.5
 
 
-def test_too_few_objects_teach_nothing():
+def test_too_few_objects_teach_nothing_and_only_their_own_classes(monkeypatch):
     objects = curvilinear_drawn(np.random.default_rng(2), TRUTH, 3, moments=20)
     assert fit_curvilinear(objects, TRUTH) == TRUTH
     assert fit_curvilinear([], TRUTH) == TRUTH
-
-
-def test_only_classes_that_move_so_are_learned(monkeypatch):
     monkeypatch.setattr(learning, "EVALUATIONS", 10)
     start = replace(TRUTH, acceleration_noise=5.0)
     objects = {"car": curvilinear_drawn(np.random.default_rng(3), TRUTH, 24, moments=25)}

@@ -68,16 +68,12 @@ def in_order_of_components(graph, names, matrix):
 
 
 @given(intervals)
-def test_constant_velocity_in_closed_form(dt):
+def test_constant_velocity_and_acceleration_in_closed_form(dt):
     F, b, Q = dense(discretise(SceneGraph.of([4], CAR), dt))
     eye, q = np.eye(2), 1.5
     assert np.allclose(F, np.block([[eye, dt * eye], [0 * eye, eye]]), rtol=1e-13, atol=0)
     assert np.allclose(Q, q * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], eye), rtol=1e-12, atol=1e-300)
     assert not b.any()
-
-
-@given(intervals)
-def test_constant_acceleration_in_closed_form(dt):
     F, _, Q = dense(discretise(SceneGraph.of([4], BUS), dt))
     eye, q = np.eye(2), 0.4
     one_axis = [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
@@ -95,13 +91,20 @@ def test_every_type_without_edges_is_the_matrix_exponential(subtests):
 
 
 @given(seeds, intervals)
-def test_rate_zero_is_exactly_no_edges(seed, dt):
+def test_rate_zero_is_exactly_no_edges_and_noise_is_positive_semidefinite(seed, dt):
     rng = np.random.default_rng(seed)
     types = random_types(rng, 5)
     graph = random_graph(rng, types, max_rate=0.0)
     with_edges, without = dense(discretise(graph, dt)), dense(discretise(SceneGraph(graph.nodes, graph.types), dt))
     for a, b in zip(with_edges, without, strict=True):
         assert np.array_equal(a, b)
+    rng = np.random.default_rng(seed)
+    for blocks in discretise(random_graph(rng, random_types(rng, 5), arbitrary=False), dt).Q:
+        for Q in blocks.values:
+            assert np.array_equal(Q, Q.T)
+            scale = np.sqrt(np.diag(Q))
+            correlation = Q / np.where(scale > 0, scale, 1)[:, None] / np.where(scale > 0, scale, 1)
+            assert np.linalg.eigvalsh(correlation)[0] > -1e-10
 
 
 def test_no_nodes_and_intervals_that_are_none(subtests):
@@ -236,17 +239,6 @@ def test_the_step_is_as_sparse_as_the_graph(seed, dt):
     assert sorted(noisy) == [(k, k) for k in range(len(types))]
 
 
-@given(seeds, intervals)
-def test_the_process_noise_is_symmetric_and_positive_semidefinite(seed, dt):
-    rng = np.random.default_rng(seed)
-    for blocks in discretise(random_graph(rng, random_types(rng, 5), arbitrary=False), dt).Q:
-        for Q in blocks.values:
-            assert np.array_equal(Q, Q.T)
-            scale = np.sqrt(np.diag(Q))
-            correlation = Q / np.where(scale > 0, scale, 1)[:, None] / np.where(scale > 0, scale, 1)
-            assert np.linalg.eigvalsh(correlation)[0] > -1e-10
-
-
 @given(seeds, st.floats(0.01, 5))
 def test_rules_that_choose_the_same_pair_are_added_up(seed, dt):
     rng = np.random.default_rng(seed)
@@ -347,10 +339,6 @@ def test_no_interval_makes_shared_velocity_unstable(seed, dt, max_rate):
     assert velocities.min() > -1e-12
     assert np.allclose(velocities.sum(axis=1), 1, atol=1e-9)
     assert np.abs(np.linalg.eigvals(velocities)).max() <= 1 + 1e-9
-
-
-@given(seeds, intervals, st.floats(0, 1e3))
-def test_no_interval_makes_shared_velocity_unstable_among_mixed_types(seed, dt, max_rate):
     rng = np.random.default_rng(seed)
     graph = consensus_graph(rng, random_types(rng, 7, MOVING), max_rate)
     F = discretise(graph, dt).F_matrix.toarray()

@@ -55,7 +55,7 @@ def test_a_follower_listens_to_its_leader_once_nobody_sees_it():
 # who exists
 
 
-def test_clutter_pulls_at_nobody():
+def test_leaders_are_the_nearest_that_exist_and_clutter_pulls_at_nobody():
     nodes = table([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]], 0.0)
     unsure = replace(nodes, existence=np.array([1.0, 0.25, 0.0]))
     full, weighted = (build_graph(each, [Neighbours()]).edges[0] for each in (nodes, unsure))
@@ -63,9 +63,6 @@ def test_clutter_pulls_at_nobody():
     assert 2 not in weighted.source
     for i, j, rate in zip(weighted.target, weighted.source, weighted.rate, strict=True):
         assert rate == pytest.approx(of[i, j] * unsure.existence[j])
-
-
-def test_the_nearest_leader_that_exists_leads():
     nodes = table(*straight(4, gap=8.0))  # 3 behind 2 behind 1 behind 0
     rule = Following(gap_scale=np.inf)
     r = np.array([0.9, 0.6, 0.2, 1.0])

@@ -62,7 +62,7 @@ def test_the_covariance_formula(x, y, origin, position, range_noise, bearing_noi
         assert np.allclose(R, position**2 * np.eye(2), rtol=1e-3)
 
 
-def test_deviations_grow_as_the_score_falls():
+def test_deviations_grow_as_the_score_falls_class_by_class():
     noise = NoiseModel(position=0.2, low_score_growth=1.5)
     assert covariance(noise, (5.0, 0.0), probability=1.0) == pytest.approx(0.04 * np.eye(2))
     assert covariance(noise, (5.0, 0.0), probability=0.4) == pytest.approx((0.2 * (1 + 1.5 * 0.6)) ** 2 * np.eye(2))
@@ -70,9 +70,6 @@ def test_deviations_grow_as_the_score_falls():
     seen = Detections(Boxes.of(["car", "car"], np.zeros((2, 3))), np.ones(2))
     velocity = sensor.detection_covariance(seen, None, np.array([1.0, 0.5]))[:, 2:, 2:]
     assert velocity == pytest.approx(np.stack([0.25 * np.eye(2), (0.5 * 1.5) ** 2 * np.eye(2)]))
-
-
-def test_each_class_has_its_noise_and_the_default_serves_all_others():
     sensor = Sensor(noise={"car": NoiseModel(position=1.0), "default": NoiseModel(position=2.0)})
     assert sensor.deviations(labels("bus", "car", "bus"), "position").tolist() == [[2.0, 1.0, 2.0]]
     assert Sensor(noise={"car": NoiseModel()}).deviations(labels("bus"), "position").tolist() == [[0.3]]

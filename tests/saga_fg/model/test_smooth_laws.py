@@ -253,7 +253,7 @@ def test_two_at_one_place_do_not_push_and_a_bearing_of_the_sensor_itself_is_refu
             model.jacobian(np.zeros(model.state_dim))
 
 
-def test_soft_distances_are_exact_beyond_their_width_and_never_below_the_distance():
+def test_distances_are_exact_beyond_their_width_and_walls_however_cut():
     d = np.array([[0.3, 0.0], [0.0, -0.31], [3.0, 4.0], [0.2999999, 0.0], [0.1, 0.0], [0.0, 0.0]])
     soft, length = soft_distance(d, 0.3), np.hypot(*d.T)
     assert (soft.value[:3] == length[:3]).all()
@@ -261,6 +261,14 @@ def test_soft_distances_are_exact_beyond_their_width_and_never_below_the_distanc
     np.testing.assert_allclose(soft.value[3:], [0.2999999, 0.3 / 8 * (3 + 6 / 9 - 1 / 81), 0.1125], atol=1e-9)
     assert (soft.value >= length).all()
     assert (np.linalg.norm(soft.direction, axis=1) <= 1 + 1e-15).all()
+    # A straight wall in two pieces is the wall in one, and missing pieces, far away, do not act.
+    law, p = SocialForce(), np.random.default_rng(6).uniform([-3, 0.3], [3, 3], (30, 2))
+    own, still = np.concatenate([p, np.zeros_like(p)], axis=1), np.zeros((30, 4))
+    whole, cut = np.array([[-5.0, 0, 5, 0]]), np.array([[-5.0, 0, 0, 0], [0, 0, 5, 0]])
+    far = np.array([[-5.0, 0, 5, 0], [1e6, 1e6, 1e6, 1e6]])
+    one, two, three = (law.accelerations(own, still, np.broadcast_to(w, (30, *w.shape))) for w in (whole, cut, far))
+    np.testing.assert_array_equal(one.value, three.value)
+    np.testing.assert_allclose(one.value, two.value, atol=0.04)
 
 
 def test_repulsion_is_the_gradient_of_its_potential():
@@ -275,17 +283,6 @@ def test_repulsion_is_the_gradient_of_its_potential():
     downhill = -central_differences(potential, [p], [Vector(2)])[0][:, 0]
     value = force.accelerations(own, np.zeros_like(own), np.broadcast_to(force.alone, (len(p), 1, 4))).value
     np.testing.assert_allclose(value, downhill, atol=1e-8)
-
-
-def test_walls_do_not_depend_on_how_they_are_cut_or_padded():
-    """A straight wall in two pieces is the wall in one, and missing pieces, far away, do not act."""
-    law, p = SocialForce(), np.random.default_rng(6).uniform([-3, 0.3], [3, 3], (30, 2))
-    own, still = np.concatenate([p, np.zeros_like(p)], axis=1), np.zeros((30, 4))
-    whole, cut = np.array([[-5.0, 0, 5, 0]]), np.array([[-5.0, 0, 0, 0], [0, 0, 5, 0]])
-    far = np.array([[-5.0, 0, 5, 0], [1e6, 1e6, 1e6, 1e6]])
-    one, two, three = (law.accelerations(own, still, np.broadcast_to(w, (30, *w.shape))) for w in (whole, cut, far))
-    np.testing.assert_array_equal(one.value, three.value)
-    np.testing.assert_allclose(one.value, two.value, atol=0.04)
 
 
 # Edge rules that would drive objects apart are refused, alone and together

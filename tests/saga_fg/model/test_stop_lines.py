@@ -299,16 +299,13 @@ def test_who_leaves_a_lane_or_is_pushed_out_by_cones_is_let_go():
 # cones
 
 
-def test_cones_push_aside_whose_lane_they_close():
+def test_cones_push_aside_whose_lane_they_close_to_where_the_edge_is_just_cleared():
     nodes = taper()
     acceleration = pull(nodes, ConeLine())
     assert acceleration[0, 1] > 0.5
     assert acceleration[0, 0] == pytest.approx(0)
     assert np.allclose(acceleration[1:], 0)
-
-
-def test_cones_push_to_where_the_edge_is_just_cleared_on_either_side():
-    """Looking 15 m ahead, at the second cone, which is at y = -1: the way aside there is clearance - 1."""
+    # Looking 15 m ahead, at the second cone, which is at y = -1: the way aside there is clearance - 1.
     assert pull(taper(), ConeLine())[0, 1] == pytest.approx(CONE_RATE * (CLEARANCE - 1) / PREVIEW)
     nodes = taper()
     mirrored = table([(str(nodes.label[k]), *(nodes.position[k] * (1, -1)), 10.0 * (k < 2), 0, 4) for k in range(7)])

@@ -152,12 +152,18 @@ def one_each(P, R, rng):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_of_two_tracks_it_is_the_joint_likelihood_over_the_product_of_the_two(seed):
+def test_joint_likelihoods_of_two_tracks_and_the_hungarian_assignment_without_pairs(seed):
     P, R, rng = drawn(seed, n=2)
     innovation, S, costs = one_each(P, R, rng)
     joint = multivariate_normal(np.zeros(4), P + np.kron(np.eye(2), R)).logpdf(innovation.ravel())
     apart = sum(multivariate_normal(np.zeros(2), S[k]).logpdf(innovation[k]) for k in range(2))
     assert costs.cost.sum() == pytest.approx(-2 * (joint - apart), abs=1e-7)
+    problem = quadratic_drawn(seed, tracks=12, detections=9, most=60, coupling=0.0)
+    gain = np.zeros((37, 9))
+    gain[problem.track, problem.detection] = problem.gain
+    pairs = set(zip(*(rows.tolist() for rows in assign(gain, gain < 0, 0.0)), strict=True))
+    chosen = solved(problem)
+    assert set(zip(problem.track[chosen].tolist(), problem.detection[chosen].tolist(), strict=True)) == pairs
 
 
 def test_trees_of_ties_count_every_edge_once_and_independent_tracks_none():
@@ -230,16 +236,6 @@ def test_no_choice_costs_less(coupling, seed):
     assert problem.cost(solved(problem)) == pytest.approx(least_cost(problem), abs=1e-9)
 
 
-@given(seed=st.integers(0, 2**32 - 1))
-def test_without_costs_of_pairs_it_is_the_hungarian_assignment(seed):
-    problem = quadratic_drawn(seed, tracks=12, detections=9, most=60, coupling=0.0)
-    gain = np.zeros((37, 9))
-    gain[problem.track, problem.detection] = problem.gain
-    pairs = set(zip(*(rows.tolist() for rows in assign(gain, gain < 0, 0.0)), strict=True))
-    chosen = solved(problem)
-    assert set(zip(problem.track[chosen].tolist(), problem.detection[chosen].tolist(), strict=True)) == pairs
-
-
 def test_a_large_component_is_no_worse_than_the_hungarian_assignment(monkeypatch):
     monkeypatch.setattr(assignment, "LARGEST_FRONTIER", 500)
     for seed in range(5):
@@ -267,7 +263,7 @@ def most_compared(request, monkeypatch):
 
 
 @pytest.mark.usefixtures("most_compared")
-def test_pairs_are_those_of_all_distances_in_order(subtests):
+def test_pairs_are_those_of_all_distances_in_order_and_of_nothing_none(subtests):
     for seed in range(5):
         with subtests.test(seed=seed):
             rng = np.random.default_rng(seed)
@@ -276,17 +272,9 @@ def test_pairs_are_those_of_all_distances_in_order(subtests):
             found = near_pairs(a, b, reach, further)
             np.testing.assert_array_equal(found, by_distances(a, b, reach, further))
             assert len(found[0]) > 20
-
-
-@pytest.mark.usefixtures("most_compared")
-def test_unknown_reaches_find_nothing_and_infinite_ones_everything():
     a, b = np.array([[0.0, 0.0], [1e9, 0.0], [0.0, 0.0]]), np.array([[0.0, 1.0], [5.0, 5.0]])
     i, j = near_pairs(a, b, np.array([np.nan, np.inf, 1.0]), np.array([0.0, np.nan]))
     assert (i.tolist(), j.tolist()) == ([1, 2], [0, 0])
-
-
-@pytest.mark.usefixtures("most_compared")
-def test_nothing_is_near_nothing(subtests):
     for n, m in [(0, 0), (0, 3), (3, 0)]:
         with subtests.test(n=n, m=m):
             i, j = near_pairs(np.zeros((n, 2)), np.zeros((m, 2)), np.ones(n))

@@ -263,16 +263,13 @@ def test_known_places_say_where_the_graph_is_and_how_it_is_turned(dim):
     assert np.sqrt(spread[graph.places.pose].max()) < 0.011  # no worse than what is known of them
 
 
-def test_a_known_place_counts_by_its_distance():
+def test_known_places_count_by_their_distance_and_find_false_loops():
     graph, _ = surveyed(2)
     assert graph.places is not None
     off = graph.world_T_pose[graph.places.pose, :2, 2] - graph.places.position
     expected = 0.5 * np.einsum("ni,nij,nj", off, graph.places.information, off)
     held = replace(graph, places=None)
     assert graph_error(graph) == pytest.approx(expected + graph_error(held))
-
-
-def test_false_loops_are_found_with_known_places():
     graph, true = surveyed(2)
     places = graph.places
     spoilt = replace(with_false_loops(replace(graph, places=None), 0.5, seed=1), places=places)

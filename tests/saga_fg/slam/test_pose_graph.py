@@ -123,7 +123,7 @@ def squares(rounds: int) -> RunningPoseGraph:
     return graph
 
 
-def test_the_shortest_way_takes_the_least_of_parallel_measurements():
+def test_the_shortest_way_takes_the_least_of_parallel_measurements_and_a_pose_alone_is_settled():
     graph = RunningPoseGraph(np.eye(3))
     for _ in range(4):
         graph.append(moved(2, np.array([[1.0, 0, 0]]))[0], 1e-4 * np.eye(3))
@@ -133,6 +133,9 @@ def test_the_shortest_way_takes_the_least_of_parallel_measurements():
     graph.close([Measured(1, 2, step, np.eye(3)), Measured(3, 2, np.linalg.inv(shorter), np.eye(3))])
     assert graph.distances(0) == pytest.approx([0, 1, 2, 2.5, 3.5])
     assert graph.distances(4) == pytest.approx([3.5, 2.5, 1.5, 1, 0])
+    graph = RunningPoseGraph(np.eye(3))
+    assert graph.distances(0).tolist() == [0]
+    assert len(graph.settled().graph) == 1
 
 
 def test_loops_are_closed_and_a_false_one_is_left_out_at_the_end():
@@ -143,12 +146,6 @@ def test_loops_are_closed_and_a_false_one_is_left_out_at_the_end():
     agreed = graph.settled()
     assert agreed.kept.tolist() == [True] * 20 + [False]
     np.testing.assert_allclose(agreed.graph.world_T_pose[8], np.eye(3), atol=1e-6)
-
-
-def test_a_pose_alone_is_settled():
-    graph = RunningPoseGraph(np.eye(3))
-    assert graph.distances(0).tolist() == [0]
-    assert len(graph.settled().graph) == 1
 
 
 # The proof of the global minimum of the chordal cost, and the way to it from a bad local one
@@ -186,7 +183,7 @@ def test_a_staircase_that_ends_early_has_a_bound_and_no_proof(monkeypatch):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_the_cost_is_the_sum_over_measurements(dim):
+def test_the_cost_is_the_sum_over_measurements_and_none_where_all_agree(dim):
     graph, true = loop(dim, seed=2)
     T, covariance = graph.first_T_second, np.linalg.inv(graph.information)
     kappa = (1.0 if dim == 2 else 1.5) / np.trace(covariance[:, graph.rotation, graph.rotation], axis1=1, axis2=2)
@@ -196,6 +193,11 @@ def test_the_cost_is_the_sum_over_measurements(dim):
     shifted = t[graph.second] - t[graph.first] - (R[graph.first] @ T[:, :dim, dim:])[:, :, 0]
     expected = (kappa * (turned**2).sum(axis=(1, 2)) + tau * (shifted**2).sum(axis=1)).sum()
     assert ChordalCost.of(graph).at(true) == pytest.approx(expected, rel=1e-9)
+    graph, true = loop(dim, seed=0)
+    exact = replace(graph, first_T_second=np.linalg.inv(true[graph.first]) @ true[graph.second])
+    minimum = chordal_minimum(exact, chordal_poses(exact))
+    assert (minimum.cost, minimum.bound, minimum.gap) == (0.0, 0.0, 0.0)
+    assert minimum.certified
 
 
 def seen_from_outside(dim: int, noise: float, seed: int = 0) -> tuple[PoseGraph, FloatArray, FloatArray]:
@@ -343,15 +345,6 @@ def test_other_starts_are_tried_beside_proven_poses_only_where_they_are_better()
     assert optimise_poses(graph).chordal is None
     there = optimise_poses(graph.at(far.world_T_pose), certify=True)
     assert there.error <= far.error * (1 + 1e-9)
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_measurements_that_all_agree_cost_nothing(dim):
-    graph, true = loop(dim, seed=0)
-    exact = replace(graph, first_T_second=np.linalg.inv(true[graph.first]) @ true[graph.second])
-    minimum = chordal_minimum(exact, chordal_poses(exact))
-    assert (minimum.cost, minimum.bound, minimum.gap) == (0.0, 0.0, 0.0)
-    assert minimum.certified
 
 
 def test_the_whole_way_is_bounded():

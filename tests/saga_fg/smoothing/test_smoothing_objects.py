@@ -1,13 +1,15 @@
-"""Tracklets joined, detections claimed, stands recognised, scores from all evidence."""
-
-from __future__ import annotations
+"""Objects of a recording, and providers of factors on them."""
 
 import tracemalloc
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import pytest
 
-from saga_fg.model.edge_rules import Following
+from factors import ResidualFactors, prior_factor
+from saga_fg.graph import LANDMARK, OBJECT, Additions, FactorProvider, GraphError, GraphView, NewVariable
+from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.motion import NodeType
 from saga_fg.model.sensor import NoiseModel, Sensor
@@ -19,6 +21,7 @@ from saga_fg.smoothing import (
     OfflineClass,
     SmoothedEdges,
     StateTable,
+    StationaryStates,
     assign_free_detections,
     evidence_scores,
     frame_rate,
@@ -32,6 +35,10 @@ from saga_fg.smoothing import (
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
+from tests.saga_fg.smoothing.test_smoothing_states import CLASSES as PROVIDERS_CLASSES
+from tests.saga_fg.smoothing.test_smoothing_states import SENSORS as PROVIDERS_SENSORS
+
+# Tracklets joined, detections claimed, stands recognised, scores from all evidence
 
 SENSORS = {"default": Sensor({"default": NoiseModel(position=0.1)})}
 CLASSES = {"default": OfflineClass(acceleration_noise=0.5)}
@@ -69,27 +76,21 @@ def joined(paths: dict[int, FloatArray], max_gap: float = 3.0) -> dict[int, int]
     )
 
 
-def test_tracklets_of_one_motion_are_one_object_over_several_gaps() -> None:
+def test_motions_over_gaps_are_one_object_and_other_motions_new_ones():
     paths = {4: line(0, 5, (0, 0), (5, 0)), 7: line(9, 12, (0, 0), (5, 0)), 2: line(15, 19, (0, 0), (5, 0))}
     assert joined(paths) == {4: 4, 7: 4, 2: 4}
-
-
-def test_crossing_objects_keep_to_their_own_motion() -> None:
     paths = {
         0: line(0, 6, (0, 0), (5, 0)), 1: line(0, 6, (23, -23), (0, 5)),
         2: line(11, 19, (0, 0), (5, 0)), 3: line(11, 19, (23, -23), (0, 5)),
     }  # fmt: skip
     assert joined(paths) == {0: 0, 1: 1, 2: 0, 3: 1}
-
-
-def test_what_moves_otherwise_or_comes_too_late_is_new() -> None:
     paths = {0: line(0, 6, (0, 0), (5, 0)), 1: line(9, 19, (0, 30), (5, 0))}
     assert joined(paths) == {0: 0, 1: 1}
     paths = {0: line(0, 6, (0, 0), (5, 0)), 1: line(12, 19, (0, 0), (5, 0))}
     assert joined(paths, max_gap=1.0) == {0: 0, 1: 1}
 
 
-def test_an_object_claims_detections_before_its_initiation_but_not_those_of_others() -> None:
+def test_an_object_claims_detections_before_its_initiation_but_not_those_of_others():
     evidence, numbers = gathered({0: line(0, 19, (0, 0), (5, 0)), 1: line(0, 19, (0, 20), (5, 0))})
     tracked = np.where(evidence.moment < 2, -1, numbers)
     lifespans = lifespans_of(tracked, evidence.boxes.label, evidence.moment)
@@ -100,7 +101,7 @@ def test_an_object_claims_detections_before_its_initiation_but_not_those_of_othe
     assert assign_free_detections(evidence, tracked, lifespans, states, 0.0, 3.0).tolist() == tracked.tolist()
 
 
-def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not() -> None:
+def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not():
     rng = np.random.default_rng(0)
     noise = rng.normal(0, 0.1, (20, 2))
     waits = np.where(TIMES[:, None] < 4, [[0.0, 20.0]], [[0.0, 20.0]] + 4.0 * (TIMES[:, None] - 4) * [[1.0, 0.0]])
@@ -115,7 +116,7 @@ def test_parked_and_waiting_cars_stand_and_creeping_ones_do_not() -> None:
     assert (standing.id == 2).sum() == 0
 
 
-def test_a_score_is_the_mean_over_all_opportunities_and_those_of_the_prior() -> None:
+def test_a_score_is_the_mean_over_all_opportunities_and_those_of_the_prior():
     evidence, numbers = gathered({0: line(0, 9, (0, 0), (1, 0)), 1: line(5, 5, (0, 9), (0, 0))}, score=0.8)
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, numbers, lifespans, ObjectMotion(np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES))
@@ -124,7 +125,7 @@ def test_a_score_is_the_mean_over_all_opportunities_and_those_of_the_prior() -> 
     assert score.tolist() == pytest.approx([8.0 / 12.0, 0.8 / 3.0])
 
 
-def test_the_front_is_where_an_object_drives_else_what_most_detections_say() -> None:
+def test_the_front_is_where_an_object_drives_else_what_most_detections_say():
     evidence, numbers = gathered({0: line(0, 19, (0, 0), (-5, 0)), 1: line(0, 19, (0, 20), (0, 0))})
     lifespans = lifespans_of(numbers, evidence.boxes.label, evidence.moment)
     states = smooth_states(evidence, numbers, lifespans, ObjectMotion(np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES))
@@ -137,7 +138,7 @@ def test_the_front_is_where_an_object_drives_else_what_most_detections_say() -> 
     assert (variance > 0).all()
 
 
-def test_edges_follow_from_smoothed_states_and_strangers_move_on_their_own() -> None:
+def test_edges_follow_from_smoothed_states_and_strangers_move_on_their_own():
     lifespans = Lifespans(
         np.array([1, 2, 5]), np.array(["car"] * 3), np.zeros(3, dtype=np.int64), np.ones(3, dtype=np.int64)
     )
@@ -151,7 +152,7 @@ def test_edges_follow_from_smoothed_states_and_strangers_move_on_their_own() -> 
     assert (graph.nodes[group.target].tolist(), graph.nodes[group.source].tolist()) == ([1], [2])
 
 
-def test_many_tracklets_are_stitched_without_an_array_of_all_pairs() -> None:
+def test_many_tracklets_are_stitched_without_an_array_of_all_pairs():
     count, rng = 1500, np.random.default_rng(0)
     seen = Lifespans(np.arange(count), np.full(count, "car"), *(np.sort(rng.integers(20, size=(2, count)), axis=0)))
     longer = seen.reaching(TIMES, 1.0, 3.0)
@@ -177,3 +178,112 @@ def test_many_tracklets_are_stitched_without_an_array_of_all_pairs() -> None:
     assert (joined <= (gap > 0) & (gap <= 3.0)).all()
     assert (found[2::3] == np.arange(count)[2::3]).all()
     assert peak < count**2
+
+
+# Factors of users' own in offline smoothing: they act, are named when they fail, and without any nothing changes
+
+PLACE = np.array([4e5, -2e5])  # of the scene in the world
+WALL = PLACE[1] + 4.0
+
+
+class Quiet:
+    name = "quiet"
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[float, set[tuple[str, int]]]] = []
+
+    def factors(self, view: GraphView) -> Additions:
+        self.asked.append((view.time, {(one.label, one.id) for one in view.now(OBJECT).values()}))
+        return Additions()
+
+
+class Wall:
+    """Pedestrians keep half a metre away from it."""
+
+    name = "wall"
+
+    def factors(self, view: GraphView) -> Additions:
+        rows = [[one.key] for one in view.now(OBJECT).values() if one.label == "pedestrian"]
+        keeps_off = partial(crowded, view.origin)
+        return Additions(factors=[ResidualFactors(rows, (4,), keeps_off, 0.01 * np.eye(1), name="keeps off the wall")])
+
+
+def crowded(origin: FloatArray, x: FloatArray) -> FloatArray:
+    return np.logaddexp(0.0, (x[:, 1:2] + origin[1] - (WALL - 0.5)) / 0.1)
+
+
+class Post:
+    """One variable for all time, at which whoever is first looks."""
+
+    name = "post"
+
+    def factors(self, view: GraphView) -> Additions:
+        key = view.key(LANDMARK, 0, static=True)
+        new = NewVariable(LANDMARK, 0, np.zeros(2), static=True)
+        rows = [[one.key, key] for one in list(view.now(OBJECT).values())[:1]]
+        beside = ResidualFactors(rows, (4, 2), lambda x, p: x[:, :2] - p, np.eye(2))
+        first = not view.static(LANDMARK)
+        return Additions([new] * first, [prior_factor(key, np.zeros(2), np.eye(2)), beside] if first else [beside])
+
+
+def states(providers: Sequence[FactorProvider] = ()) -> StateTable:
+    """Two pedestrians who walk towards a wall, a parked car, one who comes late and goes early; seen in the world."""
+    rng, frames, owner = np.random.default_rng(1), [], []
+    for k in range(16):
+        seen = [(0, "pedestrian", (0.4 * k, 2.0 + 0.1 * k)), (1, "pedestrian", (0.4 * k, 1.0 + 0.15 * k))]
+        seen += [(2, "car", (20.0, 0.0))] + [(3, "pedestrian", (9.0 - 0.4 * k, 0.0))] * (4 < k < 12)
+        position = [[*(PLACE + at + rng.normal(0, 0.1, 2)), 0.0] for _, _, at in seen]
+        boxes = Boxes.of([label for _, label, _ in seen], position)
+        frames.append(Frame(0.5 * k + 1.7e9, "lidar", Detections(boxes, np.full(len(seen), 0.9))))
+        owner += [i for i, _, _ in seen]
+    near = {"default": ClassSettings(nms_distance=0.0)}
+    evidence = gather_evidence(frames, np.array([1.7e9 + 7.25]), PROVIDERS_SENSORS, near)
+    object_of = np.array(owner)
+    lifespans = lifespans_of(object_of, evidence.boxes.label, evidence.moment)
+    V, n = np.tile(25 * np.eye(2), (4, 1, 1)), len(lifespans)
+    alone = smooth_states(evidence, object_of, lifespans, ObjectMotion(V, PROVIDERS_CLASSES))
+    rules = (Neighbours(min_speed=0.2, classes=("pedestrian",)),)
+    edges = SmoothedEdges(rules, 0.0, lifespans, alone, np.full(n, np.nan), np.full(n, 0.5))
+    moments = np.arange(len(evidence.times))
+    stands = StationaryStates(0.03, moments, np.full(len(moments), 2))
+    weight = np.where(object_of == 1, 0.5, 1.0)
+    return smooth_states(
+        evidence, object_of, lifespans, ObjectMotion(V, PROVIDERS_CLASSES, edges, stands), weight, providers
+    )
+
+
+def test_the_graph_is_the_problem_that_is_solved_without_providers():
+    plain, quiet = states(), Quiet()
+    asked = states([quiet])
+    assert asked.id.tolist() == plain.id.tolist()
+    sigma = np.sqrt(np.diagonal(plain.covariance, axis1=1, axis2=2))
+    assert np.abs((asked.mean - plain.mean) / sigma).max() < 1e-7
+    np.testing.assert_allclose(asked.covariance, plain.covariance, rtol=1e-7, atol=1e-10)
+    assert len(quiet.asked) == 17
+    assert quiet.asked[0] == (1.7e9, {("pedestrian", 0), ("pedestrian", 1), ("car", 2)})
+    assert quiet.asked[5][1] == {("pedestrian", 0), ("pedestrian", 1), ("car", 2), ("pedestrian", 3)}
+
+
+def test_a_wall_keeps_pedestrians_away():
+    plain, walled = states(), states([Wall()])
+    near = (plain.id == 0) & (plain.moment > 12)
+    assert (walled.mean[near, 1] < plain.mean[near, 1] - 0.02).all()
+    assert (walled.covariance[near, 1, 1] < plain.covariance[near, 1, 1]).all()
+    np.testing.assert_allclose(walled.mean[plain.id == 2], plain.mean[plain.id == 2], atol=1e-6)
+
+
+def test_a_provider_may_bring_variables_of_its_own():
+    assert np.abs(states([Post()]).mean - states().mean).max() > 0.01
+
+
+class Wrong:
+    name = "wrong"
+
+    def factors(self, view: GraphView) -> Additions:
+        rows = [[one.key] for one in view.now(OBJECT).values()]
+        return Additions(factors=[ResidualFactors(rows, (6,), lambda x: x[:, :1], np.eye(1), name="too wide")])
+
+
+def test_what_does_not_fit_is_named():
+    with pytest.raises(GraphError, match=r"provider wrong: too wide on pedestrian 0 at .* s: expected variables"):
+        states([Wrong()])

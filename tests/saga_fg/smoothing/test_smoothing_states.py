@@ -1,32 +1,46 @@
-"""Lifespans, state tables and the batch over a recording."""
+"""Smoothed states, boxes, and the memory that they take."""
 
-from __future__ import annotations
+import tracemalloc
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from factors import Robust
-from saga_fg.estimators import Gaussian, RecordingSmoother, kalman_predict, kalman_update, rts_smooth
+from saga_fg.estimators import Gaussian, RecordingSmoother, kalman_predict, kalman_update, rts_smooth, smoother
 from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_rules import Following
+from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.model.sensor import NoiseModel, Sensor
+from saga_fg.numerics.arrays import IntArray
 from saga_fg.smoothing import (
     Evidence,
     Lifespans,
     OfflineClass,
+    SmoothedEdges,
     StateTable,
     StationaryStates,
     batch_states,
+    constant_sizes,
     gather_evidence,
     lifespans_of,
+    quality_of,
     robust_weights,
+    scalar_readings,
     smooth_states,
+    smooth_walks,
 )
 from saga_fg.smoothing.batch_states import UNKNOWN_POSITION, ObjectMotion
+from saga_fg.smoothing.boxes import weighted_medians
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
+
+# Lifespans, state tables and the batch over a recording
 
 SIGMA = 0.5
 SENSORS = {"default": Sensor({"default": NoiseModel(position=SIGMA)})}
@@ -43,7 +57,7 @@ def evidence_of(times: list[float], positions: list[list[list[float]]]) -> Evide
     return gather_evidence(frames, np.array(times), SENSORS, near)
 
 
-def test_an_object_alone_is_smoothed_as_by_the_textbook() -> None:
+def test_an_object_alone_is_smoothed_as_by_the_textbook():
     rng = np.random.default_rng(0)
     times = np.cumsum(rng.uniform(0.1, 0.9, 12))
     path = np.stack([3.0 * times, np.sin(times)], axis=-1) + rng.normal(0, SIGMA, (12, 2))
@@ -70,7 +84,7 @@ def test_an_object_alone_is_smoothed_as_by_the_textbook() -> None:
     assert np.allclose(states.covariance, [g.covariance for g in expected], rtol=1e-5, atol=1e-9)
 
 
-def test_a_long_recording_is_smoothed_in_windows_and_comes_to_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_recording_is_smoothed_in_windows_and_comes_to_the_same(monkeypatch):
     rng = np.random.default_rng(1)
     times = 0.5 * np.arange(260)
     path = np.stack([3.0 * times, 10 * np.sin(times / 9)], axis=-1) + rng.normal(0, SIGMA, (260, 2))
@@ -91,7 +105,7 @@ def test_a_long_recording_is_smoothed_in_windows_and_comes_to_the_same(monkeypat
     assert np.allclose(in_windows.covariance, at_once.covariance, rtol=0, atol=1e-6)
 
 
-def test_lifespans_reach_from_first_to_last_detection_and_further_where_wanted() -> None:
+def test_lifespans_reach_from_first_to_last_detection_and_further_where_wanted():
     lifespans = lifespans_of(np.array([4, -1, 2, 4]), np.array(["car", "bus", "bus", "car"]), np.array([1, 1, 2, 3]))
     assert lifespans.id.tolist() == [2, 4]
     assert lifespans.label.tolist() == ["bus", "car"]
@@ -101,7 +115,7 @@ def test_lifespans_reach_from_first_to_last_detection_and_further_where_wanted()
     assert (longer.first.tolist(), longer.last.tolist()) == ([1, 0], [4, 4])
 
 
-def test_states_are_found_by_object_and_moment() -> None:
+def test_states_are_found_by_object_and_moment():
     ids = [np.array([3, 1]), np.array([3])]
     table = StateTable.of_moments(
         [(k + 2, i, np.ones((len(i), 4)) * i[:, None], np.ones((len(i), 4, 4))) for k, i in enumerate(ids)]
@@ -113,7 +127,7 @@ def test_states_are_found_by_object_and_moment() -> None:
     assert table.within(lifespans).moment.tolist() == [3]
 
 
-def test_a_pinned_object_stays_where_it_is() -> None:
+def test_a_pinned_object_stays_where_it_is():
     rng = np.random.default_rng(1)
     times = np.arange(20) * 0.5
     path = np.array([10.0, 5.0]) + rng.normal(0, SIGMA, (20, 2))
@@ -126,7 +140,7 @@ def test_a_pinned_object_stays_where_it_is() -> None:
     assert np.allclose(states.mean[:, :2] + evidence.origin, path.mean(axis=0), atol=0.1 * SIGMA)
 
 
-def test_a_pinned_object_wanders_by_the_drift_of_the_poses_whatever_the_rate() -> None:
+def test_a_pinned_object_wanders_by_the_drift_of_the_poses_whatever_the_rate():
     deviations = []
     for rate in (2, 20):
         times = np.arange(20 * rate + 1) / rate
@@ -142,7 +156,7 @@ def test_a_pinned_object_wanders_by_the_drift_of_the_poses_whatever_the_rate() -
     assert deviations == pytest.approx([0.2 * np.sqrt(20)] * 2, rel=0.3)
 
 
-def test_an_outlier_counts_little_after_reweighting() -> None:
+def test_an_outlier_counts_little_after_reweighting():
     times = np.arange(11) * 0.5
     path = np.zeros((11, 2))
     path[5] = [4.0, 0.0]
@@ -157,7 +171,7 @@ def test_an_outlier_counts_little_after_reweighting() -> None:
     assert middle[1] < 0.5 * middle[0]
 
 
-def test_a_stationary_object_of_a_recording_of_one_moment() -> None:
+def test_a_stationary_object_of_a_recording_of_one_moment():
     evidence, mine = evidence_of([0.0], [[[3.0, 4.0]]]), np.zeros(1, dtype=np.int64)
     stands = StationaryStates(0.03, mine, mine)
     lifespans = lifespans_of(mine, evidence.boxes.label, evidence.moment)
@@ -165,3 +179,135 @@ def test_a_stationary_object_of_a_recording_of_one_moment() -> None:
     assert np.allclose(states.mean[0, :2] + evidence.origin, [3.0, 4.0])
     assert np.allclose(states.mean[0, 2:], 0.0)
     assert (np.sqrt(np.diag(states.covariance[0])[2:]) <= stands.position_drift).all()
+
+
+# Sizes, headings, heights and scores of smoothed objects
+
+
+def chain(moments: int, objects: int = 1) -> StateTable:
+    """States of objects that live at all moments."""
+    ids = np.arange(objects)
+    return StateTable.of_moments(
+        [(k, ids, np.zeros((objects, 4)), np.tile(np.eye(4), (objects, 1, 1))) for k in range(moments)]
+    )
+
+
+@given(st.lists(st.floats(-100, 100), min_size=1, max_size=9))
+def test_with_equal_weights_the_weighted_median_is_the_median(values):
+    array = np.array(values)
+    median = weighted_medians(np.zeros(len(array), dtype=np.int64), 1, array, np.ones(len(array)))
+    assert median[0] == pytest.approx(np.median(array))
+
+
+def test_sizes_follow_the_weight_and_objects_do_not_mix():
+    size = np.array([[4.0, 2.0, 1.5], [4.2, 2.0, 1.5], [9.0, 3.0, 2.0], [np.nan] * 3])
+    owner, probability = np.array([0, 0, 0, 2]), np.array([0.9, 0.9, 0.1, 0.9])
+    found = constant_sizes(owner, 3, size, probability, np.full(4, 10.0))
+    assert 4.0 <= found[0, 0] <= 4.2
+    assert np.isnan(found[1:]).all()
+    states = chain(2, objects=2)
+    assert states.previous.tolist() == [-1, -1, 0, 1]
+    readings = scalar_readings(np.array([0, 0, 3]), np.array([1.0, 3.0, 9.0]), np.ones(3))
+    mean, _ = smooth_walks(states, np.zeros(4), readings)
+    assert mean.tolist() == [2.0, 9.0, 2.0, 9.0]
+    P = np.array([0.01, 0.01, 0.25, 4.0])[:, None, None] * np.eye(2)
+    assert quality_of(np.array([0.9, 0.3, 0.9, 0.9]), P).tolist() == ["high", "medium", "medium", "low"]
+
+
+def test_walks_are_smoothed_as_by_the_textbook_from_the_first_reading_on():
+    states = chain(5)
+    rows, value, variance = np.arange(5), np.array([1.0, 2.0, 0.0, 4.0, 1.5]), np.array([1.0, 2.0, 0.5, 1.0, 4.0])
+    mean, var = smooth_walks(states, np.zeros(5), scalar_readings(rows, value, variance))
+    assert np.allclose(mean, np.average(value, weights=1 / variance))
+    assert np.allclose(var, 1 / np.sum(1 / variance))
+    rng = np.random.default_rng(3)
+    n, growth = 7, 0.3
+    value, variance = rng.normal(0, 1, n), rng.uniform(0.5, 2, n)
+    states = chain(n)
+    mean, var = smooth_walks(states, np.full(n, growth), scalar_readings(np.arange(n), value, variance))
+    D = np.diff(np.eye(n), axis=0)
+    information = np.diag(1 / variance) + D.T @ D / growth
+    assert np.allclose(mean, np.linalg.solve(information, value / variance))
+    assert np.allclose(var, np.diag(np.linalg.inv(information)))
+    mean, var = smooth_walks(
+        chain(4), np.full(4, 0.5), scalar_readings(np.array([2]), np.array([7.0]), np.array([1.0]))
+    )
+    assert mean.tolist() == [7.0] * 4
+    assert var.tolist() == [2.0, 1.5, 1.0, 1.5]
+
+
+def test_readings_modulo_half_a_turn_ignore_flips():
+    truth = np.linspace(3.0, 3.4, 9)
+    flipped = truth + np.pi * np.array([0, 1, 0, 0, -1, 1, 0, 1, 0])
+    mean, _ = smooth_walks(chain(9), np.full(9, 0.05), scalar_readings(np.arange(9), flipped, np.full(9, 0.01)), np.pi)
+    assert np.allclose(mean, truth, atol=0.05)
+
+
+# Memory of smoothing grows with what is there at a time, not with the number of all tracks ever
+
+MOMENTS, CARS = 60, 20  # a queue of cars, 10 m apart
+MEMORY_CLASSES = {"default": OfflineClass(acceleration_noise=0.5)}
+FEW, MANY = MOMENTS, 3  # moments that a track lasts: 20 tracks ever, or 400
+
+
+def queue(moments: int) -> Evidence:
+    """All cars, seen at every moment."""
+    times = 0.5 * np.arange(moments)
+    place = np.column_stack([10.0 * np.arange(CARS), np.zeros((CARS, 2))])
+    frames = [
+        Frame(
+            time,
+            "lidar",
+            Detections(Boxes.of(["car"] * CARS, place + np.array([5.0 * time, 0, 0])), np.full(CARS, 0.9)),
+        )
+        for time in times.tolist()
+    ]
+    sensors = {"default": Sensor({"default": NoiseModel(position=0.1)})}
+    return gather_evidence(frames, times, sensors, {"default": ClassSettings(nms_distance=0.0)})
+
+
+def tracks(evidence: Evidence, length: int) -> tuple[IntArray, Lifespans]:
+    """The track of each detection, where a car gets another one every `length` moments."""
+    moments = len(evidence.times)
+    object_of = np.tile(np.arange(CARS), moments) * moments + evidence.moment // length
+    return object_of, lifespans_of(object_of, evidence.boxes.label, evidence.moment)
+
+
+def states(evidence: Evidence, length: int, tied: bool = False) -> StateTable:
+    object_of, lifespans = tracks(evidence, length)
+    V = np.tile(25.0 * np.eye(2), (len(lifespans), 1, 1))
+    alone = smooth_states(evidence, object_of, lifespans, ObjectMotion(V, MEMORY_CLASSES))
+    if not tied:
+        return alone
+    rules = (Following(interaction=SharedVelocity()),)
+    size = np.zeros(len(lifespans)), np.full(len(lifespans), 4.5)
+    edges = SmoothedEdges(rules, float(evidence.times[0]), lifespans, alone, *size)
+    return smooth_states(evidence, object_of, lifespans, ObjectMotion(V, MEMORY_CLASSES, edges))
+
+
+def peak(run: Callable[[], object]) -> int:
+    """Largest number of bytes allocated at once."""
+    run()  # what is loaded, and kept, once
+    tracemalloc.start()
+    run()
+    found = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return found
+
+
+@pytest.mark.parametrize(("kept", "tied"), [("all", False), ("in stretches", True), ("in windows", True)])
+def test_states_take_no_more_memory_for_twenty_times_as_many_tracks(tied, kept, monkeypatch):
+    if kept == "in stretches":
+        monkeypatch.setattr(smoother, "MOST_KEPT", 300_000)
+    if kept == "in windows":
+        monkeypatch.setattr(batch_states, "LONG_RECORDING", 5.0)
+    evidence = queue(MOMENTS)
+    few, many = (peak(lambda length=length: states(evidence, length, tied)) for length in (FEW, MANY))
+    assert many < 1.6 * few
+
+
+def test_in_windows_a_longer_recording_adds_its_rows_alone(monkeypatch):
+    monkeypatch.setattr(batch_states, "LONG_RECORDING", 5.0)
+    short, long = queue(MOMENTS), queue(3 * MOMENTS)
+    more = peak(lambda: states(long, MANY, tied=True)) - peak(lambda: states(short, MANY, tied=True))
+    assert more < 1000 * 2 * MOMENTS * CARS  # bytes for each state: its mean, its covariance, and copies of these

@@ -167,12 +167,21 @@ def test_a_users_estimator_tracks_as_the_toolkits_do(subtests):
             assert len(list(tracker.running_graph.variables)) >= 3
 
 
-def test_an_estimator_that_raises_is_named():
+def test_an_estimator_that_raises_is_named_and_a_step_that_fails_changes_nothing(mine, monkeypatch):
     tracker = Tracker(settings("my_estimators:Breaks"))
     with pytest.raises(InputError, match=r"estimator: my_estimators:Breaks: ZeroDivisionError: no gain"):
         run(tracker, frames(3))
     with pytest.raises(InputError, match=r"estimator: expected one of kalman"):
         Tracker(settings(""))
+    tracker, told = Tracker(settings("my_estimators:Textbook")), frames()
+    run(tracker, told[:5])
+    before = columns(tracker.tracks(told[4].timestamp))
+    with monkeypatch.context() as broken:
+        broken.setattr(mine.Textbook, "marginalise", lambda *_: 1 / 0)
+        broken.setattr(mine.Textbook, "update", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            tracker.step(told[5])
+    assert columns(tracker.tracks(told[4].timestamp)) == before
 
 
 def test_a_subclass_is_what_runs(mine):
@@ -195,18 +204,6 @@ def test_copies_and_snapshots_go_on_alike(copied):
     assert [columns(tracks) for tracks in run(tracker, told[10:])] == after
 
 
-def test_a_step_that_fails_changes_nothing(mine, monkeypatch):
-    tracker, told = Tracker(settings("my_estimators:Textbook")), frames()
-    run(tracker, told[:5])
-    before = columns(tracker.tracks(told[4].timestamp))
-    with monkeypatch.context() as broken:
-        broken.setattr(mine.Textbook, "marginalise", lambda *_: 1 / 0)
-        broken.setattr(mine.Textbook, "update", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            tracker.step(told[5])
-    assert columns(tracker.tracks(told[4].timestamp)) == before
-
-
 def test_it_is_called_with_the_settings_that_its_parameters_name(mine):
     tracker = Tracker(settings("my_estimators:with_lag", lag=3.5, max_delay=0.2))
     estimator = tracker._state.joint.estimator
@@ -218,11 +215,15 @@ def test_it_is_called_with_the_settings_that_its_parameters_name(mine):
     assert estimator_parameters("fixed-lag") == {"providers", "lag"}
 
 
-def test_from_yaml():
+def test_estimators_from_yaml_take_what_they_take():
     found = read_settings(TrackerSettings, "estimator: my_estimators:Textbook", "mine.yaml")
     assert found == replace(TrackerSettings(), estimator="my_estimators:Textbook")
     with pytest.raises(InputError, match=r"mine.yaml: estimator: expected one of kalman, isam2, fixed-lag, textbook"):
         read_settings(TrackerSettings, "estimator: textbok", "mine.yaml")
+    with pytest.raises(InputError, match="Textbook: expected no factor providers, it has no parameter `providers`"):
+        Tracker(settings("my_estimators:Textbook", providers=("saga_fg.providers:Odometry",)))
+    with pytest.raises(InputError, match=r"ego\.estimated: expected the estimator isam2 or fixed-lag, got my_est"):
+        Tracker(settings("my_estimators:Textbook", ego=EgoNodeSettings(estimated=True)))
 
 
 def test_one_line_says_what_is_wrong(subtests):
@@ -247,13 +248,6 @@ def test_one_line_says_what_is_wrong(subtests):
             assert str(raised.value).startswith("estimator: ")
             assert message in str(raised.value)
             assert "\n" not in str(raised.value)
-
-
-def test_what_an_estimator_does_not_take_is_refused():
-    with pytest.raises(InputError, match="Textbook: expected no factor providers, it has no parameter `providers`"):
-        Tracker(settings("my_estimators:Textbook", providers=("saga_fg.providers:Odometry",)))
-    with pytest.raises(InputError, match=r"ego\.estimated: expected the estimator isam2 or fixed-lag, got my_est"):
-        Tracker(settings("my_estimators:Textbook", ego=EgoNodeSettings(estimated=True)))
 
 
 @pytest.mark.parametrize(

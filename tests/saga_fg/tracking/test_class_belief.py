@@ -69,7 +69,7 @@ def test_a_belief_is_the_product_of_the_reports(reports):
         assert found[label] == pytest.approx(expected.get(label, 0.0), abs=1e-12)
 
 
-def test_counts_say_how_frequent_the_classes_are():
+def test_counts_and_missing_tables_and_rows_say_how_sure_a_sensor_is():
     counts = {"car": {"car": 900.0, "truck": 100.0}, "truck": {"truck": 90.0, "car": 10.0}}
     confused = ConfusedClasses.of({"lidar": Sensor(confusion=counts)}, {})
     found = beliefs(confused, confused.initial(confused.likelihood("lidar", np.array(["truck"])))[0])
@@ -78,17 +78,11 @@ def test_counts_say_how_frequent_the_classes_are():
         confused.initial(confused.likelihood("lidar", np.array(["truck"]))), np.array([[0.9, 0.1]])
     )
     assert np.exp(chance[0]) == pytest.approx(found["car"] * 0.9 + found["truck"] * 0.1)
-
-
-def test_a_sensor_without_a_table_is_nearly_sure():
     confused = ConfusedClasses.of(SENSORS | {"radar": Sensor()}, {})
     (row,) = confused.likelihood("radar", np.array(["car"]))
     assert row[confused.classes.index("car")] == pytest.approx(1.0, abs=3e-3)
     assert 0 < row[confused.classes.index("bus")] < 2e-3
     assert row[confused.classes.index("bicycle")] == 0
-
-
-def test_a_class_without_a_row_is_reported_rightly_as_often_as_the_others():
     rows = {"car": {"car": 80.0, "truck": 15.0, "bus": 5.0}, "bus": {"bus": 9.0, "car": 1.0}}
     confused = ConfusedClasses.of({"camera": Sensor(confusion=rows)}, {})
     column = confused.classes.index("truck")

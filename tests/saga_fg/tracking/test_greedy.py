@@ -21,7 +21,7 @@ def test_tracks_are_where_the_detections_are():
         assert tracks.coasting.tolist() == [0.0, 0.0]
 
 
-def test_velocity_is_the_detectors_or_else_the_difference_of_positions():
+def test_velocities_are_the_detectors_or_differences_not_too_close_in_time():
     tracker = GreedyTracker()
     tracker.step(frame(0.0, [(0, 0)], velocity=(3.0, 1.0)))
     measured = tracker.step(frame(0.5, [(2, 1)], velocity=(5.0, NAN)))
@@ -31,9 +31,6 @@ def test_velocity_is_the_detectors_or_else_the_difference_of_positions():
     at_once = tracker.step(frame(1.0, [(4.1, 1)], "camera"))
     assert at_once.boxes.velocity[0].tolist() == [4.0, 0.0]
     assert GreedyTracker().step(frame(0.0, [(0, 0)])).boxes.velocity.tolist() == [[0.0, 0.0]]
-
-
-def test_positions_too_close_in_time_give_no_velocity():
     tracker = GreedyTracker()
     tracker.step(frame(0.0, [(0, 0)]))
     assert tracker.step(frame(0.5, [(1, 0)])).boxes.velocity[0].tolist() == [2.0, 0.0]
@@ -71,9 +68,20 @@ def test_an_unseen_track_is_projected_and_kept_for_a_while():
     assert tracker.step(frame(2.1, [(9, 0)])).id.tolist() == [2]
 
 
-def test_scores_may_be_logits():
+def test_scores_may_be_logits_and_frames_late_or_empty():
     tracks = GreedyTracker(sensors={"lidar": Sensor(score="logit")}).step(frame(0.0, [(0, 0)], score=2.0))
     assert tracks.score == pytest.approx([1 / (1 + np.exp(-2.0))])
+    assert len(GreedyTracker().tracks(1.0)) == 0
+    tracker = GreedyTracker()
+    assert len(tracker.step(frame(0.0, []))) == 0
+    tracker.step(frame(0.1, [(0, 0)]))
+    assert len(tracker.step(frame(0.2, []))) == 0
+    assert len(tracker.tracks(0.2)) == 0
+    tracker = GreedyTracker()
+    tracker.step(frame(1.0, [(0, 0)]))
+    tracks = tracker.step(frame(0.8, [(0.1, 0)]))
+    assert tracks.timestamp == 1.0
+    assert np.isfinite(tracks.boxes.velocity).all()
 
 
 def test_projected_tracks_leave_no_trace():
@@ -85,23 +93,6 @@ def test_projected_tracks_leave_no_trace():
         ahead = watched.tracks(f.timestamp + 0.5)
         assert ahead.boxes.position[:, :2] == pytest.approx(got.boxes.position[:, :2] + 0.5 * got.boxes.velocity)
         assert ahead.coasting == pytest.approx([0.5, 0.5])
-
-
-def test_nothing_seen():
-    assert len(GreedyTracker().tracks(1.0)) == 0
-    tracker = GreedyTracker()
-    assert len(tracker.step(frame(0.0, []))) == 0
-    tracker.step(frame(0.1, [(0, 0)]))
-    assert len(tracker.step(frame(0.2, []))) == 0
-    assert len(tracker.tracks(0.2)) == 0
-
-
-def test_a_late_frame_counts_as_now():
-    tracker = GreedyTracker()
-    tracker.step(frame(1.0, [(0, 0)]))
-    tracks = tracker.step(frame(0.8, [(0.1, 0)]))
-    assert tracks.timestamp == 1.0
-    assert np.isfinite(tracks.boxes.velocity).all()
 
 
 @pytest.mark.parametrize("coordinates", ["ego", "sensor"])

@@ -73,7 +73,7 @@ def test_matches_name_the_candidates_and_why_they_were_rejected():
     assert one["edges"] == []
 
 
-def test_the_chosen_candidate_is_listed_however_many_are_nearer():
+def test_chosen_candidates_and_what_others_took_are_named():
     classes = {"default": ClassSettings(nms_distance=0.0, weak_nms_distance=0.0, min_score=0.0)}
     weak = [Detection("car", (0.02 * k, 0.0, 1.0), score=0.01) for k in range(1, 9)]
     crowd = Frame(0.1, "lidar", Detections.of([*weak, Detection("car", (0.3, 0.0, 1.0), score=0.99)]))
@@ -82,9 +82,6 @@ def test_the_chosen_candidate_is_listed_however_many_are_nearer():
     (matched,) = of_kind(events, "matched")
     assert [c["outcome"] for c in matched["candidates"]].count("chosen") == 1
     assert matched["candidates"][-1]["detection"] == 8
-
-
-def test_what_another_track_took_is_named():
     events, _ = run(frame(0.0, 0.0, 1.0), frame(0.1, 0.0, 1.0), frame(0.2, 0.9))
     last = {event["track"]: event for event in events if event["time"] == 0.2 and "track" in event}
     assert last[2]["event"] == "matched"

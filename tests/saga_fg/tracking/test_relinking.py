@@ -11,7 +11,7 @@ from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.journal import Journal
 from saga_fg.tracking.relinking import relinkable
-from tests.saga_fg.traffic_frames import columns, frame, run
+from tests.saga_fg.traffic_frames import assert_estimators_agree, assert_same, columns, frame, run
 
 # Objects that return after some seconds keep their identity; others don't take it
 
@@ -106,15 +106,9 @@ def test_among_many_detections_only_a_well_known_place_tells():
         assert (tracks.id[nearest] == 1) == same
 
 
-@pytest.mark.parametrize("estimator", ["isam2", "fixed-lag"])
-def test_estimators_agree(estimator):
+def test_estimators_agree():
     frames = [frame(0.1 * k, [VAN, *([crossing(0.1 * k)] if not 30 <= k < 65 else [])]) for k in range(80)]
-    expected = run(Tracker(SETTINGS), frames)
-    found = run(Tracker(replace(SETTINGS, estimator=estimator)), frames)
-    assert expected[-1].id.tolist() == [1, 2]
-    for a, b in zip(expected, found, strict=True):
-        assert a.id.tolist() == b.id.tolist()
-        np.testing.assert_allclose(a.boxes.position, b.boxes.position, atol=1e-6)
+    assert assert_estimators_agree(SETTINGS, None, frames, 1e-6)[-1].id.tolist() == [1, 2]
 
 
 def test_a_relinked_track_is_updated_as_any_other():
@@ -220,7 +214,4 @@ def test_the_journal_tells_of_it(providers):
 def test_estimators_agree_on_who_is_handed_over(estimator):
     expected = handed_returning(beside)[1]
     found = handed_returning(beside, settings=replace(SETTINGS, estimator=estimator))[1]
-    for a, b in zip(expected, found, strict=True):
-        assert a.id.tolist() == b.id.tolist()
-        np.testing.assert_allclose(a.boxes.position, b.boxes.position, atol=1e-6)
-        np.testing.assert_allclose(a.boxes.velocity, b.boxes.velocity, atol=1e-6)
+    assert_same(expected, found, 1e-6)

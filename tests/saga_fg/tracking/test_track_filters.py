@@ -24,7 +24,16 @@ from saga_fg.tracking.track_filters import (
     Stationarity,
     TurnRate,
 )
-from tests.saga_fg.traffic_frames import at_pose, columns, frame, run, seen, straight, turning_vehicle
+from tests.saga_fg.traffic_frames import (
+    assert_estimators_agree,
+    at_pose,
+    columns,
+    frame,
+    run,
+    seen,
+    straight,
+    turning_vehicle,
+)
 
 # Size, height and heading of a track: means, a scalar filter, and a heading that may be off by half a turn
 
@@ -474,15 +483,8 @@ def test_lines_of_sight_begin_at_the_sensor_and_have_no_meaning_at_it():
     assert tracks.boxes.velocity[0].tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("estimator", ["isam2", "fixed-lag"])
-def test_every_estimator_gives_the_same_tracks(estimator):
-    reference, other = tracker(), tracker(estimator)
-    for f in traffic(0):
-        first, second = reference.step(f), other.step(f)
-        assert first.id.tolist() == second.id.tolist()
-        assert second.boxes.position == pytest.approx(first.boxes.position, abs=1e-8)
-        assert second.boxes.velocity == pytest.approx(first.boxes.velocity, abs=1e-8)
-        assert second.velocity_covariance == pytest.approx(first.velocity_covariance, rel=1e-7, abs=1e-8)
+def test_every_estimator_gives_the_same_tracks():
+    assert_estimators_agree(TrackerSettings(), RANGE_RATE_SENSORS, traffic(0), covariances=1e-7)
 
 
 def test_velocities_are_consistent_and_better_than_without():

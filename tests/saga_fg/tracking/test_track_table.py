@@ -50,15 +50,12 @@ def test_all_columns_are_appended_and_selected_together():
         np.testing.assert_array_equal(column, arrays(b)[name])
 
 
-def test_a_snapshot_shares_no_array_that_can_be_written():
+def test_snapshots_share_no_array_that_can_be_written_and_empty_tables_take_tracks():
     tracks = table(0.0, 10.0)
     kept = tracks.copied()
     for name, column in arrays(kept).items():
         np.testing.assert_array_equal(column, arrays(tracks)[name])
         assert not (np.shares_memory(column, arrays(tracks)[name]) and column.flags.writeable)
-
-
-def test_an_empty_table_takes_tracks():
     tracks = table(0.0, 10.0)
     sensors = tracks.sensors.empty(0, tracks.sensors.sensors)
     empty = TrackTable.empty()

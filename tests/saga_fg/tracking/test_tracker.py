@@ -17,7 +17,18 @@ from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
 from saga_fg.tracking.tracker_state import LIFETIME
-from tests.saga_fg.traffic_frames import NAN, SIZE, at_pose, columns, frame, run, seen, straight, turning_vehicle
+from tests.saga_fg.traffic_frames import (
+    NAN,
+    SIZE,
+    assert_same,
+    at_pose,
+    columns,
+    frame,
+    run,
+    seen,
+    straight,
+    turning_vehicle,
+)
 
 TENTHS = np.arange(0, 5, 0.1)
 
@@ -100,14 +111,11 @@ def test_what_was_not_measured_does_no_harm(subtests):
 # initiation, coasting, deletion
 
 
-def test_tracks_are_born_where_no_track_explains_a_detection():
+def test_detections_that_no_track_explains_begin_tracks_if_they_are_not_weak():
     tracker = Tracker(settings())
     assert tracker.step(frame(0.0, [(0, 0)])).id.tolist() == [1]
     assert tracker.step(frame(0.1, [(0, 0), (30, 0)])).id.tolist() == [1, 2]
     assert tracker.step(frame(0.2, [(30, 0), (60, 5), (0, 0)])).id.tolist() == [1, 2, 3]
-
-
-def test_weak_detections_start_no_track_but_keep_one_alive():
     tracker = Tracker(settings(initiation_score=0.5, min_score=0.1))
     assert len(tracker.step(frame(0.0, [(0, 0)], score=0.4))) == 0
     assert len(tracker.step(frame(0.1, [(0, 0)], score=0.6))) == 1
@@ -256,16 +264,6 @@ def traffic(seed=3, **fields):
     return seen(np.random.default_rng(seed), truth, TENTHS, **fields)
 
 
-def agree(first, second, shift=(0.0, 0.0, 0.0), tolerance=1e-8):
-    for a, b in zip(first, second, strict=True):
-        assert a.id.tolist() == b.id.tolist()
-        assert b.boxes.position - a.boxes.position == pytest.approx(np.tile(shift, (len(a), 1)), abs=tolerance)
-        for name in ("velocity", "yaw", "size"):
-            assert getattr(b.boxes, name) == pytest.approx(getattr(a.boxes, name), abs=tolerance)
-        assert b.position_covariance == pytest.approx(a.position_covariance, abs=tolerance)
-        assert b.score == pytest.approx(a.score, abs=tolerance)
-
-
 @pytest.mark.parametrize("coordinates", ["ego", "sensor"])
 def test_frames_in_vehicle_or_sensor_coordinates_give_the_same_tracks(coordinates):
     noise = {"default": NoiseModel(0.3, range_noise=0.01, bearing_noise=0.002)}
@@ -275,7 +273,7 @@ def test_frames_in_vehicle_or_sensor_coordinates_give_the_same_tracks(coordinate
         Frame(f.timestamp, f.sensor, f.detections, turning_vehicle(f.timestamp)) for f in traffic(velocity=(4.0, 1.0))
     ]
     told = [at_pose(f, turning_vehicle(f.timestamp), coordinates, mount.ego_T_sensor) for f in frames]
-    agree(run(Tracker(sensors=sensors), frames), run(Tracker(sensors=sensors), told), tolerance=1e-7)
+    assert_same(run(Tracker(sensors=sensors), frames), run(Tracker(sensors=sensors), told), tolerance=1e-7)
 
 
 @pytest.mark.parametrize("first", ["an object", "nothing"])
@@ -287,7 +285,7 @@ def test_far_from_the_origin_nothing_changes(first):
     T = np.eye(4)
     T[:3, 3] = shift
     moved = [Frame(f.timestamp, f.sensor, f.detections.transformed(T)) for f in frames]
-    agree(run(Tracker(), frames), run(Tracker(), moved), shift, tolerance=2e-9 * 4e6 / 4)
+    assert_same(run(Tracker(), frames), run(Tracker(), moved), 2e-9 * 4e6 / 4, shift=shift)
 
 
 def test_a_turned_world_turns_the_tracks():
@@ -306,7 +304,7 @@ def test_the_same_frames_in_any_order_of_detections_give_the_same_tracks():
     assert [columns(t) for t in first] == [columns(t) for t in second]
     frames = traffic()
     reversed_later = [frames[0], *(Frame(f.timestamp, f.sensor, f.detections.select([2, 1, 0])) for f in frames[1:])]
-    agree(run(Tracker(), frames), run(Tracker(), reversed_later), tolerance=1e-9)
+    assert_same(run(Tracker(), frames), run(Tracker(), reversed_later), tolerance=1e-9)
 
 
 def test_earlier_reports_do_not_change_afterwards():

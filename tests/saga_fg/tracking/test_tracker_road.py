@@ -23,7 +23,7 @@ from saga_fg.tracking.prediction import node_table
 from saga_fg.tracking.traffic import SPREAD, Passages, SpeedPriorSettings, Traffic, TrafficSettings, speed_prior
 from saga_fg.types.road_map import COLOURS, Lane, RoadMap, StopLine, TrafficLight, colours
 from saga_fg.types.track import known_velocities
-from tests.saga_fg.traffic_frames import frame
+from tests.saga_fg.traffic_frames import assert_same, frame
 
 # The tracker on scenes of more than cars: what nodes of other kinds are worth, and that they keep to the rules
 
@@ -130,9 +130,14 @@ def test_an_unreported_light_is_believed_by_who_stops_and_who_goes():
     assert starting["green"] > before["green"] + 0.15
 
 
-def test_two_vehicles_tell_more_than_one():
+def test_two_vehicles_tell_more_than_one_and_hidden_ones_nothing():
     one, two = (believed(light_frames(lambda time: 3.0, road_map=wide(width), width=width)) for width in (1, 2))
     assert two["red"] + two["amber"] > one["red"] + one["amber"]
+    # A car that is no longer seen is expected to brake for what may be red; that is no evidence of red.
+    seen = believed(light_frames(lambda time: 45 - 8 * time, 1.0))
+    hidden = believed(light_frames(lambda time: 45 - 8 * time, 3.0, hidden_from=1.0))
+    later = SETTINGS.signals.predicted(np.array([[seen["red"], seen["amber"], 0.0, seen["green"]]]), 2.0)[0]
+    assert hidden["red"] == pytest.approx(later[0], abs=0.05)
 
 
 def wide(lanes):
@@ -152,14 +157,6 @@ def test_all_lines_of_a_light_gain_and_those_of_others_do_not():
         zip(tracker.map_nodes.name, node_table(tracker._state).closed[-len(tracker.map_nodes) :], strict=True)
     )
     assert closed["line"] == closed["across"] > 0.75 > closed["far"]
-
-
-def test_hidden_vehicles_tell_nothing():
-    """A car that is no longer seen is expected to brake for what may be red; that is no evidence of red."""
-    seen = believed(light_frames(lambda time: 45 - 8 * time, 1.0))
-    hidden = believed(light_frames(lambda time: 45 - 8 * time, 3.0, hidden_from=1.0))
-    later = SETTINGS.signals.predicted(np.array([[seen["red"], seen["amber"], 0.0, seen["green"]]]), 2.0)[0]
-    assert hidden["red"] == pytest.approx(later[0], abs=0.05)
 
 
 def test_colours_are_inferred_alike_by_every_estimator_and_after_a_restart():
@@ -211,13 +208,9 @@ def test_every_estimator_tracks_the_road_alike(estimator):
         replace(f, detections=Detections.concatenate([f.detections, cones()])) for f in queue_frames(duration=1.5)
     ]
     exact = replace(SETTINGS, tolerance=0.0)
-    one = tracked(frames, exact)
-    other = tracked(frames, replace(exact, estimator=estimator))
-    for horizon in (0.0, 1.0):
-        a, b = one.tracks(1.4 + horizon), other.tracks(1.4 + horizon)
-        assert a.id.tolist() == b.id.tolist()
-        assert np.allclose(a.boxes.position, b.boxes.position, atol=1e-6)
-        assert np.allclose(a.position_covariance, b.position_covariance, rtol=1e-6, atol=1e-9)
+    one, other = (tracked(frames, replace(exact, estimator=name)) for name in ("kalman", estimator))
+    for time in (1.4, 2.4):
+        assert_same(one.tracks(time), other.tracks(time), 1e-6)
 
 
 def cones():
@@ -412,16 +405,13 @@ def behind_a_leader(settings, newcomer=True):
     return tracks
 
 
-def test_a_car_that_appears_behind_another_starts_at_its_speed_with_less_doubt():
+def test_newcomers_start_at_the_speed_of_their_leader_and_in_doubt():
     on = behind_a_leader(TrackerSettings(edges=(), traffic=ON))
     off = behind_a_leader(TrackerSettings(edges=()))
     assert off.boxes.velocity[1] == pytest.approx([0.0, 0.0])
     assert on.boxes.velocity[1] == pytest.approx([9.0, 0.0], abs=1.5)
     assert np.trace(on.velocity_covariance[1]) > 10, "it may be parked all the same"
     np.testing.assert_array_equal(on.boxes.position[0], off.boxes.position[0])
-
-
-def test_a_track_is_reported_at_once_with_a_velocity_as_wide_as_it_is():
     newcomer = behind_a_leader(TrackerSettings(edges=()))
     assert newcomer.id.tolist() == [1, 2]
     known = np.isfinite(known_velocities(newcomer.boxes.velocity, newcomer.velocity_covariance))

@@ -300,13 +300,9 @@ def test_a_frame_sent_twice_confirms_nothing():
 
 
 @ALL
-def test_a_slow_stream_loses_no_frame(make):
+def test_slow_streams_lose_no_frame_and_those_that_become_slow_one(make):
     times = np.cumsum([0.0, 60.0, 58.0, 63.0, 40.0, 60.0])
     assert verdicts(make(), [frame(t, [(0.0, 0.0)]) for t in times]) == ["accepted", "set_ahead", *["accepted"] * 4]
-
-
-@ALL
-def test_a_stream_that_becomes_slow_loses_one(make):
     tracker = make()
     run(tracker, at(0.0, np.arange(10) / 10))
     told = verdicts(tracker, [frame(0.9 + 60.0 * k, [(0.0, 0.0)]) for k in range(1, 5)])

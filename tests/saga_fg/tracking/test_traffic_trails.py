@@ -14,7 +14,7 @@ from saga_fg.tracking import ClassSettings, courses
 from saga_fg.tracking.courses import typical_speed
 from saga_fg.tracking.traffic import STEP, Passages, Traffic, TrafficSettings, paths
 from saga_fg.types.road_map import Lane, RoadMap
-from tests.saga_fg.traffic_frames import frame
+from tests.saga_fg.traffic_frames import assert_same, frame
 
 SETTINGS = TrafficSettings(memory=60.0)
 SPEED, RADIUS, DT = 8.0, 20.0, 0.1
@@ -245,9 +245,7 @@ def test_every_estimator_takes_the_same_paths(estimator, subtests):
             trackers, _ = driven((one, replace(one, estimator=estimator)), gap=1.0)
             assert trackers[0].graph.motions[0].settling[1] > 0
             first, second = (tracker.tracks(6.3) for tracker in trackers)
-            assert first.id.tolist() == second.id.tolist()
-            assert first.boxes.position == pytest.approx(second.boxes.position, abs=1e-7)
-            assert first.position_covariance == pytest.approx(second.position_covariance, rel=1e-6)
+            assert_same(first, second, 1e-7, 1e-6)
 
 
 def test_trails_are_part_of_a_snapshot():

@@ -231,7 +231,7 @@ def test_known_volumes_overlap_and_unknown_ones_nothing():
 
 
 @given(boxes, boxes)
-def test_equals_polygon_clipping(a, b):
+def test_overlaps_are_those_of_clipped_polygons_symmetric_and_bounded(a, b):
     (pa,), (pb,) = corner_lists(a), corner_lists(b)
     common = clipped(pa, pb)
     union = area(pa) + area(pb) - common
@@ -241,10 +241,6 @@ def test_equals_polygon_clipping(a, b):
     common *= max(0.0, high - low)
     volume = area(pa) * a.size[0, 2] + area(pb) * b.size[0, 2] - common
     assert paired_iou_3d(a, b)[0] == pytest.approx(common / volume, abs=1e-8)
-
-
-@given(boxes, boxes)
-def test_symmetric_and_bounded(a, b):
     for function in (paired_bev_iou, paired_iou_3d):
         value = function(a, b)[0]
         assert value == pytest.approx(function(b, a)[0], abs=1e-9)

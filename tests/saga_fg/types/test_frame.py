@@ -232,14 +232,11 @@ def test_a_wrong_scene_is_refused(subtests):
             scene(**columns)
 
 
-def test_annotations_keep_their_columns():
+def test_annotations_keep_their_columns_and_wrong_ones_are_refused(subtests):
     truth = annotations()
     assert len(truth) == 2
     assert truth.visible.tolist() == [True, False]
     assert len(Annotations(np.array([]), Boxes.empty(), np.array([]))) == 0
-
-
-def test_wrong_annotations_are_refused(subtests):
     for ids, visible, message in [
         (("a", "a"), (True, True), "id: expected unique object ids"),
         (("a",), (True, True), "id: expected 2 entries, got 1"),
@@ -323,19 +320,21 @@ def min_distance(line: np.ndarray, places: np.ndarray) -> np.ndarray:
     return np.hypot(*np.moveaxis(places[:, None] - points, -1, 0)).min(axis=1)
 
 
-def test_a_direction_turns_evenly_from_piece_to_piece():
+def test_directions_turn_evenly_lanes_cross_and_there_may_be_nothing():
     corner = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]])
     angle = [math.atan2(y, x) for x, y in direction_at(corner, np.array([-5.0, 5.0, 10.0, 15.0, 40.0]))]
     assert angle == pytest.approx([0, 0, math.pi / 4, math.pi / 2, math.pi / 2])
-
-
-def test_lanes_that_cross_in_the_direction_of_travel_are_found():
     across = LanesAcross.from_lanes((STRAIGHT, BACK, ASIDE), (LINE, FAR, NOWHERE))
     assert len(across.centre) == 2  # nothing crosses a line against its direction
     pairs = list(zip(across.line.tolist(), across.lane.tolist(), across.s.tolist(), strict=True))
     assert [pair[:2] for pair in pairs] == [(0, 0), (0, 1), (1, 0)]  # a lane runs on straight beyond its end
     assert [pair[2] for pair in pairs] == pytest.approx([50, 50, 250])
     assert across.e[:2] == pytest.approx([1.5, -1.5])
+    for lanes, lines in (((), ()), ((STRAIGHT,), ()), ((), (LINE,))):
+        across = LanesAcross.from_lanes(lanes, lines)
+        assert len(across.line) == 0
+        assert len(across.inside(np.zeros((3, 2)), np.zeros((3, 2))).vehicle) == 0
+        assert len(across.crossings(np.array([0, 0]))[0]) == 0
 
 
 def test_a_line_that_was_moved_is_crossed_elsewhere():
@@ -353,11 +352,3 @@ def test_a_line_that_was_moved_is_crossed_elsewhere():
     assert there.feet.s == pytest.approx([40, 60])
     assert there.feet.e == pytest.approx([1, 1])
     assert len(moved.inside(np.array([[-110.0, 1.0]]), np.array([[-1.0, 0.0]])).vehicle) == 0
-
-
-def test_there_may_be_nothing():
-    for lanes, lines in (((), ()), ((STRAIGHT,), ()), ((), (LINE,))):
-        across = LanesAcross.from_lanes(lanes, lines)
-        assert len(across.line) == 0
-        assert len(across.inside(np.zeros((3, 2)), np.zeros((3, 2))).vehicle) == 0
-        assert len(across.crossings(np.array([0, 0]))[0]) == 0

@@ -48,7 +48,7 @@ def test_frames_come_in_order_of_time_and_by_sensor():
     assert all(len(found) == 1 for _, _, found in moments)
 
 
-def test_times_of_pandas_are_seconds():
+def test_times_of_pandas_are_seconds_and_rows_without_a_place_moments():
     start = pd.Timestamp("2024-05-01 12:00:00")
     for unit in ("s", "ns"):
         times = table().assign(timestamp=lambda t: (start + pd.to_timedelta(t.timestamp, unit="s")).dt.round("100ms"))
@@ -56,9 +56,6 @@ def test_times_of_pandas_are_seconds():
             times["timestamp"] = times.timestamp.astype("datetime64[ns]")
         first, *_ = next(moments_of_table(times))
         assert first == pytest.approx(start.timestamp())
-
-
-def test_a_row_without_a_place_is_a_moment_without_detections():
     rows = pd.concat([table(), pd.DataFrame({"timestamp": [5.0], "x": [None], "y": [None]})])
     *_, (time, _, found) = moments_of_table(rows)
     assert (time, len(found)) == (5.0, 0)
