@@ -13,8 +13,6 @@ from pathlib import Path
 
 import pytest
 
-# Contents of the installed package: the four packages, their data files, the command, and nothing else
-
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"factors", "saga_fg", "data_tools", "pipelines"}
 

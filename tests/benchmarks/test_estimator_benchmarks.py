@@ -25,8 +25,6 @@ from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import OBJECT
 from saga_fg.smoothing import gather_evidence
 
-# The estimators' benchmark in miniature: it measures what it says, and everybody is exact
-
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:

@@ -17,8 +17,6 @@ from saga_fg.numerics.assignment import gate
 from saga_fg.slam.mapping import LocalMap
 from saga_fg.types.landmark import Observation
 
-# Maps whose cost does not grow: which landmarks are near, a filter of these alone, and what a long drive holds
-
 TREE, R = PointLandmark(density=0.01), 0.05**2 * np.eye(2)
 Q = np.diag([0.02, 0.02, 0.002]) ** 2
 SURE = 1e-6 * np.eye(3)

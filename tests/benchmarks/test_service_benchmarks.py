@@ -28,8 +28,6 @@ from pipelines.serving import StreamTracker
 from pipelines.serving.messages import encode
 from saga_fg.errors import SagaError
 
-# The endurance benchmark in miniature: it measures what it says, and what it asks of trackers holds
-
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:

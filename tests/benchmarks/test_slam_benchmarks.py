@@ -28,8 +28,6 @@ from saga_fg.slam.pose_graph import PoseGraph, PosePriors
 from saga_fg.types.boxes import Boxes
 from tests.saga_fg.loops import loop
 
-# `python -m benchmarks loops`: false loops, simulated courses, and what is refused before anything runs
-
 
 def spoilt(folder: Path, graph: PoseGraph, *options: str) -> tuple[int, str, str]:
     sound, _ = loop(2, seed=0)

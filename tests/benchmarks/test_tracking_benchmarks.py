@@ -36,8 +36,6 @@ from saga_fg.model.edge_rules import Following
 from saga_fg.model.stability import LearnedInteractions
 from tests.pipelines.sampled_gaps import HIDDEN, SEEN, SHORT, TIMES, labelled, straight, tracks, without
 
-# The benchmark of gaps: who is compared, what is fitted to what, and its command from end to end
-
 SEVEN_SECONDS = replace(SHORT, duration=7.0)
 
 

@@ -1,4 +1,4 @@
-"""Plots."""
+"""Plots. Pictures: what is drawn is where the data say."""
 
 import json
 import math
@@ -11,8 +11,6 @@ from data_tools.figures import FigureTable, as_json, cell, count, write_figures
 from data_tools.metrics import LabelErrors, RecallCurves
 from data_tools.plots import calibration_plot, error_histograms, plot, png, recall_sweep, running_graph_picture
 from saga_fg import Detection, Detections, Frame, InputError, Tracker, track
-
-# Pictures: what is drawn is where the data say
 
 
 def label_errors(nees: np.ndarray) -> LabelErrors:

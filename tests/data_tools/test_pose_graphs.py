@@ -15,8 +15,6 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import PoseGraph, factor_graph, optimise_poses, pose_values
 from tests.pipelines.command import done
 
-# The g2o format: what is read is what was written, GTSAM reads the same, and what is wrong is located
-
 PLANAR = """\
 VERTEX_SE2 7 1 0 1.5707963267948966
 VERTEX_SE2 3 0 0 0

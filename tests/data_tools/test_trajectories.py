@@ -1,4 +1,4 @@
-"""Trajectories: files and errors."""
+"""Trajectories: files and errors. Trajectories, their alignment and their errors, against cases worked out by hand."""
 
 from pathlib import Path
 
@@ -26,8 +26,6 @@ from data_tools.trajectories import (
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_of, yaw_transform
 from saga_fg.slam.joint import OdometryIncrements, OdometryNoise
-
-# Trajectories, their alignment and their errors, against cases worked out by hand
 
 
 def straight(n: int, step: float = 1.0, drift: float = 0.0) -> Trajectory:

@@ -17,8 +17,6 @@ from factors.validation import (
     whiteners,
 )
 
-# Input that crashes GTSAM, or makes it answer wrongly without a word, raises an exception here
-
 TRAPS = {
     "block of wrong height": "gaussian_factor([1, 2], [I2, np.eye(3)], np.zeros(2))",
     "right-hand side of wrong length": "gaussian_factor([1], [I2], np.zeros(3), np.eye(3))",

@@ -30,8 +30,6 @@ from factors import (
 )
 from factors.gaussian import nonlinear_graph_at
 
-# The linear interaction factor against its definition, one by one and a whole step at a time
-
 
 def random_states(rng, dims):
     states = {key: rng.normal(size=dim) for key, dim in dims.items()}

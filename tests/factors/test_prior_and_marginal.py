@@ -32,8 +32,6 @@ from factors import (
 )
 from factors.gaussian import block_covariances
 
-# Priors and marginals against the dense formulas: Schur complement and block of the covariance
-
 
 def random_graph(rng, dims, covariance):
     keys = list(dims)

@@ -25,8 +25,6 @@ from saga_fg import InputError
 from tests.pipelines.command import COMMAND, done, refused, saga_fg
 from tests.pipelines.scale_out_example import write_recordings
 
-# The command as users meet it: help with examples, one-line errors, exit codes, nothing half-written
-
 
 def commands(group: Any, path: str = "") -> Iterator[str]:
     """All commands by their full names: `track nuscenes`, ..."""

@@ -31,8 +31,6 @@ from saga_fg.settings import setting, settings_group
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.traffic import SpeedPrior
 
-# Settings through YAML: exact both ways, deep overrides, and errors that name file, key and what was expected
-
 
 @dataclass(frozen=True)
 class GateSettings:

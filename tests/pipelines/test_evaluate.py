@@ -1,4 +1,4 @@
-"""`saga-fg evaluate` and `saga-fg demo`."""
+"""`saga-fg evaluate` and `saga-fg demo`. `saga-fg evaluate`: figures of results, as tables and as JSON."""
 
 import json
 from collections.abc import Mapping
@@ -23,8 +23,6 @@ from saga_fg.numerics.geometry import inverse_transform, transform_points
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
 from tests.pipelines.command import done, refused
-
-# `saga-fg evaluate`: figures of results, as tables and as JSON
 
 
 def evaluate(*arguments: str | Path) -> Result:

@@ -16,8 +16,6 @@ from saga_fg import InputError
 from tests.pipelines.command import done, refused, saga_fg
 from tests.pipelines.page_in_browser import tried_in_browser
 
-# `saga-fg track --explain` and `saga-fg explain`: the life of a track, from files
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -1,4 +1,4 @@
-"""`saga-fg learn`."""
+"""`saga-fg learn`. `saga-fg learn interactions`: which form is written, and what tracking does with its file."""
 
 import json
 import math
@@ -38,8 +38,6 @@ from saga_fg.model.stability import LearnedInteractions
 from saga_fg.types.by_class import DEFAULT
 from tests.pipelines.command import done, refused
 from tests.saga_fg.following_pairs import RATE, following_pairs
-
-# `saga-fg learn interactions`: which form is written, and what tracking does with its file
 
 run = CliRunner().invoke
 FOLLOW = Following(CarFollowing(time_constant=float("inf")), rate=RATE, gap_scale=100.0)

@@ -1,4 +1,4 @@
-"""Tables of one's own, and what looks wrong in them."""
+"""Tables of one's own, and what looks wrong in them. From a stranger's table to a judged result."""
 
 import json
 import re
@@ -14,8 +14,6 @@ from saga_fg import Boxes, Detections, Frame
 from saga_fg.tracking import Tracker
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
 from tests.pipelines.strangers_tables import T0, rows, run_line, saga_fg, write
-
-# From a stranger's table to a judged result
 
 
 def test_overlaps_are_those_that_both_have(tmp_path):

@@ -1,4 +1,4 @@
-"""The report of a run."""
+"""The report of a run. Reports: the data of the player, charts, the page, and the page in a browser."""
 
 import base64
 import html
@@ -39,8 +39,6 @@ from saga_fg.types.frame import Detections
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
 from tests.pipelines.command import done, refused
 from tests.pipelines.page_in_browser import tried_in_browser
-
-# Reports: the data of the player, charts, the page, and the page in a browser
 
 SHORT = SimulatorSettings(duration=4.0, warm_up=5.0)
 CONFIG = load_config("simulated")

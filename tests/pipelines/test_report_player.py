@@ -26,8 +26,6 @@ from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import VERSION, tables, write_tables
 from tests.pipelines.page_in_browser import tried_in_browser
 
-# The page's player in a browser: what it shows first, its filters, its links, its keys
-
 MOMENTS = 10
 KINDS = {  # class, y, score, moments, unseen for, s
     "car-1": ("car", 0.0, 0.9, range(10), 0.0),

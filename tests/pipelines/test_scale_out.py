@@ -39,8 +39,6 @@ from saga_fg.types.dataset import Dataset
 from tests.pipelines.command import COMMAND, done, refused, saga_fg
 from tests.pipelines.scale_out_example import CONFIG, TRACK, Broken, Deadly, InThisProcess, content, write_recordings
 
-# Many scenes in parallel: the same bytes whatever the workers, only what has to be done again, nothing lost
-
 
 def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int = 0) -> RunSummary:
     def new_pool(scratch):

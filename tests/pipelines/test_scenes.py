@@ -24,8 +24,6 @@ from saga_fg.types.road_map import RoadMap, StopLine, TrafficLight
 from tests.pipelines.command import done
 from tests.pipelines.sampled_gaps import SHORT
 
-# Scenes of more than cars as files: what is written is what was simulated, and it can be tracked
-
 
 def run(*arguments):
     result = done(*arguments)

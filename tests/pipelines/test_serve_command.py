@@ -15,8 +15,6 @@ from pipelines.serving import StreamClient, parse_address
 from saga_fg import InputError
 from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
-# `saga-fg serve` as a process of its own, over sockets and pipes
-
 
 def test_clients_share_one_tracker_and_one_may_listen():
     with serving("--listen", "127.0.0.1:0") as (address, _):

@@ -18,8 +18,6 @@ from pipelines.serving.state import read_state, write_state
 from saga_fg import InputError
 from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
-# A service that is killed and started again: nothing is lost, nothing counted twice
-
 FRAMES = 40
 
 

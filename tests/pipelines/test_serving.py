@@ -1,4 +1,4 @@
-"""Streams of frames, predictions, failures."""
+"""Streams of frames, predictions, failures. The stream: messages, clock, reordering, and what a line is answered."""
 
 import io
 import json
@@ -23,8 +23,6 @@ from saga_fg import Frame, InputError, Tracks
 from saga_fg.model.edge_rules import Following
 from saga_fg.numerics.geometry import yaw_of
 from saga_fg.tracking import Tracker
-
-# The stream: messages, clock, reordering, and what a line is answered
 
 SETTINGS = StreamSettings()
 

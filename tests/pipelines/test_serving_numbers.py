@@ -16,8 +16,6 @@ from pipelines.serving.messages import encode
 from saga_fg import Frame, Tracks
 from tests.pipelines.running_service import COMMAND
 
-# Numbers of frames that somebody else, or a client that was restarted, has sent: no sensor is shut out by them
-
 
 def stream(**settings: Any) -> StreamTracker[None]:
     return StreamTracker(lambda: load_config("file").new_tracker("kf"), StreamSettings(**settings))

@@ -1,4 +1,4 @@
-"""Labels: the command, scenes, recordings, crowds."""
+"""Labels: the command, scenes, recordings, crowds. `saga-fg smooth`, as a user calls it."""
 
 import csv
 import json
@@ -23,8 +23,6 @@ from saga_fg import Boxes, Detections, Frame, Scene, Tracks
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Annotations, Dataset
 from tests.pipelines.command import done, refused
-
-# `saga-fg smooth`, as a user calls it
 
 
 def test_shipped_settings_survive_the_round_trip():

@@ -15,8 +15,6 @@ from pipelines.smoothing.streaming import Backlog, TrackedFrame
 from saga_fg import Detections, Frame, InputError
 from tests.pipelines.command import done
 
-# Recordings smoothed as they are read: the same labels as of the whole at once, and what lasts of objects
-
 HEADER = "timestamp,label,x,y,length,width,height,yaw,score"
 
 

@@ -29,8 +29,6 @@ from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import VERSION, write_results, write_tables
 from tests.pipelines.command import done, refused, saga_fg
 
-# `saga-fg simulate` and `saga-fg track` on what it made: files in, files out, and every mistake in one line
-
 METHODS = ("saga", "kf", "centerpoint")
 
 

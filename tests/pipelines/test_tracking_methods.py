@@ -25,8 +25,6 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
 from tests.pipelines.command import done
 
-# Nonlinear motion and interactions chosen in the tracker's configuration, with every estimator
-
 SETTINGS = """
 estimator: {estimator}
 classes:

@@ -28,8 +28,6 @@ from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import VERSION, tables, write_tables
 from tests.pipelines.command import done, refused
 
-# The view in space: what is in the file, read back by rerun's own reader
-
 Rows = dict[str, dict[Any, Any]]
 """Column -> time (None: always) -> value."""
 

@@ -13,8 +13,6 @@ from benchmarks.recordings.ranges import trilateration
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg import InputError
 
-# `python -m benchmarks landmarks` on drives made up here: trees told apart, beacons found by ranges alone
-
 
 def landmarks(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, ["landmarks", *map(str, arguments)], catch_exceptions=False)

@@ -17,8 +17,6 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, lanelet, rows, write_ngsim
 
-# Road maps of lanelets: lanes, stop lines, and which lights govern them, on crossings written by hand
-
 STEPS = np.arange(2)
 
 

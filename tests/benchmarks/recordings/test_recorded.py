@@ -24,8 +24,6 @@ from saga_fg.types.dataset import Scene
 from tests.benchmarks.recordings.ngsim_example import crossing, rows, write_ngsim
 from tests.pipelines.command import done
 
-# Detections made from recorded traffic: viewpoints, what hides what, seeds, and colours of lights
-
 PERFECT = SensorSettings(
     detection_probability=1.0, clutter_rate=0.0, reach=1000.0, max_range=500.0, size_noise=0.0, yaw_noise=0.0
 )

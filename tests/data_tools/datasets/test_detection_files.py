@@ -1,4 +1,4 @@
-"""Tables of detections."""
+"""Tables of detections. Tables of detections in every format."""
 
 import csv
 import inspect
@@ -17,8 +17,6 @@ from data_tools.datasets.detection_files.dataset import survey_table
 from saga_fg import Dataset, InputError
 from saga_fg.numerics.geometry import yaw_of
 from tests.data_tools.datasets.drive_tables import NPZ, write
-
-# Tables of detections in every format
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".ndjson", ".jsonl", ".npz"])

@@ -23,8 +23,6 @@ from data_tools.simulator.settings import TrafficSettings
 from saga_fg import Boxes, Scene, Tracks
 from saga_fg.errors import InputError
 
-# Simulated scenes written in the nuScenes layout and read back; what the official development kit relies on holds
-
 SHORT = SimulatorSettings(duration=4.0, warm_up=5.0)
 TABLES = (
     *("attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample"),

@@ -1,4 +1,4 @@
-"""Tables of tracks and labels."""
+"""Tables of tracks and labels. Tables of tracks: written, and read again."""
 
 import json
 from pathlib import Path
@@ -22,8 +22,6 @@ from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from saga_fg import Boxes, InputError, Scene, Tracks
 from saga_fg.smoothing import Labels
 from saga_fg.types.dataset import Annotations
-
-# Tables of tracks: written, and read again
 
 
 def tracks(timestamp: float) -> Tracks:

@@ -28,8 +28,6 @@ from saga_fg.errors import InputError, MissingExtraError
 from tests.data_tools import hostile_readers as readers
 from tests.data_tools.damage import Target, another, targets
 
-# Readers in a child process: nothing that a file makes them do reaches this one but its records
-
 PROBLEM = "expected a good file"
 
 

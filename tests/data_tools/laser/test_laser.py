@@ -10,8 +10,6 @@ from data_tools.laser import LineMap, OccupancyGrid, ScoreGrid, read_carmen
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
 
-# CARMEN logs: what is written is read, both records, and what is wrong is located
-
 READINGS = " ".join(f"{1 + k / 10:.2f}" for k in range(11))
 FLASER = f"FLASER 11 {READINGS} 1.2 2.0 0 1.0 2.0 0 17.5 nohost 0.1\n"
 ROBOT = f"ROBOTLASER1 0 -1.57 3.14 0.314 5 0.01 0 11 {READINGS} 0 1.2 2 0.5 1 2 0.5 0 0 0 0 0 17.5 nohost 0.1\n"

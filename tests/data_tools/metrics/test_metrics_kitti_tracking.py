@@ -17,8 +17,6 @@ from data_tools.metrics import KittiTrackingSequence, SceneBoxes, hota_metrics, 
 from data_tools.metrics.kitti_tracking import track_scores, trajectory_counts
 from saga_fg import Boxes, InputError, MissingExtraError
 
-# KITTI 3D tracking metrics: cases by hand, a plain reading of the rules, the figures of the reference evaluation
-
 BOX = {"type": "Car", "z": 10.0, "score": math.nan, "truncated": 0, "occluded": 0, "bbox": (100, 100, 200, 200)}
 LOW = {"bbox": (100, 100, 200, 120)}
 

@@ -1,4 +1,4 @@
-"""Metrics of labels."""
+"""Metrics of labels. Errors at labels: by hand, and the laws of pairing."""
 
 import math
 
@@ -28,8 +28,6 @@ from data_tools.metrics.labels import (
 )
 from data_tools.metrics.scene_boxes import nearest_pairs
 from saga_fg import Boxes
-
-# Errors at labels: by hand, and the laws of pairing
 
 
 def table(rows, covariance=None):

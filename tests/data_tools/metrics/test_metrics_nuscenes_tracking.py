@@ -28,8 +28,6 @@ from data_tools.metrics import (
 from saga_fg import Annotations, Boxes, InputError, Tracks
 from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
 
-# The nuScenes tracking metrics: cases worked out by hand, and a plain loop-by-loop reading of the definition
-
 
 def table(rows):
     """SceneBoxes from (frame, id, label, x, y, score), in order of frame."""

@@ -23,8 +23,6 @@ from data_tools.metrics import (
 from saga_fg import Annotations, Boxes, InputError, Tracks
 from saga_fg.types.boxes import bev_iou
 
-# Metrics of a scene: small cases worked out by hand
-
 
 def truth(objects, hidden=()):
     """Annotations from {name: (x, y)} or {name: (x, y, vx, vy)}; class "car", "pedestrian" for names in lower case."""

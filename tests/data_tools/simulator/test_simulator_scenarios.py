@@ -1,4 +1,4 @@
-"""Simulated traffic."""
+"""Simulated traffic. The Intelligent Driver Model: its equilibrium, and what a queue of such drivers does."""
 
 from dataclasses import replace
 from functools import cache
@@ -26,8 +26,6 @@ from data_tools.simulator.traffic import Traffic, record_traffic
 from data_tools.simulator.world import World, build_world, scene_from_world
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.road_map import COLOUR_LABELS
-
-# The Intelligent Driver Model: its equilibrium, and what a queue of such drivers does
 
 
 def drivers(count: int, desired_speed: float = 14.0) -> Drivers:

@@ -19,8 +19,6 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
 
-# The simulated world: nobody overlaps, motion is smooth, and the moving parts do what they are there for
-
 SETTINGS = SimulatorSettings()
 MERGES = SimulatorSettings(merge_probability=1.0)
 

@@ -25,8 +25,6 @@ from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections
 
-# Sensors report with the statistics of their settings, within 4 standard errors of a fixed seed's draw
-
 POSE = yaw_transform(800.0, 400.0, 0.0, 2.0)
 CENTRED = replace(lidar(), position=(0.0, 0.0, 1.8))
 

@@ -40,8 +40,6 @@ from tests.saga_fg.every_estimator import ESTIMATORS, maker
 from tests.saga_fg.graph_keys import newest_key
 from tests.saga_fg.road_scenes import road_program
 
-# Every estimator, one suite: equal to the textbook, beyond the programs of `saga_fg.conformance`
-
 SMOOTHERS = [kind for kind in ESTIMATORS if hasattr(maker(kind.values[0])(), "smoothed")]
 
 

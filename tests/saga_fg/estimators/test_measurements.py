@@ -13,8 +13,6 @@ from saga_fg.numerics.arrays import FloatArray
 from tests.saga_fg.graph_keys import newest_key
 from tests.saga_fg.model.test_motion import BACK_ENDS
 
-# Measurements: shapes, finite numbers and noise are checked at the door
-
 
 def measurements(**columns):
     good = {"nodes": [7, 3], "z": np.zeros((2, 2)), "H": np.eye(2, 4), "R": np.eye(2)}

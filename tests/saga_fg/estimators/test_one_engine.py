@@ -31,8 +31,6 @@ from tests.saga_fg.traffic_frames import run as damped_run
 from tests.saga_fg.traffic_frames import seen as damped_seen
 from tests.saga_fg.traffic_frames import straight
 
-# One engine: what is tied is solved by the graph alone, what is alone by the Kalman kernels; objects pass between
-
 JOINT_STEPS = (filtering.predict, filtering.corrected)
 
 

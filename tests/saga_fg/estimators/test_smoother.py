@@ -29,8 +29,6 @@ from tests.saga_fg.estimator_scenario import (
 )
 from tests.saga_fg.graph_keys import keys_of
 
-# A recording is smoothed as by the textbook, whole, in stretches, and in a window that does not grow
-
 NODES = np.arange(12)
 
 

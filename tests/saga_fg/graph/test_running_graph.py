@@ -1,4 +1,4 @@
-"""The running graph against the batch solution."""
+"""Laws of the running graph. Law 1: what is linear equals the textbook, whatever comes and goes."""
 
 import copy
 from functools import partial
@@ -37,8 +37,6 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.nonlinear_interactions import Accelerations
 from saga_fg.model.scene_graph import NonlinearEdges
 from tests.saga_fg.graph_estimator import GraphEstimator
-
-# Law 1 of the running graph: what is linear equals the textbook, whatever comes and goes and however time runs
 
 USUAL = (0.02, 0.1, 0.37, 0.5, 1.2)
 MILLISECONDS = (1e-3, 0.05, 1.0)

@@ -44,8 +44,6 @@ from saga_fg.graph import (
 from saga_fg.graph.variables import KINDS, LARGEST, described
 from saga_fg.model.discretisation import discretise
 
-# The running graph as a value: keys that can be read back, names, snapshots, exchange and marginalisation
-
 
 class Once:
     """Adds something in the first frame, and nothing later."""

@@ -1,4 +1,4 @@
-"""Kernels against plain NumPy."""
+"""Kernels against plain NumPy. The joint Kalman filter where numbers are hard, and partitions of its state."""
 
 import pickle
 from itertools import product
@@ -18,8 +18,6 @@ from saga_fg.model.discretisation import linear_motions
 from saga_fg.numerics.arrays import distinct
 from saga_fg.types.boxes import Boxes, bev_iou, paired_bev_iou
 from saga_fg.types.frame import Detections, Frame
-
-# The joint Kalman filter where numbers are hard, and partitions of its state
 
 
 def played(scenario, bounds):

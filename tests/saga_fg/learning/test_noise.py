@@ -51,8 +51,6 @@ from saga_fg.model.turning import KnownCourses
 from saga_fg.tracking import ClassSettings, Tracker, TrackerSettings
 from tests.saga_fg.following_pairs import GAP, following_pairs, scene_of
 
-# Process noise from data: the likelihood is the textbook filter's, and its maximum is the truth
-
 
 def drawn(rng, acceleration_noise, count=40, length=30, noise=0.2):
     """Objects that move as the model says, seen at irregular times with known noise."""

@@ -26,8 +26,6 @@ from saga_fg.model.discretisation import Blocks, Transition, discretise
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
 from saga_fg.model.stability import joint_generator
 
-# Discretisation: the classical one without edges, second order against the joint exponential, stable for any dt
-
 seeds = st.integers(0, 2**32 - 1)
 intervals = st.one_of(st.floats(1e-9, 1e3), st.sampled_from([0.0, 1e-9, 1e-3, 0.1, 1.0, 1e3]))
 

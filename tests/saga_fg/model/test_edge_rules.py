@@ -1,4 +1,4 @@
-"""Rules of edges: who interacts with whom."""
+"""Rules of edges: who interacts with whom. Edge rules: who is coupled with whom, and how strongly."""
 
 from dataclasses import replace
 
@@ -23,8 +23,6 @@ from saga_fg.model.interactions import SHARP, CarFollowing, Paths, SharedVelocit
 from saga_fg.model.nonlinear_interactions import IntelligentDriver, SmoothDriver
 from saga_fg.numerics.geometry import Polylines, yaw_transform
 from tests.saga_fg.model.drawn_traffic import bend, edges, joined, leaders, random_traffic, straight, table, with_path
-
-# Edge rules: who is coupled with whom, and how strongly
 
 seeds = st.integers(0, 2**32 - 1)
 

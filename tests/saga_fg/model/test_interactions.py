@@ -31,8 +31,6 @@ from saga_fg.model.stop_lines import DriverStopping, RedLight
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.road_scenes import queue, table
 
-# Interaction functions: their triples are the written law, and the law knows no place and no direction
-
 seeds = st.integers(0, 2**32 - 1)
 pairs_of_types = st.tuples(st.sampled_from(MOVING), st.sampled_from(MOVING))
 INTERACTIONS = [

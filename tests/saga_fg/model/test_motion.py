@@ -1,4 +1,4 @@
-"""Motion models."""
+"""Motion models. Node types: named components, and own motions that are what the books say."""
 
 from dataclasses import dataclass
 
@@ -25,8 +25,6 @@ from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
 from saga_fg.model.turning import CoordinatedTurn
 from tests.saga_fg.graph_keys import keys_of
-
-# Node types: named components, and own motions that are what the books say
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,6 @@ from saga_fg import (
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 from saga_fg.numerics.geometry import transform_points, yaw_transform
 
-# A sensor's model: noise along and across the line of sight, field of view, extrinsics, scores
-
 metres = st.floats(-200, 200)
 
 

@@ -32,8 +32,6 @@ from saga_fg.model.nonlinear_interactions import FALLOFF, RADII, STRENGTH, Smoot
 from saga_fg.model.stability import LearnedInteractions, highest_rate, require_stable
 from saga_fg.tracking import TrackerSettings
 
-# Every shipped law, motion and measurement of objects is smooth: it and its gradient are continuous, and bounded
-
 DISTANCES = np.array([0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-3, 0.1, 0.3, 1.0, 5.0])  # m
 LIPSCHITZ = 1e5  # of gradients, per m or m/s: drivers at 20 m/s who pass through others need half of it
 INTERVALS = 400  # of a path

@@ -1,4 +1,4 @@
-"""Turning objects, and known courses."""
+"""Turning objects, and known courses. Coordinated turn: exact discretisation, smooth where it goes straight."""
 
 from dataclasses import replace
 from itertools import product
@@ -15,8 +15,6 @@ from saga_fg.model.discretisation import discretise, linear_motions
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.scene_graph import Edges
 from saga_fg.model.turning import RATE_CORRELATION, CoordinatedTurn, KnownCourses, Unseen, turning_time
-
-# Coordinated turn: exact discretisation, smooth where it goes straight
 
 TURN = CoordinatedTurn()
 SMALL = (0.0, 0.0099, 0.0101, -2.0)

@@ -24,8 +24,6 @@ from saga_fg.numerics.assignment import (
 )
 from saga_fg.numerics.gating import near_pairs
 
-# Association: the gate lets through what it promises, the assignment is the best there is
-
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -1,4 +1,4 @@
-"""Geometry and arrays."""
+"""Geometry and arrays. Rigid transforms, angles and quaternions: laws, and known cases."""
 
 import gtsam
 import numpy as np
@@ -25,8 +25,6 @@ from saga_fg.numerics.geometry import (
     yaw_quaternion,
     yaw_transform,
 )
-
-# Rigid transforms, angles and quaternions: laws, and known cases
 
 angles = st.floats(-1e4, 1e4)
 lengths = st.floats(-1e6, 1e6)

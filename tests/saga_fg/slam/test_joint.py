@@ -1,4 +1,4 @@
-"""Objects and the vehicle's way in one graph."""
+"""Objects and the vehicle's way in one graph. Path of the vehicle and objects around it, together."""
 
 from dataclasses import replace
 
@@ -29,8 +29,6 @@ from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.landmark import Observation
 from tests.saga_fg.ego_drive import NOISE, drive, new_tracker
-
-# Path of the vehicle and objects around it, together
 
 POOR = OdometryNoise(scale=0.02, bias=0.005)
 

@@ -18,8 +18,6 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LandmarkObservations, LocalMap, MeasuredMotion, associate, landmark_key, pose_key
 from saga_fg.types.landmark import LandmarkType, Observation
 
-# Landmarks: every type behind the protocol, their filter, and association
-
 KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark(), LineLandmark()]
 POLE = np.diag([0.1, 0.1]) ** 2
 TREE, R = PointLandmark(density=0.01), 0.05**2 * np.eye(2)

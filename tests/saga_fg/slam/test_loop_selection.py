@@ -1,4 +1,4 @@
-"""Which loops are believed."""
+"""Which loops are believed. Loops are left out where other loops contradict them, and never by odometry alone."""
 
 import time
 from dataclasses import replace
@@ -27,8 +27,6 @@ from saga_fg.slam.pose_graph.consensus import chosen_edges
 from saga_fg.slam.pose_graph.optimisation import graph_values
 from saga_fg.slam.submaps import LoopClosure
 from saga_fg.slam.submaps.loops import LoopSelection, _AnchoredLoops, select_loops
-
-# Loops are left out where other loops contradict them, and never by odometry alone
 
 PER_LAP, STEPS, EVERY = 100, 200, 5
 STATED = np.array([1e-3] * 3 + [0.03] * 3)

@@ -27,8 +27,6 @@ from saga_fg.slam.pose_graph.certificate import descend, lowest_eigenvalue, near
 from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
 from tests.saga_fg.loops import loop, moved
 
-# Pose graphs: the optimum does not depend on the guess, and its covariances are honest
-
 
 def test_the_chordal_start_is_of_rotations_and_exact_without_noise(subtests):
     for dim, seed in product([2, 3], range(3)):

@@ -38,8 +38,6 @@ from saga_fg.types.frame import Detections, Frame
 from tests.saga_fg.smoothing.test_smoothing_states import CLASSES as PROVIDERS_CLASSES
 from tests.saga_fg.smoothing.test_smoothing_states import SENSORS as PROVIDERS_SENSORS
 
-# Tracklets joined, detections claimed, stands recognised, scores from all evidence
-
 SENSORS = {"default": Sensor({"default": NoiseModel(position=0.1)})}
 CLASSES = {"default": OfflineClass(acceleration_noise=0.5)}
 TIMES = np.arange(20) * 0.5

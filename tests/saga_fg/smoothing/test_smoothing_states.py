@@ -1,4 +1,4 @@
-"""Smoothed states, boxes, and the memory that they take."""
+"""Smoothed states, boxes, and the memory that they take. Lifespans, state tables and the batch over a recording."""
 
 import tracemalloc
 from collections.abc import Callable
@@ -39,8 +39,6 @@ from saga_fg.smoothing.boxes import weighted_medians
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
-
-# Lifespans, state tables and the batch over a recording
 
 SIGMA = 0.5
 SENSORS = {"default": Sensor({"default": NoiseModel(position=SIGMA)})}

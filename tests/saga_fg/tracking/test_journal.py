@@ -27,8 +27,6 @@ from tests.saga_fg.traffic_frames import columns, seen
 from tests.saga_fg.traffic_frames import frame as edge_frame
 from tests.saga_fg.traffic_frames import run as edge_run
 
-# The journal of a tracker: what it says of a few frames worked out by hand, and that keeping it changes nothing
-
 SETTINGS = TrackerSettings(edges=())
 
 

@@ -37,8 +37,6 @@ from saga_fg.tracking.measurements import suppress_duplicates
 from saga_fg.types.frame import EgoMeasurements, GpsFix, OdometryIncrement
 from tests.saga_fg.traffic_frames import at_pose, frame, seen, straight, turning_vehicle
 
-# Duplicates: of two detections too close to be two objects the weaker goes
-
 
 def kept(x, probability, distance=1.0, label="car", shadow=0.0):
     n = len(x)

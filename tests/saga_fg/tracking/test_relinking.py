@@ -13,8 +13,6 @@ from saga_fg.tracking.journal import Journal
 from saga_fg.tracking.relinking import relinkable
 from tests.saga_fg.traffic_frames import assert_estimators_agree, assert_same, columns, frame, run
 
-# Objects that return after some seconds keep their identity; others don't take it
-
 SETTINGS = TrackerSettings(
     {"default": ClassSettings(ConstantVelocity(acceleration_noise=0.5), max_deviation=1.0, max_distance=3.0)},
     edges=(),

@@ -35,8 +35,6 @@ from tests.saga_fg.traffic_frames import (
     turning_vehicle,
 )
 
-# Size, height and heading of a track: means, a scalar filter, and a heading that may be off by half a turn
-
 NAN = float("nan")
 angles = st.floats(-3.1, 3.1)
 

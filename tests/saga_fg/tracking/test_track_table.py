@@ -18,8 +18,6 @@ from saga_fg.tracking.track_table import PRIOR_LOGIT, SensorEvidence, TrackTable
 from saga_fg.tracking.tracker_state import LIFETIME
 from tests.saga_fg.traffic_frames import NAN, frame, run
 
-# One table of tracks: all columns, those of sub-tables too, are selected, appended and copied together
-
 
 def table(*x: float) -> TrackTable:
     """The tracks of a tracker after a frame of cars at these places."""

@@ -22,8 +22,6 @@ from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
 from tests.saga_fg.traffic_frames import assert_estimators_agree, assert_same, columns, frame, run, seen, straight
 
-# The tracker and its graph: what the edges are good for, and what happens without
-
 PATIENT = {
     "classes": {"default": ClassSettings(motion=ConstantVelocity(1.0), max_deviation=np.inf)},
     "max_coasting": 10.0,

@@ -24,8 +24,6 @@ from saga_fg.types.frame import Detection, Detections
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight, Wall
 from tests.saga_fg.traffic_frames import assert_same, columns, frame, run, seen, straight
 
-# Factors of users' own in the tracker: they act, they are refused by name, and without them nothing changes
-
 PLACE = np.array([5e5, -3e5])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
 SIDE_BY_SIDE = (Neighbours(),)

@@ -25,8 +25,6 @@ from saga_fg.types.road_map import COLOURS, Lane, RoadMap, StopLine, TrafficLigh
 from saga_fg.types.track import known_velocities
 from tests.saga_fg.traffic_frames import assert_same, frame
 
-# The tracker on scenes of more than cars: what nodes of other kinds are worth, and that they keep to the rules
-
 MAP = RoadMap(
     (TrafficLight("light", (12.0, 0.0)),),
     (StopLine("line", (0.0, 1.75), (0.0, -1.75), "light"),),

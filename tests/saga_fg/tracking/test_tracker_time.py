@@ -9,8 +9,6 @@ from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.clock import REMEMBERED, Clock
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
-# The tracker and time: several sensors at irregular times, late frames, and looking ahead without a trace
-
 FAST = straight([(0.0, 0.0), (-25.0, 4.0)], [(20.0, 0.0), (22.0, 0.0)])
 SENSORS = {
     "lidar": Sensor(noise={"default": NoiseModel(position=0.4)}),

@@ -1,4 +1,4 @@
-"""Boxes, and how they overlap."""
+"""Boxes, and how they overlap. Boxes: columns checked once, moved between frames, cut and joined."""
 
 import dataclasses
 import math
@@ -12,8 +12,6 @@ from hypothesis.extra.numpy import arrays
 from saga_fg import Boxes, InputError
 from saga_fg.numerics.geometry import inverse_transform, wrap_angle, yaw_transform
 from saga_fg.types.boxes import bev_iou, iou_3d, paired_bev_iou, paired_iou_3d, touching_pairs
-
-# Boxes: columns checked once, moved between frames, cut and joined
 
 NAN = float("nan")
 COLUMNS = ("label", "position", "size", "yaw", "velocity")

@@ -15,8 +15,6 @@ from saga_fg.types.dataset import LabelledObjects
 from saga_fg.types.road_map import Lane, LanesAcross, StopLine
 from saga_fg.types.track import KNOWN_SPEED_DEVIATION, known_velocities
 
-# Detections and frames: a table and its rows are the same thing; what is wrong is named
-
 NAN = float("nan")
 metres = st.floats(-1e4, 1e4)
 maybe = st.one_of(st.just(NAN), st.floats(-3, 3))
