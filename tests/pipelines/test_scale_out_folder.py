@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from pipelines.cli import app
 from pipelines.scale_out import Manifest, OutputFolder, RunSummary, file_name, run_scenes
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
+from tests.pipelines.command import done, refused
 from tests.pipelines.scale_out_example import TRACK, InThisProcess, content, write_recordings
 
 
@@ -167,16 +166,12 @@ def test_the_output_itself_may_be_a_link(tmp_path):
 def test_merged_tables_are_not_written_through_a_link(tmp_path, victim):
     (tmp_path / "short.yaml").write_text("duration: 1.0\nwarm_up: 1.0\n")
 
-    def saga_fg(*arguments: object) -> tuple[int, str]:
-        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-        return result.exit_code, result.stderr
-
     data, out = tmp_path / "data", tmp_path / "out"
-    assert saga_fg("simulate", "-o", data, "--scenes", 1, "--config", tmp_path / "short.yaml")[0] == 0
+    done("simulate", "-o", data, "--scenes", 1, "--config", tmp_path / "short.yaml")
     (out / "v1.0-mini").symlink_to(victim)
-    code, error = saga_fg(
+    said = refused(
         *("smooth", "nuscenes", "--dataroot", data, "--split", "all", "--workers", 1, "-o", out),
         *("--detections", f"lidar={data / 'detections' / 'lidar.json'}"),
     )
-    assert (code, error) == (2, f"error: {out / 'v1.0-mini'}: not writable: expected a folder, this is a link\n")
+    assert said == f"error: {out / 'v1.0-mini'}: not writable: expected a folder, this is a link\n"
     assert unharmed(victim)

@@ -54,7 +54,8 @@ def run(*arguments: object) -> Any:
     return CliRunner().invoke(app, ["view", *map(str, arguments)])
 
 
-def test_tracks_truth_and_edges_are_in_the_file(tmp_path):
+def test_sizes_labels_edges_and_the_graph_are_in_the_file(tmp_path):
+    """All places are those of the file for Foxglove, which is compared with the result below."""
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra [view])")
     config = load_config("simulated")
     scene = SimulatedTraffic(SimulatorSettings(duration=2.0, warm_up=5.0), scenes=1, seed=1).scene("scene-0001")
@@ -73,7 +74,6 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path):
         return times[time]
 
     assert len(tracks) > 5
-    np.testing.assert_allclose(at("saga/boxes", "Boxes3D:centers"), tracks.boxes.position - origin, atol=1e-3)
     np.testing.assert_allclose(at("saga/boxes", "Boxes3D:half_sizes"), tracks.boxes.size / 2, atol=1e-3)
     labels = at("saga/boxes", "Boxes3D:labels")
     assert [label.split()[:2] for label in labels] == [
@@ -81,16 +81,11 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path):
     ]
     assert len(at("saga/ellipses", "Ellipsoids3D:half_sizes")) == len(tracks)
     paths = at("saga/trajectories", "LineStrips3D:strips")
-    np.testing.assert_allclose([path[-1] for path in paths], tracks.boxes.position - origin, atol=1e-3)
     assert max(map(len, paths)) == k + 1
     strips = np.array(at("saga/edges", "LineStrips3D:strips"))
     assert strips.shape[1:] == (2, 3)  # from the place of one track to that of another
     places = tracks.boxes.position - origin
     assert (np.abs(strips[:, :, None] - places).max(axis=3).min(axis=2) < 1e-3).all()
-    assert scene.ground_truth is not None
-    seen = len(at("truth/seen", "Boxes3D:centers"))
-    assert seen == scene.ground_truth[k].visible.sum()
-    assert seen + len(at("truth/hidden", "Boxes3D:centers")) == len(scene.ground_truth[k])
     graph = [each for each in graphs if abs(each["time"] - scene.timestamps[k]) < 1e-4][-1]
     assert at("graph/nodes", "Points3D:labels") == [node["name"] for node in graph["nodes"]]
     np.testing.assert_allclose(
@@ -103,7 +98,6 @@ def test_tracks_truth_and_edges_are_in_the_file(tmp_path):
     assert len(at("graph/interaction", "LineStrips3D:strips")) == 2 * sum(
         factor["kind"] == "interaction" for factor in graph["factors"]
     )
-    np.testing.assert_allclose(at("ego", "Transform3D:translation")[0], scene.world_T_ego[k, :3, 3] - origin, atol=1e-3)
 
 
 def test_the_ellipse_holds_ninety_percent():
