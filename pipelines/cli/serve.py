@@ -18,7 +18,7 @@ from pipelines.checks import Checks
 from pipelines.cli import options as how
 from pipelines.cli.options import Config, Verbose
 from pipelines.cli.termination import TERMINATED
-from pipelines.config import TrackConfig, load_config
+from pipelines.config import Method, TrackConfig, load_config
 from pipelines.configuration import load_settings, write_settings
 from pipelines.explaining import clock_text
 from pipelines.serving import (
@@ -131,15 +131,15 @@ serve = how.as_command(_serve_stream)
 
 
 def _restored(
-    stream: StreamTracker[Any], snapshot: Path, every: float, settings: TrackConfig, method: str
+    stream: StreamTracker[Any], snapshot: Path, every: float, settings: TrackConfig, method: Method
 ) -> StateKeeper:
     """The keeper of a stream that goes on from its file, if there is one."""
     if settings.tracker.providers:
         raise InputError("--snapshot: expected no tracker.providers, whose factors cannot be kept in a file")
-    tracker = settings.tracker
-    if tracker.estimator in ("isam2", "fixed-lag") and tracker.nonlinear(tracker.edges):
+    if not settings.new_tracker(method).plain_snapshots:
         raise InputError(
-            f"--snapshot: expected estimator: kalman where objects move nonlinearly, got {tracker.estimator}"
+            "--snapshot: expected an estimator whose snapshots are plain values, as kalman's, where objects move "
+            f"nonlinearly, got {settings.tracker.estimator}"
         )
     configuration = write_settings(settings, comments=False)
     header = {"version": version("saga-fg"), "method": method, "configuration": configuration}

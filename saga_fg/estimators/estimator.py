@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,6 +62,8 @@ class Estimator:
 
     lag: float = 0.0
     """Age up to which `update` puts measurements at their own time, s; 0: it takes those of the present alone."""
+    snapshots_hold_models: ClassVar[bool] = False
+    """Whether a snapshot holds the models of what moves nonlinearly, which are functions and no plain values."""
     providers: Sequence[FactorProvider] = ()
     """Asked for factors once a frame by `ask_providers`; empty for none."""
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,42 +24,33 @@ from numpy.typing import ArrayLike
 
 from factors.gaussian import Elimination
 from saga_fg.errors import InputError, UnknownNodeError, require_type
-from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian, not_smaller
+from saga_fg.estimators.block_gaussian import BlockGaussian, not_smaller
 from saga_fg.estimators.estimator import Estimator
 from saga_fg.estimators.filtering import Dynamics, predict
-from saga_fg.estimators.graph_window import SAME_TIME, GraphWindow, WindowEpoch
+from saga_fg.estimators.graph_window import SAME_TIME, GraphState, GraphWindow, WindowEpoch
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
-from saga_fg.estimators.independent import IndependentObjects, IndependentVariables
-from saga_fg.estimators.interval_dynamics import IntervalDynamics, by_covariance, lossy, merged, replace_by_prior
+from saga_fg.estimators.independent import IndependentObjects, IndependentVariables, uncoupled
+from saga_fg.estimators.interval_dynamics import (
+    IntervalDynamics,
+    by_covariance,
+    lossy,
+    merged,
+    replace_by_prior,
+    with_noise,
+)
 from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
-from saga_fg.estimators.partition import Partition, StateLayout, checked_prior
+from saga_fg.estimators.partition import StateLayout, checked_prior
 from saga_fg.estimators.smoother import SmoothedState
-from saga_fg.estimators.solution import linear_solution
+from saga_fg.estimators.whole_graph import WholeGraph, whole_graph
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
-from saga_fg.graph.variables import MAP_NODE, OBJECT, node_key, node_kind
+from saga_fg.graph.variables import MAP_NODE, OBJECT, node_key
 from saga_fg.model.discretisation import Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, shallow_copy
 from saga_fg.types.frame import Frame
 
 _RELEASE_EVERY = 10  # predictions between looks for objects whose correlation with others has decayed
-
-
-@dataclass(frozen=True, eq=False)
-class GraphState:
-    """The filter as a value, which can be pickled; see `GraphFilter` for its parts."""
-
-    graph: SceneFactorGraph
-    layout: StateLayout
-    keys: Mapping[int, int]
-    independent: IndependentObjects
-    window: GraphWindow
-    labels: Mapping[int, str]
-    auxiliary: tuple[int, ...]
-    predictions: int
-    posterior: BlockGaussian | None
-    before: tuple[BlockGaussian, Dynamics] | None = None  # see there; without nodes in iSAM2 not needed
 
 
 class GraphFilter(Estimator):
@@ -76,6 +67,8 @@ class GraphFilter(Estimator):
     The covariance of nodes that are `unsettled` is not smaller than the one predicted over the last interval, see
     `saga_fg.estimators.block_gaussian`: what was measured meanwhile counts for their place alone.
     """
+
+    snapshots_hold_models = True
 
     def __init__(self, providers: Sequence[FactorProvider] = (), lag: float = 0.0) -> None:
         self.providers, self.lag = tuple(providers), float(checked("lag", lag, ()))
@@ -195,7 +188,7 @@ class GraphFilter(Estimator):
             number, time = self._smoother.graph().epoch + 1, self.time + transition.dt
             time = max(time, float(np.nextafter(self.time, np.inf)))
             self._predictions += 1
-            coupled = _coupled(interval, dynamics)
+            coupled = interval.coupled(dynamics)
             if self.lag or self.providers:
                 if self._predictions % _RELEASE_EVERY == 0:
                     self._release_independent()
@@ -284,57 +277,21 @@ class GraphFilter(Estimator):
 
     def graph(self) -> SceneFactorGraph:
         """The running graph, with the variables and factors of the objects that nothing ties to others."""
-        return self._whole()[0]
-
-    def _whole(self) -> tuple[SceneFactorGraph, list[Mapping[int, int]]]:
-        """The graph of all objects, and the keys of their variables by id, for each epoch of the window."""
-        graph, nodes = self._smoother.graph(), self._independent.layout.nodes
-        keys: dict[int, Mapping[int, int]] = {epoch.number: epoch.keys for epoch in self._window.epochs}
-        if len(nodes):
-            graph = graph.copy()
-            old = {
-                node_key(node, epoch.number)
-                for node in nodes.tolist()
-                for epoch in self._independent.epochs[self._independent.since(node) :]
-            }
-            graph.marginalise(old & graph.variables.keys())  # of nodes of the same ids that have left
-            added = self._independent.add_to(graph, nodes, self._labels)
-            step, base, values = linear_solution(graph).step, graph.base, graph.values
-            for key in {key for own in added for key in own.values()}:  # the others are where iSAM2 has them
-                values.update(key, base.atVector(key) + step.at(key))
-            graph.moved_to(values)
-            for epoch, own in zip(self._independent.epochs, added, strict=True):
-                keys[epoch.number] = {**keys.get(epoch.number, {}), **own}
-        return graph, [keys[epoch.number] for epoch in self._window.epochs]
+        return self._whole().graph
 
     def smoothed(self) -> tuple[SmoothedState, ...]:
         """Every epoch within the lag, oldest first, of the nodes that are there now: given all measurements.
 
         A node is in those epochs only in which the graph has its variable.
         """
-        graph, every = self._whole()
-        solution, result = linear_solution(graph), list[SmoothedState]()
-        for time, layout, here, mean in self._epochs(graph, every):
-            joint = Partition(layout, np.zeros(len(layout), dtype=np.int64))
-            blocks = (solution.covariance(here)[None],) if here else ()
-            result.append(SmoothedState(time, BlockGaussian(joint, mean, blocks)))
-        return tuple(result)
+        return self._whole().smoothed(self._layout, self.start)
 
     def smoothed_means(self) -> tuple[tuple[float, StateLayout, FloatArray], ...]:
         """Time, s, layout and mean of every state of `smoothed`, whose covariances cost an elimination each."""
-        return tuple((time, layout, mean) for time, layout, _, mean in self._epochs(*self._whole()))
+        return tuple((time, layout, mean) for time, layout, _, mean in self._whole().epochs(self._layout, self.start))
 
-    def _epochs(
-        self, graph: SceneFactorGraph, every: Sequence[Mapping[int, int]]
-    ) -> Iterator[tuple[float, StateLayout, list[int], FloatArray]]:
-        """Time, layout, keys and mean of every epoch within the lag; `every`: keys of the nodes by epoch."""
-        present = self._layout.nodes.tolist()
-        for epoch, keys in zip(self._window.epochs, every, strict=True):
-            if epoch.time >= self.start - SAME_TIME:
-                there = np.array([keys.get(node) in graph.variables for node in present], dtype=bool)
-                layout = self._layout.select(there)
-                here = [keys[node] for node in layout.nodes.tolist()]
-                yield epoch.time, layout, here, np.concatenate([np.empty(0), *(graph.state(key) for key in here)])
+    def _whole(self) -> WholeGraph:
+        return whole_graph(self._smoother.graph(), self._independent, self._window, self._labels)
 
     def snapshot(self) -> GraphState:
         """The whole state as a value, which can be pickled. iSAM2 begins anew from it: both go on to the same bits."""
@@ -352,18 +309,9 @@ class GraphFilter(Estimator):
         self._posterior, self._tied, self._stale = state.posterior, None, frozenset()
 
     def _state(self) -> GraphState:
-        return GraphState(
-            graph=self._smoother.graph(),
-            layout=self._layout,
-            keys=self._keys,
-            independent=self._independent,
-            window=self._window,
-            labels=self._labels,
-            auxiliary=self._auxiliary,
-            predictions=self._predictions,
-            posterior=self._posterior,
-            before=self._before if self._keys else None,
-        )
+        before = self._before if self._keys else None
+        whole = self._smoother.graph(), self._layout, self._keys, self._independent, self._window, self._labels
+        return GraphState(*whole, self._auxiliary, self._predictions, self._posterior, before)
 
     def _note(self, method: str, *arguments: Any) -> None:
         """Note a call, to come again after a late measurement."""
@@ -430,26 +378,13 @@ class GraphFilter(Estimator):
             return
         graph = self._smoother.graph()
         x = self._joint(key for key in self.others if key in graph.variables)
-        parts = x.uncorrelated(UNCORRELATED).label
-        alone = np.flatnonzero(np.bincount(parts)[parts] == 1)
-        ids = [node for node in x.layout.nodes[alone].tolist() if node in self._keys]
-        own: dict[int, set[int]] = {node: set() for node in ids}
-        named = {node_kind(node): node for node in ids}
-        for key, one in graph.variables.items():
-            if (node := named.get((one.kind, one.id))) is not None:
-                own[node].add(key)
-        free = np.array([node for node in ids if graph.independent(own[node])], dtype=np.int64)
-        if len(free):
-            self._smoother.marginalise(key for node in free.tolist() for key in own[node])
-            self._released(x.only(free).decoupled())
-
-    def _released(self, x: BlockGaussian) -> None:
-        """Go on with objects that have left iSAM2."""
-        gone = set(x.layout.nodes.tolist())
-        self._independent = self._independent.with_released(self._layout, x)
-        self._keys = {node: key for node, key in self._keys.items() if node not in gone}
-        self._window = self._window.without(gone)
-        self._tied = None
+        free = uncoupled(graph, x, self._keys)
+        if free:
+            self._smoother.marginalise(key for keys in free.values() for key in keys)
+            alone = x.only(np.array(list(free), dtype=np.int64)).decoupled()
+            self._independent = self._independent.with_released(self._layout, alone)
+            self._keys = {node: key for node, key in self._keys.items() if node not in free}
+            self._window, self._tied = self._window.without(set(free)), None
 
     def _begin_epoch(
         self, x: BlockGaussian, transition: Transition, dynamics: Dynamics, number: int, time: float
@@ -469,7 +404,7 @@ class GraphFilter(Estimator):
                 change = self._predict_by_covariance(x, of_tied, chosen, keys)
             unused[rows] |= chosen
             if unused.any():
-                transition = _with_noise(transition, np.isin(transition.nodes, self._layout.nodes[unused]))
+                transition = with_noise(transition, np.isin(transition.nodes, self._layout.nodes[unused]))
         moved = Interactions(transition, self._keys, carried_over)
         begun = [moved, *predictors(self.providers)]
         offered = IndependentVariables(self._independent, self._labels) if self.providers else None
@@ -562,23 +497,3 @@ class GraphFilter(Estimator):
                 getattr(self, call.method)(*call.arguments)
             transition = epoch.transition
         self._smoother.frame, self._smoother.origin = now
-
-
-def _coupled(interval: IntervalDynamics, dynamics: Dynamics) -> BoolArray:
-    """(n,) nodes that an interval ties to others, or moves nonlinearly."""
-    tied = np.zeros(len(dynamics.layout), dtype=bool)
-    for F in dynamics.F:
-        across = (F.target != F.source) & F.values.any(axis=(1, 2))
-        tied[F.target[across]] = tied[F.source[across]] = True
-    for _, rows in interval.nonlinear_rows(dynamics.layout):
-        tied[rows] = True
-    return tied
-
-
-def _with_noise(transition: Transition, rows: BoolArray) -> Transition:
-    """Give some nodes (n,) noise of variance 1, so that their factors, which are not used, can be made."""
-    Q = [
-        replace(group, values=np.where(rows[group.target][:, None, None], np.eye(group.values.shape[1]), group.values))
-        for group in transition.Q
-    ]
-    return replace(transition, Q=tuple(Q))

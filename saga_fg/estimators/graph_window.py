@@ -15,6 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
+from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.filtering import Dynamics
+from saga_fg.estimators.independent import IndependentObjects
+from saga_fg.estimators.partition import StateLayout
+from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.discretisation import Transition
 from saga_fg.numerics.arrays import BoolArray, checked
 
@@ -110,3 +115,19 @@ class GraphWindow:
         gone = [call.arguments[0] for epoch in self.epochs[k + 1 :] for call in epoch.calls if call.method == LEFT]
         found = ~np.isin(ids, np.concatenate([np.empty(0, dtype=np.int64), *map(np.atleast_1d, gone)]))
         return found if state is None else found & np.isin(ids, state.layout.nodes)
+
+
+@dataclass(frozen=True, eq=False)
+class GraphState:
+    """The filter as a value, which can be pickled; see `saga_fg.estimators.graph_filter` for its parts."""
+
+    graph: SceneFactorGraph
+    layout: StateLayout
+    keys: Mapping[int, int]
+    independent: IndependentObjects
+    window: GraphWindow
+    labels: Mapping[int, str]
+    auxiliary: tuple[int, ...]
+    predictions: int
+    posterior: BlockGaussian | None
+    before: tuple[BlockGaussian, Dynamics] | None = None  # see there; without nodes in iSAM2 not needed

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from factors import GaussianFactors, Vector, gaussian_factors
-from saga_fg.estimators.block_gaussian import BlockGaussian
+from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian
 from saga_fg.estimators.filtering import Dynamics, corrected, noise_ratio, predict
 from saga_fg.estimators.interval_dynamics import LARGEST_RATIO, merged
 from saga_fg.estimators.measurements import Measurements
@@ -257,3 +257,18 @@ class IndependentVariables:
         for cached in ("variables", "_places"):
             self.__dict__.pop(cached, None)
         self._gone |= set(nodes.tolist())
+
+
+def uncoupled(graph: SceneFactorGraph, x: BlockGaussian, nodes: Collection[int]) -> dict[int, set[int]]:
+    """Those of some `nodes` that are no longer correlated with anything in a graph, with the keys of their variables.
+
+    x: the joint Gaussian of what the graph has at its newest epoch
+    """
+    parts = x.uncorrelated(UNCORRELATED).label
+    alone = np.flatnonzero(np.bincount(parts)[parts] == 1)
+    own = {node: set[int]() for node in x.layout.nodes[alone].tolist() if node in nodes}
+    named = {node_kind(node): node for node in own}
+    for key, one in graph.variables.items():
+        if (node := named.get((one.kind, one.id))) is not None:
+            own[node].add(key)
+    return {node: keys for node, keys in own.items() if graph.independent(keys)}

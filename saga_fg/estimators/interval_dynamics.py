@@ -24,7 +24,7 @@ its variable.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -71,6 +71,16 @@ class IntervalDynamics:
         """Nonlinear dynamics with their rows (n, 1 + k) of `layout`."""
         place = layout.rows(self.transition.nodes)
         return [(group, place[group.rows]) for group in self.nonlinear]
+
+    def coupled(self, dynamics: Dynamics) -> BoolArray:
+        """(n,) nodes of the linearised `dynamics` that the interval ties to others, or moves nonlinearly."""
+        tied = np.zeros(len(dynamics.layout), dtype=bool)
+        for F in dynamics.F:
+            across = (F.target != F.source) & F.values.any(axis=(1, 2))
+            tied[F.target[across]] = tied[F.source[across]] = True
+        for _, rows in self.nonlinear_rows(dynamics.layout):
+            tied[rows] = True
+        return tied
 
     def split(self, dt: float) -> tuple[IntervalDynamics, IntervalDynamics]:
         """The first `dt` seconds of the interval and the rest, with the same edges."""
@@ -354,3 +364,12 @@ def replace_by_prior(
         except FactorError as error:
             raise InputError(f"transition: {with_names(graph.variables, str(error), keys)}") from error
         graph.replace_by_prior(leaving, prior)
+
+
+def with_noise(transition: Transition, rows: BoolArray) -> Transition:
+    """Give some nodes (n,) noise of variance 1, so that their factors, which are not used, can be made."""
+    Q = [
+        replace(group, values=np.where(rows[group.target][:, None, None], np.eye(group.values.shape[1]), group.values))
+        for group in transition.Q
+    ]
+    return replace(transition, Q=tuple(Q))

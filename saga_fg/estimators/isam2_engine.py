@@ -16,7 +16,7 @@ import itertools
 import logging
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, KeysView, Mapping, Sequence, Set
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -27,6 +27,7 @@ import scipy.linalg
 from factors import FactorError, SingularSystemError, marginal_moments
 from factors.gaussian import Elimination, block_covariances, native_factor, singular_system
 from saga_fg.estimators.damped_steps import solve_damped
+from saga_fg.estimators.displacements import Displacements
 from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.factor_groups import HeldGroup
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
@@ -459,64 +460,3 @@ def _columns(dims: Mapping[int, int], keys: Iterable[int]) -> IntArray:
     """The columns of `keys` among those of variables of `dims`, which stand one after the other."""
     start = dict(zip(dims, itertools.accumulate(dims.values(), initial=0), strict=False))
     return np.array([column for key in keys for column in range(start[key], start[key] + dims[key])], dtype=np.int64)
-
-
-class Displacements:
-    """Variables with delta_0 (d,), where their factors were linearised, and R (d, d), in rows without gaps.
-
-    Rows are as wide as the largest variable; what a smaller one does not fill is zero.
-    """
-
-    def __init__(self) -> None:
-        self._keys: list[int] = []
-        self._row: dict[int, int] = {}
-        self._dims: dict[int, int] = {}
-        self._at, self._root = np.zeros((16, 0)), np.zeros((16, 0, 0))
-
-    def add(self, dims: Mapping[int, int]) -> None:
-        """New variables at their base."""
-        first, (rows, width) = len(self._keys), self._at.shape
-        more = 2 * len(dims) + rows if first + len(dims) > rows else 0
-        wider = max([width, *dims.values()]) - width
-        if more or wider:
-            self._at = np.pad(self._at, ((0, more), (0, wider)))
-            self._root = np.pad(self._root, ((0, more), (0, wider), (0, wider)))
-        self._keys += dims
-        self._row |= dict(zip(dims, range(first, len(self._keys)), strict=True))
-        self._dims |= dims
-
-    def remove(self, keys: Iterable[int]) -> None:
-        """Forget variables; the last one takes the row of each."""
-        for key in keys:
-            row, last = self._row.pop(key), self._keys.pop()
-            del self._dims[key]
-            end = len(self._keys)
-            if last != key:
-                self._keys[row], self._row[last] = last, row
-                self._at[row], self._root[row] = self._at[end], self._root[end]
-            self._at[end], self._root[end] = 0.0, 0.0
-
-    def dims(self, keys: Iterable[int]) -> dict[int, int]:
-        """Dimensions of variables, by key in their order."""
-        return {key: self._dims[key] for key in keys}
-
-    @property
-    def keys(self) -> KeysView[int]:
-        """All variables."""
-        return self._dims.keys()
-
-    def set_root(self, key: int, R: FloatArray) -> None:
-        """Set R of a variable."""
-        self._root[self._row[key], : len(R), : len(R)] = R
-
-    def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
-        """Variables that are farther off than the threshold; their linearisation point is reset."""
-        if not self._keys:
-            return []
-        n, now = len(self._keys), np.zeros_like(self._at[: len(self._keys)])
-        dims = np.array([self._dims[key] for key in self._keys])
-        now[np.arange(now.shape[1]) < dims[:, None]] = delta.vector(self._keys)
-        way = (self._root[:n] @ (now - self._at[:n])[:, :, None])[:, :, 0]
-        rows = np.flatnonzero(np.linalg.norm(way, axis=1) > threshold)
-        self._at[rows] = now[rows]
-        return [self._keys[row] for row in rows.tolist()]

@@ -265,7 +265,7 @@ class RecordingSmoother:
     def _steps_backwards(self) -> Iterator[_Step]:
         """The filter's pass from the last epoch to the first, linearised where it should be."""
         if all(epoch.linear for epoch in self._epochs):
-            return _stretches(self._prior, self._epochs, self._most)
+            return _filtered_backwards(self._prior, self._epochs, self._most)
         means: list[FloatArray] = []
         for _ in range(_MAX_LINEARISATIONS):
             steps = list(_filtered(self._prior, self._epochs, self._most, means))
@@ -311,7 +311,7 @@ def _filtered(
         yield _Step(x, dynamics, prior)
 
 
-def _stretches(prior: BlockGaussian, epochs: Sequence[_Epoch], most: int | None) -> Iterator[_Step]:
+def _filtered_backwards(prior: BlockGaussian, epochs: Sequence[_Epoch], most: int | None) -> Iterator[_Step]:
     """The filter's pass from the last epoch to the first, keeping about `MOST_KEPT` bytes and a few priors."""
     steps, size = list[_Step](), 0
     for step in _filtered(prior, epochs, most):
@@ -330,7 +330,7 @@ def _stretches(prior: BlockGaussian, epochs: Sequence[_Epoch], most: int | None)
         if k in begins:
             priors.append(step.prior)
     for begin in reversed(begins):
-        yield from _stretches(priors.pop(), epochs[begin : begin + length], most)
+        yield from _filtered_backwards(priors.pop(), epochs[begin : begin + length], most)
 
 
 def _smoothed(steps: Iterable[_Step]) -> Iterator[BlockGaussian]:

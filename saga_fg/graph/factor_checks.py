@@ -13,6 +13,7 @@ that least squares cannot take, and takes a `LinearContainerFactor` without a li
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -220,8 +221,10 @@ def factor_error(variables: Variables, held: HeldGroup, rows: IntArray, error: E
     named = [str(variables[key]) for key in list(keys)[:6]] + ["..."] * (len(keys) > 6)
     expected = isinstance(error, FactorError | InputError)
     text = " ".join(str(error).split()) if expected else " ".join(repr(error).split())
-    where = f"{held.factors.name} on {', '.join(named)}: "
-    return GraphError(f"provider {held.provider}: {where}{with_names(variables, text, keys).removeprefix(where)[:500]}")
+    name = held.factors.name
+    text = re.sub(rf"^(\d+ )?{re.escape(name)}( on [^:]*)?: ", "", text)  # factors name themselves
+    where = f"provider {held.provider}: {name} on {', '.join(named)}: "
+    return GraphError(where + with_names(variables, text, keys)[:500])
 
 
 def with_names(variables: Variables, text: str, keys: Iterable[int]) -> str:

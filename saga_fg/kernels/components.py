@@ -181,6 +181,19 @@ def root_of(root: IntArray, node: int) -> int:
     return node
 
 
+@kernel_part
+def numbered_sets(root: IntArray) -> IntArray:
+    """Numbers (n,) of the sets of nodes, from 0 in the order of their first; no root comes after a node below it."""
+    number, sets = np.empty(len(root), dtype=np.int64), 0
+    for k in range(len(root)):
+        if root[k] == k:
+            number[k] = sets
+            sets += 1
+        else:
+            number[k] = number[root[k]]
+    return number
+
+
 @kernel("f1 i1 i1 i1 i1 i1 f")
 def uncorrelated_labels(
     flat: FloatArray,
@@ -220,18 +233,7 @@ def uncorrelated_labels(
                 if tied:
                     root[max(one, other)] = min(one, other)
             j = before[j]
-    number = np.empty(n, dtype=np.int64)
-    parts = 0
-    for i in range(n):
-        one = i
-        while root[one] != one:
-            one = root[one]
-        if one == i:
-            number[i] = parts
-            parts += 1
-        else:
-            number[i] = number[one]
-    return number
+    return numbered_sets(root)
 
 
 @kernel("i i1 i1 i1 i")
@@ -247,14 +249,7 @@ def united_labels(count: int, nodes: IntArray, a: IntArray, b: IntArray, most: i
         if one != other and size[one] + size[other] <= most:
             first, second = min(one, other), max(one, other)
             root[second], size[first] = first, size[one] + size[other]
-    number, sets = np.empty(count, dtype=np.int64), 0
-    for k in range(count):  # a root comes before its set
-        if root[k] == k:
-            number[k] = sets
-            sets += 1
-        else:
-            number[k] = number[root[k]]
-    return number
+    return numbered_sets(root)
 
 
 @kernel("u2c")

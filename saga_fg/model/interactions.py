@@ -265,6 +265,11 @@ def unit(heading: FloatArray) -> FloatArray:
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 
 
+def ahead_and_aside(offset: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Components of offsets (..., 2) along directions u (..., 2) and to the left of them."""
+    return np.einsum("...i,...i->...", offset, u), u[..., 0] * offset[..., 1] - u[..., 1] * offset[..., 0]
+
+
 def applies(needs: Needs, target: NodeType, source: NodeType) -> bool:
     """True if nodes of these types have the components that an interaction needs."""
     own, other = needs

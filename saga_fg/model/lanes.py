@@ -30,8 +30,17 @@ from typing import ClassVar
 import numpy as np
 
 from saga_fg.model.edge_rules import CLEARANCE, CONES, MIN_SPEED, VEHICLES, Pairs, anticipated, cones_ahead
-from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
-from saga_fg.numerics.arrays import FloatArray, IntArray, of_classes
+from saga_fg.model.interactions import (
+    POSITION,
+    VELOCITY,
+    Needs,
+    NodeTable,
+    Triples,
+    ahead_and_aside,
+    unit,
+    velocity_triples,
+)
+from saga_fg.numerics.arrays import IntArray, of_classes
 from saga_fg.numerics.geometry import direction_at, feet, on_it
 from saga_fg.settings import Settings, setting
 from saga_fg.types.road_map import LANE
@@ -90,17 +99,12 @@ class InLane(Settings):
             at = feet(nodes.outline[lane], nodes.position[vehicles])
             along = np.einsum("ei,ei->e", at.direction, u)
             inside = (np.abs(at.e) <= nodes.width[lane] / 2) & (along > 0) & on_it(nodes.outline[lane], at.s)
-            drift = _across(nodes.velocity[vehicles], at.direction)
+            drift = ahead_and_aside(nodes.velocity[vehicles], at.direction)[1]
             mine = vehicles[inside]
             targets.append(mine)
             sources.append(np.full(len(mine), lane, dtype=np.int64))
             rates.append(LANE_RATE * np.exp(-((drift[inside] / LATERAL_SPEED_SCALE) ** 2) / 2))
         return Pairs(np.concatenate(targets), np.concatenate(sources), np.concatenate(rates))
-
-
-def _across(velocity: FloatArray, direction: FloatArray) -> FloatArray:
-    """Components (n,) of velocities (n, 2) to the left of directions (n, 2)."""
-    return np.asarray(direction[:, 0] * velocity[:, 1] - direction[:, 1] * velocity[:, 0])
 
 
 @dataclass(frozen=True)

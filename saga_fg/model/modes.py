@@ -171,7 +171,7 @@ class ModeTable:
     @cached_property
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean (n, d) and covariance (n, d, d) of the mixtures."""
-        return _moments(self.weight, self.mean, self.P)
+        return _mixture_moments(self.weight, self.mean, self.P)
 
     def anchored(self, mean: FloatArray, P: FloatArray) -> ModeTable:
         """Mapped so that the mixtures follow the marginals (n, d) and (n, d, d) of a joint state."""
@@ -185,7 +185,7 @@ class ModeTable:
         """dt seconds later, and the linear motions with the same moments; scale (n,) of the process noise."""
         w = self.weight[:, :, None] * self.mixture.transition(dt)
         weight = w.sum(axis=1)
-        mixed = [_moments(w[:, :, r] / weight[:, r, None], self.mean, self.P) for r in range(weight.shape[1])]
+        mixed = [_mixture_moments(w[:, :, r] / weight[:, r, None], self.mean, self.P) for r in range(weight.shape[1])]
         start, P0 = (np.stack(parts, axis=1) for parts in zip(*mixed, strict=True))
         F, c, Q = mode_dynamics(self.mixture, start, dt)
         Q = Q if scale is None else Q * scale[:, None, None, None]
@@ -216,7 +216,7 @@ class ModeTable:
         weight = weight / weight.sum(axis=1, keepdims=True)
         m = m + (np.swapaxes(gain_T, -1, -2) @ innovation[..., None])[..., 0]
         P = P - np.swapaxes(gain_T, -1, -2) @ S @ gain_T
-        before, after = (self.moments[0][rows], self.moments[1][rows]), _moments(weight, m, P)
+        before, after = (self.moments[0][rows], self.moments[1][rows]), _mixture_moments(weight, m, P)
         equivalent, directions, shift, spread = _equivalent(*before, *after)
         columns = [column.copy() for column in self._columns]
         changed = weight, m, P, self.shift[rows] + shift, self.spread[rows] + spread
@@ -288,7 +288,7 @@ def _equivalent(
     return z, scale[..., None] * directions, (axes @ left[0][..., None])[..., 0], spread
 
 
-def _moments(weight: FloatArray, mean: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _mixture_moments(weight: FloatArray, mean: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean (n, d) and covariance (n, d, d) of mixtures: weight (n, M), mean (n, M, d), P (n, M, d, d)."""
     middle = np.einsum("ns,nsi->ni", weight, mean)
     apart = mean - middle[:, None]

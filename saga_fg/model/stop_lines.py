@@ -41,7 +41,16 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from saga_fg.model.edge_rules import VEHICLES, Pairs
-from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
+from saga_fg.model.interactions import (
+    POSITION,
+    VELOCITY,
+    Needs,
+    NodeTable,
+    Triples,
+    ahead_and_aside,
+    unit,
+    velocity_triples,
+)
 from saga_fg.model.nonlinear_interactions import (
     MIN_GAP,
     Along,
@@ -97,9 +106,8 @@ def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
 def _approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
     offset = nodes.position[source] - nodes.position[target]
     u = unit(nodes.heading[target])
-    distance = np.einsum("ei,ei->e", offset, u)
+    distance, aside = ahead_and_aside(offset, u)  # of the line's middle
     ends = _ends(nodes, source)
-    aside = u[:, 0] * offset[:, 1] - u[:, 1] * offset[:, 0]  # of the line's middle, to the left of the vehicle's path
     aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4
     comes = (np.abs(aside) < np.hypot(*(ends[:, 0] - ends[:, 1]).T) / 2) & aligned & (distance > 0)
     found = Approach(comes, distance, u, -aside)
@@ -180,8 +188,7 @@ def passed_vehicles(nodes: NodeTable) -> ComingVehicles:
     target, source = _near(nodes, CLEARED)
     beyond, across = nodes.position[target] - nodes.position[source], unit(nodes.heading[source])
     ends = _ends(nodes, source)
-    aside = across[:, 0] * beyond[:, 1] - across[:, 1] * beyond[:, 0]
-    passed = np.einsum("ei,ei->e", beyond, across)
+    passed, aside = ahead_and_aside(beyond, across)
     aligned = np.abs(wrap_angle(nodes.heading[target] - nodes.heading[source])) < math.pi / 4
     inside = (passed > 0) & aligned & (np.abs(aside) < np.hypot(*(ends[:, 0] - ends[:, 1]).T) / 2)
     u = unit(nodes.heading[target])

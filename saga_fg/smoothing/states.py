@@ -16,7 +16,8 @@ from typing import Literal, Self, get_args
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.model.edge_rules import EdgeRule, build_graph
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph

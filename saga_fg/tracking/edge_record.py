@@ -31,7 +31,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saga_fg.model.edge_rules import EdgeRule, Governing, build_graph
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.graph_building import Governing, build_graph
 from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, unit
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray

@@ -164,6 +164,11 @@ class GreedyTracker:
         """Distance from the newest frame from which another has to be confirmed, s."""
         return MAX_JUMP
 
+    @property
+    def plain_snapshots(self) -> bool:
+        """Snapshots are plain values."""
+        return True
+
     def snapshot(self) -> GreedySnapshot:
         """Everything that the tracker knows, as a value."""
         return GreedySnapshot(self._memory, self._next_id, self._clock, self.time_verdict)

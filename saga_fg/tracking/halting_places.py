@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from saga_fg.model.edge_rules import VEHICLES
-from saga_fg.model.interactions import NodeTable, unit
+from saga_fg.model.interactions import NodeTable, ahead_and_aside, unit
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import wrap_angle
 
@@ -53,11 +53,11 @@ class Lines(Columns):
 
     def beyond(self, position: FloatArray) -> FloatArray:
         """(n, k) m by which places (n, 2) are beyond each line."""
-        return _seen_from(self.position, self.heading, position)[0]
+        return ahead_and_aside(position[:, None] - self.position, unit(self.heading))[0]
 
     def approached(self, position: FloatArray, heading: FloatArray) -> BoolArray:
         """(n, k) whether vehicles are in the lane of each line, and go its way."""
-        _, aside = _seen_from(self.position, self.heading, position)
+        _, aside = ahead_and_aside(position[:, None] - self.position, unit(self.heading))
         return np.asarray((np.abs(aside) < LANE) & (np.abs(wrap_angle(heading[:, None] - self.heading)) < ALIKE))
 
 
@@ -135,13 +135,7 @@ class HaltingPlaces:
 
 def _nobody_before(position: FloatArray, heading: FloatArray, rows: IntArray) -> BoolArray:
     """(k,) which of `rows` have no other vehicle within `FREE` on their way."""
-    ahead, aside = _seen_from(position[rows], heading[rows], position)
+    ahead, aside = ahead_and_aside(position[:, None] - position[rows], unit(heading[rows]))
     turned = np.abs(wrap_angle(heading[:, None] - heading[rows]))
     before = (ahead > 0.5) & (ahead < FREE) & (np.abs(aside) < LANE) & (turned < math.pi / 3)
     return np.asarray(~before.any(axis=0))
-
-
-def _seen_from(place: FloatArray, heading: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far positions (n, 2) are ahead of places (k, 2) along their headings (k,), and to the left, (n, k), m."""
-    u, offset = unit(heading), position[:, None] - place
-    return np.einsum("nki,ki->nk", offset, u), u[:, 0] * offset[..., 1] - u[:, 1] * offset[..., 0]

@@ -26,7 +26,7 @@ import math
 
 import numpy as np
 
-from saga_fg.model.edge_rules import build_graph
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable, Paths
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.tracking.courses import known_courses, predicted_paths

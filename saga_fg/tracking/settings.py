@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, require_rules, traffic_rules
+from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
+from saga_fg.model.graph_building import require_rules
 from saga_fg.model.lanes import ConeLine, InLane
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk

@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, SagaError, require_type
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
-from saga_fg.model.edge_rules import EdgeRule, require_rules
+from saga_fg.model.edge_rules import EdgeRule
+from saga_fg.model.graph_building import require_rules
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
@@ -290,6 +291,12 @@ class Tracker:
     def world_T_ego(self) -> FloatArray | None:
         """The vehicle's pose (4, 4) as estimated in the running graph; None where it is not."""
         return self._state.world_T_ego
+
+    @property
+    def plain_snapshots(self) -> bool:
+        """Whether snapshots are plain values, which go into a file without pickling."""
+        models = self._state.joint.estimator.snapshots_hold_models
+        return not (models and self.settings.nonlinear(self.rules))
 
     @property
     def running_graph(self) -> SceneFactorGraph:

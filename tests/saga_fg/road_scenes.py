@@ -8,7 +8,8 @@ from saga_fg import ConstantVelocity, NodeType, RandomWalk
 from saga_fg.conformance.programs import Add, Marginalise, Predict, Update
 from saga_fg.estimators import Measurements
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following, build_graph
+from saga_fg.model.edge_rules import Following
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.lanes import ConeLine, InLane
 from saga_fg.model.rigid_coupling import Attached

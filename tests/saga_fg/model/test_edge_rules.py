@@ -10,15 +10,8 @@ from hypothesis import strategies as st
 from saga_fg import ConstantVelocity, InputError, NodeType
 from saga_fg.conformance.programs import BUS, CAR, CONE
 from saga_fg.kernels.edges import pairs_ahead
-from saga_fg.model.edge_rules import (
-    SPREAD,
-    UNSEEN_ACCELERATION,
-    Following,
-    Neighbours,
-    Pairs,
-    build_graph,
-    traffic_rules,
-)
+from saga_fg.model.edge_rules import SPREAD, UNSEEN_ACCELERATION, Following, Neighbours, Pairs, traffic_rules
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import SHARP, CarFollowing, Paths, SharedVelocity
 from saga_fg.model.nonlinear_interactions import IntelligentDriver, SmoothDriver
 from saga_fg.numerics.geometry import Polylines, yaw_transform

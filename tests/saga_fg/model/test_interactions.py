@@ -15,7 +15,8 @@ from saga_fg import InputError
 from saga_fg.conformance.programs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
 from saga_fg.model import nonlinear_interactions
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following, build_graph
+from saga_fg.model.edge_rules import Following
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
 from saga_fg.model.nonlinear_interactions import (
     HIDDEN_VEHICLE_GAP,

@@ -25,7 +25,8 @@ from pipelines.configuration import read_settings, write_settings
 from saga_fg import InputError
 from saga_fg.learning import TEMPLATE
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following, Neighbours, build_graph
+from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, velocity_triples
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.nonlinear_interactions import FALLOFF, RADII, STRENGTH, SmoothDriver, SocialForce

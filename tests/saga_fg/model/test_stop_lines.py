@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import InputError
-from saga_fg.model.edge_rules import CLEARANCE, Following, anticipated, build_graph
+from saga_fg.model.edge_rules import CLEARANCE, Following, anticipated
+from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.lanes import CONE_RATE, PREVIEW, ConeLine, InLane
 from saga_fg.model.rigid_coupling import OFFSET_TIME, Attached, RigidCoupling

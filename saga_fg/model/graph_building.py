@@ -1,0 +1,121 @@
+"""The scene graph that edge rules make of nodes; rules and laws of users' own are checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from saga_fg.errors import InputError
+from saga_fg.model.edge_rules import EdgeRule, Pairs
+from saga_fg.model.interactions import NodeTable, applies
+from saga_fg.model.motion import distinct_types
+from saga_fg.model.scene_graph import Edges, NonlinearEdges, RecordedMotions, SceneGraph
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, unchecked
+
+Governing = Callable[[int, NodeTable, IntArray, IntArray], FloatArray]
+_MAX_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that
+E = TypeVar("E", Edges, NonlinearEdges)
+
+
+def build_graph(
+    nodes: NodeTable,
+    rules: Sequence[EdgeRule],
+    explained_noise: float = 0.0,
+    noise_scale: FloatArray | None = None,
+    motions: tuple[RecordedMotions, ...] = (),
+    interacting: BoolArray | None = None,
+    governing: Governing | None = None,
+    min_rate: float = 1e-3,
+) -> SceneGraph:
+    """The scene graph of `nodes` with the edges `rules` choose, their rates times the existence of their sources.
+
+    Edges weaker than `min_rate` (1/s) are left out.
+
+    A node acted on at the total rate K has its diffusion multiplied by exp(-explained_noise K), explained_noise in s:
+    motion that follows a leader is explained. `noise_scale` (n,) are further factors on it. `motions` are those
+    of the graph. Rules see, and tie, the nodes that are `interacting` (n,), None: all. `governing` gives the
+    probabilities (E,) that edges of a rule, by its number, govern between nodes; they scale its rates.
+
+    Raises `InputError` for a rule whose pairs name rows that are not there, or rates that are not finite.
+    """
+    groups: list[Edges] = []
+    nonlinear: list[NonlinearEdges] = []
+    total_rate = np.zeros(len(nodes))
+    graph_nodes, types = nodes, distinct_types(nodes.types)
+    row = np.arange(len(nodes)) if interacting is None else interacting.nonzero()[0]
+    if len(row) < len(nodes):
+        nodes = nodes.select(row)
+    if len(nodes) > 1:
+        first: dict[tuple[str, ...], int] = {}  # an interaction sees no more of a type than its components
+        kind = np.array([first.setdefault(t.components, len(first)) for t in types[0]])[types[1][row]]
+        for number, rule in enumerate(rules):
+            target, source, rate = _pairs(rule, nodes)
+            if len(target) == 0:
+                continue
+            rate = rate * nodes.existence[source]
+            if governing is not None:
+                rate = rate * governing(number, nodes, target, source)
+            keep = (rate >= min_rate).nonzero()[0]
+            target, source, rate = target[keep], source[keep], rate[keep]
+            pair_kind = kind[target] * len(first) + kind[source]
+            for k in np.bincount(pair_kind).nonzero()[0]:
+                mine = (pair_kind == k).nonzero()[0]
+                t, s = target[mine], source[mine]
+                law, shipped = rule.interaction, _shipped(rule) and _shipped(rule.interaction)
+                if not applies(law.needs, nodes.types[t[0]], nodes.types[s[0]]):
+                    continue
+                ends = {"target": row[t], "source": row[s], "rate": rate[mine]}
+                if hasattr(law, "triples"):
+                    triples = law.triples(nodes, t, s)._asdict()
+                    groups.append(_made(Edges, shipped, interaction=type(law).__name__, **ends, **triples))
+                else:
+                    ends["given"] = law.given(nodes, t, s)
+                    nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
+                total_rate += np.bincount(row[t], weights=rate[mine], minlength=len(total_rate))
+    scale = np.exp(-np.minimum(explained_noise * total_rate, _MAX_EXPLAINED))
+    if noise_scale is not None:
+        scale = scale * noise_scale
+    parts = {"edges": tuple(groups), "diffusion_scale": scale, "nonlinear": tuple(nonlinear), "motions": motions}
+    return unchecked(SceneGraph, nodes=graph_nodes.id, types=graph_nodes.types, kinds=types, **parts)
+
+
+def _made(kind: type[E], shipped: bool, **columns: Any) -> E:
+    """Edges, which are checked unless their rule and law are of this package."""
+    return unchecked(kind, **columns) if shipped else kind(**columns)
+
+
+def _pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
+    """The pairs of a rule; `InputError` for rows or rates of a user's that are not valid."""
+    return rule.pairs(nodes) if _shipped(rule) else _checked_pairs(rule, nodes)
+
+
+def _shipped(part: object) -> bool:
+    """True if a rule or law is of this package, and none that was derived from one."""
+    return type(part).__module__.startswith("saga_fg.")
+
+
+def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
+    """The pairs of a user's rule; `InputError` for rows or rates that are not valid."""
+    what = f"edge rule {type(rule).__name__}"
+    pairs = rule.pairs(nodes)
+    target = checked_rows(f"{what}: target", pairs[0])
+    source = checked_rows(f"{what}: source", pairs[1], len(target))
+    for name, rows in (("target", target), ("source", source)):
+        if len(rows) and (rows.min() < 0 or rows.max() >= len(nodes)):
+            bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
+            raise InputError(f"{what}: {name}: row {bad} is outside {len(nodes)} nodes")
+    return Pairs(target, source, checked(f"{what}: rate", pairs[2], (len(target),)))
+
+
+def require_rules(name: str, rules: object) -> None:
+    """Raise `InputError` unless `rules` are a tuple or list of edge rules, which edges of a graph are not."""
+    if not isinstance(rules, tuple | list):
+        raise InputError(f"{name}: expected a tuple of edge rules, got {type(rules).__name__}")
+    for k, rule in enumerate(rules):
+        if isinstance(rule, type) or not (hasattr(rule, "interaction") and hasattr(rule, "pairs")):
+            instead = "; their law can be the interaction of a rule" if isinstance(rule, NonlinearEdges) else ""
+            raise InputError(
+                f"{name}[{k}]: expected an edge rule, with interaction and pairs, got {type(rule).__name__}{instead}"
+            )
