@@ -274,10 +274,10 @@ def judge_run(source: DatasetSource, output: Path, method: str, configuration: s
     result = output / source.all_tracks
     write_run_record(result, RunRecord(method, configuration, {}))
     found = source.read_results(result)
-    evaluation = source.evaluate(found, hota)
+    evaluation = found.evaluate(hota)
     figures: dict[str, Any] = {"method": method, "version": version("saga-fg"), "figures": evaluation.figures()}
     write_figures(output / "figures.json", figures)
-    write_text(output / "report.html", _page(source, result, found, evaluation))
+    write_text(output / "report.html", _page(source, result, found.scenes, evaluation))
     return evaluation
 
 

@@ -14,7 +14,7 @@ from data_tools.datasets.detection_files import TableImport, TruthFile
 from data_tools.datasets.detection_files.column_names import pairs
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.formats import column_names
-from data_tools.datasets.results import SceneResult, read_table_results
+from data_tools.datasets.results import Results, SceneResult, clear_figures, read_table_results
 from data_tools.datasets.source import (
     TRACKING,
     ChosenScenes,
@@ -57,6 +57,7 @@ class DetectionFileSource(DatasetSource):
     has_truth = False
     truth_option = "--truth"
     summarised = True
+    part_option = "table"
     example = "detections.csv"
     detections: list[str] | None = option(
         "Table of detections: .csv, .ndjson, .jsonl, .npz, .parquet or .feather (extra [parquet]). In parallel: "
@@ -117,13 +118,8 @@ class DetectionFileSource(DatasetSource):
         )
         return own.over(self.table_import or TableImport())
 
-    @property
-    def title(self) -> str:
+    def __str__(self) -> str:
         return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"
-
-    @property
-    def tracks_suffix(self) -> str:
-        return f".{self.table}"
 
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[Dataset]:
@@ -151,7 +147,10 @@ class DetectionFileSource(DatasetSource):
         with local_copy(self._table(), self._hosts) as path:
             yield read_scenes_in_parts(path, scenes=chosen, how=self.how)
 
-    def read_results(self, result: Path) -> Mapping[str, SceneResult]:
+    def read_results(self, result: Path) -> Results:
+        return Results(self._results(result), _score)
+
+    def _results(self, result: Path) -> Mapping[str, SceneResult]:
         if self.truth is not None:
             with self._true_scenes() as truth:
                 return read_table_results(result, truth, self.scenes is not None, self.how, judged=True)
@@ -159,17 +158,6 @@ class DetectionFileSource(DatasetSource):
             return read_table_results(result, None, how=self.how)
         with self.open() as dataset:
             return read_table_results(result, dataset, every_scene=True, how=self.how)
-
-    def evaluate(
-        self,
-        results: Mapping[str, SceneResult],
-        hota: bool = False,
-        innovations: Mapping[str, FloatArray] | None = None,
-    ) -> Evaluation:
-        from data_tools.evaluation import evaluate_tracks
-
-        hota = hota or find_spec("trackeval") is not None
-        return evaluate_tracks([(each.scene, each.found) for each in results.values()], hota, innovations, sweep=True)
 
     def option_for(self, mend: Mend) -> str:
         names: Mapping[str, str] = {}
@@ -215,6 +203,13 @@ class DetectionFileSource(DatasetSource):
                 "expected one table of detections; several need --workers N or --ray, and a folder as --output"
             )
         return (self.detections or [""])[0]
+
+
+def _score(
+    scenes: Mapping[str, SceneResult], hota: bool = False, innovations: Mapping[str, FloatArray] | None = None
+) -> Evaluation:
+    """All figures that can be computed here."""
+    return clear_figures(scenes, hota or find_spec("trackeval") is not None, innovations, sweep=True)
 
 
 class DetectedTruth:

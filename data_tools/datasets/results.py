@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.plausibility import Mend, usual_class
 from saga_fg.types.track import known_velocities
+
+if TYPE_CHECKING:
+    from data_tools.evaluation import Evaluation
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +39,37 @@ class SceneResult:
     scene: Scene
     found: SceneBoxes
     coasting: FloatArray | None = field(default=None, kw_only=True)
+
+
+def clear_figures(
+    scenes: Mapping[str, SceneResult],
+    hota: bool = False,
+    innovations: Mapping[str, FloatArray] | None = None,
+    sweep: bool = False,
+) -> Evaluation:
+    """Score tracks by CLEAR figures and RMSE; sweep: at every score, too."""
+    from data_tools.evaluation import evaluate_tracks
+
+    return evaluate_tracks([(each.scene, each.found) for each in scenes.values()], hota, innovations, sweep=sweep)
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """The result of any tracker by scene, with ground truth, and how this is scored.
+
+    score  of scenes, whether with HOTA, and the squared distances of the run by class, or None
+    """
+
+    scenes: Mapping[str, SceneResult]
+    score: Callable[[Any, bool, Mapping[str, FloatArray] | None], Evaluation] = clear_figures
+
+    def only(self, names: Collection[str]) -> Results:
+        """Some of the scenes."""
+        return replace(self, scenes={name: each for name, each in self.scenes.items() if name in names})
+
+    def evaluate(self, hota: bool = False, innovations: Mapping[str, FloatArray] | None = None) -> Evaluation:
+        """Score the tracks. innovations: squared distances of the run, by class."""
+        return self.score(self.scenes, hota, innovations)
 
 
 def read_table_results(

@@ -47,8 +47,7 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
-    from data_tools.datasets.results import SceneResult
-    from data_tools.evaluation import Evaluation
+    from data_tools.datasets.results import Results
     from data_tools.lidar.scan import ScanSequence
     from saga_fg.smoothing import Labels
     from saga_fg.types.plausibility import Mend
@@ -236,6 +235,13 @@ def input_files(source: DatasetSource) -> tuple[Path, ...]:
     return tuple(Path(place) for place in places if os.path.isfile(place))  # noqa: PTH113 (stands any text)
 
 
+def part_suffix(source: DatasetSource) -> str:
+    """Suffix of the result of one part, in parallel runs."""
+    if source.part_option:
+        return f".{getattr(source, source.part_option)}"
+    return Path(source.tracks_example).suffix or ".csv"
+
+
 @dataclass(frozen=True, kw_only=True)
 class DatasetSource(ABC):
     """Recordings and how to work with them; the fields are the options that name them. Picklable.
@@ -247,6 +253,7 @@ class DatasetSource(ABC):
     example         options of the examples in the help
     tracks          what `track` writes, for the help; tracks_example: such a name
     merged          result of all parts in parallel, "" for none: of tracks, of labels
+    part_option     option that chooses the suffix of the result of one part, "" for that of tracks_example
     all_tracks      what holds the tracks of all parts of a parallel run, for `benchmark`; "" for none
     submission      pattern of the files that the official server takes, "" for none
     summarised      whether figures have a narrow summary
@@ -261,20 +268,15 @@ class DatasetSource(ABC):
     tracks: ClassVar[str] = "Table of tracks to write: .csv, .ndjson, .jsonl or .parquet (extra [parquet])."
     tracks_example: ClassVar[str] = "tracks.csv"
     merged: ClassVar[tuple[str, str]] = ("", "")
+    part_option: ClassVar[str] = ""
     all_tracks: ClassVar[str] = ""
     submission: ClassVar[str] = ""
     summarised: ClassVar[bool] = False
     shows: ClassVar[tuple[Literal["scans", "maps", "images"], ...]] = ()
 
-    @property
-    def title(self) -> str:
+    def __str__(self) -> str:
         """Title of the recordings in reports."""
         return self.name
-
-    @property
-    def tracks_suffix(self) -> str:
-        """Suffix of the result of one part, in parallel runs."""
-        return Path(self.tracks_example).suffix or ".csv"
 
     @abstractmethod
     def open(self, truth: bool = False) -> AbstractContextManager[Dataset]:
@@ -330,33 +332,24 @@ class DatasetSource(ABC):
 
     def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
         """Write the result of one part of a parallel run to folder/tracks/STEM.*."""
-        self.write_tracks(folder / "tracks" / f"{stem}{self.tracks_suffix}", dataset, scenes)
+        self.write_tracks(folder / "tracks" / f"{stem}{part_suffix(self)}", dataset, scenes)
 
     def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
         """Join the tracks, or labels, of all parts of a parallel run to the file `merged`."""
         return
 
-    def read_results(self, result: Path) -> Mapping[str, SceneResult]:
-        """The result of any tracker by scene, with ground truth. Raises `InputError` for one missing or broken.
+    def read_results(self, result: Path) -> Results:
+        """The result of any tracker by scene, with ground truth, which scores it.
+
+        Raises `InputError` for one missing or broken.
 
         The scenes are those the result has; where the field `scenes` names some, all of these.
         """
-        from data_tools.datasets.results import read_table_results
+        from data_tools.datasets.results import Results, read_table_results
 
         named = isinstance(getattr(self, "scenes", None), str)
         with self.open(truth=self.has_truth) as dataset:
-            return read_table_results(result, dataset, every_scene=named)
-
-    def evaluate(
-        self,
-        results: Mapping[str, SceneResult],
-        hota: bool = False,
-        innovations: Mapping[str, FloatArray] | None = None,
-    ) -> Evaluation:
-        """Score results that `read_results` has read. innovations: squared distances of the run, by class."""
-        from data_tools.evaluation import evaluate_tracks
-
-        return evaluate_tracks([(each.scene, each.found) for each in results.values()], hota, innovations)
+            return Results(read_table_results(result, dataset, every_scene=named))
 
 
 Kind = Literal["drivable", "walkway", "crossing"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,7 +11,7 @@ import numpy as np
 import typer
 
 from data_tools.datasets.detection_files import read_tracks
-from data_tools.datasets.results import SceneResult
+from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource, Innovations, input_files
 from data_tools.evaluation import LEGEND
 from data_tools.files.atomic_files import atomic_directory, write_text, write_zip
@@ -80,7 +79,7 @@ def _evaluate(
             found = source.read_results(result)
             nis = journal_innovations(journal_of(result)) if shown.innovations else {}
     with working("scoring"):
-        evaluation = source.evaluate(found, shown.hota, nis)
+        evaluation = found.evaluate(shown.hota, nis)
     summary = evaluation.summary()
     if summary is not None:
         show_summary(summary, LEGEND)
@@ -94,9 +93,7 @@ def _evaluate(
                 (folder / f"{name}.png").write_bytes(png(picture))
 
 
-def _tracked(
-    source: DatasetSource, settings: TrackConfig, method: Method
-) -> tuple[Mapping[str, SceneResult], Innovations]:
+def _tracked(source: DatasetSource, settings: TrackConfig, method: Method) -> tuple[Results, Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
     checks = Checks(settings.of_method(method), option_for=source.option_for)
     recorder = InnovationRecorder()

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.detection_files import read_predictions
-from data_tools.datasets.results import SceneResult
+from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable, as_json
 from data_tools.files.atomic_files import write_text
@@ -161,7 +161,7 @@ class _Result:
 
     method: str
     path: Path
-    found: Mapping[str, SceneResult]
+    found: Results
     record: RunRecord | None
 
 
@@ -183,7 +183,7 @@ def result_report(source: DatasetSource, result: Path, beside: Path | None = Non
     tables: list[FigureTable] = []
     charts: list[Chart] = []
     for each in results:
-        found = {scene.scene.name: each.found[scene.scene.name] for scene in scenes if scene.scene.name in each.found}
+        found = each.found.only([scene.scene.name for scene in scenes])
         prefix = f"{each.method}: " if len(results) > 1 else ""
         own_tables, own_charts = _figures(source, found)
         if each.record is not None:
@@ -197,10 +197,10 @@ def result_report(source: DatasetSource, result: Path, beside: Path | None = Non
     facts = [", ".join(each.path.name for each in results)]
     facts += [f"{len(names)} scenes" if len(names) > 3 else ", ".join(names)]
     facts += [f"{sum(len(each.scene) for each in scenes)} moments"]
-    facts += [f"{sum(len(found.found) for found in first.found.values())} boxes"]
+    facts += [f"{sum(len(found.found) for found in first.found.scenes.values())} boxes"]
     facts += [f"saga-fg {first.record.version}"] if first.record is not None else []
     return Report(
-        f"{' and '.join(each.method for each in results)} on {source.title}",
+        f"{' and '.join(each.method for each in results)} on {source}",
         facts,
         scenes,
         tables,
@@ -210,7 +210,7 @@ def result_report(source: DatasetSource, result: Path, beside: Path | None = Non
     )
 
 
-def result_scenes(source: DatasetSource, result: Path, found: Mapping[str, SceneResult]) -> list[ReportScene]:
+def result_scenes(source: DatasetSource, result: Path, found: Results) -> list[ReportScene]:
     """Return the scenes of a result, with edges by the rules of the dataset's default configuration.
 
     Raises `InputError` for a broken record of the run, or broken predictions.
@@ -244,7 +244,7 @@ def _scenes(source: DatasetSource, result: _Result) -> list[ReportScene]:
             config.sensors,
             {result.method: predicted[name]} if name in predicted else {},
         )
-        for name, each in result.found.items()
+        for name, each in result.found.scenes.items()
     ]
 
 
@@ -283,9 +283,9 @@ def _on_the_ground(source: DatasetSource, scenes: Sequence[ReportScene], width: 
     ]
 
 
-def _figures(source: DatasetSource, found: Mapping[str, SceneResult]) -> tuple[list[FigureTable], list[Chart]]:
+def _figures(source: DatasetSource, found: Results) -> tuple[list[FigureTable], list[Chart]]:
     if source.has_truth:
-        evaluation = source.evaluate(found)
+        evaluation = found.evaluate()
         return list(evaluation.tables()), accuracy_charts(evaluation.errors)
-    results = list(found.values())
+    results = list(found.scenes.values())
     return [track_figures(results)], track_charts(results)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Protocol
 
 from data_tools.datasets.detection_files import write_label_table
-from data_tools.datasets.source import DatasetSource, Part
+from data_tools.datasets.source import DatasetSource, Part, part_suffix
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
 from pipelines.scale_out.pools import Job, Outcome, SceneTask
@@ -139,7 +139,7 @@ class TrackTask:
     def configuration(self) -> str:
         """The method, the form of the results, and the settings."""
         ahead = "" if self.horizons is None else f", predicted by {self.horizons.tolist()} s"
-        head = f"# track, method {self.method}, results of {self.source.name} as {self.source.tracks_suffix}{ahead}\n"
+        head = f"# track, method {self.method}, results of {self.source.name} as {part_suffix(self.source)}{ahead}\n"
         head += _reading(self.source)
         return head + write_settings(self.settings, comments=False)
 
@@ -147,7 +147,7 @@ class TrackTask:
         """Write the tracks; counts frames, boxes and tracks, these also by class."""
         counts = dict.fromkeys(("frames", "tracks", "boxes"), 0)
         tracked = track_dataset(dataset, lambda: self.settings.new_tracker(self.method), horizons=self.horizons)
-        runs, part = _counted(tracked, counts), folder / "tracks" / f"{file_name(name)}{self.source.tracks_suffix}"
+        runs, part = _counted(tracked, counts), folder / "tracks" / f"{file_name(name)}{part_suffix(self.source)}"
         part.parent.mkdir()
         with keep_predictions(runs, part, self.horizons is not None) as kept:
             self.source.write_track_part(folder, file_name(name), dataset, ((run.scene, run.tracks) for run in kept))

@@ -42,7 +42,7 @@ from data_tools.datasets.argoverse2.logs import (
     transforms,
 )
 from data_tools.datasets.detection_files import TrackRows, read_detections
-from data_tools.datasets.results import SceneResult, scene_result
+from data_tools.datasets.results import Results, scene_result
 from data_tools.datasets.source import ChosenScenes, Surroundings, TrackedScenes, option
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context, is_url, local_copy, local_tree
@@ -261,7 +261,7 @@ class ArgoverseSource(AnnotatedSource):
     def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
         merge_feather_tracks(output / self.merged[0], [output / "tracks" / f"{stem}.feather" for stem in stems])
 
-    def read_results(self, result: Path) -> Mapping[str, SceneResult]:
+    def read_results(self, result: Path) -> Results:
         if result.suffix == ".pkl":
             raise InputError(
                 f"{result}: expected .feather or a table; a .pkl is not read, as that would run its content"
@@ -275,7 +275,7 @@ class ArgoverseSource(AnnotatedSource):
                 raise InputError(f"{result}: log_id: expected one of the logs, such as {dataset.scenes[0]}")
             scenes = {name: dataset.scene(name) for name in names}
             rows = read_feather_tracks(result, scenes)
-        return {name: scene_result(scene, rows, result) for name, scene in scenes.items()}
+        return Results({name: scene_result(scene, rows, result) for name, scene in scenes.items()})
 
     def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
         root = self.dataroot

@@ -49,11 +49,10 @@ from data_tools.datasets.kitti.labels import (
     observation_angles,
     read_kitti_labels,
 )
-from data_tools.datasets.results import SceneResult
+from data_tools.datasets.results import Results, SceneResult
 from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
-    Innovations,
     LabelledScenes,
     OpenedPart,
     Parts,
@@ -429,21 +428,13 @@ class KittiSource(DatasetSource):
         merged = output / self.merged[labels]
         merge_tables(merged, [merged.parent / f"{stem}.csv" for stem in stems])
 
-    def read_results(self, result: Path) -> Mapping[str, SceneResult]:
-        chosen = self._chosen()
+    def read_results(self, result: Path) -> Results:
+        chosen, classes = self._chosen(), names("--classes", self.classes)
         chosen = result_sequences(result) if chosen is None else chosen
         with self.restricted(chosen).open(truth=True) as dataset:
-            return scored_sequences(result, dataset)
-
-    def evaluate(
-        self,
-        results: Mapping[str, SceneResult],
-        hota: bool = False,
-        innovations: Innovations | None = None,
-    ) -> Evaluation:
-        scored = {name: each for name, each in results.items() if isinstance(each, ScoredSequence)}
-        classes, exempt = names("--classes", self.classes), self.persons == "exempt"
-        return evaluate_kitti(scored, classes, overlaps(self.iou), hota, innovations, exempt)
+            scored = scored_sequences(result, dataset)
+        ious, exempt = overlaps(self.iou), self.persons == "exempt"
+        return Results(scored, lambda some, hota, nis: evaluate_kitti(some, classes, ious, hota, nis, exempt))
 
     def _chosen(self) -> tuple[str, ...] | None:
         return None if self.sequences is None else names("--sequences", self.sequences)

@@ -27,7 +27,7 @@ from data_tools.datasets.mcap.dataset import (
 )
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import Recording, definition
-from data_tools.datasets.results import SceneResult, read_table_results, scene_result
+from data_tools.datasets.results import Results, read_table_results, scene_result
 from data_tools.datasets.source import TRACKING, DatasetSource, OpenedPart, Parts, TrackedScenes, file_digest, option
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context
@@ -121,6 +121,7 @@ class McapSource(DatasetSource):
     example = "drive.mcap --topic /perception/objects"
     tracks = "File to write: .mcap for messages of the type that the detections have; a table: .csv, .ndjson, .parquet."
     tracks_example = "tracks.mcap"
+    part_option = "table"
     recording: list[str] | None = option(
         "MCAP file or bag folder. In parallel: several of them.",
         None,
@@ -140,10 +141,6 @@ class McapSource(DatasetSource):
         "Topic of nav_msgs/Odometry for the pose of the vehicle; /tf if left out.", None, metavar="TOPIC"
     )
     table: Literal["mcap", "csv", "ndjson"] = option("Format of the results, in parallel.", "mcap", verbs=("track",))
-
-    @property
-    def tracks_suffix(self) -> str:
-        return f".{self.table}"
 
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[McapRecording]:
@@ -167,14 +164,14 @@ class McapSource(DatasetSource):
     def with_kept(self, kept: Mapping[str, Any]) -> Self:
         return self if self.world is not None or "world" not in kept else replace(self, world=str(kept["world"]))
 
-    def read_results(self, result: Path) -> Mapping[str, SceneResult]:
+    def read_results(self, result: Path) -> Results:
         with self.open() as dataset:
             if result.suffix != ".mcap":
-                return read_table_results(result, dataset, every_scene=True)
+                return Results(read_table_results(result, dataset, every_scene=True))
             (name,) = dataset.scenes
             scene = dataset.scene(name)
             rows = read_track_messages(result, scene, pairs("--classes", self.classes))
-            return {name: scene_result(scene, rows, result)}
+            return Results({name: scene_result(scene, rows, result)})
 
     def _options(self) -> RecordingOptions:
         topics: dict[str, str] = {}

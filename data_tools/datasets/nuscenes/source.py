@@ -22,12 +22,11 @@ from data_tools.datasets.nuscenes.results import (
 )
 from data_tools.datasets.nuscenes.tables import SceneRecord, read_annotations, split_scenes
 from data_tools.datasets.nuscenes.writer import merge_label_parts, write_label_part, write_nuscenes_labels
-from data_tools.datasets.results import SceneResult
+from data_tools.datasets.results import Results, SceneResult
 from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
     HeldScene,
-    Innovations,
     LabelledScenes,
     OpenedPart,
     Parts,
@@ -246,18 +245,10 @@ class NuScenesSource(DatasetSource):
             objects = (output / "objects" / f"{stem}.ndjson" for stem in stems)
             merge_label_parts(output, dataset.dataroot, dataset.version, objects)
 
-    def read_results(self, result: Path) -> Mapping[str, SceneResult]:
+    def read_results(self, result: Path) -> Results:
         with self._local() as (root, files):
-            return read_scored_scenes(result, root, self.version, self._chosen(root), files)
-
-    def evaluate(
-        self,
-        results: Mapping[str, SceneResult],
-        hota: bool = False,
-        innovations: Innovations | None = None,
-    ) -> Evaluation:
-        scored = {name: each for name, each in results.items() if isinstance(each, ScoredScene)}
-        return evaluate_nuscenes(scored, hota, innovations)
+            scored = read_scored_scenes(result, root, self.version, self._chosen(root), files)
+        return Results(scored, evaluate_nuscenes)
 
     @contextmanager
     def _local(self) -> Iterator[tuple[Path, dict[str, Path]]]:

@@ -312,11 +312,11 @@ def test_a_result_of_some_recordings_is_scored_on_these(recordings, caplog):
     table.write_text("\n".join(["scene,timestamp,id,label,x,y", *rows]) + "\n")
     source = EthUcySource(dataroot=str(recordings))
     found = source.read_results(table)
-    assert list(found) == ["hotel"]
-    assert source.evaluate(found).programs["tracking"]["overall"]["mota"] == 1.0
+    assert list(found.scenes) == ["hotel"]
+    assert found.evaluate().programs["tracking"]["overall"]["mota"] == 1.0
     assert "has tracks in 1 of the 2 scenes" in caplog.text
     named = source.restricted(["eth", "hotel"]).read_results(table)
-    assert list(named) == ["eth", "hotel"]  # recordings that are named count although nothing was found in one
-    assert source.evaluate(named).programs["tracking"]["overall"]["mota"] == 0.5
+    assert list(named.scenes) == ["eth", "hotel"]  # recordings that are named count although nothing was found in one
+    assert named.evaluate().programs["tracking"]["overall"]["mota"] == 0.5
     table.write_text("scene,timestamp,id,label,x,y\n")
-    assert list(source.read_results(table)) == ["eth", "hotel"]
+    assert list(source.read_results(table).scenes) == ["eth", "hotel"]
