@@ -227,9 +227,7 @@ def test_a_program_is_told_of_another_factors_before_it_is_run(folder):
 
 # Promises of docs/security.md on files from outside
 
-SECURITY_ROOT = Path(__file__).parent.parent
-SECURITY_PACKAGES = ("factors", "saga_fg", "data_tools", "pipelines")
-SOURCES = sorted(path for package in SECURITY_PACKAGES for path in (SECURITY_ROOT / package).rglob("*.py"))
+SOURCES = sorted(path for package in sorted(PACKAGES) for path in (ROOT / package).rglob("*.py"))
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
 FORBIDDEN_CALLS = {"eval", "exec", "yaml.load", "yaml.full_load", "yaml.unsafe_load", "os.system"}
 
@@ -265,9 +263,9 @@ def faults(tree: ast.AST) -> list[str]:
 
 
 def test_nothing_from_outside_is_executed(subtests):
-    for package in SECURITY_PACKAGES:
+    for package in sorted(PACKAGES):
         with subtests.test(package=package):
-            paths = [path for path in SOURCES if path.relative_to(SECURITY_ROOT).parts[0] == package]
+            paths = [path for path in SOURCES if path.relative_to(ROOT).parts[0] == package]
             assert len(paths) > 10
             assert {
                 path.name: bad for path in paths if (bad := faults(ast.parse(path.read_text(encoding="utf-8"))))

@@ -342,8 +342,6 @@ def test_a_motion_that_is_none_does_not_reach_the_graph(subtests):
 
 # Uncertain identity and motion of objects beside a vehicle whose path is estimated
 
-MIXTURES_POOR = JointSettings(OdometryNoise(scale=0.02, bias=0.005))
-
 
 def epoch(z: list[list[float]], names: list[int], labels: tuple[str, ...]) -> RecordedEpoch:
     """Detections at `z` of the objects `names`, in order."""
@@ -398,12 +396,12 @@ def test_a_wrong_association_does_not_bend_the_path():
         )
         return Confused(settings, {"default": Sensor(noise=noise)})
 
-    right, wrong = (estimate_jointly(frames, odometry, new, MIXTURES_POOR, poses[0]) for new in (new_tracker, confused))
+    right, wrong = (estimate_jointly(frames, odometry, new, SETTINGS, poses[0]) for new in (new_tracker, confused))
     off = [off_path(one.world_T_ego, poses).max() for one in (right, wrong)]
     assert off[1] < off[0] + 0.1
     seen = [now.seen.probability for now in wrong._record]
     assert all((p[:2] < 0.1).all() for p in seen[10:15])
-    online = OnlineEstimator(confused(), 3.0, MIXTURES_POOR, start=poses[0])
+    online = OnlineEstimator(confused(), 3.0, SETTINGS, start=poses[0])
     for k, frame in enumerate(frames):
         step = online.step(frame, odometry.a_T_b[k - 1] if k else None)
     assert np.linalg.norm((step.newest.world_T_ego[-1] - poses[-1])[:2, 3]) < off[0] + 0.3
@@ -411,11 +409,11 @@ def test_a_wrong_association_does_not_bend_the_path():
 
 def test_objects_say_how_probably_they_are_stationary():
     frames, odometry, poses, cars = drive(parked=6, moving=2)
-    estimate = estimate_jointly(frames, odometry, new_tracker, MIXTURES_POOR, poses[0])
+    estimate = estimate_jointly(frames, odometry, new_tracker, SETTINGS, poses[0])
     middle = estimate.objects[len(poses) // 2]
     nearest = np.linalg.norm(middle.position[:, None] - cars[len(poses) // 2][None], axis=2).argmin(axis=1)
     np.testing.assert_array_equal(middle.stationary > 0.5, nearest < 6)
-    online = OnlineEstimator(new_tracker(), 3.0, MIXTURES_POOR, start=poses[0])
+    online = OnlineEstimator(new_tracker(), 3.0, SETTINGS, start=poses[0])
     for k, frame in enumerate(frames):
         last = online.step(frame, odometry.a_T_b[k - 1] if k else None).newest.objects[-1]
     assert (last.stationary > 0.5).sum() >= 3
@@ -441,7 +439,7 @@ def test_traffic_that_brakes_as_one_does_not_bend_the_path():
     record = record_epochs(frames, poses, odometry, new_tracker())
     assert [len(new_streams(now)) for now in record[3:6]] == [1, 1, 1]
     assert len(motion_factors(record[5])) == 8 + 1
-    estimate = estimate_jointly(frames, odometry, new_tracker, MIXTURES_POOR, poses[0])
+    estimate = estimate_jointly(frames, odometry, new_tracker, SETTINGS, poses[0])
     assert off_path(estimate.world_T_ego, poses).max() < 0.5
 
 
@@ -452,4 +450,4 @@ def test_nonlinear_motion_is_refused():
         return Tracker(TrackerSettings({"default": ClassSettings(motion=CoordinatedTurn())}, edges=()))
 
     with pytest.raises(InputError, match="expected linear motion"):
-        estimate_jointly(frames, odometry, turning, MIXTURES_POOR, poses[0])
+        estimate_jointly(frames, odometry, turning, SETTINGS, poses[0])
