@@ -52,7 +52,7 @@ NOISE = OdometryNoise(  # like that of scan registration: headings drift, distan
     course=1e-3,
     course_drift=1e-5,
 )
-SETTINGS = LidarSlamSettings(landmarks=False, oxts_rotation=2e-3, oxts_translation=0.03)
+SETTINGS = LidarSlamSettings(landmarks=False, recorded_rotation=2e-3, recorded_translation=0.03)
 PERIOD, FALSE, OVER = 0.25, 1.5, 400.0  # s between scans: 2 m at most; m; m of relative errors
 
 
@@ -151,7 +151,7 @@ class _Drifting:
 def drive_course(seed: int, drift: float = 0.0) -> tuple[SimulatedCourse, LidarSlamResult]:
     """Drive the course of a seed."""
     course = SimulatedCourse(seed, period=PERIOD, skewed=False)
-    return course, lidar_slam(_Drifting(course, odometry_of(course, seed, drift)), "oxts", settings=SETTINGS)
+    return course, lidar_slam(_Drifting(course, odometry_of(course, seed, drift)), "recorded", settings=SETTINGS)
 
 
 def course_row(seed: int, drift: float) -> dict[str, Any]:

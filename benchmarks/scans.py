@@ -21,13 +21,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
 
+from data_tools.datasets.mcap.objects import header
+from data_tools.datasets.mcap.recording import definition
 from data_tools.files.atomic_files import write_text
 from data_tools.laser import LaserLog
 from data_tools.lidar import Scan, constant_velocity
+from data_tools.lidar.scan import ScanSequence
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import inverse_transform, transforms, wrap_angle, yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -251,6 +255,31 @@ class SimulatedScans:
 
     def __getitem__(self, row: int) -> Scan:
         return self._scans[row]
+
+
+_FIELDS = ("x", "y", "z", "time")
+
+
+def write_recording(scans: ScanSequence, folder: Path, mcap: Path | None = None, begin: int = 1_700_000_000) -> None:
+    """Write scans with times as files NANOSECONDS.npz, and as PointCloud2 of MCAP; begin: s, of the first one."""
+    from mcap_ros2.writer import Writer
+
+    folder.mkdir()
+    stamps = [begin * 10**9 + round(1e9 * time) for time in scans.timestamps.tolist()]
+    for k, stamp in enumerate(stamps):
+        np.savez(folder / f"{stamp}.npz", points=scans[k].points, time=np.asarray(scans[k].time))
+    if mcap is None:
+        return
+    fields = [{"name": name, "offset": 4 * k, "datatype": 7, "count": 1} for k, name in enumerate(_FIELDS)]
+    with mcap.open("wb") as file:
+        writer: Any = Writer(file)
+        schema = writer.register_msgdef("sensor_msgs/msg/PointCloud2", definition("sensor_msgs/PointCloud2"))
+        for k, stamp in enumerate(stamps):
+            rows = np.column_stack([scans[k].points, np.asarray(scans[k].time)]).astype("<f4")
+            layout = {"height": 1, "width": len(rows), "fields": fields, "is_bigendian": False, "is_dense": True}
+            data = {"point_step": 4 * len(_FIELDS), "row_step": rows.nbytes, "data": rows.tobytes()}
+            writer.write_message("/points", schema, {"header": header(stamp, "lidar"), **layout, **data}, stamp, stamp)
+        writer.finish()
 
 
 _OUTER, _WIDTH = (30.0, 20.0), 3.0  # m: the building, its corridor

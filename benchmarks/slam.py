@@ -106,7 +106,7 @@ def slam(
 
 def odometry_rows(scans: ScanSequence, kiss: bool = True) -> Iterator[Row]:
     """Each contender on the scans of each case. Raises `MissingExtraError` when `kiss` is wanted and not installed."""
-    truth, ego_T_lidar = Trajectory(scans.timestamps, scans.world_T_ego), scans.ego_T_lidar
+    truth, ego_T_lidar = Trajectory(scans.timestamps, _poses(scans)), scans.ego_T_lidar
     for case, skewed in (("as recorded", False), ("de-skewed", True)):
         places: dict[str, Place] = {OURS: _ours(SETTINGS)}
         if kiss:
@@ -181,13 +181,19 @@ def still_clouds(scans: ScanSequence, map_T_lidar: FloatArray, skewed: bool) -> 
     return clouds
 
 
+def _poses(scans: ScanSequence) -> FloatArray:
+    """world_T_ego (K, 4, 4) of scans that have them."""
+    assert scans.world_T_ego is not None
+    return scans.world_T_ego
+
+
 def all_in_rows(scans: ScanSequence, lap: float | None = None) -> Iterator[Row]:
     """CPU time of every step: odometry, landmarks, graph and loops; lap: m, if each passes the same streets.
 
     The last row compares the end with the beginning (the last lap's keyframes with the first lap's, else the last third
     with the first): of keyframes, of those that close a submap, and of work that never changes.
     """
-    slam = LidarSlam(scans.world_T_ego[0] @ scans.ego_T_lidar, vehicle=Vehicle(scans.ego_T_lidar))
+    slam = LidarSlam(_poses(scans)[0] @ scans.ego_T_lidar, vehicle=Vehicle(scans.ego_T_lidar))
     spent, points, memory = np.zeros(len(scans)), np.zeros(len(scans)), np.zeros(len(scans))
     keyframes, closing = np.zeros((2, len(scans)), dtype=np.bool_)
     load = np.full(len(scans), np.nan)
@@ -200,7 +206,7 @@ def all_in_rows(scans: ScanSequence, lap: float | None = None) -> Iterator[Row]:
             if k % EVERY == EVERY - 1:
                 load[k] = _load(scans)
         result, finish = clocked(slam.finish)
-    way = np.linalg.norm(np.diff(scans.world_T_ego[:, :3, 3], axis=0), axis=1).cumsum()
+    way = np.linalg.norm(np.diff(_poses(scans)[:, :3, 3], axis=0), axis=1).cumsum()
     way = np.concatenate([[0.0], way])
     plain, closed = (np.where(keyframes & rows, spent, np.nan) for rows in (~closing, closing))
     counts = {"scans": len(scans), "keyframes": int(keyframes.sum()), "submaps": len(result.submaps)}

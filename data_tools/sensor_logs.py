@@ -13,6 +13,7 @@ projection at its scale (as KITTI's development kit does). Accelerations are spe
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.kitti.dataset import read_sensors, world_position
+from data_tools.datasets.kitti.dataset import FRAME_PERIOD, read_sensors, world_position
 from data_tools.files.readers import LARGEST, TextTable, read_lines
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
@@ -47,6 +48,7 @@ _COLUMNS: Mapping[SensorName, tuple[str, ...]] = {
 }
 _GEODETIC = ("latitude", "longitude", "altitude")
 _MOST = {"latitude": math.radians(85.0), "longitude": math.radians(180.0), "altitude": 1e5}  # rad and m; others: 1e15
+_log = logging.getLogger(__name__)
 _HEADER = re.compile(r"\s*([A-Za-z_]+)\s*\[\s*([^\]]*?)\s*\]\s*")
 
 
@@ -99,6 +101,29 @@ def read_sensor_log(
     return numbers
 
 
+_GRAVITY, _IN_G, _FASTEST_TURN = 9.80665, (0.7, 1.4), 12.0  # m/s^2; medians of forces in g; rad/s, of any vehicle
+
+
+def plausible_inertial(table: FloatArray) -> FloatArray:
+    """Inertial samples (n, 7) in SI units, those that are clearly in g or in deg/s converted, with a warning.
+
+    The median of specific forces is near 1 g on every vehicle, and none turns at 12 rad/s for a hundredth of its drive.
+    """
+    if not len(table):
+        return table
+    force, rate = np.linalg.norm(table[:, 1:4], axis=1), np.linalg.norm(table[:, 4:], axis=1)
+    middle, fastest, factor = float(np.median(force)), float(np.quantile(rate, 0.99)), np.ones(7)
+    if _IN_G[0] < middle < _IN_G[1]:
+        _log.warning("imu: accelerations have a median of %.2f, taken for g: they are multiplied by 9.80665", middle)
+        factor[1:4] = _GRAVITY
+    elif abs(middle - _GRAVITY) > _GRAVITY / 3:
+        _log.warning("imu: accelerations have a median of %.2f m/s^2, where gravity is 9.81: check their unit", middle)
+    if fastest > _FASTEST_TURN:
+        _log.warning("imu: turn rates reach %.0f, taken for deg/s: they are multiplied by pi / 180", fastest)
+        factor[4:] = math.pi / 180
+    return table * factor
+
+
 @dataclass(eq=False)
 class SensorLog:
     """Tables of a drive by sensor, (n, 1 + d) with the time first.
@@ -130,20 +155,21 @@ class SensorLog:
             first = until
 
 
-def kitti_sensor_log(
-    path: str | Path, sensors: tuple[SensorName, ...], period: float, gps: float, wheels: float, seed: int
-) -> SensorLog:
-    """Return the sensors of a KITTI sequence from its GPS/IMU records, one every `period` s.
+_GPS_NOISE, _WHEELS_NOISE = 1.0, 0.05  # m and m/s, of the fixes and speeds made from GPS/IMU records
+
+
+def kitti_sensor_log(path: str | Path, sensors: tuple[SensorName, ...], seed: int) -> SensorLog:
+    """Return the sensors of a KITTI sequence from its GPS/IMU records.
 
     Inertial samples are those recorded. Fixes and speeds are of the filtered solution that the estimate is compared
-    with; so they get noise from `seed`: `gps`, m, by axis, and `wheels`, m/s, with a scale that is wrong by 1 %.
+    with; so they get noise from `seed`: 1 m by axis, and 0.05 m/s with a scale that is wrong by 1 %.
     """
     records, rng = read_sensors(path), np.random.default_rng(seed)
-    time = period * np.arange(len(records.position))
+    time = FRAME_PERIOD * np.arange(len(records.position))
     scale = 1 + rng.choice([-0.01, 0.01])
     noisy: dict[SensorName, FloatArray] = {
         "imu": np.hstack([records.acceleration, records.angular_rate]),
-        "wheels": (scale * records.speed + rng.normal(0, wheels, len(time)))[:, None],
-        "gps": records.position + rng.normal(0, gps, (len(time), 3)),
+        "wheels": (scale * records.speed + rng.normal(0, _WHEELS_NOISE, len(time)))[:, None],
+        "gps": records.position + rng.normal(0, _GPS_NOISE, (len(time), 3)),
     }
     return SensorLog({name: np.column_stack([time, noisy[name]]) for name in sensors})

@@ -5,7 +5,8 @@
                 odom_x odom_y odom_heading  tv rv forward side turn  time host logger_time
 
 m, rad and s; readings run from right to left. The first pose is the laser's, the second one the robot's, both by
-odometry; where they differ by the same transform throughout, that is where the laser is mounted. FLASER means 180
+odometry; where they differ by the same transform throughout, that is where the laser is mounted. The number of
+readings and their directions may change from record to record, as those of interlaced lasers do. FLASER means 180
 degrees about the direction ahead, as CARMEN guesses: 180, 360 or 720 readings lack the last one of 181, 361 or 721, and
 400 or 401 readings are of a quarter degree each. A value far more frequent than those near it, with hardly a reading
 beyond, says that nothing was hit. Source: http://carmen.sourceforge.net/logger_playback.html.
@@ -17,7 +18,7 @@ import bz2
 import gzip
 import logging
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,8 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class LaserLog:
     """time (n,) s, as logged, in the order of the file, not always sorted; ranges (n, m) m, NaN where nothing
-    was hit; angles (m,) rad from ahead; odometry (n, 3) of the robot, m and rad; robot_T_laser (3,): x, y, heading.
+    was hit; angles (n, m) rad from ahead, or (m,) of all scans; odometry (n, 3) of the robot, m and rad;
+    robot_T_laser (3,): x, y, heading. Scans of fewer readings than others end in NaN.
     """
 
     time: FloatArray
@@ -60,26 +62,38 @@ class LaserLog:
 
     def first(self, count: int) -> LaserLog:
         """The first scans."""
-        return replace(self, time=self.time[:count], ranges=self.ranges[:count], odometry=self.odometry[:count])
+        columns = ("time", "ranges", "odometry", *(["angles"] if self.angles.ndim == 2 else []))
+        return replace(self, **{name: getattr(self, name)[:count] for name in columns})
+
+    def directions(self, row: int) -> FloatArray:
+        """The angles (m,) of a scan, rad."""
+        return self.angles[row] if self.angles.ndim == 2 else self.angles
 
     def points(self, row: int, largest_range: float = np.inf) -> FloatArray:
         """Points (n, 2) that a scan hit, m, in the laser's frame."""
-        r = self.ranges[row]
+        r, angles = self.ranges[row], self.directions(row)
         hit = r < largest_range
-        return np.asarray(r[hit, None] * np.stack([np.cos(self.angles[hit]), np.sin(self.angles[hit])], axis=1))
+        return np.asarray(r[hit, None] * np.stack([np.cos(angles[hit]), np.sin(angles[hit])], axis=1))
+
+
+def padded(rows: Sequence[FloatArray]) -> FloatArray:
+    """Rows of several lengths as one table, NaN behind the shorter ones."""
+    lengths = np.array([len(row) for row in rows])
+    table = np.full((len(rows), int(lengths.max())), np.nan)
+    table[np.arange(table.shape[1]) < lengths[:, None]] = np.concatenate(rows)
+    return table
 
 
 def read_carmen(path: str | Path) -> LaserLog:
     """Read the front laser of a log; .bz2 and .gz are unpacked. Warns of other lasers, which are left out.
 
-    Raises `InputError` naming the line of a record with a wrong number of values, a number that is none or too large,
-    or another number of readings than the first.
+    Each record has its own directions: interlaced lasers alternate between them. Raises `InputError` naming the line of
+    a record with a wrong number of values, or a number that is none or too large.
     """
     file = Path(path)
-    rows: list[FloatArray] = []
-    angles: FloatArray | None = None
+    ranges, angles, rest, largest = list[FloatArray](), list[FloatArray](), list[FloatArray](), list[float]()
     others: set[str] = set()
-    chosen, largest = "", np.inf
+    chosen = ""
     for number, line in enumerate(_lines(file), start=1):
         tag = line[: line.find(" ")]
         if tag not in _RECORDS or (chosen and tag != chosen):  # a log with both says the same twice
@@ -88,22 +102,25 @@ def read_carmen(path: str | Path) -> LaserLog:
             continue
         where = f"{file}: line {number}"
         fields = line.split()[1:]
-        found, here, most = _flaser(where, fields) if tag == "FLASER" else _robotlaser(where, fields)
-        if angles is None:
-            angles, chosen, largest = here, tag, most
-        if len(here) != len(angles):
-            raise InputError(f"{where}: expected {len(angles)} readings as before, got {len(here)}")
-        rows.append(found)
-    if angles is None:
+        values, directions, most = _flaser(where, fields) if tag == "FLASER" else _robotlaser(where, fields)
+        chosen, readings = tag, len(directions)
+        if angles and len(angles[-1]) == readings and (angles[-1] == directions).all():
+            directions = angles[-1]
+        ranges.append(values[1 : 1 + readings])
+        angles.append(directions)
+        rest.append(np.concatenate([values[:1], values[1 + readings :]]))
+        largest.append(most)
+    if not rest:
         there = f"only {', '.join(sorted(others)[:_NAMED])}" if others else "none"
         raise InputError(f"{file}: expected records {' or '.join(_RECORDS)}, there are {there}")
     if ignored := sorted(others & _OTHER_LASERS):
         _log.warning("%s: the readings of %s are left out, %s are taken", file, ", ".join(ignored), chosen)
-    table, m = np.array(rows), len(angles)
-    ranges, laser, robot = table[:, 1 : 1 + m], table[:, 1 + m : 4 + m], table[:, 4 + m :]
-    largest = min(largest, 0.999 * _nothing(ranges))
-    ranges = np.where((ranges > 0) & (ranges < largest), ranges, np.nan)
-    return LaserLog(table[:, 0], ranges, angles, robot, _mounting(robot, laser))
+    table, measured = np.array(rest), padded(ranges)
+    nothing = 0.999 * _nothing(measured)
+    measured = np.where((measured > 0) & (measured < np.minimum(largest, nothing)[:, None]), measured, np.nan)
+    laser, robot = table[:, 1:4], table[:, 4:]
+    alike = all(each is angles[0] for each in angles)
+    return LaserLog(table[:, 0], measured, angles[0] if alike else padded(angles), robot, _mounting(robot, laser))
 
 
 def _flaser(where: str, fields: list[str]) -> tuple[FloatArray, FloatArray, float]:

@@ -44,6 +44,7 @@ class Scan:
     points     (N, 3) m
     intensity  (N,) strength of the echo in the sensor's own unit, NaN where unknown
     time       (N,) s relative to the timestamp of the scan; None where unknown
+    dropped    how many points without a place the file or message held besides, as beams without an echo
 
     Raises `InputError` for arrays of other shapes and positions that are not finite.
     """
@@ -51,6 +52,7 @@ class Scan:
     points: FloatArray
     intensity: FloatArray
     time: FloatArray | None = None
+    dropped: int = 0
 
     def __post_init__(self) -> None:
         points = checked("points", self.points, (None, 3))
@@ -79,17 +81,17 @@ class Scan:
 
 
 class ScanSequence(Protocol):
-    """K recorded scans in order of time, each read on access; `data_tools.datasets.kitti.KittiScans` is one.
+    """K recorded scans in order of time, each read on access; `data_tools.recordings.ScanRecording` is one.
 
     timestamps   (K,) s
-    world_T_ego  (K, 4, 4) reference poses of the vehicle
+    world_T_ego  (K, 4, 4) reference poses of the vehicle; None where the recording has none
     ego_T_lidar  (4, 4) pose of the sensor on the vehicle
     """
 
     @property
     def timestamps(self) -> FloatArray: ...
     @property
-    def world_T_ego(self) -> FloatArray: ...
+    def world_T_ego(self) -> FloatArray | None: ...
     @property
     def ego_T_lidar(self) -> FloatArray: ...
     def __len__(self) -> int: ...

@@ -1,30 +1,33 @@
-"""Scans and clouds in files: headers checked before Open3D reads them.
+"""Scans from files, by the suffix of their name, and point clouds written as PLY or PCD.
 
-Scans read from files, by the suffix of their name, and point clouds written as PLY or PCD, by Open3D.
+A file is read as named columns, one value a point, and these make the scan, as those of a message of ROS do
+(`scan_of_columns`): places `x`, `y`, `z`, m, in the sensor's frame, an intensity, and the time of each point. Columns
+of other names are left out. Points without a place, by which files say "no echo", are dropped and counted.
 
-    .bin      KITTI: float32 x, y, z, intensity of each point, without a header
-    .pcd.bin  nuScenes: float32 x, y, z, intensity, ring of each point, without a header
-    .pcd      Point Cloud Library, read by Open3D; the field `intensity` is kept
-    .ply      polygon file format, read by Open3D; the property `intensity` is kept
-    .npy      an array (N, 3) or wider: x, y, z and, in a fourth column, intensity
-    .npz      arrays `points` (N, 3), and optionally `intensity` (N,) and `time` (N,)
+    .bin       records of floats: x, y, z, then perhaps intensity, ring, time (`columns_of_records`)
+    .pcd.bin   nuScenes: float32 x, y, z, intensity, ring
+    .pcd       Point Cloud Library: ascii, binary or binary_compressed
+    .ply       polygon file format: ascii, little- and big-endian
+    .las .laz  ASPRS, by laspy (extra [las]; lazrs for .laz): places, `intensity`, `gps_time`
+    .npy       an array (N, 3) or wider, with the columns of .bin
+    .npz       arrays `points` (N, 3), and optionally `intensity` (N,) and `time` (N,), or one array for each column
 
-Points are metres in the sensor's frame. Points that are not finite mean "no echo" in PCD files and are left out there;
-elsewhere they are errors. Sources: development kits of KITTI (https://www.cvlibs.net/datasets/kitti) and nuScenes
-(https://github.com/nutonomy/nuscenes-devkit, LidarPointCloud); G. Turk, The PLY polygon file format, 1994.
+Records have no header. Which floats they are (4 or 8 bytes, of either byte order) is known by what is plausible, and
+how many a point has by how unlike the columns are: with a wrong number each column mixes x, y and z, and
 
-Validation of PCD and PLY files before Open3D reads them.
+    (1 / C) sum_c log(deviation of column c)
 
-A wrong header makes a C++ reader read or allocate out of bounds. Therefore every number in the header is checked, and
-that the file contains the announced points.
+is larger, as the entropy of a mixture is. Points that no sensor measures are an error, not a scan.
 
-Sources: https://pointclouds.org/documentation/tutorials/pcd_file_format.html and
-http://paulbourke.net/dataformats/ply.
+Headers of PCD and PLY are checked against the data after them. Sources: development kits of KITTI
+(https://www.cvlibs.net/datasets/kitti) and nuScenes (https://github.com/nutonomy/nuscenes-devkit, LidarPointCloud);
+https://pointclouds.org/documentation/tutorials/pcd_file_format.html; G. Turk, The PLY polygon file format, 1994; LAS
+specification 1.4 R15.
 
-Open3D, imported on first use, because the import takes half a second and much memory.
-
-On Linux its extension links `libusb-1.0.so.0` (for depth cameras), which neither its wheel nor a slim system carries.
-The package `libusb-package` carries it; once loaded with global symbols, it satisfies the later link by its name.
+Open3D writes clouds, and reads compressed PCD. It is imported on first use, because the import takes half a second and
+much memory. On Linux its extension links `libusb-1.0.so.0` (for depth cameras), which neither its wheel nor a slim
+system carries. The package `libusb-package` carries it; once loaded with global symbols, it satisfies the later link by
+its name.
 """
 
 from __future__ import annotations
@@ -34,39 +37,215 @@ import importlib
 import struct
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import BinaryIO, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_tools.files.atomic_files import write_bytes
-from data_tools.files.input_files import error_context, open_bytes
+from data_tools.files.input_files import error_context, open_bytes, read_bytes
 from data_tools.files.isolated_reading import isolated
 from data_tools.files.readers import load_archive, load_array
 from data_tools.lidar.scan import Scan
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics.arrays import BoolArray, FloatArray, checked
+
+Columns = Mapping[str, NDArray[Any]]
+"""Values (N,) of the points by name."""
+
+_INTENSITIES = ("intensity", "intensities", "reflectivity", "reflectance", "i", "signal")
+_TIMES = ("time", "timestamp", "t", "time_stamp", "timestamps", "offset_time", "time_offset", "gps_time", "stamps")
+_TURN = 1.5  # s, more than a scan takes
+_UNITS = {1.0: _TURN, 1e-3: 1e3 * _TURN, 1e-6: 1e6 * _TURN, 1e-9: 1e9 * _TURN}  # s: longest scan in that unit
+_NEAREST, _FARTHEST = 0.01, 1000.0  # m, of what sensors measure
+_MEASURED = 0.5  # least share of the points that must lie so
+
+
+def read_scan(path: str | Path) -> Scan:
+    """Read one scan. Raises `InputError` naming the file and what was expected of it."""
+    columns = read_columns(path)
+    with error_context(str(path)):
+        return scan_of_columns(columns)
+
+
+def read_columns(path: str | Path) -> Columns:
+    """The columns of a file, by the suffix of its name. Raises `InputError` as `read_scan` does."""
+    path = Path(path)
+    name = path.name.lower()
+    suffix = next((suffix for suffix in SUFFIXES if name.endswith(suffix)), None)
+    if suffix is None:
+        raise InputError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
+    with error_context(str(path)):
+        return _READERS[suffix](path)
+
+
+def scan_of_columns(columns: Columns, stamp: float | None = None) -> Scan:
+    """The scan of columns; stamp: its timestamp, s, for times of points that are of the same clock.
+
+    Raises `InputError` where a place is missing, and for points that lie where no sensor measures any.
+    """
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise InputError(f"expected a column {missing[0]}, there are {', '.join(columns) or 'none'}")
+    with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN
+        points = np.stack([np.asarray(columns[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+        known: BoolArray = np.asarray(np.isfinite(points).all(axis=1))
+        points = points if (whole := bool(known.all())) else points[known]
+        named = next((columns[name] for name in _INTENSITIES if name in columns), None)
+        intensity = np.full(len(points), np.nan)
+        if named is not None:
+            intensity = np.array(named if whole else named[known], dtype=np.float64)  # a copy: files are read-only
+            intensity[~np.isfinite(intensity)] = np.nan
+        times = next((columns[name] for name in _TIMES if name in columns), None)
+        time = None if times is None else relative_times(times if whole else times[known], stamp)
+        if len(points) and not plausible(points):
+            middle = float(np.median(np.linalg.norm(points, axis=1)))
+            raise InputError(
+                f"expected points in metres, at distances from {_NEAREST:g} to {_FARTHEST:g} m, "
+                f"the median is {middle:.4g}: another unit or another layout"
+            )
+    return Scan(points, intensity, time, int(len(known) - len(points)))
+
+
+def scan_columns(columns: Columns) -> dict[str, NDArray[Any]]:
+    """Those of the columns that `scan_of_columns` takes."""
+    named = [next((name for name in names if name in columns), None) for names in (_INTENSITIES, _TIMES)]
+    return {name: columns[name] for name in ("x", "y", "z", *named) if name is not None and name in columns}
+
+
+def plausible(points: FloatArray) -> bool:
+    """True if half of the points (N, 3) that are not at the sensor itself lie where sensors measure."""
+    square = np.einsum("ni,ni->n", points, points)
+    near = square < _NEAREST**2
+    here = near & (square == 0)  # "no echo", as some drivers say it
+    return bool((~near & (square < _FARTHEST**2)).sum() >= _MEASURED * (len(points) - here.sum()))
+
+
+def relative_times(values: NDArray[Any], stamp: float | None = None) -> FloatArray | None:
+    """Times (N,) of points, s relative to the scan's stamp, from values in s, ms, us or ns; None where all are one.
+
+    The unit is told by the span, as no scan takes longer than 1.5 s; whole numbers are no seconds. Times of a clock are
+    relative to `stamp` if that is of the same one, to the first point else. Raises `InputError` for a longer span, and
+    for times that are not finite.
+    """
+    if not len(values):
+        return None
+    first, last = values.min(), values.max()
+    span = float(last) - float(first)
+    if not np.isfinite(span):
+        raise InputError("time: expected finite times of the points")
+    if span == 0:
+        return None
+    units = [unit for unit, longest in _UNITS.items() if span <= longest and (unit < 1 or values.dtype.kind == "f")]
+    if not units:
+        raise InputError(f"time: expected the times of one scan, in s, ms, us or ns, they span {span:g}")
+    begin, since = float(first) * units[0], (values - first).astype(np.float64) * units[0]
+    if stamp is not None and abs(begin - stamp) < _TURN:
+        return np.asarray(since + (begin - stamp))
+    return np.asarray(since + begin if abs(begin) < _TURN else since)
+
+
+def read_records(path: str | Path, record: np.dtype[Any]) -> Scan:
+    """Read a scan of records of a known layout. Raises `InputError` as `read_scan` does."""
+    with error_context(str(path)):
+        return scan_of_columns(record_columns(read_bytes(path), record))
+
+
+def record_columns(content: bytes, record: np.dtype[Any]) -> Columns:
+    """The columns of records of a known layout. Raises `InputError` for a size that is no multiple of theirs."""
+    if len(content) % record.itemsize:
+        names = ", ".join(record.names or ())
+        raise InputError(f"expected records of {record.itemsize} bytes ({names}), got {len(content)} bytes")
+    points = np.frombuffer(content, dtype=record)
+    return {name: points[name] for name in record.names or ()}
+
+
+NUSCENES = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity", "ring")])
+KITTI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+_FLOATS = ("<f4", "<f8", ">f4")
+_WIDTHS = range(3, 9)  # floats of a point
+_SAMPLE = 30_000  # numbers that tell the layout
+_LARGEST, _LEAST, _GARBAGE = 1e7, 1e-12, 0.01  # sizes of numbers, and the share beyond and below that is garbage
+_UNLIKE = 0.05  # of log deviations that differ; within it the fewest columns are taken
+_FEW = 100  # points
+
+
+def columns_of_records(content: bytes) -> Columns:
+    """The columns of records of which nothing is known. Raises `InputError` where no layout gives a scan.
+
+    So few points that statistics tell nothing are taken for KITTI's, where their size allows it.
+    """
+    if not content:
+        return {axis: np.empty(0) for axis in "xyz"}
+    if len(content) < _FEW * KITTI.itemsize and len(content) % KITTI.itemsize == 0:
+        return record_columns(content, KITTI)
+    for kind in _FLOATS:
+        found: dict[int, float] = {}
+        for width in _WIDTHS:
+            if len(content) % (width * int(kind[2])):
+                continue
+            with np.errstate(all="ignore"):
+                table = np.frombuffer(content, dtype=kind).reshape(-1, width)[: _SAMPLE // width].astype(np.float64)
+                table = table[np.isfinite(table).all(axis=1)]
+                size = np.abs(table)
+                if not size.size or ((size > _LARGEST) | ((size > 0) & (size < _LEAST))).mean() > _GARBAGE:
+                    break
+                spread = np.log(table.std(axis=0) + 1e-3)
+            if np.ptp(spread) > _UNLIKE:  # else each column is a mixture
+                found[width] = float(spread.mean())
+        if found:
+            width = min(width for width, value in found.items() if value <= min(found.values()) + _UNLIKE)
+            return _named(np.frombuffer(content, dtype=kind).reshape(-1, width))
+    raise InputError(
+        f"expected records of 3 to 8 floats, x, y, z first, in metres; the {len(content)} bytes are none, or cut off"
+    )
+
+
+def _named(table: NDArray[Any]) -> Columns:
+    """Columns of numbers by name: after the intensity small whole numbers are rings, and fractions that grow times."""
+    names = ["x", "y", "z", "intensity"][: table.shape[1]]
+    for column in table[:, 4:].T:
+        name = f"column {len(names) + 1}"
+        whole = bool((column == np.floor(column)).all())
+        if whole and "ring" not in names and column.min() >= 0 and column.max() < 256:
+            name = "ring"
+        elif not whole and "time" not in names and np.abs(column).max() < _TURN and _grows(column):
+            name = "time"
+        names.append(name)
+    return dict(zip(names, table.T, strict=True))
+
+
+def _grows(values: NDArray[Any]) -> bool:
+    return len(values) > 1 and bool((np.diff(values) >= 0).mean() > 0.9)
+
 
 _PCD_KEYS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "POINTS", "DATA")
 _PCD_TYPES = {("F", 4), ("F", 8), *((kind, size) for kind in "IU" for size in (1, 2, 4, 8))}
-_PLY_SIZES = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("double", "float64"), 8),
+_PLY_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
 }
 LONGEST_HEADER = 20_000  # bytes
 LONGEST_LINE = 1000  # of a header, bytes
-LONGEST_WORD = 100  # bytes; RPly, which reads PLY files for Open3D, writes beyond its buffer from 256 on
+LONGEST_WORD = 100  # bytes
 MOST_VALUES = 100  # of a point
 
 
-def check_pcd(content: bytes) -> None:
-    """Raises `InputError` where the header of a PCD file is broken or promises more than there is."""
-    lines, body = _header(content, b"DATA")
+def pcd_columns(path: Path) -> Columns:
+    """The fields of a PCD file, of a compressed one by Open3D.
+
+    Raises `InputError` where the header is broken or promises more than there is.
+    """
+    lines, body = _header(read_bytes(path), b"DATA")
     found: dict[str, list[str]] = {}
     for line in lines:
         key, *values = line.split() or ["#"]
@@ -89,22 +268,38 @@ def check_pcd(content: bytes) -> None:
     width, height, points = (_numbers(key, found[key], 1, 2**31 - 1, 0)[0] for key in ("WIDTH", "HEIGHT", "POINTS"))
     if points != width * height:
         _fault("POINTS to be WIDTH x HEIGHT")
-    size = points * sum(size * count for size, count in zip(sizes, counts, strict=True))
-    kind = found["DATA"][:1]
-    if kind == ["ascii"]:
-        _rows(body, points, sum(counts))
-    elif kind == ["binary"]:
-        _room(body, size)
-    elif kind == ["binary_compressed"]:
-        packed, unpacked = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, -1)
-        if unpacked != size:
-            _fault(f"{size} bytes of compressed points")
-        _room(body[8:], packed)
-    else:
-        _fault("DATA to be ascii, binary or binary_compressed")
+    kinds = [f"<{kind.lower()}{size}" for kind, size in zip(found["TYPE"], sizes, strict=True)]
+    record = np.dtype([(str(k), kind, (count,)) for k, (kind, count) in enumerate(zip(kinds, counts, strict=True))])
+    match found["DATA"][:1]:
+        case ["ascii"]:
+            table = _rows(body, points, sum(counts))
+            columns = np.split(table, np.cumsum(counts)[:-1], axis=1)
+        case ["binary"]:
+            rows = _records(body, record, points)
+            columns = [rows[str(k)] for k in range(len(fields))]
+        case ["binary_compressed"]:
+            packed, unpacked = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, -1)
+            if unpacked != points * record.itemsize:
+                _fault(f"{points * record.itemsize} bytes of compressed points")
+            _room(body[8:], packed)
+            return dict(isolated("expected a point cloud that Open3D can read", _open3d_columns, path))
+        case _:
+            _fault("DATA to be ascii, binary or binary_compressed")
+    single = [k for k, count in enumerate(counts) if count == 1]
+    return {fields[k]: columns[k][:, 0] for k in reversed(single)}  # of two of one name the first
 
 
-def check_ply(content: bytes) -> None:
+def _open3d_columns(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
+    cloud = load_open3d().t.io.read_point_cloud(str(path)).point
+    places = cloud["positions"].numpy()
+    for k, axis in enumerate("xyz"):
+        yield axis, places[:, k].copy()
+    for name in cloud:
+        if cloud[name].shape[1:] == [1]:
+            yield name, cloud[name].numpy()[:, 0].copy()
+
+
+def ply_columns(content: bytes) -> Columns:
     """Raises `InputError` where the header of a PLY file is broken or promises more than there is."""
     lines, body = _header(content, b"end_header")
     words = [line.split() for line in lines if line.split() and line.split()[0] not in ("comment", "obj_info")]
@@ -122,7 +317,7 @@ def check_ply(content: bytes) -> None:
     for line in words[3:-1]:
         if line[0] != "property":
             break
-        if len(line) != 3 or line[1] not in _PLY_SIZES:
+        if len(line) != 3 or line[1] not in _PLY_TYPES:
             _fault("vertices with properties of one number each")
         properties.append(line)
     names = [line[2] for line in properties]
@@ -131,9 +326,10 @@ def check_ply(content: bytes) -> None:
     if any(line[:1] == ["element"] and _numbers("element", line[2:], 1, 2**31 - 1, 0) != [0] for line in words[3:]):
         _fault("vertices alone")
     if form == "ascii":
-        _rows(body, points, len(properties))
-    else:
-        _room(body, points * sum(_PLY_SIZES[line[1]] for line in properties))
+        return dict(zip(names, _rows(body, points, len(properties)).T, strict=True))
+    order = "<" if form == "binary_little_endian" else ">"
+    rows = _records(body, np.dtype([(name, order + _PLY_TYPES[kind]) for _, kind, name in properties]), points)
+    return {name: rows[name] for name in names}
 
 
 def _header(content: bytes, last: bytes) -> tuple[list[str], bytes]:
@@ -160,18 +356,23 @@ def _numbers(what: str, words: Sequence[str], count: int, most: int, least: int 
     return [int(word) for word in words]
 
 
-def _rows(body: bytes, points: int, values: int) -> None:
-    rows = [line.split() for line in body.splitlines() if line.strip()]
-    if len(rows) < points or any(len(row) != values for row in rows[:points]):
-        _fault(f"{points} lines of {values} numbers after the header")
-    if any(len(word) > LONGEST_WORD for row in rows[:points] for word in row):
-        _fault(f"numbers of at most {LONGEST_WORD} bytes after the header")
+def _rows(body: bytes, points: int, values: int) -> FloatArray:
+    """The numbers (points, values) of lines."""
+    if not points:
+        return np.empty((0, values))
+    lines = [line for line in body.splitlines() if line.strip()][:points]
     try:
-        for row in rows[:points]:
-            for word in row:
-                float(word)
+        table = np.loadtxt(lines, comments=None, ndmin=2, encoding="latin-1") if len(lines) == points else np.empty(0)
     except ValueError:
-        _fault("numbers after the header")
+        table = np.empty(0)
+    if table.shape != (points, values):
+        _fault(f"{points} lines of {values} numbers after the header")
+    return table
+
+
+def _records(body: bytes, record: np.dtype[Any], points: int) -> NDArray[Any]:
+    _room(body, points * record.itemsize)
+    return np.frombuffer(body, dtype=record, count=points)
 
 
 def _room(body: bytes, size: int) -> None:
@@ -181,6 +382,62 @@ def _room(body: bytes, size: int) -> None:
 
 def _fault(expected: str) -> NoReturn:
     raise InputError(f"expected {expected}")
+
+
+def _array(path: Path) -> Columns:
+    with open_bytes(path) as file:
+        array = load_array(file)
+    if array.ndim != 2 or not 3 <= array.shape[1] <= MOST_VALUES or array.dtype.kind not in "fiu":
+        raise InputError(f"expected numbers (N, 3) or wider, got {array.dtype} {array.shape}")
+    return _named(array) if len(array) else {axis: array[:, k] for k, axis in enumerate("xyz")}
+
+
+def _arrays(path: Path) -> Columns:
+    columns = dict(load_archive(path)[1])
+    if "points" in columns:
+        points = columns.pop("points")
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"points: expected shape (N, 3), got {points.shape}")
+        columns |= {axis: points[:, k] for k, axis in enumerate("xyz")}
+    if not {"x", "y", "z"} <= set(columns):
+        raise InputError("expected the array points (N, 3), or arrays x, y and z")
+    size = columns["x"].shape
+    if bad := [name for name, each in columns.items() if each.shape != size or each.dtype.kind not in "fiub"]:
+        raise InputError(f"{bad[0]}: expected numbers of shape {size}, got {columns[bad[0]].shape}")
+    return columns
+
+
+def _las(path: Path) -> Columns:
+    if find_spec("laspy") is None:
+        raise MissingExtraError("files .las and .laz need laspy: pip install 'saga-fg[las]'")
+    return dict(isolated("expected a file that laspy can read", _las_columns, path))
+
+
+def _las_columns(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
+    import laspy
+
+    with open_bytes(path) as file:
+        cloud = laspy.read(file)
+    for name in (
+        "x",
+        "y",
+        "z",
+        *(name for name in ("intensity", "gps_time") if name in cloud.point_format.dimension_names),
+    ):
+        yield name, np.asarray(cloud[name])
+
+
+_READERS: dict[str, Callable[[Path], Columns]] = {
+    ".pcd.bin": lambda path: record_columns(read_bytes(path), NUSCENES),
+    ".bin": lambda path: columns_of_records(read_bytes(path)),
+    ".pcd": pcd_columns,
+    ".ply": lambda path: ply_columns(read_bytes(path)),
+    ".las": _las,
+    ".laz": _las,
+    ".npy": _array,
+    ".npz": _arrays,
+}
+SUFFIXES = tuple(_READERS)
 
 
 def load_open3d() -> ModuleType:
@@ -202,20 +459,6 @@ def _preload_libusb() -> None:
         return  # the system may have its own libusb
     if path is not None:
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
-
-
-_PROBLEM = "expected a point cloud that Open3D can read"
-
-
-def read_scan(path: str | Path) -> Scan:
-    """Read one scan. Raises `InputError` naming the file and what was expected of it."""
-    path = Path(path)
-    name = path.name.lower()
-    ending = next((ending for ending in _READERS if name.endswith(ending)), None)
-    if ending is None:
-        raise InputError(f"{path}: expected a name that ends in {', '.join(_READERS)}")
-    with open_bytes(path) as file, error_context(str(path)):
-        return _READERS[ending](file, path)
 
 
 def write_cloud(path: str | Path, points: FloatArray, colours: NDArray[np.uint8] | None = None) -> None:
@@ -243,68 +486,6 @@ def write_cloud(path: str | Path, points: FloatArray, colours: NDArray[np.uint8]
         write_bytes(path, whole.read_bytes())
 
 
-def _kitti(file: BinaryIO, _: Path) -> Scan:
-    return _of_columns(_records(file.read(), 4))
-
-
-def _nuscenes(file: BinaryIO, _: Path) -> Scan:
-    return _of_columns(_records(file.read(), 5))
-
-
-def _records(content: bytes, columns: int) -> FloatArray:
-    size = 4 * columns
-    if not content or len(content) % size:
-        raise InputError(f"expected records of {size} bytes ({columns} float32 a point), got {len(content)} bytes")
-    with np.errstate(invalid="ignore"):  # NaN is refused by the scan
-        return np.frombuffer(content, dtype="<f4").reshape(-1, columns).astype(np.float64)
-
-
-def _array(file: BinaryIO, _: Path) -> Scan:
-    array = load_array(file)
-    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
-        raise InputError(f"expected numbers (N, 3) or wider, got {array.dtype} {array.shape}")
-    return _of_columns(np.asarray(array, dtype=np.float64))
-
-
-def _arrays(_: BinaryIO, path: Path) -> Scan:
-    columns = load_archive(path, ("points", "intensity", "time"))[1]
-    if "points" not in columns:
-        raise InputError("expected the array points (N, 3)")
-    scan = Scan.of(columns["points"])
-    return Scan(scan.points, columns.get("intensity", scan.intensity), columns.get("time"))
-
-
-def _cloud(file: BinaryIO, path: Path) -> Scan:
-    check = check_pcd if path.suffix.lower() == ".pcd" else check_ply
-    check(file.read())
-    ((points, intensity),) = isolated(_PROBLEM, _open3d_columns, path)
-    finite = np.isfinite(points).all(axis=1)
-    scan = Scan.of(points[finite])
-    return scan if intensity is None else Scan(scan.points, intensity.reshape(len(points))[finite])
-
-
-def _open3d_columns(path: Path) -> Iterator[tuple[FloatArray, FloatArray | None]]:
-    """Points (N, 3) and intensities (N,) or (N, 1), as they are in the file."""
-    cloud = load_open3d().t.io.read_point_cloud(str(path)).point
-    if "positions" not in cloud:
-        raise InputError(f"{path}: {_PROBLEM}, with x, y, z of each point")
-    intensity = cloud["intensity"].numpy().astype(np.float64) if "intensity" in cloud else None
-    yield cloud["positions"].numpy().astype(np.float64), intensity
-
-
-def _of_columns(columns: FloatArray) -> Scan:
-    intensity = columns[:, 3] if columns.shape[1] > 3 else np.full(len(columns), np.nan)
-    return Scan(columns[:, :3], intensity)
-
-
 _EMPTY = "\n".join(
     ["ply", "format ascii 1.0", "element vertex 0", *(f"property float {axis}" for axis in "xyz"), "end_header", ""]
 )
-_READERS: dict[str, Callable[[BinaryIO, Path], Scan]] = {
-    ".pcd.bin": _nuscenes,
-    ".bin": _kitti,
-    ".pcd": _cloud,
-    ".ply": _cloud,
-    ".npy": _array,
-    ".npz": _arrays,
-}

@@ -92,7 +92,7 @@ view_app = dataset_commands(
 
 @view_app.command()
 def slam(
-    result: Annotated[Path, typer.Argument(help="Folder that `saga-fg slam kitti` wrote.")],
+    result: Annotated[Path, typer.Argument(help="Folder that `saga-fg slam scans` wrote.")],
     save: Save = None,
     verbose: options.Verbose = False,
 ) -> None:

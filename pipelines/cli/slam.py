@@ -16,11 +16,12 @@ from data_tools import pose_graphs
 from data_tools.files.atomic_files import check_writable_folder
 from data_tools.files.input_files import error_context
 from data_tools.laser import read_carmen
+from data_tools.recordings import RecordingOptions, is_bag, read_bag_laser
 from data_tools.simulator import simulate_scene
 from factors import Robust
 from pipelines.cli.console import counted, new_group, progress_bar, working
 from pipelines.cli.options import Config, Lag, Online, Verbose, as_command, online_window
-from pipelines.cli.slam_kitti import kitti
+from pipelines.cli.slam_scans import scans
 from pipelines.slam.configuration import load_laser_settings, load_slam_config
 from pipelines.slam.joint import run_joint, street
 from pipelines.slam.laser_slam import laser_slam
@@ -152,8 +153,18 @@ def generate(
 
 
 def laser(
-    file: Annotated[Path, typer.Argument(help="Log in CARMEN's format (FLASER or ROBOTLASER1); .bz2 and .gz too.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="Log in CARMEN's format (FLASER or ROBOTLASER1), .bz2 and .gz too; MCAP or a bag of ROS 2 with "
+            "LaserScan and odometry."
+        ),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Of a bag with several lasers: the topic of scans.", metavar="TOPIC")
+    ] = None,
+    ego: Annotated[str, typer.Option("--ego", help="Frame of the robot in a bag.", metavar="FRAME")] = "base_link",
     scans: Annotated[int | None, typer.Option("--scans", min=2, help="Only so many, from the first on.")] = None,
     config: Config = None,
     verbose: Verbose = False,
@@ -164,12 +175,17 @@ def laser(
     the graph (poses.g2o), the map as a picture (map.png) and figures.json.
 
     \b
-    Example:
+    Examples:
       saga-fg slam laser intel.clf.bz2 --output intel
+      saga-fg slam laser drive.mcap --topic /scan --ego base_footprint --output drive
     """
     check_writable_folder(output)
     settings = load_laser_settings(config)
-    log = read_carmen(file)
+    if is_bag(file):
+        topics = {} if topic is None else {"laser": topic}
+        log = read_bag_laser(file, RecordingOptions(topics=topics, ego=ego))
+    else:
+        log = read_carmen(file)
     if scans is not None:
         log = log.first(scans)
     began = time.process_time()
@@ -227,5 +243,5 @@ def simulated(
 
 
 slam_app = new_group("Estimate where the vehicle was and what stands around it, in one factor graph.")
-for run in (g2o, kitti, generate, laser, simulated):
+for run in (scans, g2o, generate, laser, simulated):
     slam_app.command()(as_command(run))

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, get_args
 
+import gtsam
 import numpy as np
 
-from data_tools.datasets.kitti.dataset import FRAME_PERIOD, read_origin, world_position
-from data_tools.sensor_logs import SensorLog, kitti_sensor_log, read_sensor_log
+from data_tools.datasets.kitti.dataset import world_position
+from data_tools.recordings import ScanRecording
+from data_tools.sensor_logs import SensorLog, plausible_inertial, read_sensor_log
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings
 from pipelines.slam.laser_slam import LaserSettings
 from pipelines.slam.lidar_slam import LidarSlamSettings
 from pipelines.slam.localisation import LocaliserSettings
+from pipelines.slam.submaps import Origin
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.providers.odometry import mounting
 from saga_fg.settings import setting, settings_group
 from saga_fg.slam.joint import JointSettings
 from saga_fg.slam.sensors import SensorName, SensorSettings
@@ -28,16 +33,16 @@ from saga_fg.tracking.by_name import made_by_name, new_provider
 
 @dataclass(frozen=True)
 class SlamSettings:
-    """Settings of `saga-fg slam simulated` and `saga-fg slam kitti`."""
+    """Settings of `saga-fg slam simulated` and `saga-fg slam scans`."""
 
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, asked at every pose"
     )
     landmarks: tuple[str, ...] = setting((), "your own detectors of landmarks, MODULE:NAME, asked at every pose")
     joint: JointSettings = settings_group(JointSettings, "simulated: ego path and objects together")
-    sensors: SensorSettings = settings_group(SensorSettings, "kitti: GPS, IMU and wheels of the vehicle, also in a map")
-    lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "kitti: LiDAR SLAM, with objects")
-    localisation: LocaliserSettings = settings_group(LocaliserSettings, "kitti --map: localisation in a map")
+    sensors: SensorSettings = settings_group(SensorSettings, "scans: GPS, IMU and wheels of the vehicle, also in a map")
+    lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "scans: LiDAR SLAM, with objects")
+    localisation: LocaliserSettings = settings_group(LocaliserSettings, "scans --map: localisation in a map")
     laser: LaserSettings = settings_group(LaserSettings, "laser: planar laser and wheels")
 
     def new_providers(self) -> list[FactorProvider]:
@@ -76,24 +81,23 @@ def load_slam_config(family: str | Path, path: Path | None = None) -> SlamConfig
     return config if path is None else load_settings(SlamConfig, path, config)
 
 
-GPS_NOISE, WHEELS_NOISE = 1.0, 0.05  # m and m/s, of the fixes and speeds made from GPS/IMU records
+_TILTED = 25.0  # deg, beyond which no vehicle stands or drives
+_log = logging.getLogger(__name__)
 
 
 def sensor_log(
-    records: Path,
+    recording: ScanRecording,
     sensors: str,
     files: Sequence[str],
-    seed: int,
-    timestamps: FloatArray,
-    origin: Callable[[], tuple[float, float, float]] | None = None,
     settings: SensorSettings | None = None,
+    origin: Callable[[], Origin] | None = None,
 ) -> SensorLog | None:
-    """Measurements of the sensors named, like "gps,imu", from KITTI's GPS/IMU records, and of files like "imu=FILE".
+    """Measurements of the sensors named, like "gps,imu", of a recording, and of files like "imu=FILE".
 
-    timestamps: (K,) s, of the drive; origin: gives latitude, longitude (deg) and altitude (m) of the world's origin,
-    asked for where fixes are so, by default where the records begin; settings: noise and places of the sensors.
-    Raises `InputError` for an unknown sensor, for one that is named twice, and for a file without a row within the
-    drive.
+    settings: noise and places of the sensors; where they are left as they are, places are those of the recording.
+    origin: gives latitude, longitude (deg) and altitude (m) of the origin of another world than the recording's, for
+    fixes. Raises `InputError` for a sensor that is unknown, named twice or not in the recording, and for a file without
+    a row within the drive.
     """
     named = [one.strip() for one in sensors.split(",") if one.strip()]
     given = [one.partition("=") for one in files]
@@ -109,19 +113,51 @@ def sensor_log(
         raise InputError(f"{twice[0]}: expected either --sensors or --sensor-log, once")
     if not named and not given:
         return None
-    tables: dict[SensorName, FloatArray] = {}
-    if named:
-        chosen = tuple(cast(SensorName, name) for name in named)
-        tables |= kitti_sensor_log(records, chosen, FRAME_PERIOD, GPS_NOISE, WHEELS_NOISE, seed).tables
-        if origin is not None and "gps" in tables:
-            latitude, longitude, altitude = (np.array([value]) for value in read_origin(records))
-            off = world_position(latitude, longitude, altitude, np.array(origin()))[0]
-            tables["gps"] = tables["gps"] + np.concatenate([[0.0], off])
+    place, tables = settings or SensorSettings(), dict[SensorName, FloatArray]()
+    recorded = recording.sensors() if named else {}
+    for name in named:
+        if name not in recorded:
+            raise InputError(
+                f"--sensors {name}: expected a sensor of the recording, it has {', '.join(recorded) or 'none'}"
+            )
+        tables[cast(SensorName, name)] = recorded[cast(SensorName, name)]
+    if origin is not None and "gps" in tables and recording.origin is not None:
+        latitude, longitude, altitude = (np.array([value]) for value in recording.origin)
+        off = world_position(latitude, longitude, altitude, np.array(origin()))[0]
+        tables["gps"] = tables["gps"] + np.concatenate([[0.0], off])
     for name, _, path in given:
-        table = read_sensor_log(path, cast(SensorName, name), origin or (lambda: read_origin(records)))
-        _check_times(path, table[:, 0], timestamps)
+        table = read_sensor_log(path, cast(SensorName, name), origin or _origin_of(recording))
+        _check_times(path, table[:, 0], recording.timestamps)
         tables[cast(SensorName, name)] = table
-    return SensorLog({name: np.asarray(table) for name, table in tables.items()}, settings or SensorSettings())
+    place = _placed(place, recording.mounts)
+    if "imu" in tables:
+        tables["imu"] = plausible_inertial(tables["imu"])
+        up = mounting("mounted", place.imu.mounted).matrix()[:3, :3] @ np.median(tables["imu"][:, 1:4], axis=0)
+        tilt = np.degrees(np.arccos(up[2] / max(np.linalg.norm(up), 1e-9)))
+        if tilt > _TILTED:
+            _log.warning(
+                "imu: gravity is %.0f deg off the vehicle's vertical: check where it is mounted "
+                "(/tf, slam.sensors.imu), and its axes",
+                tilt,
+            )
+    return SensorLog({name: np.asarray(table) for name, table in tables.items()}, place)
+
+
+def _origin_of(recording: ScanRecording) -> Callable[[], Origin] | None:
+    return None if recording.origin is None else lambda: cast(Origin, recording.origin)
+
+
+def _placed(settings: SensorSettings, mounts: Mapping[SensorName, FloatArray]) -> SensorSettings:
+    """The settings with the places of sensors that are left at their defaults."""
+    default = SensorSettings()
+    if "gps" in mounts and settings.gps.antenna == default.gps.antenna:
+        x, y, z = mounts["gps"][:3, 3].tolist()
+        settings = replace(settings, gps=replace(settings.gps, antenna=(x, y, z)))
+    if "imu" in mounts and settings.imu.mounted == default.imu.mounted:
+        yaw, pitch, roll = gtsam.Rot3(mounts["imu"][:3, :3]).ypr().tolist()
+        x, y, z = mounts["imu"][:3, 3].tolist()
+        settings = replace(settings, imu=replace(settings.imu, mounted=(x, y, z, roll, pitch, yaw)))
+    return settings
 
 
 def _check_times(path: str, times: FloatArray, timestamps: FloatArray) -> None:

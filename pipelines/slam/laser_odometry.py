@@ -83,7 +83,8 @@ def check_wheels(log: LaserLog) -> None:
     """Raise `InputError` where the wheels say one pose throughout while what the laser sees changes."""
     if len(log) < 2 or np.ptp(log.odometry, axis=0).max() > _STILL:
         return
-    changed = (np.abs(log.ranges - log.ranges[0]) > _CHANGED).mean(axis=1)
+    alike = np.broadcast_to(np.isclose(log.angles, log.directions(0)), log.ranges.shape)  # not so of interlaced lasers
+    changed = (alike & (np.abs(log.ranges - log.ranges[0]) > _CHANGED)).sum(axis=1) / np.maximum(alike.sum(axis=1), 1)
     if (moved := int(np.argmax(changed > _MANY))) > 0:
         raise InputError(
             f"scan {moved + 1}: {100 * changed[moved]:.0f} % of the readings differ from those of the first scan, but "

@@ -21,6 +21,7 @@ World coordinates are those of the recording (KITTI: x east, y north, z up, from
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -47,7 +48,7 @@ from pipelines.slam.saved_graph import write_graph, write_landmark_table
 from pipelines.slam.scan_content import LINE, WALL
 from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.types.landmark import Landmark
 
 # all that a run may write, also in a map of an earlier one: a folder holds the files of its last run
@@ -59,16 +60,19 @@ LIDAR_FILES = (
 )
 HEIGHT = 3.0  # m above the first pose, to which poles and walls are drawn
 _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
+_MOVES, _TELLING = 1.0, 10.0  # m/s; m of way that tell where ahead is
+_ONE_WAY, _SIDEWAYS = 0.9, 20.0  # length of the mean direction; deg off the axis
+_log = logging.getLogger(__name__)
 _LINED = (WALL.name, LINE.name)
 POLE_COLOUR, WALL_COLOUR, LINE_COLOUR = (255, 127, 14), (214, 39, 40), (148, 103, 189)
 
 
 def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySettings | None = None) -> dict[str, Any]:
-    """Errors (start aligned) of the three trajectories against the recording's poses, residuals, and counts.
+    """Errors (start aligned) of the three trajectories against the recording's poses, if it has any; residuals, counts.
 
     odometry: settings of the run
     """
-    truth = Trajectory(scans.timestamps, scans.world_T_ego)
+    truth = reference(scans)
     paths = {name: getattr(result, name) for name in ("odometry", "online", "trajectory")}
     paths["without_objects"], kinds = result.alone, [landmark.kind.name for landmark in result.landmarks]
     return {
@@ -79,11 +83,39 @@ def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySett
         "odometry_inflation": dict(zip(("rotation", "translation"), result.selection.inflation.tolist(), strict=True)),
         "submaps": len(result.submaps),
         "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
-        "misfits": dict(result.misfits),
+        "misfits": {**result.misfits, **_misplaced(result.trajectory)},
         "unjudged": dict(result.unjudged),
         "scan_to_map_residual": _residual(result, scans, odometry or OdometrySettings()),
-        **{name: asdict(trajectory_errors(path, truth, "start")) for name, path in paths.items() if path is not None},
+        **{
+            name: asdict(trajectory_errors(path, truth, "start"))
+            for name, path in paths.items()
+            if path is not None and truth is not None
+        },
     }
+
+
+def _misplaced(path: Trajectory) -> dict[str, str]:
+    """The LiDAR, with a warning, where the vehicle moves one way throughout that is neither ahead nor backwards."""
+    steps = (inverse_transform(path.world_T_ego[:-1]) @ path.world_T_ego[1:])[:, :3, 3]
+    way = np.linalg.norm(steps, axis=1)
+    moves = way > _MOVES * np.diff(path.timestamps)
+    if way[moves].sum() < _TELLING:
+        return {}
+    mean = (steps[moves] / way[moves, None]).mean(axis=0)
+    off = float(np.degrees(np.arccos(min(abs(mean[0]) / np.linalg.norm(mean), 1.0))))
+    if np.linalg.norm(mean) < _ONE_WAY or off < _SIDEWAYS:
+        return {}
+    text = (
+        f"lidar: the vehicle moves {off:.0f} deg off its axis ahead throughout: check where the LiDAR is mounted "
+        "(--mount, /tf), unless it is carried"
+    )
+    _log.warning(text)
+    return {"lidar": text}
+
+
+def reference(scans: ScanSequence) -> Trajectory | None:
+    """The recording's own poses; None where it has none."""
+    return None if scans.world_T_ego is None else Trajectory(scans.timestamps, scans.world_T_ego)
 
 
 def degenerate_spans(times: FloatArray, degenerate: Sequence[tuple[str, ...]]) -> list[dict[str, Any]]:
@@ -120,12 +152,12 @@ def write_lidar_slam(
     s = settings or LidarSlamSettings()
     clouds, objects = [submap.points for submap in result.submaps], result.objects
     points, lines = placed_clouds(clouds, result.world_T_submap, s.map_spacing), _lines(result)
-    figures = metrics(result, scans, s.odometry)
+    figures, truth = metrics(result, scans, s.odometry), reference(scans)
     if objects is not None:
         figures["objects"] = len(object_paths(objects))
     with atomic_directory(output, known=LIDAR_FILES) as folder:
         given = {name: getattr(result, name) for name in ("trajectory", "odometry", "online")}
-        write_paths(folder, **given, reference=Trajectory(scans.timestamps, scans.world_T_ego))
+        write_paths(folder, **given, reference=truth)
         if len(points):
             (folder / "map").mkdir()
             write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin), s.map_format)
@@ -135,7 +167,8 @@ def write_lidar_slam(
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
         if result.landmarks:
             _write_landmarks(folder, result, lines)
-        paths = {"reference": scans.world_T_ego[:, :3, 3], "trajectory": result.trajectory.positions}
+        paths = {} if truth is None else {"reference": truth.positions}
+        paths["trajectory"] = result.trajectory.positions
         if objects is not None:
             write_objects(folder / "tracks.csv", objects)
         driven = () if objects is None else tuple(confirmed_paths(objects).values())
@@ -145,11 +178,12 @@ def write_lidar_slam(
     return figures
 
 
-def write_paths(folder: Path, **paths: Trajectory) -> None:
-    """Write each path as NAME.tum, and that of the name `trajectory` in KITTI's format besides."""
-    write_kitti_poses(folder / "trajectory.txt", paths["trajectory"], folder / "times.txt")
-    for name, path in paths.items():
-        write_tum_poses(folder / f"{name}.tum", path)
+def write_paths(folder: Path, trajectory: Trajectory, **others: Trajectory | None) -> None:
+    """Write each path as NAME.tum, and `trajectory` in KITTI's format besides."""
+    write_kitti_poses(folder / "trajectory.txt", trajectory, folder / "times.txt")
+    for name, path in {"trajectory": trajectory, **others}.items():
+        if path is not None:
+            write_tum_poses(folder / f"{name}.tum", path)
 
 
 def _write_landmarks(folder: Path, result: LidarSlamResult, lines: Mapping[int, FloatArray]) -> None:

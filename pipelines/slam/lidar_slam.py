@@ -40,7 +40,7 @@ from pipelines.slam.odometry import (
 )
 from pipelines.slam.scan_content import MovingObjects, ScanLandmarkSettings, frames_at, observe_landmarks
 from pipelines.slam.submaps import CloudFormat, SubmapBuilder, world_T_submap
-from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
+from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors, start_by_fixes
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -132,7 +132,7 @@ class LidarSlamResult:
         return np.array(self.drive.keyframes, dtype=np.int64)
 
 
-OdometrySource = Literal["lidar", "oxts"]
+OdometrySource = Literal["lidar", "recorded"]
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
 CALIBRATED = OdometryNoise(
     turn_noise=1e-3,
@@ -161,10 +161,10 @@ class LidarSlamSettings(Settings):
     )
     map_format: CloudFormat = setting("ply", "format of the files of the map's submaps: ply or pcd")
     objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "objects in the same graph")
-    oxts_rotation: Positive = setting(
+    recorded_rotation: Positive = setting(
         2e-4, "standard deviation of the rotation of a GPS/IMU increment between scans, rad; usual 1e-4 to 1e-3"
     )
-    oxts_translation: Positive = setting(
+    recorded_translation: Positive = setting(
         0.005,
         "standard deviation of the translation of a GPS/IMU increment between scans, m; accuracy of the velocity that "
         "the records state (KITTI: 0.01 to 0.05 m/s) times the period; higher: landmarks and objects move the path",
@@ -174,7 +174,7 @@ class LidarSlamSettings(Settings):
 class LidarSlam:
     """LiDAR SLAM of a drive: `step` takes scan by scan, `finish` gives the map.
 
-    start       (4, 4) the sensor's first pose in the world, z up
+    start       (4, 4) the sensor's first pose in the world, z up, or that and its covariance (6, 6), in its frame
     providers   of other factors, asked at every keyframe
     vehicle     whose path the result has, where the LiDAR is on it, and the sensors whose measurements `step` gets
     moving      leaves points on moving objects out of the scans, by the detections that `step` gets
@@ -188,7 +188,7 @@ class LidarSlam:
 
     def __init__(
         self,
-        start: FloatArray | None = None,
+        start: FloatArray | tuple[FloatArray, FloatArray] | None = None,
         settings: LidarSlamSettings | None = None,
         *,
         providers: Sequence[FactorProvider] = (),
@@ -199,19 +199,21 @@ class LidarSlam:
         vehicle: Vehicle | None = None,
     ) -> None:
         self.settings = s = settings or LidarSlamSettings()
-        self._start = np.eye(4) if start is None else checked_transform("start", start)
+        pose, first = start if isinstance(start, tuple) else (start, START)
+        self._first: FloatArray = first
+        self._start = np.eye(4) if pose is None else checked_transform("start", pose)
         self._odometry = LidarOdometry(s.odometry) if odometry is None else odometry
         self._sensors, self._moving = VehicleSensors(vehicle or Vehicle(), bool(providers)), moving
         self._measured = self._sensors.since_keyframe
         both = [*self._sensors.new_providers(), *providers]
         self._new_graph = partial(SubmapGraph, settings=s.submaps, providers=both)
-        self._graph = self._new_graph(self._start, START)
+        self._graph = self._new_graph(self._start, self._first)
         self._detectors, self._others = tuple(detectors), bool(providers)
         self._closed = ClosedSubmaps(PlaceLoops(s.loops) if loops is None and s.loop_closures else loops)
         self._builder = SubmapBuilder(s.map_spacing, straighten=not isinstance(self._odometry, LidarOdometry))
         self._path, self._online = Drive(), list[FloatArray]()
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
-        self._finished, self._covariance = False, START  # of the last keyframe's pose
+        self._finished, self._covariance = False, self._first  # of the last keyframe's pose
 
     @property
     def graph(self) -> SubmapGraph:
@@ -312,7 +314,7 @@ class LidarSlam:
         if self._path.keyframes:
             moved = self._path.moved(self._path.keyframes[-1])
         elif row:  # a detector or provider raised at the scans before
-            self._graph = self._new_graph(self._path.poses[row], START + self._path.moved(0)[1])
+            self._graph = self._new_graph(self._path.poses[row], self._first + self._path.moved(0)[1])
         frame = self._measured.frame(self._path.times[row], detections)
         closes = self._graph.append(self._path.times[row], moved, seen, frame)
         self._measured.clear()
@@ -337,16 +339,25 @@ def lidar_slam(
     objects: tuple[Sequence[Frame], Tracker] | None = None,
 ) -> LidarSlamResult:
     """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
-    counts is the first, unless the source is "oxts".
+    counts is the first, unless the source is "recorded". Without poses the world is the vehicle's frame at the first
+    scan, or that of the fixes by GPS, if there are any: the first scans then tell which way it looks.
 
     providers, detectors: as of `LidarSlam`; log: of the vehicle's sensors, in the recording's world; objects: frames
     with detections at the times of all scans, and a new tracker: moving objects leave the scans.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
-    recorded = RecordedOdometry(scans, s.oxts_rotation, s.oxts_translation, s.odometry) if source == "oxts" else None
-    start = scans.world_T_ego[0] @ scans.ego_T_lidar
+    recorded = (
+        RecordedOdometry(scans, s.recorded_rotation, s.recorded_translation, s.odometry)
+        if source == "recorded"
+        else None
+    )
     log = log or SensorLog({})
+    start: FloatArray | tuple[FloatArray, FloatArray] = scans.ego_T_lidar
+    if scans.world_T_ego is not None:
+        start = scans.world_T_ego[0] @ scans.ego_T_lidar
+    elif "gps" in log.tables:
+        start = start_by_fixes(scans, log.tables["gps"], np.array(log.settings.gps.antenna), s.odometry)
     seen: Sequence[Frame | None] = [None] * len(scans.timestamps)
     if objects is not None:
         seen = frames_at(objects[0], scans.timestamps, inverse_transform(scans.ego_T_lidar), objects[1])

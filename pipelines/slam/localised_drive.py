@@ -23,7 +23,7 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors
-from pipelines.slam.lidar_results import LIDAR_FILES, write_paths
+from pipelines.slam.lidar_results import LIDAR_FILES, reference, write_paths
 from pipelines.slam.localisation import Localiser, LocaliserSettings
 from pipelines.slam.results import write_covariances
 from pipelines.slam.submaps import SlamMap, placed_clouds
@@ -94,22 +94,24 @@ def localise(
 
 def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, slam_map: SlamMap) -> dict[str, Any]:
     """Write all files, or none; returns the metrics."""
-    truth, path = Trajectory(scans.timestamps, scans.world_T_ego), found.trajectory
+    truth, path = reference(scans), found.trajectory
     figures: dict[str, Any] = {
         "scans": len(scans),
         "registered": int(found.registered.sum()),
         "first_registered": int(np.argmax(found.registered)) if found.registered.any() else None,
         "misfits": dict(found.misfits),
         "unjudged": dict(found.unjudged),
-        "trajectory": asdict(trajectory_errors(path, truth, "none")),
-        "aligned": asdict(trajectory_errors(path, truth, "rigid")),
     }
+    if truth is not None:
+        figures["trajectory"] = asdict(trajectory_errors(path, truth, "none"))
+        figures["aligned"] = asdict(trajectory_errors(path, truth, "rigid"))
     points = placed_clouds(slam_map.points, slam_map.map_T_submap, 0.3)
     with atomic_directory(output, known=LIDAR_FILES) as folder:
         write_paths(folder, trajectory=path, reference=truth)
         registered, times = found.registered.astype(int).tolist(), path.timestamps.tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, found.covariances, registered=registered)
-        drawn = {"reference": truth.positions, "trajectory": path.positions}
+        drawn = {} if truth is None else {"reference": truth.positions}
+        drawn["trajectory"] = path.positions
         write_bytes(folder / "above.png", png(scan_map_from_above(points, drawn, np.empty((0, 2)), {})))
         write_figures(folder / "metrics.json", figures)
     return figures

@@ -420,6 +420,8 @@ class RecordedOdometry:
     """The poses of a recording as odometry, with deviations of `rotation`, rad, and `translation`, m, a scan."""
 
     def __init__(self, scans: ScanSequence, rotation: float, translation: float, settings: OdometrySettings) -> None:
+        if scans.world_T_ego is None:
+            raise InputError("odometry: expected poses in the recording, it has none")
         self._poses, self._times, self._settings = scans.world_T_ego @ scans.ego_T_lidar, scans.timestamps, settings
         self._noise = np.diag([rotation] * 3 + [translation] * 3) ** 2
         self._row, self._keyframe = -1, 0

@@ -17,11 +17,12 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from pipelines.slam.odometry import OdometryStep
+from data_tools.lidar.scan import ScanSequence
+from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import checked_transform, inverse_transform
+from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, yaw_transform
 from saga_fg.providers import Wheels
 from saga_fg.providers.odometry import mounting
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings, sensor_providers
@@ -207,3 +208,44 @@ class VehicleSensors:
         if wheels is None or "wheels" not in self.names:
             return None
         return np.concatenate([np.full(3, np.nan), self.ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]])
+
+
+_BASELINE, _SHORTEST = 30.0, 5.0  # m of a drive that tell its heading in the world, and must
+_FEWEST_FIXES, _BEST_FIX = 4, 0.02  # fixes on it; m, of any fix
+_LEVEL, _TRUE = 0.02, 0.01  # rad: a vehicle's tilt at the first scan; error of a heading by odometry
+
+
+def start_by_fixes(
+    scans: ScanSequence, fixes: FloatArray, antenna: FloatArray, settings: OdometrySettings
+) -> tuple[FloatArray, FloatArray]:
+    """The first pose (4, 4) of the LiDAR in the world of fixes (n, 4): time, x, y, z, and its covariance (6, 6).
+
+    The path of the antenna (3,), by odometry over the first way, is laid on the fixes from above. Raises `InputError`
+    where these are too few, or the way too short.
+    """
+    odometry, places = LidarOdometry(settings), list[FloatArray]()
+    lidar_T_ego = inverse_transform(scans.ego_T_lidar)
+    for k, time in enumerate(scans.timestamps.tolist()):
+        pose = scans.ego_T_lidar @ odometry.step(scans[k], time).map_T_lidar @ lidar_T_ego
+        places.append(pose[:3, :3] @ antenna + pose[:3, 3])
+        if np.linalg.norm(places[-1] - places[0]) > _BASELINE:
+            break
+    times = scans.timestamps[: len(places)]
+    within = fixes[(fixes[:, 0] >= times[0]) & (fixes[:, 0] <= times[-1])]
+    path = np.stack([np.interp(within[:, 0], times, axis) for axis in np.array(places).T], axis=1)
+    if len(within) < _FEWEST_FIXES or np.linalg.norm(np.ptp(path[:, :2], axis=0)) < _SHORTEST:
+        way = float(np.linalg.norm(np.ptp(path[:, :2], axis=0))) if len(within) else 0.0
+        raise InputError(
+            f"gps: expected {_FEWEST_FIXES} fixes over {_SHORTEST:g} m of the drive, which tell its heading, "
+            f"got {len(within)} over {way:.1f} m"
+        )
+    a, b = path - path.mean(axis=0), within[:, 1:] - within[:, 1:].mean(axis=0)
+    yaw = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))
+    world_T_ego = yaw_transform(yaw=yaw)
+    world_T_ego[:3, 3] = within[:, 1:].mean(axis=0) - world_T_ego[:3, :3] @ path.mean(axis=0)
+    off = b - a @ world_T_ego[:3, :3].T
+    variance = np.maximum((off**2).mean(axis=0), _BEST_FIX**2) * len(within) / (len(within) - 2)
+    heading = float(variance[:2].mean() / (a[:, :2] ** 2).sum()) + _TRUE**2
+    moved = variance / len(within) + heading * float((path.mean(axis=0)[:2] ** 2).sum())
+    P = carried_covariance(lidar_T_ego, np.diag([_LEVEL**2, _LEVEL**2, heading, *moved.tolist()]))
+    return world_T_ego @ scans.ego_T_lidar, (P + P.T) / 2

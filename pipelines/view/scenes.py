@@ -19,7 +19,7 @@ A scene and its tracks as drawings, at times from the scene's start (its first m
 Metres about the vehicle's first place, z up: viewers count in float32. All layers of a moment are drawn at its time,
 so that none outlives it.
 
-Results of `saga-fg slam kitti` as drawings: paths, the map, landmarks with their names.
+Results of `saga-fg slam scans` as drawings: paths, the map, landmarks with their names.
 
     ROOT/trajectory, ROOT/odometry, ROOT/online   paths, those that are there
     ROOT/pose                                     a moving frame along the trajectory; ROOT/pose/body: the vehicle
@@ -265,7 +265,7 @@ class SlamView:
 def read_slam_view(folder: Path) -> SlamView:
     """Read the files of a run of SLAM. Raises `InputError` for a folder without trajectory.tum and for broken files."""
     if not (folder / "trajectory.tum").is_file():
-        raise InputError(f"{folder}: expected trajectory.tum, as `saga-fg slam kitti` writes")
+        raise InputError(f"{folder}: expected trajectory.tum, as `saga-fg slam scans` writes")
     paths = {name: read_tum_poses(file) for name in PATHS if (file := folder / f"{name}.tum").is_file()}
     clouds = {name: file for name in ("map", "landmarks") if (file := folder / f"{name}.ply").is_file()}
     names, places = _named(folder / "landmarks.json")

@@ -28,8 +28,9 @@ from data_tools.datasets.kitti.source import read_scored_sequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
 from data_tools.files.input_files import expanded
 from data_tools.laser import read_carmen
-from data_tools.lidar import read_scan
+from data_tools.lidar import Scan, read_scan
 from data_tools.pose_graphs import read_g2o
+from data_tools.recordings import open_recording
 from data_tools.sensor_logs import read_sensor_log
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from pipelines.config import OTHER_FILES, TrackConfig, load_config, load_interactions
@@ -182,6 +183,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "Plaza": Target(plaza, lambda: read_landmark_log(plaza[0])),
         "ETH and UCY": one("eth/obsmat.txt", OBSMAT, lambda path: EthUcy(folder).scene("eth")),
         **_image(folder / "image.png"),
+        **_scan_folders(folder),
         **_traffic(folder),
         **_recordings(folder),
         "predictions": one("a.predictions.csv", PREDICTIONS, lambda path: read_predictions(folder / "a")),
@@ -369,7 +371,66 @@ def _recordings(folder: Path) -> dict[str, Target]:
     return {
         "recording, MCAP": Target((mcap,), lambda: McapRecording(mcap).scene("drive")),
         "recording, SQLite": Target((sqlite,), lambda: McapRecording(sqlite).scene(sqlite.stem)),
+        **_scan_recordings(folder),
     }
+
+
+def _scan_recordings(folder: Path) -> dict[str, Target]:
+    """Scans, a laser and sensors as MCAP and as SQLite."""
+    from data_tools.recordings import read_bag_laser
+    from tests.data_tools import mcap_example as example
+    from tests.data_tools import scans_example as scans
+
+    scan = Scan(np.arange(1.0, 13.0).reshape(4, 3), np.ones(4), np.arange(4) / 100)
+    messages = scans.scan_messages([scan] * 3, scans.BEGIN + np.arange(3.0) / 10, np.eye(4))
+    for k in range(3):
+        time = scans.BEGIN + k / 10
+        at = round(time * 1e9)
+        messages.append(("/imu", scans.IMU, scans.imu_message(time, (0, 0, 9.8), (0, 0, 0)), at))
+        messages.append(("/fix", scans.FIX, scans.fix_message(time, 49.0, 8.4, 110.0), at))
+        messages.append(("/odom", example.ODOMETRY, scans.odometry_message(time, np.eye(4), 1.0), at))
+        messages.append(("/scan", scans.LASER, scans.laser_message(time, np.ones(12), -1.0, 0.1, "lidar"), at))
+    mcap = example.write_mcap(folder / "scans.mcap", messages, plain=True)
+    sqlite = next(example.write_bag(folder / "scans", messages).glob("*.db3"))
+    return {
+        "scans, MCAP": Target((mcap,), lambda: (_read_recording(mcap), read_bag_laser(mcap))),
+        "scans, SQLite": Target((sqlite,), lambda: _read_recording(sqlite)),
+    }
+
+
+def _read_recording(path: Path) -> object:
+    found = open_recording(path)
+    return found.sensors(), [found[row] for row in range(len(found))]
+
+
+def _scan_folders(folder: Path) -> dict[str, Target]:
+    """Scans with a table of their times, in an archive, and as surveyors have them, where laspy is installed."""
+    points = np.arange(1.0, 13.0).reshape(4, 3)
+    (folder / "drive").mkdir()
+    for k in range(3):
+        np.column_stack([points, np.ones(4)]).astype("<f4").tofile(folder / "drive" / f"{k:06d}.bin")
+    table = folder / "drive" / "times.csv"
+    table.write_text("name,time\n000000.bin,0.0\n000001.bin,0.1\n000002.bin,0.2\n")
+    packed = folder / "packed.npz"
+    np.savez(packed, points=points, intensity=np.ones(4), time=np.arange(4) / 100)
+    raw = folder / "raw.bin"
+    np.column_stack([np.random.default_rng(0).normal(0, [9, 5, 1], (200, 3)), np.ones(200)]).astype("<f4").tofile(raw)
+    binary = folder / "binary.pcd"
+    binary.write_bytes(PCD.replace("DATA ascii\n1 2 3\n4 5 6\n", "DATA binary\n").encode() + bytes(24))
+    found = {
+        "scans in a folder": Target((table,), lambda: _read_recording(folder / "drive")),
+        "scan, archive": Target((packed,), lambda: read_scan(packed)),
+        "scan, records": Target((raw,), lambda: read_scan(raw)),
+        "scan, PCD of bytes": Target((binary,), lambda: read_scan(binary)),
+    }
+    if importlib.util.find_spec("laspy") is None:
+        return found
+    import laspy
+
+    cloud = laspy.LasData(laspy.LasHeader(point_format=1, version="1.2"))
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.write(str(folder / "scan.las"))
+    return {**found, "scan, LAS": Target((folder / "scan.las",), lambda: read_scan(folder / "scan.las"))}
 
 
 def _read_nuscenes(root: Path) -> list[Scene]:

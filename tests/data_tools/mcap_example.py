@@ -241,6 +241,6 @@ def _value(store, kind, value):
     if node.name in ("ARRAY", "SEQUENCE"):
         inner = argument[0]
         if inner[0].name == "BASE" and inner[1][0] != "string":
-            return np.array(value, dtype=inner[1][0])
+            return np.frombuffer(value, np.uint8) if isinstance(value, bytes) else np.array(value, dtype=inner[1][0])
         return [_value(store, inner, each) for each in value]
     return value

@@ -1,4 +1,4 @@
-"""`saga-fg slam kitti --map`: a run that localises in the map of another, and options that do not go with it."""
+"""`saga-fg slam scans --map`: a run that localises in the map of another, and options that do not go with it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_what_a_configuration_adds_is_refused_in_a_map(
         with subtests.test(name=name):
             write_map(tmp_path, POINT)
             (tmp_path / "own.yaml").write_text(f"slam: {{{name}: [own:Own]}}\n")
-            command = ["slam", "kitti", "--dataroot", str(recordings / "kitti"), "--map", str(tmp_path)]
+            command = ["slam", "scans", str(recordings / "kitti"), "--map", str(tmp_path)]
             outcome = CliRunner().invoke(
                 app, [*command, "--config", str(tmp_path / "own.yaml"), "--output", str(tmp_path / "out")]
             )
@@ -35,32 +35,23 @@ def test_what_a_configuration_adds_is_refused_in_a_map(
 @pytest.mark.parametrize("guess", ["1,2", "1,2,3,x", "1,2,3,nan"])
 def test_a_guess_that_is_none_is_named(recordings: Path, tmp_path: Path, guess: str) -> None:
     write_map(tmp_path, POINT)
-    command = ["slam", "kitti", "--dataroot", str(recordings / "kitti"), "--map", str(tmp_path), "--guess", guess]
+    command = ["slam", "scans", str(recordings / "kitti"), "--map", str(tmp_path), "--guess", guess]
     outcome = CliRunner().invoke(app, [*command, "--output", str(tmp_path / "out")])
     assert outcome.exit_code != 0
     assert f"--guess: expected x,y,z,yaw, m and rad, got '{guess}'" in " ".join(outcome.output.split())
 
 
 def test_options_that_a_map_has_no_use_for_are_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
-    for option in [["--odometry", "oxts"], ["--no-landmarks"]]:
+    for option in [["--odometry", "recorded"], ["--no-landmarks"]]:
         with subtests.test(option=option):
-            command = [
-                "slam",
-                "kitti",
-                "--dataroot",
-                str(tmp_path),
-                "--map",
-                str(tmp_path),
-                "--output",
-                str(tmp_path / "o"),
-            ]
+            command = ["slam", "scans", str(tmp_path), "--map", str(tmp_path), "--output", str(tmp_path / "o")]
             outcome = CliRunner().invoke(app, [*command, *option])
             assert outcome.exit_code != 0
             assert "--map: expected without" in outcome.output
 
 
 def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_path: Path) -> None:
-    options = ["slam", "kitti", "--dataroot", str(recordings / "kitti")]
+    options = ["slam", "scans", str(recordings / "kitti")]
     done(*options, "--scans", "20", "--no-landmarks", "--output", tmp_path / "first")
     assert read_map(tmp_path / "first").origin is not None
     again = ["--scans", "10", "--map", str(tmp_path / "first"), "--guess", "0.5,0.3,0,-1.2", "--sensors", "gps,wheels"]
@@ -79,7 +70,7 @@ def test_the_command_localises_in_a_map_it_has_written(recordings: Path, tmp_pat
 
 
 def test_a_map_is_not_written_over(tmp_path: Path) -> None:
-    command = ["slam", "kitti", "--dataroot", str(tmp_path), "--sequence", "0000"]
+    command = ["slam", "scans", str(tmp_path), "--sequence", "0000"]
     result = CliRunner().invoke(app, [*command, "--map", str(tmp_path), "--output", str(tmp_path)])
     assert result.exit_code != 0
     assert "--output: expected another folder than that of --map" in f"{result.output}{result.exception}"

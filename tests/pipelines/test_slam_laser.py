@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scans import LaserKind, laser_drive, write_carmen
-from data_tools.laser import LaserLog
+from data_tools.laser import LaserLog, read_carmen
 from data_tools.trajectories import read_tum_poses
 from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam
 from saga_fg import InputError
@@ -161,3 +161,20 @@ def test_a_bad_step_is_refused(subtests: pytest.Subtests) -> None:
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             LaserSlam().step(points, odometry)
+
+
+def test_interlaced_scans_are_as_good_as_others(tmp_path: Path) -> None:
+    """Every other scan has the directions between those of the one before, as a log of a laser that interlaces."""
+    log, true = laser_drive(0, rounds=0.2, kind=LaserKind(readings=360))
+    lines = []
+    for row, (time, pose) in enumerate(zip(log.time, log.odometry, strict=True)):
+        angles, ranges = (values[row % 2 :: 2] for values in (log.angles, np.nan_to_num(log.ranges[row], nan=81.91)))
+        at = " ".join(f"{value:.6f}" for value in pose)
+        step = angles[1] - angles[0]
+        head = f"ROBOTLASER1 0 {angles[0]:.6f} {np.pi:.6f} {step:.8f} 81.9 0.01 0 {len(ranges)}"
+        readings = " ".join(f"{r:.3f}" for r in ranges)
+        lines.append(f"{head} {readings} 0 {at} {at} 0 0 0 0 0 {time:.6f} nohost {time:.6f}\n")
+    (tmp_path / "drive.log").write_text("".join(lines))
+    both = [laser_slam(each, LaserSettings()).poses for each in (log, read_carmen(tmp_path / "drive.log"))]
+    errors = [np.linalg.norm((poses - true)[:, :2, 2], axis=1).max() for poses in both]
+    assert errors[1] < max(1.5 * errors[0], 0.1)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.scans import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, drive
-from data_tools.sensor_logs import SensorLog
+from data_tools.lidar import Scan
+from data_tools.recordings import ScanRecording
+from data_tools.sensor_logs import SensorLog, kitti_sensor_log, plausible_inertial
 from pipelines.slam.configuration import sensor_log
 from pipelines.slam.lidar_results import degenerate_spans, metrics
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
@@ -24,6 +27,8 @@ from tests.pipelines.command import done
 PERIOD = 0.1
 TIMES = PERIOD * np.arange(10)
 PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False)
+NOTHING = Scan.of(np.empty((0, 3)))
+RECORDING = ScanRecording("folder", TIMES, lambda row: NOTHING, str)
 
 
 def braking_drive(world: StaticWorld, count: int = 34) -> tuple[SimulatedScans, np.ndarray]:
@@ -98,8 +103,8 @@ def test_spans_of_scans_that_leave_the_same_motions_open() -> None:
 def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) -> None:
     table = tmp_path / "wheels.csv"
     table.write_text("time [s],speed [km/h]\n" + "".join(f"{0.1 * k:.1f},12.6\n" for k in range(1, 12)))
-    options = ["--dataroot", str(recordings / "kitti"), "--scans", "8", "--no-landmarks", "--sensors", "gps,imu"]
-    command = ["slam", "kitti", *options, "--sensor-log", f"wheels={table}", "--output", str(tmp_path / "run")]
+    options = [str(recordings / "kitti"), "--scans", "8", "--no-landmarks", "--sensors", "gps,imu"]
+    command = ["slam", "scans", *options, "--sensor-log", f"wheels={table}", "--output", str(tmp_path / "run")]
     done(*command)
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert figures["degenerate"] == []
@@ -114,14 +119,16 @@ def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) 
 
 def test_sensors_that_are_not_there_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--sensors: expected some of gps, imu, wheels, got 'radar'"):
-        sensor_log(tmp_path, "radar", [], 0, TIMES)
+        sensor_log(RECORDING, "radar", [])
     with pytest.raises(InputError, match="--sensor-log: expected some of gps, imu, wheels, got 'radar'"):
-        sensor_log(tmp_path, "", ["radar=radar.csv"], 0, TIMES)
+        sensor_log(RECORDING, "", ["radar=radar.csv"])
     with pytest.raises(InputError, match="imu: expected either --sensors or --sensor-log, once"):
-        sensor_log(tmp_path, "imu", ["imu=imu.csv"], 0, TIMES)
+        sensor_log(RECORDING, "imu", ["imu=imu.csv"])
     with pytest.raises(InputError, match=r"--sensor-log: expected SENSOR=FILE, such as imu=imu.csv, got 'imu'"):
-        sensor_log(tmp_path, "", ["imu"], 0, TIMES)
-    assert sensor_log(tmp_path, "", [], 0, TIMES) is None
+        sensor_log(RECORDING, "", ["imu"])
+    with pytest.raises(InputError, match="--sensors gps: expected a sensor of the recording, it has none"):
+        sensor_log(RECORDING, "gps", [])
+    assert sensor_log(RECORDING, "", []) is None
 
 
 def test_a_log_of_another_time_is_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
@@ -135,22 +142,38 @@ def test_a_log_of_another_time_is_refused(tmp_path: Path, subtests: pytest.Subte
             with pytest.raises(
                 InputError, match=rf"wheels\.csv: time: expected rows .* from 0\.000 to 0\.900 s, got {got}"
             ):
-                sensor_log(tmp_path, "", [f"wheels={table}"], 0, TIMES)
+                sensor_log(RECORDING, "", [f"wheels={table}"])
 
 
 def test_fixes_are_placed_where_the_recording_begins(tmp_path: Path) -> None:
     """Not where the log begins."""
     records, table = tmp_path / "0000.txt", tmp_path / "gps.csv"
-    records.write_text(" ".join(["49.0", "8.4", "100.0", *["0"] * 27]) + "\n")
+    records.write_text(11 * (" ".join(["49.0", "8.4", "100.0", *["0"] * 27]) + "\n"))
+    recording = replace(
+        RECORDING, origin=(49.0, 8.4, 100.0), sensors=lambda: kitti_sensor_log(records, ("gps",), 0).tables
+    )
     table.write_text("time [s],latitude [deg],longitude [deg],altitude [m]\n0.5,49.0001,8.4,103\n0.6,49.0002,8.4,103\n")
-    log = sensor_log(records, "", [f"gps={table}"], 0, TIMES)
+    log = sensor_log(recording, "", [f"gps={table}"])
     assert log is not None
     np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, 11.132, 3], [0, 22.264, 3]], rtol=1e-3, atol=1e-6)
     of_map = (49.001, 8.4, 90.0)  # 111 m north of the records, 10 m below
-    log = sensor_log(records, "", [f"gps={table}"], 0, TIMES, lambda: of_map)
+    log = sensor_log(recording, "", [f"gps={table}"], None, lambda: of_map)
     assert log is not None
     np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, -100.19, 13], [0, -89.06, 13]], rtol=1e-3, atol=1e-6)
-    records.write_text(11 * records.read_text())
-    from_records = sensor_log(records, "gps", [], 0, TIMES, lambda: of_map)
+    from_records = sensor_log(recording, "gps", [], None, lambda: of_map)
     assert from_records is not None
     np.testing.assert_allclose(from_records.tables["gps"][:, 1:].mean(axis=0), [0, -111.32, 10], atol=2.0)
+
+
+@pytest.mark.parametrize(("force", "turn", "said"), [(1.0, 0.1, "taken for g"), (9.8, 40.0, "taken for deg/s")])
+def test_inertial_samples_in_g_or_degrees_are_converted_and_named(
+    force: float, turn: float, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    table = np.column_stack([TIMES, np.zeros((10, 2)), np.full(10, force), np.zeros((10, 2)), np.full(10, turn)])
+    found = plausible_inertial(table)
+    assert said in caplog.text
+    np.testing.assert_allclose(found[:, 3], 9.8, atol=0.01)
+    np.testing.assert_allclose(found[:, 6], turn if turn < 1 else np.deg2rad(turn))
+    caplog.clear()
+    np.testing.assert_array_equal(plausible_inertial(found), found)
+    assert not caplog.text

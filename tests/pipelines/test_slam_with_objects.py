@@ -51,8 +51,10 @@ def poor_drive(count: int = 24) -> tuple[SimulatedScans, np.ndarray, list[Frame]
 
 def test_parked_cars_are_landmarks_and_moving_ones_are_tracked(tmp_path: Path) -> None:
     scans, truth, frames = poor_drive()
-    settings = LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05)
-    alone = lidar_slam(scans, "oxts", settings=settings)
+    settings = LidarSlamSettings(
+        landmarks=False, loop_closures=False, recorded_rotation=0.003, recorded_translation=0.05
+    )
+    alone = lidar_slam(scans, "recorded", settings=settings)
     found = with_objects(alone, scans, frames, load_config("kitti"), settings)
     assert found.objects is not None
     reference = Trajectory(scans.timestamps, truth)
@@ -72,8 +74,8 @@ def test_parked_cars_are_landmarks_and_moving_ones_are_tracked(tmp_path: Path) -
 
 def test_landmarks_and_objects_are_in_one_graph() -> None:
     scans, _, frames = poor_drive(12)
-    settings = LidarSlamSettings(oxts_rotation=0.003, oxts_translation=0.05)
-    alone = lidar_slam(scans, "oxts", settings=settings)
+    settings = LidarSlamSettings(recorded_rotation=0.003, recorded_translation=0.05)
+    alone = lidar_slam(scans, "recorded", settings=settings)
     found = with_objects(alone, scans, frames, load_config("kitti"), settings)
     assert [mark.number for mark in found.landmarks] == [mark.number for mark in alone.landmarks]
     for with_, without in zip(found.landmarks, alone.landmarks, strict=True):
@@ -95,9 +97,11 @@ def test_the_sensors_of_the_vehicle_are_in_the_same_graph(sensors: tuple[SensorN
         "imu": np.column_stack([times, np.gradient(speed, times), rest, rest + 9.81, rest, rest, rest]),
     }
     gps = replace(SensorSettings().gps, deviation=0.02, height_deviation=0.02)
-    settings = LidarSlamSettings(landmarks=False, loop_closures=False, oxts_rotation=0.003, oxts_translation=0.05)
+    settings = LidarSlamSettings(
+        landmarks=False, loop_closures=False, recorded_rotation=0.003, recorded_translation=0.05
+    )
     log, config = SensorLog({name: tables[name] for name in sensors}, SensorSettings(gps=gps)), load_config("kitti")
-    alone = lidar_slam(scans, "oxts", settings=settings, log=log)
+    alone = lidar_slam(scans, "recorded", settings=settings, log=log)
     without, found = (with_objects(alone, scans, frames, config, settings, 1.0, log=one) for one in (None, log))
 
     def error(path: Trajectory) -> float:
@@ -111,15 +115,17 @@ def test_the_sensors_of_the_vehicle_are_in_the_same_graph(sensors: tuple[SensorN
 def test_a_scan_without_a_frame_is_named() -> None:
     scans, _, frames = poor_drive(6)
     with pytest.raises(InputError, match=r"expected one of detections at 0\.500 s, the time of a scan"):
-        with_objects(lidar_slam(scans, "oxts"), scans, frames[:-1], load_config("kitti"))
+        with_objects(lidar_slam(scans, "recorded"), scans, frames[:-1], load_config("kitti"))
 
 
-@pytest.mark.parametrize("options", [["--scans", "8"], ["--sequence", "0004", "--odometry", "oxts", "--scans", "12"]])
+@pytest.mark.parametrize(
+    "options", [["--scans", "8"], ["--sequence", "0004", "--odometry", "recorded", "--scans", "12"]]
+)
 def test_the_command_with_and_without_scans(recordings: Path, tmp_path: Path, options: list[str]) -> None:
-    arguments = ["--dataroot", str(recordings / "kitti"), "--objects", *options, "--output", str(tmp_path / "run")]
-    outcome = done("slam", "kitti", *arguments)
-    assert "trajectory against GPS/IMU: ATE" in outcome.stdout
-    assert ("without objects against GPS/IMU: ATE" in outcome.stdout) == ("0004" not in options)
+    arguments = [str(recordings / "kitti"), "--objects", *options, "--output", str(tmp_path / "run")]
+    outcome = done("slam", "scans", *arguments)
+    assert "trajectory against the recording: ATE" in outcome.stdout
+    assert ("without objects against the recording: ATE" in outcome.stdout) == ("0004" not in options)
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert figures["objects"] > 0
     assert (figures["scan_to_map_residual"] is None) == ("0004" in options)
@@ -129,8 +135,8 @@ def test_the_command_with_and_without_scans(recordings: Path, tmp_path: Path, op
 
 
 def test_sequences_without_scans_need_poses_and_objects(recordings: Path, tmp_path: Path) -> None:
-    arguments = ["--dataroot", str(recordings / "kitti"), "--sequence", "0004", "--output", str(tmp_path / "run")]
-    outcome = CliRunner().invoke(app, ["slam", "kitti", *arguments])
+    arguments = [str(recordings / "kitti"), "--sequence", "0004", "--output", str(tmp_path / "run")]
+    outcome = CliRunner().invoke(app, ["slam", "scans", *arguments])
     assert outcome.exit_code != 0
-    assert "expected LiDAR scans" in outcome.output
+    assert "--sequence: unknown sequence '0004'" in outcome.output
     assert not (tmp_path / "run").exists()

@@ -60,7 +60,8 @@ from data_tools.datasets.source import Images
 from data_tools.files.input_files import error_context, local_tree, unknown_name
 from data_tools.files.readers import TextTable, read_lines, read_table
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
-from data_tools.lidar import Scan, azimuth_times, read_scan
+from data_tools.lidar import Scan, azimuth_times
+from data_tools.lidar.scan_files import KITTI, read_records
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, is_rotation
@@ -72,6 +73,7 @@ _KEYS: dict[str, tuple[tuple[int, int], tuple[str, ...]]] = {
     "R_rect": ((3, 3), ("R_rect", "R0_rect")),
     "Tr_velo_cam": ((3, 4), ("Tr_velo_cam", "Tr_velo_to_cam")),
     "Tr_imu_velo": ((3, 4), ("Tr_imu_velo", "Tr_imu_to_velo")),
+    "Tr": ((3, 4), ("Tr",)),  # of the odometry benchmark
 }
 
 
@@ -87,17 +89,28 @@ class Calibration:
 def read_calibration(path: str | Path) -> Calibration:
     """Read a calibration file. Raises `InputError` for missing keys, missing numbers, rotations that are none."""
     path = Path(path)
-    found: dict[str, tuple[int, list[str]]] = {}
-    for number, line in enumerate(read_lines(path), start=1):
-        key, *values = line.split() or [""]
-        found[key.rstrip(":")] = (number, values)
-    matrices = {name: _matrix(path, found, name) for name in _KEYS}
+    found = _calibration_lines(path)
+    matrices = {name: _matrix(path, found, name) for name in _KEYS if name != "Tr"}
     camera_T_velodyne = _rigid(matrices["R_rect"]) @ _rigid(matrices["Tr_velo_cam"])
     return Calibration(
         camera_T_velodyne=camera_T_velodyne,
         camera_T_imu=camera_T_velodyne @ _rigid(matrices["Tr_imu_velo"]),
         projection=matrices["P2"],
     )
+
+
+def read_transform(path: Path, key: str) -> FloatArray:
+    """The rigid transform (4, 4) of one key. Raises `InputError` as `read_calibration` does."""
+    return _rigid(_matrix(path, _calibration_lines(path), key))
+
+
+def _calibration_lines(path: Path) -> dict[str, tuple[int, list[str]]]:
+    """Line number and values by key."""
+    found: dict[str, tuple[int, list[str]]] = {}
+    for number, line in enumerate(read_lines(path), start=1):
+        key, *values = line.split() or [""]
+        found[key.rstrip(":")] = (number, values)
+    return found
 
 
 def _matrix(path: Path, found: dict[str, tuple[int, list[str]]], name: str) -> FloatArray:
@@ -361,7 +374,7 @@ class KittiScans:
     def __getitem__(self, row: int) -> Scan:
         if not self._files:
             return Scan(np.empty((0, 3)), np.empty(0))
-        scan = read_scan(self._files[row])
+        scan = read_records(self._files[row], KITTI)
         return replace(scan, time=azimuth_times(scan.points, FRAME_PERIOD)) if self._timed else scan
 
     def __iter__(self) -> Iterator[Scan]:

@@ -120,6 +120,12 @@ class TransformTree:
         """The frame at the top of the tree that a frame is in."""
         return self._upwards(frame)[-1]
 
+    def moves_in(self, frame: str) -> str | None:
+        """The nearest frame above that `frame` moves in; None if it stands still in all."""
+        upwards = self._upwards(frame)
+        moving = (parent for child, parent in pairwise(upwards) if not self._edges[child].static)
+        return next(moving, None)
+
     def connected(self, a: str, b: str) -> bool:
         """True if both frames are in one tree."""
         return self.root(a) == self.root(b)

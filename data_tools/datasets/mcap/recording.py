@@ -12,8 +12,8 @@ Definitions of ROS 2 messages in the text form of their packages: for bags that 
     std_msgs/Header header            a type and the name of a field on each line
     Object[] objects
 
-Source: the packages std_msgs, geometry_msgs, nav_msgs, tf2_msgs (ros2/common_interfaces, ros2/geometry2), vision_msgs
-4, autoware_perception_msgs (autowarefoundation/autoware_msgs).
+Source: the packages std_msgs, geometry_msgs, nav_msgs, sensor_msgs, tf2_msgs (ros2/common_interfaces,
+ros2/geometry2), vision_msgs 4, autoware_perception_msgs (autowarefoundation/autoware_msgs).
 """
 
 from __future__ import annotations
@@ -56,6 +56,26 @@ _FIELDS = {
     "nav_msgs/Odometry": (
         "std_msgs/Header header, string child_frame_id, geometry_msgs/PoseWithCovariance pose, "
         "geometry_msgs/TwistWithCovariance twist"
+    ),
+    "sensor_msgs/PointField": "string name, uint32 offset, uint8 datatype, uint32 count",
+    "sensor_msgs/PointCloud2": (
+        "std_msgs/Header header, uint32 height, uint32 width, sensor_msgs/PointField[] fields, bool is_bigendian, "
+        "uint32 point_step, uint32 row_step, uint8[] data, bool is_dense"
+    ),
+    "sensor_msgs/LaserScan": (
+        "std_msgs/Header header, float32 angle_min, float32 angle_max, float32 angle_increment, "
+        "float32 time_increment, float32 scan_time, float32 range_min, float32 range_max, float32[] ranges, "
+        "float32[] intensities"
+    ),
+    "sensor_msgs/Imu": (
+        "std_msgs/Header header, geometry_msgs/Quaternion orientation, float64[9] orientation_covariance, "
+        "geometry_msgs/Vector3 angular_velocity, float64[9] angular_velocity_covariance, "
+        "geometry_msgs/Vector3 linear_acceleration, float64[9] linear_acceleration_covariance"
+    ),
+    "sensor_msgs/NavSatStatus": "int8 status, uint16 service",
+    "sensor_msgs/NavSatFix": (
+        "std_msgs/Header header, sensor_msgs/NavSatStatus status, float64 latitude, float64 longitude, "
+        "float64 altitude, float64[9] position_covariance, uint8 position_covariance_type"
     ),
     "vision_msgs/BoundingBox3D": "geometry_msgs/Pose center, geometry_msgs/Vector3 size",
     "vision_msgs/ObjectHypothesis": "string class_id, float64 score",
@@ -177,15 +197,15 @@ class Recording:
         return {name: self.topics[name] for name in topics}
 
 
-def decoded_messages(files: Sequence[Path], topics: Mapping[str, Topic]) -> Iterator[LoggedMessage]:
-    """Messages of some topics in the order of the files, to be read in a child process.
+def decoded_messages(files: Sequence[Path], topics: Mapping[str, Topic], since: int = 0) -> Iterator[LoggedMessage]:
+    """Messages of some topics in the order of the files, to be read in a child process; those logged from `since`, ns.
 
     Raises `InputError` for one that cannot be decoded.
     """
     counts = dict.fromkeys(topics, 0)
     for file in files:
         with _readable(file):
-            for topic, time, decode, data in _reader(file).messages(topics):
+            for topic, time, decode, data in _reader(file).messages(topics, since):
                 counts[topic] += 1
                 with one_line("not readable", f"{file}: {topic}: message {counts[topic]}"):
                     message = decode(data)
@@ -223,13 +243,14 @@ class _McapFile:
                     found[channel.topic] = Topic(channel.topic, plain_type(schema.name), count + 1)
         return list(found.values())
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Decode, bytes]]:
+    def messages(self, topics: Collection[str], since: int) -> Iterator[tuple[str, int, Decode, bytes]]:
         from mcap.reader import make_reader
 
         decoders: dict[int, Decode] = {}
         with open_bytes(self.path) as file:
             reader = make_reader(file, validate_crcs=True)
-            for schema, channel, message in reader.iter_messages(topics=list(topics), log_time_order=False):
+            begin = since or None
+            for schema, channel, message in reader.iter_messages(list(topics), begin, log_time_order=False):
                 if channel.id not in decoders:
                     decoders[channel.id] = _decoder(f"{self.path}: {channel.topic}", schema, channel.message_encoding)
                 yield channel.topic, message.log_time, decoders[channel.id], message.data
@@ -249,17 +270,18 @@ class _SqliteFile:
                 Topic(str(name), plain_type(str(type_)), int(count)) for name, type_, count in database.execute(query)
             ]
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Decode, bytes]]:
+    def messages(self, topics: Collection[str], since: int) -> Iterator[tuple[str, int, Decode, bytes]]:
         from mcap.records import Schema
 
         decoders: dict[str, Decode] = {}
         marks = ",".join("?" * len(topics))
         query = f"""SELECT topics.name, topics.type, topics.serialization_format, messages.timestamp, messages.data
                     FROM messages JOIN topics ON messages.topic_id = topics.id
-                    WHERE topics.name IN ({marks}) ORDER BY messages.timestamp, messages.id"""
+                    WHERE topics.name IN ({marks}) AND (? = 0 OR messages.timestamp >= ?)
+                    ORDER BY messages.timestamp, messages.id"""
         with self._opened() as (database, tables):
             definitions = self._definitions(database) if "message_definitions" in tables else {}
-            for topic, type_, encoding, time, data in database.execute(query, tuple(topics)):
+            for topic, type_, encoding, time, data in database.execute(query, (*topics, since, since)):
                 if topic not in decoders:
                     text = definitions.get(type_, "")
                     schema = Schema(id=1, name=type_, encoding="ros2msg" if text else "", data=text.encode())

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.scans import SimulatedScans
 from data_tools.lidar import Scan, read_scan, write_cloud
-from saga_fg.errors import InputError
+from data_tools.lidar.scan_files import load_open3d, relative_times
+from saga_fg.errors import InputError, MissingExtraError
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.5, 0.25, -1.75], [10.0, -20.0, 0.5]])
 INTENSITY = np.array([0.0, 0.5, 0.25])
@@ -81,10 +83,10 @@ def test_points_without_intensity_have_none(tmp_path: Path, name: str) -> None:
 
 def test_damaged_files_say_what_is_wrong(tmp_path: Path, subtests: pytest.Subtests) -> None:
     for name, content, expected in [
-        ("a.bin", b"123456", r"a\.bin: expected records of 16 bytes .* got 6 bytes"),
-        ("a.bin", b"", r"a\.bin: expected records of 16 bytes .* got 0 bytes"),
+        ("a.bin", b"123456", r"a\.bin: expected records of 3 to 8 floats, .* the 6 bytes are none, or cut off"),
         ("a.pcd.bin", b"0" * 16, r"a\.pcd\.bin: expected records of 20 bytes"),
-        ("a.bin", np.array([np.nan, 0, 0, 0], "<f4").tobytes(), r"a\.bin: points\[0, 0\]: expected a finite number"),
+        ("a.bin", np.full(8, 1e-30, "<f4").tobytes(), r"a\.bin: expected points in metres, .* the median is 1\.7"),
+        ("a.pcd", PCD.replace("10 -20", "1e7 -2e8").replace("1 2 3", "1e5 2 3").encode(), r"the median is 1e\+05"),
         ("a.npy", b"no array", r"a\.npy: expected NumPy's format, with plain arrays and no pickled"),
         ("a.npz", b"no archive", r"a\.npz: expected NumPy's format, with plain arrays and no pickled"),
         ("a.pcd", b"", r"a\.pcd: expected a header that ends in a line DATA"),
@@ -100,10 +102,137 @@ def test_damaged_files_say_what_is_wrong(tmp_path: Path, subtests: pytest.Subtes
                 read_scan(tmp_path / name)
 
 
-def test_a_signalling_nan_is_refused_as_any_other(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.full((1, 4), 0x7FA00000, dtype="<u4").view("<f4"))
-    with pytest.raises(InputError, match=r"a\.npy: points\[0, 0\]: expected a finite number"):
-        read_scan(tmp_path / "a.npy")
+def test_points_without_a_place_are_dropped_and_counted(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    rows = np.array([[1, 2, 3, 0.5], [np.nan, 0, 0, 0], [4, np.inf, 6, 1], [7, 8, 9, np.nan]], dtype="<f4")
+    rows[1] = np.full(4, 0x7FA00000, dtype="<u4").view("<f4")  # a signalling NaN
+    np.save(tmp_path / "a.npy", rows)
+    rows.tofile(tmp_path / "a.bin")
+    np.savez(tmp_path / "a.npz", points=rows[:, :3], intensity=rows[:, 3], time=np.arange(4.0) / 100)
+    for name in ("a.npy", "a.bin", "a.npz"):
+        with subtests.test(name):
+            scan = read_scan(tmp_path / name)
+            np.testing.assert_array_equal(scan.points, [[1, 2, 3], [7, 8, 9]])
+            assert scan.intensity[0] == 0.5
+            assert np.isnan(scan.intensity[1])
+            assert scan.dropped == 2
+    assert scan.time.tolist() == [0.0, 0.03]
+    (tmp_path / "none.bin").write_bytes(b"")
+    assert len(read_scan(tmp_path / "none.bin")) == 0
+
+
+def simulated() -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) and times (N,) of a scan."""
+    scan = SimulatedScans(0, 2)[0]
+    return scan.points, scan.time
+
+
+@pytest.mark.parametrize("kind", ["<f4", "<f8", ">f4"])
+def test_columns_of_records_without_a_header_are_told(tmp_path: Path, kind: str, subtests: pytest.Subtests) -> None:
+    """Whatever their number: a scan of five columns is none of four."""
+    points, time = simulated()
+    rng = np.random.default_rng(0)
+    ring, intensity = np.arange(len(points)) % 24, rng.integers(0, 256, len(points))
+    for columns in (
+        [points],
+        [points, intensity],
+        [points, 0 * intensity],
+        [points, intensity, ring],
+        [points, intensity / 255, ring, time - time[0]],
+        [points, rng.normal(size=points.shape)],
+        [points, intensity, ring, time - time[0], ring, intensity],
+    ):
+        table = np.column_stack(columns).astype(kind)
+        with subtests.test(columns=table.shape[1]):
+            table[: len(table) // 120 * 120].tofile(tmp_path / "a.bin")
+            scan = read_scan(tmp_path / "a.bin")
+            np.testing.assert_array_equal(scan.points, table[: len(scan), :3].astype(np.float64))
+            assert len(scan) == len(table) // 120 * 120
+            assert (scan.time is not None) == (len(columns) > 3)
+            for cut in (1, 4, 8):
+                (tmp_path / "cut.bin").write_bytes((tmp_path / "a.bin").read_bytes()[:-cut])
+                with pytest.raises(InputError, match=r"cut\.bin: expected records .*, or cut off"):
+                    read_scan(tmp_path / "cut.bin")
+
+
+def test_what_is_no_scan_does_not_become_points(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for content in (rng.bytes(12000), b"plain text " * 1200, rng.integers(0, 9, 3000).astype("<i4").tobytes()):
+        (tmp_path / "a.bin").write_bytes(content)
+        with pytest.raises(InputError, match=r"a\.bin: expected"):
+            read_scan(tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.pcd", {}),
+        ("b.pcd", {"compressed": True}),
+        ("c.pcd", {"write_ascii": True}),
+        ("d.ply", {}),
+        ("e.ply", {"write_ascii": True}),
+    ],
+)
+def test_clouds_that_open3d_wrote_keep_the_times_of_their_points(
+    tmp_path: Path, name: str, options: dict[str, bool]
+) -> None:
+    points, time = simulated()
+    open3d = load_open3d()
+    cloud = open3d.t.geometry.PointCloud(open3d.core.Tensor(points.astype(np.float32)))
+    cloud.point["intensity"] = open3d.core.Tensor(points[:, :1].astype(np.float32))
+    cloud.point["timestamp"] = open3d.core.Tensor(time[:, None])
+    assert open3d.t.io.write_point_cloud(str(tmp_path / name), cloud, **options)
+    scan = read_scan(tmp_path / name)
+    np.testing.assert_allclose(scan.points, points, atol=1e-4)
+    np.testing.assert_allclose(scan.intensity, points[:, 0], atol=1e-4)
+    np.testing.assert_allclose(scan.time, time, atol=1e-5)
+
+
+def test_surveyors_files_are_read_by_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.las").write_bytes(b"LASF")
+    with monkeypatch.context() as patch:
+        patch.setattr("data_tools.lidar.scan_files.find_spec", lambda name: None)
+        with pytest.raises(MissingExtraError, match=r"need laspy: pip install 'saga-fg\[las\]'"):
+            read_scan(tmp_path / "a.las")
+    laspy = pytest.importorskip("laspy")
+    points, time = simulated()
+    header = laspy.LasHeader(point_format=1, version="1.2")
+    header.scales = [1e-4] * 3
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.intensity, cloud.gps_time = np.arange(len(points)) % 256, 1e9 + time
+    cloud.write(str(tmp_path / "b.las"))
+    scan = read_scan(tmp_path / "b.las")
+    np.testing.assert_allclose(scan.points, points, atol=1e-4)
+    np.testing.assert_allclose(scan.time, time - time[0], atol=1e-6)
+    assert scan.intensity[:3].tolist() == [0, 1, 2]
+    with pytest.raises(InputError, match=r"a\.las: expected a file that laspy can read"):
+        read_scan(tmp_path / "a.las")
+
+
+@pytest.mark.parametrize(
+    ("values", "stamp", "first", "last"),
+    [
+        (np.array([0, 50_000_000, 100_000_000], dtype=np.uint32), 5.0, 0.0, 0.1),  # ns, Ouster
+        (np.array([-0.1, -0.05, 0.0], dtype=np.float32), 5.0, -0.1, 0.0),  # s, Velodyne
+        (np.array([1.7e9, 1.7e9 + 0.1]), 1.7e9 + 0.05, -0.05, 0.05),  # the clock of the header, Hesai
+        (np.array([0.2, 0.3]), 1.7e9, 0.2, 0.3),
+        (np.array([1.7e9, 1.7e9 + 0.1]), 3.0, 0.0, 0.1),  # another clock than that of the header
+        (np.array([1700000000000000000, 1700000000100000000]), 1.7e9, 0.0, 0.1),
+        (np.array([0.0, 100.0]), None, 0.0, 0.1),  # ms
+        (np.array([0, 100_000]), None, 0.0, 0.1),  # us
+    ],
+)
+def test_times_of_points_have_the_unit_that_a_turn_takes(
+    values: np.ndarray, stamp: float | None, first: float, last: float
+) -> None:
+    found = relative_times(values, stamp)
+    np.testing.assert_allclose(found[[0, -1]], [first, last], atol=1e-6)
+
+
+def test_times_that_are_one_are_none_and_too_long_ones_an_error() -> None:
+    assert relative_times(np.zeros(5)) is None
+    with pytest.raises(InputError, match="time: expected the times of one scan, in s, ms, us or ns, they span 1e"):
+        relative_times(np.array([0.0, 1e12]))
 
 
 def test_an_array_of_another_shape_and_an_archive_without_points_are_refused(tmp_path: Path) -> None:

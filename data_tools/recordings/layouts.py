@@ -1,0 +1,466 @@
+"""Layouts of recordings of LiDAR scans, found by looking at a folder. Each is a short function beside its source.
+
+A layout of one's own is a function `open(source, options)` that returns a `ScanRecording`: MODULE:NAME, or an entry
+point of the group `saga_fg.scans` of an installed package.
+
+Marked *untested on originals*: written by the specification, and tested with files that were made by it.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.datasets.kitti import KittiScans, KittiTracking
+from data_tools.datasets.kitti.dataset import read_origin, read_transform
+from data_tools.datasets.nuscenes.dataset import file_below
+from data_tools.datasets.nuscenes.tables import read_scenes, read_table, rigid_transform, table_folder
+from data_tools.files.input_files import error_context, unknown_name
+from data_tools.files.readers import read_lines
+from data_tools.files.readers import read_table as read_rows
+from data_tools.lidar.scan import Scan
+from data_tools.lidar.scan_files import KITTI, NUSCENES, SUFFIXES, read_columns, read_records, scan_of_columns
+from data_tools.recordings.bags import is_bag, open_bag
+from data_tools.recordings.recording import RecordingOptions, ScanRecording
+from data_tools.sensor_logs import kitti_sensor_log
+from data_tools.trajectories import read_kitti_poses, read_tum_poses
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import inverse_transform, quaternion_rotation
+from saga_fg.providers.odometry import mounting
+from saga_fg.tracking.by_name import named
+
+GROUP = "saga_fg.scans"
+"""Group of entry points of packages that bring layouts."""
+
+Opener = Callable[[Path, RecordingOptions], ScanRecording]
+_TABLES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
+_UNITS = {1e17: 1e-9, 1e14: 1e-6, 1e11: 1e-3, 0.0: 1.0}  # numbers from these on are in units of so many s
+_OUSTER = (64, 1024)  # beams and columns of a turn
+_log = logging.getLogger(__name__)
+
+
+def open_recording(
+    source: str | Path, options: RecordingOptions | None = None, layout: str | None = None
+) -> ScanRecording:
+    """Open a recording; layout: one of `LAYOUTS`, MODULE:NAME or an entry point, found by looking if None.
+
+    Raises `InputError` naming the source where it is none, and what is wrong in it.
+    """
+    source, options = Path(source), options or RecordingOptions()
+    if layout is not None:
+        opener = _opener(layout)
+    else:
+        if not source.exists():
+            raise InputError(f"{source}: expected a recording of scans, there is no such file or folder")
+        opener = next((opener for fits, opener in LAYOUTS.values() if fits(source)), _folder)
+    try:
+        found = opener(source, options)
+        if not isinstance(found, ScanRecording):
+            raise InputError(f"layout {layout}: expected a ScanRecording, got {type(found).__name__}")
+        return found.chosen(options)
+    except InputError as error:
+        if str(source) in str(error):  # a file of it
+            raise
+        raise InputError(f"{source}: {error}") from error
+
+
+def _opener(layout: str) -> Opener:
+    if layout in LAYOUTS:
+        return LAYOUTS[layout][1]
+    points = {point.name: point for point in entry_points(group=GROUP)}
+    if ":" not in layout and layout not in points:
+        raise InputError(unknown_name("layout", layout, (*LAYOUTS, *points)))
+    opener: Opener = named(layout if ":" in layout else points[layout].value, "layout")
+    return opener
+
+
+def _folder(source: Path, options: RecordingOptions) -> ScanRecording:
+    """Scans in files of one format, with times in a table (`times.txt`, ... there or above) or in their names.
+
+    A table has a time on each line, or the name of a file before it. Times are s, ms, us or ns, known by their size, or
+    dates. Names with less than a time in them are numbers of scans, `period` s apart.
+    """
+    there = sorted(source.iterdir()) if source.is_dir() else [source]
+    files = [path for path in there if path.name.lower().endswith(SUFFIXES)]
+    if not files:
+        if any(path.suffix == ".bag" for path in there):
+            raise InputError("expected a bag of ROS 2 or MCAP: convert that of ROS 1 first: rosbags-convert --src FILE")
+        raise InputError(f"expected scans {', '.join(SUFFIXES)}, a bag, or one of {', '.join(LAYOUTS)}; there are none")
+    kinds = sorted({_suffix(path) for path in files})
+    if len(kinds) > 1:
+        raise InputError(f"expected scans of one format, there are {', '.join(kinds)}")
+    table = next((each for at in (source, source.parent) for name in _TABLES if (each := at / name).is_file()), None)
+    if table is not None and source.is_dir():
+        times, lines = _times_of_table(table, files)
+        return _of_files("folder", files, times, _read_alike(files), clock=lambda row: f"{table}: line {lines[row]}")
+    times = _times_of_names(files, options.period)
+    order = np.argsort(times, kind="stable").tolist()
+    files = [files[k] for k in order]
+    return _of_files("folder", files, times[order], _read_alike(files))
+
+
+def _read_alike(files: Sequence[Path]) -> Callable[[Path], Scan]:
+    """A reader of files that must have the columns of the first one with points."""
+    first: dict[str, tuple[str, ...]] = {}
+
+    def read(path: Path) -> Scan:
+        columns = read_columns(path)
+        if len(columns["x"]):
+            names = first.setdefault("names", tuple(columns))
+            if set(columns) != set(names):
+                raise InputError(
+                    f"expected the columns {', '.join(names)} of the scans before, got {', '.join(columns)}: "
+                    "a scan of another sensor?"
+                )
+        return scan_of_columns(columns)
+
+    for path in files:
+        if path.stat().st_size:
+            with error_context(str(path)):
+                read(path)
+            break
+    return read
+
+
+def _of_files(
+    layout: str, files: Sequence[Path], times: FloatArray, read: Callable[[Path], Scan], **given: Any
+) -> ScanRecording:
+    return ScanRecording(layout, times, lambda row: read(files[row]), lambda row: str(files[row]), **given)
+
+
+def _suffix(path: Path) -> str:
+    return next(suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix))
+
+
+def _stem(path: Path) -> str:
+    return path.name[: -len(_suffix(path))]
+
+
+def _seconds(text: str) -> float:
+    """A time, s, of a number in s, ms, us or ns, or of a date. Raises `ValueError` for none."""
+    if ":" in text:
+        return float(np.datetime64(text.strip().replace(" ", "T"), "ns").astype(np.int64)) * 1e-9
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value * next(unit for least, unit in _UNITS.items() if abs(value) >= least)
+
+
+def _times_of_names(files: Sequence[Path], period: float) -> FloatArray:
+    """Times (K,), s: 1583836591_182590976, 0.25, 1532402927647951 or 1403715273262142976 at the end of a name."""
+    times, numbers = list[float](), list[int]()
+    for path in files:
+        if found := re.search(r"(\d+)\.(\d+)$|(\d{9,})[_-](\d{9})$|(\d{12,20})$", _stem(path)):
+            whole, fraction, seconds, nanoseconds, stamp = found.groups()
+            if whole:
+                times.append(float(f"{whole}.{fraction}"))
+            else:
+                times.append(_seconds(stamp) if stamp else int(seconds) + 1e-9 * int(nanoseconds))
+        elif number := re.search(r"(\d{1,11})$", _stem(path)):
+            numbers.append(int(number[1]))
+    if len(times) == len(files):
+        return np.array(times)
+    at = np.array(numbers if len(numbers) == len(files) else range(len(files)), dtype=np.float64)
+    _log.warning(
+        "%s: no times in the names and no table: the scans are taken to be %g s apart", files[0].parent, period
+    )
+    return np.asarray(period * (at - at[0] if len(numbers) == len(files) else at))
+
+
+def _times_of_table(table: Path, files: Sequence[Path]) -> tuple[FloatArray, list[int]]:
+    """Times (K,), s, of the files in their order, and the lines that say them."""
+    times, lines = list[float](), list[int]()
+    by_name: dict[str, tuple[float, int]] = {}
+    for number, line in enumerate(read_lines(table), start=1):
+        words = re.split(r"[,;\s]+", line.strip())
+        if not words[0] or words[0].startswith("#"):
+            continue
+        name, text = ("", line) if len(words) == 1 or ":" in words[1] else (words[0], words[1])
+        try:
+            time = _seconds(text)
+        except ValueError:
+            if times or by_name:
+                raise InputError(f"{table}: line {number}: expected a time, got {text[:40]!r}") from None
+            continue  # a line of titles
+        if name:
+            by_name[name] = (time, number)
+        else:
+            times.append(time)
+            lines.append(number)
+    for path in files if by_name else ():
+        found = by_name.get(path.name) or by_name.get(_stem(path))
+        if found is None:
+            raise InputError(f"{table}: expected a line for {path.name}, there is none")
+        times.append(found[0])
+        lines.append(found[1])
+    if len(times) != len(files):
+        raise InputError(f"{table}: expected {len(files)} times, one for each scan, got {len(times)}")
+    return np.array(times), lines
+
+
+def _one_of(what: str, chosen: str | None, there: Iterable[str]) -> str:
+    """The sequence of a name, or the only one there is."""
+    known = tuple(sorted(there))
+    if chosen is None and len(known) == 1:
+        return known[0]
+    if chosen is None:
+        raise InputError(f"expected --sequence with a {what} of {', '.join(known[:12]) or 'several, there is none'}")
+    if chosen not in known:
+        raise InputError(f"--sequence: {unknown_name(what, chosen, known)}")
+    return chosen
+
+
+def _nearest(times: FloatArray, poses: FloatArray, wanted: FloatArray, longest: float = 0.1) -> FloatArray | None:
+    """The poses (K, 4, 4) nearest to some times (K,), s, from the first place on; None where some are too far off."""
+    order = np.argsort(times)
+    times, poses = times[order], poses[order]
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1) if len(times) > 1 else np.zeros(len(wanted), int)
+    row = np.where(np.abs(times[after - 1] - wanted) < np.abs(times[after] - wanted), after - 1, after)
+    if (off := np.abs(times[row] - wanted) > longest).any():
+        _log.warning("%d of %d scans have no pose within %g s: poses are left out", off.sum(), len(wanted), longest)
+        return None
+    found = poses[row].copy()
+    found[:, :3, 3] -= np.round(found[0, :3, 3])
+    return found
+
+
+def _ouster(path: Path) -> Scan:
+    """A scan without times of the Ouster of MulRan and Newer College, column by column in a turn."""
+    scan = read_records(path, KITTI) if path.suffix == ".bin" else scan_of_columns(read_columns(path))
+    beams, columns = _OUSTER
+    if scan.time is not None or len(scan) != beams * columns:
+        return scan
+    return replace(scan, time=np.repeat(np.arange(columns) / columns * 0.1, beams))
+
+
+def kitti_tracking(source: Path, options: RecordingOptions) -> ScanRecording:
+    """KITTI tracking: velodyne/NNNN/KKKKKK.bin, oxts/NNNN.txt, calib/NNNN.txt, in training/ or there.
+
+    Sensors are made from the GPS/IMU records: inertial samples are those recorded, fixes and speeds get noise, 1 m by
+    axis and 0.05 m/s. Source: https://www.cvlibs.net/datasets/kitti (development kit of tracking).
+    """
+    root = source / "training" if (source / "training").is_dir() else source
+    blind = options.blind and not (root / "velodyne" / str(options.sequence)).is_dir()
+    there = (root / "oxts").glob("*.txt") if blind else (root / "velodyne").glob("*")
+    name = _one_of("sequence", options.sequence, (path.stem for path in there))
+    scans = KittiScans(source, name, options.timed, blind=blind)
+    records, files = root / "oxts" / f"{name}.txt", root / "velodyne" / name
+    return ScanRecording(
+        "kitti-tracking",
+        scans.timestamps,
+        scans.__getitem__,
+        lambda row: str(files / f"{scans.frames[row]:06d}.bin"),
+        scans.ego_T_lidar,
+        scans.world_T_ego,
+        read_origin(records),
+        lambda: kitti_sensor_log(records, ("imu", "wheels", "gps"), options.seed).tables,
+        blind=blind,
+        objects=lambda folder: (
+            KittiTracking(source, folder or source / "detections" / "pointrcnn", [name]).scene(name).frames
+        ),
+    )
+
+
+def kitti_odometry(source: Path, options: RecordingOptions) -> ScanRecording:
+    """KITTI odometry: sequences/NN/velodyne/KKKKKK.bin, times.txt, calib.txt, and poses/NN.txt; or one such sequence.
+
+    Scans are compensated for motion. Poses are those of the left camera. Source:
+    https://www.cvlibs.net/datasets/kitti/eval_odometry.php (development kit). Untested on originals.
+    """
+    if (source / "sequences").is_dir():
+        there = (path.name for path in (source / "sequences").iterdir() if (path / "velodyne").is_dir())
+        source = source / "sequences" / _one_of("sequence", options.sequence, there)
+    files = sorted((source / "velodyne").glob("*.bin"))
+    table = source / "times.txt"
+    times, lines = _times_of_table(table, files)
+    poses, truth = None, source.parents[1] / "poses" / f"{source.name}.txt" if len(source.parts) > 1 else source
+    if truth.is_file():
+        camera_T_lidar = read_transform(source / "calib.txt", "Tr")
+        poses = inverse_transform(camera_T_lidar) @ read_kitti_poses(truth).world_T_ego @ camera_T_lidar
+        if len(poses) != len(files):
+            raise InputError(f"{truth}: expected {len(files)} poses, one for each scan, got {len(poses)}")
+    return _of_files(
+        "kitti-odometry",
+        files,
+        times,
+        lambda path: read_records(path, KITTI),
+        world_T_ego=poses,
+        clock=lambda row: f"{table}: line {lines[row]}",
+    )
+
+
+def mulran(source: Path, options: RecordingOptions) -> ScanRecording:
+    """MulRan: Ouster/NANOSECONDS.bin of x, y, z, intensity; global_pose.csv: ns, 12 numbers of the vehicle's pose.
+
+    Sources: Kim et al., MulRan, ICRA 2020; https://sites.google.com/view/mulran-pr, whose calib_base2ouster.txt the
+    place of the LiDAR is from. Untested on originals.
+    """
+    files = sorted((source / "Ouster").glob("*.bin"), key=lambda path: int(path.stem))
+    times, poses = _times_of_names(files, options.period), None
+    if (table := source / "global_pose.csv").is_file():
+        numbers = read_rows(table, (13,), "time, r11, ..., tz", ",").numbers(slice(0, 13), ("pose",) * 13, np.inf)
+        every = np.tile(np.eye(4), (len(numbers), 1, 1))
+        every[:, :3] = numbers[:, 1:].reshape(-1, 3, 4)
+        poses = _nearest(numbers[:, 0] * 1e-9, every, times)
+    ego_T_lidar = mounting("calib", (1.7042, -0.021, 1.8047, *np.radians([0.0001, 0.0003, 179.6654]).tolist())).matrix()
+    return _of_files("mulran", files, times, _ouster, ego_T_lidar=ego_T_lidar, world_T_ego=poses)
+
+
+def _record(fields: str) -> np.dtype[Any]:
+    """Records of fields like "x f4 y f4", without gaps, in little-endian order."""
+    words = fields.split()
+    return np.dtype([(name, f"<{kind}") for name, kind in zip(words[::2], words[1::2], strict=True)])
+
+
+_HELIPR = {
+    "Avia": _record("x f4 y f4 z f4 reflectivity u1 tag u1 line u1 offset_time u4"),
+    "Aeva": _record("x f4 y f4 z f4 reflectivity f4 velocity f4 time_offset i4 line u1 intensity f4"),
+    "Ouster": _record("x f4 y f4 z f4 intensity f4 t u4 reflectivity u2 ring u2 ambient u2"),
+    "Velodyne": _record("x f4 y f4 z f4 intensity f4 ring u2 time f4"),
+}
+_EARLY_AEVA = _record("x f4 y f4 z f4 reflectivity f4 velocity f4 time_offset i4 line u1")
+_LAST_EARLY = 1691936557946849179  # ns, until when
+
+
+def helipr(source: Path, options: RecordingOptions) -> ScanRecording:
+    """HeLiPR: LiDAR/SENSOR/NANOSECONDS.bin, LiDAR_GT/global_SENSOR_gt.txt: ns, x, y, z, qx, qy, qz, qw of the LiDAR.
+
+    The sensor is the sequence. Sources: Jung et al., HeLiPR, IJRR 2024;
+    https://github.com/minwoo0611/HeLiPR-File-Player (ROSThread.cpp). Untested on originals.
+    """
+    there = (path.name for path in (source / "LiDAR").iterdir() if path.name in _HELIPR)
+    sensor = _one_of("sensor", options.sequence, there)
+    files = sorted((source / "LiDAR" / sensor).glob("*.bin"), key=lambda path: int(path.stem))
+    times, poses = _times_of_names(files, options.period), None
+    if (truth := source / "LiDAR_GT" / f"global_{sensor}_gt.txt").is_file():
+        names = ("time", *_TUM)
+        numbers = read_rows(truth, (8,), ", ".join(names)).numbers(slice(0, 8), names, np.inf)
+        poses = _nearest(numbers[:, 0] * 1e-9, _poses(numbers[:, 1:]), times)
+
+    def read(path: Path) -> Scan:
+        early = sensor == "Aeva" and int(path.stem) <= _LAST_EARLY
+        return read_records(path, _EARLY_AEVA if early else _HELIPR[sensor])
+
+    return _of_files("helipr", files, times, read, world_T_ego=poses)
+
+
+def newer_college(source: Path, options: RecordingOptions) -> ScanRecording:
+    """Newer College: raw_format/ouster_scan/cloud_SECONDS_NANOSECONDS.pcd, and ground_truth/registered_poses.csv: s,
+    ns, x, y, z, qx, qy, qz, qw of the camera.
+
+    Sources: Ramezani et al., The Newer College Dataset, IROS 2020; https://ori-drs.github.io/newer-college-dataset.
+    Untested on originals.
+    """
+    files = sorted((source / "raw_format" / "ouster_scan").glob("*.pcd"))
+    times, poses = _times_of_names(files, options.period), None
+    order = np.argsort(times, kind="stable").tolist()
+    files, times = [files[k] for k in order], times[order]
+    if (truth := source / "ground_truth" / "registered_poses.csv").is_file():
+        names = ("sec", "nsec", *_TUM)
+        numbers = read_rows(truth, (9,), ", ".join(names), ",", "#").numbers(slice(0, 9), names, np.inf)
+        camera_T_lidar = _poses(np.array([[-0.084, -0.025, 0.050, 0.0, 0.0, 0.924, 0.383]]))[0]
+        poses = _nearest(numbers[:, 0] + 1e-9 * numbers[:, 1], _poses(numbers[:, 2:]) @ camera_T_lidar, times)
+    return _of_files("newer-college", files, times, _ouster, world_T_ego=poses)
+
+
+_TUM = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def _poses(rows: FloatArray) -> FloatArray:
+    """Poses (n, 4, 4) of rows (n, 7): x, y, z, qx, qy, qz, qw."""
+    norm = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    if (norm < 0.9).any() or (norm > 1.1).any():
+        raise InputError(f"pose {int(np.argmax((norm < 0.9) | (norm > 1.1))) + 1}: expected a unit quaternion")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = quaternion_rotation((rows[:, 3:] / norm)[:, [3, 0, 1, 2]])
+    poses[:, :3, 3] = rows[:, :3]
+    return poses
+
+
+def hilti(source: Path, options: RecordingOptions) -> ScanRecording:
+    """Hilti SLAM challenges: a bag, converted by rosbags-convert, and beside it poses of the IMU in TUM's format.
+
+    Source: https://hilti-challenge.com, 2021 to 2023. The poses are sparse, or those of a part: they are taken where
+    each scan has one. Untested on originals.
+    """
+    bag = next(path for path in sorted(source.iterdir()) if is_bag(path))
+    found = open_bag(bag, options)
+    truth = read_tum_poses(next(path for path in sorted(source.iterdir()) if path.suffix in (".txt", ".tum")))
+    return replace(found, layout="hilti", world_T_ego=_nearest(truth.timestamps, truth.world_T_ego, found.timestamps))
+
+
+def nuscenes(source: Path, options: RecordingOptions) -> ScanRecording:
+    """nuScenes: sweeps and keyframes of LIDAR_TOP of a scene, with poses and places by the tables in v1.0-VERSION/.
+
+    Source: https://www.nuscenes.org/nuscenes (schema), https://github.com/nutonomy/nuscenes-devkit. Untested on
+    originals.
+    """
+    folder = table_folder(source, next(path.name for path in sorted(source.glob("v1.0-*")) if path.is_dir()))
+    scene = _one_of("scene", options.sequence, (name for (name,) in read_table(folder, "scene", ("name",))))
+    samples = set(read_scenes(folder, [scene]).records[scene].tokens)
+    fields = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp")
+    rows = {
+        float(time) * 1e-6: (file_below(source, folder, sample, name), pose, mount)
+        for sample, pose, mount, name, time in read_table(folder, "sample_data", fields)
+        if sample in samples and "LIDAR_TOP" in str(name)
+    }
+    times = np.array(sorted(time for time, (path, _, _) in rows.items() if path.is_file()))
+    if not len(times):
+        raise InputError(
+            f"expected scans of LIDAR_TOP of {scene}, none of the {len(rows)} that the tables name is there"
+        )
+    files, poses, mounts = zip(*(rows[time] for time in times.tolist()), strict=True)
+
+    def transforms(table: str, wanted: Sequence[str]) -> FloatArray:
+        every = {token: place for token, *place in read_table(folder, table, ("token", "translation", "rotation"))}
+        with error_context(str(folder / f"{table}.json")):
+            if lacking := [token for token in wanted if token not in every]:
+                raise InputError(f"expected a record {lacking[0]}, there is none")
+            return np.array([rigid_transform(*every[token]) for token in wanted])
+
+    return _of_files(
+        "nuscenes",
+        files,
+        times,
+        lambda path: read_records(path, NUSCENES),
+        ego_T_lidar=transforms("calibrated_sensor", mounts[:1])[0],
+        world_T_ego=transforms("ego_pose", poses),
+    )
+
+
+def _has(*patterns: str) -> Callable[[Path], bool]:
+    return lambda source: source.is_dir() and all(any(source.glob(pattern)) for pattern in patterns)
+
+
+LAYOUTS: Mapping[str, tuple[Callable[[Path], bool], Opener]] = {
+    "bag": (is_bag, open_bag),
+    "kitti-tracking": (
+        lambda source: (
+            _has("oxts/*.txt", "calib/*.txt")(source / "training") or _has("oxts/*.txt", "calib/*.txt")(source)
+        ),
+        kitti_tracking,
+    ),
+    "kitti-odometry": (
+        lambda source: _has("sequences/*/velodyne")(source) or _has("velodyne/*.bin", "times.txt")(source),
+        kitti_odometry,
+    ),
+    "mulran": (_has("Ouster/*.bin"), mulran),
+    "helipr": (_has("LiDAR/*/*.bin"), helipr),
+    "newer-college": (_has("raw_format/ouster_scan/*.pcd"), newer_college),
+    "nuscenes": (_has("v1.0-*/sample_data.json"), nuscenes),
+    "hilti": (
+        lambda source: source.is_dir() and any(map(is_bag, source.iterdir())) and _has("*.t[xu][tm]")(source),
+        hilti,
+    ),
+    "folder": (lambda source: True, _folder),
+}
+"""Layouts by name: whether a source has it, and how it is opened. The first that fits is taken."""

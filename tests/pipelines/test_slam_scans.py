@@ -1,0 +1,173 @@
+"""`saga-fg slam scans` and `slam laser` on recordings of one's own: folders, bags, their sensors, and what is wrong."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.scans import SimulatedScans, laser_drive
+from data_tools.datasets.kitti.dataset import EARTH_RADIUS
+from data_tools.recordings import open_recording
+from data_tools.trajectories import Trajectory, read_tum_poses, trajectory_errors
+from pipelines.slam.laser_slam import laser_slam
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from saga_fg.errors import InputError
+from saga_fg.numerics.geometry import inverse_transform, yaw_transform
+from tests.data_tools import mcap_example as example
+from tests.data_tools.recordings.test_bags import laser_messages
+from tests.data_tools.scans_example import BEGIN, FIX, IMU, fix_message, imu_message, scan_messages, write_scans
+from tests.pipelines.command import saga_fg
+
+needs_ros = pytest.mark.skipif(find_spec("rosbags") is None or find_spec("mcap_ros2") is None, reason="needs rosbags")
+COUNT = 24
+MOUNT = yaw_transform(1.0, 0.0, 0.5, 0.2)
+PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False)
+
+
+@pytest.fixture(scope="module")
+def drive() -> SimulatedScans:
+    return SimulatedScans(0, COUNT)
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    outcome = saga_fg("slam", *arguments)
+    return outcome.exit_code, " ".join(outcome.output.split())
+
+
+def times(drive: SimulatedScans) -> np.ndarray:
+    return BEGIN + drive.timestamps
+
+
+def test_a_folder_of_scans(tmp_path: Path, drive: SimulatedScans) -> None:
+    scans = [drive[k] for k in range(COUNT)]
+    folder = write_scans(tmp_path / "scans", "pcd", scans, times(drive))
+    code, output = run("scans", folder, "--output", tmp_path / "run")
+    assert code == 0, output
+    assert f"{COUNT} scans" in output
+    assert "against the recording" not in output
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert {"trajectory.tum", "trajectory.txt", "map.ply", "graph.g2o", "metrics.json", "above.png"} <= written
+    assert "reference.tum" not in written
+    path = read_tum_poses(tmp_path / "run" / "trajectory.tum")
+    truth = Trajectory(times(drive), drive.world_T_ego)
+    assert trajectory_errors(path, truth, "start").ate < 0.1
+    code, output = run("scans", folder, "--map", tmp_path / "run", "--guess", "0,0,0,0", "--output", tmp_path / "again")
+    assert code == 0, output
+    assert not (tmp_path / "again" / "reference.tum").exists()
+
+
+@needs_ros
+def test_every_form_gives_the_same_trajectory(tmp_path: Path, drive: SimulatedScans) -> None:
+    """With one rounding: points are float32, times of points as precise as names and headers are."""
+    scans = [drive[k] for k in range(10)]
+    sources = [write_scans(tmp_path / kind, kind, scans, times(drive)[:10]) for kind in ("npz", "pcd", "ply")]
+    messages = scan_messages(scans, times(drive)[:10])
+    sources += [example.write_mcap(tmp_path / "a.mcap", messages), example.write_bag(tmp_path / "bag", messages)]
+    found = [lidar_slam(open_recording(source), settings=PLAIN).trajectory.world_T_ego for source in sources]
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-6)
+
+
+def bag_messages(drive: SimulatedScans, factor: float = 1.0, tilt: float = 0.0) -> list[tuple]:
+    """Scans of a LiDAR ahead on the vehicle, inertial samples, and fixes of a drive that begins to the north-east."""
+    world_T_start = yaw_transform(0.0, 0.0, 0.0, 0.7)
+    poses = world_T_start @ inverse_transform(drive.world_T_ego[0] @ inverse_transform(MOUNT)) @ drive.world_T_ego
+    ego = poses @ inverse_transform(MOUNT)
+    messages = scan_messages([drive[k] for k in range(COUNT)], times(drive), MOUNT)
+    gravity = factor * 9.81 * np.array([0.0, np.sin(tilt), np.cos(tilt)])
+    for time in np.arange(BEGIN - 0.05, times(drive)[-1] + 0.05, 0.01):
+        messages.append(("/imu", IMU, imu_message(time, gravity, (0, 0, 0)), round(time * 1e9)))
+    scale = EARTH_RADIUS * np.cos(np.radians(49.0))
+    for time, pose in zip(times(drive), ego, strict=True):
+        degrees = np.degrees(pose[:2, 3] / scale) * [1.0, np.cos(np.radians(49.0))]
+        messages.append(("/fix", FIX, fix_message(time, 49.0 + degrees[1], 8.4 + degrees[0], 110.0), round(time * 1e9)))
+    return sorted(messages, key=lambda message: message[3])
+
+
+@needs_ros
+def test_a_bag_with_inertial_samples_and_fixes(tmp_path: Path, drive: SimulatedScans) -> None:
+    bag = example.write_bag(tmp_path / "bag", bag_messages(drive))
+    options = ["--no-landmarks", "--sensors", "imu,gps", "--output", tmp_path / "run"]
+    code, output = run("scans", bag, *options)
+    assert code == 0, output
+    poses = read_tum_poses(tmp_path / "run" / "trajectory.tum").world_T_ego
+    step = poses[10, :3, 3] - poses[0, :3, 3]
+    truth = drive.world_T_ego @ inverse_transform(MOUNT)
+    true = yaw_transform(yaw=0.7)[:3, :3] @ (inverse_transform(truth[0]) @ truth[10])[:3, 3]
+    assert np.linalg.norm(step - true) < 0.3  # in the world of the fixes
+    code, output = run("scans", bag, "--sensors", "wheels", "--output", tmp_path / "none")
+    assert code != 0
+    assert "--sensors wheels: expected a sensor of the recording, it has imu, gps" in output
+    assert not (tmp_path / "none").exists()
+
+
+@needs_ros
+@pytest.mark.parametrize(
+    ("factor", "tilt", "said"),
+    [(1 / 9.81, 0.0, "taken for g"), (1.0, 1.5, "imu: gravity is 86 deg off the vehicle's vertical")],
+)
+def test_wrong_units_and_mountings_of_an_imu_are_named(
+    tmp_path: Path, drive: SimulatedScans, factor: float, tilt: float, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    messages = bag_messages(drive, factor, tilt)
+    code, output = run(
+        *("scans", example.write_bag(tmp_path / "bag", messages), "--scans", "6", "--no-landmarks"),
+        *("--sensors", "imu", "--output", tmp_path / "run"),
+    )
+    assert code == 0, output
+    assert said in caplog.text
+
+
+def test_a_lidar_that_is_mounted_elsewhere_is_named(
+    tmp_path: Path, drive: SimulatedScans, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = write_scans(tmp_path / "scans", "npz", [drive[k] for k in range(COUNT)], times(drive))
+    for turn, named in (("0", False), ("1.57", True), ("3.14", False)):
+        caplog.clear()
+        options = ["--no-landmarks", "--mount", f"0,0,0,0,0,{turn}", "--output", tmp_path / "run"]
+        code, output = run("scans", folder, *options)
+        assert code == 0, output
+        assert ("check where the LiDAR is mounted" in caplog.text) == named
+        misfits = json.loads((tmp_path / "run" / "metrics.json").read_text())["misfits"]
+        assert ("lidar" in misfits) == named
+
+
+def test_options_that_are_wrong_are_named(tmp_path: Path, drive: SimulatedScans) -> None:
+    folder = write_scans(tmp_path / "scans", "bin", [drive[0], drive[1]], times(drive)[:2])
+    for options, said in (
+        (["--mount", "1,2"], "--mount: expected x,y,z,roll,pitch,yaw, m and rad, got '1,2'"),
+        (["--topic", "a=b", "--topic", "a=c"], "--topic a=c: expected TOPIC or SENSOR=TOPIC, once for each sensor"),
+        (["--layout", "kitty"], "unknown layout 'kitty'"),
+        (["--objects"], "--objects: expected a recording with detections"),
+        (["--odometry", "recorded"], "odometry: expected poses in the recording, it has none"),
+        (["--sensors", "gps"], "--sensors gps: expected a sensor of the recording, it has none"),
+    ):
+        code, output = run("scans", folder, *options, "--output", tmp_path / "run")
+        assert code != 0
+        assert said in output
+        assert not (tmp_path / "run").exists()
+
+
+def test_a_drive_whose_heading_fixes_cannot_tell_is_refused(drive: SimulatedScans, tmp_path: Path) -> None:
+    folder = write_scans(tmp_path / "scans", "npz", [drive[k] for k in range(4)], times(drive)[:4])
+    table = tmp_path / "gps.csv"
+    table.write_text("time [s],x [m],y [m],z [m]\n" + "".join(f"{time},0,0,0\n" for time in times(drive)[:4]))
+    code, output = run("scans", folder, "--sensor-log", f"gps={table}", "--output", tmp_path / "run")
+    assert code != 0
+    assert "gps: expected 4 fixes over 5 m of the drive, which tell its heading, got 4 over 2.5 m" in output
+
+
+@needs_ros
+def test_a_laser_in_a_bag(tmp_path: Path) -> None:
+    log, _ = laser_drive(0, rounds=0.1)
+    code, output = run("laser", example.write_bag(tmp_path / "bag", laser_messages(log)), "--output", tmp_path / "run")
+    assert code == 0, output
+    path = read_tum_poses(tmp_path / "run" / "trajectory.tum")
+    same = laser_slam(log).poses
+    np.testing.assert_allclose(path.world_T_ego[:, :2, 3], same[:, :2, 2], atol=2e-3)
+    with pytest.raises(InputError):
+        open_recording(tmp_path / "bag")
