@@ -271,7 +271,7 @@ def judge_run(source: DatasetSource, output: Path, method: str, configuration: s
 
     configuration: YAML of the run. Raises `InputError` for results that do not fit the ground truth.
     """
-    result = output / source.all_tracks
+    result = output / source.written.all_tracks
     write_run_record(result, RunRecord(method, configuration, {}))
     found = source.read_results(result)
     evaluation = found.evaluate(hota)

@@ -21,6 +21,7 @@ from data_tools.datasets.source import (
     DatasetSource,
     OpenedPart,
     Parts,
+    ResultFormat,
     Verb,
     file_digest,
     names,
@@ -39,6 +40,12 @@ JUDGED: tuple[Verb, ...] = ("evaluate", "report", "view")
 """Verbs that compare with true objects."""
 
 
+class FileFormat(ResultFormat):
+    """Tables."""
+
+    part_option = "table"
+
+
 @dataclass(frozen=True, kw_only=True)
 class DetectionFileSource(DatasetSource):
     """Your own detections: a table with a row for each.
@@ -54,10 +61,10 @@ class DetectionFileSource(DatasetSource):
     """
 
     name = "file"
+    written = FileFormat()
     has_truth = False
     truth_option = "--truth"
     summarised = True
-    part_option = "table"
     example = "detections.csv"
     detections: list[str] | None = option(
         "Table of detections: .csv, .ndjson, .jsonl, .npz, .parquet or .feather (extra [parquet]). In parallel: "

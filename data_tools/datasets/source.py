@@ -1,6 +1,6 @@
 """A dataset for all verbs of the command, and datasets by name.
 
-It says its options, how it opens, and how its results are written, read and scored.
+It says its options, how it opens, how its results are written and read.
 
 A new dataset is a dataclass derived from `DatasetSource`, whose fields are its options:
 
@@ -237,9 +237,51 @@ def input_files(source: DatasetSource) -> tuple[Path, ...]:
 
 def part_suffix(source: DatasetSource) -> str:
     """Suffix of the result of one part, in parallel runs."""
-    if source.part_option:
-        return f".{getattr(source, source.part_option)}"
-    return Path(source.tracks_example).suffix or ".csv"
+    written = source.written
+    return (
+        f".{getattr(source, written.part_option)}"
+        if written.part_option
+        else Path(written.tracks_example).suffix or ".csv"
+    )
+
+
+class ResultFormat:
+    """How results are written: tables, if nothing else is said.
+
+    tracks       what `track` writes, for the help; tracks_example: such a name
+    merged       result of all parts in parallel, "" for none: of tracks, of labels
+    part_option  option that chooses the suffix of the result of one part, "" for that of tracks_example
+    all_tracks   what holds the tracks of all parts of a parallel run, for `benchmark`; "" for none
+    submission   pattern of the files that the official server takes, "" for none
+    """
+
+    tracks = "Table of tracks to write: .csv, .ndjson, .jsonl or .parquet (extra [parquet])."
+    tracks_example = "tracks.csv"
+    merged = ("", "")
+    part_option = ""
+    all_tracks = ""
+    submission = ""
+
+    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+        """Write the result of tracking; it appears when all is done."""
+        from data_tools.datasets.detection_files import write_tracks
+
+        write_tracks(output, scenes)
+
+    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
+        """Write labels in the dataset's own format to a folder that has the table of labels.
+
+        part  name of a part of a parallel run, whose files go to folder/*/PART.*
+        """
+        return
+
+    def write_track_part(self, part: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+        """Write the result of one part of a parallel run, which is named for a file in a folder of its own."""
+        self.write_tracks(part, dataset, scenes)
+
+    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
+        """Join the tracks, or labels, of all parts of a parallel run to the file `merged`."""
+        return
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,11 +293,7 @@ class DatasetSource(ABC):
     has_truth       whether there is ground truth
     truth_option    option that names a table of ground truth where there is none otherwise; "" for none
     example         options of the examples in the help
-    tracks          what `track` writes, for the help; tracks_example: such a name
-    merged          result of all parts in parallel, "" for none: of tracks, of labels
-    part_option     option that chooses the suffix of the result of one part, "" for that of tracks_example
-    all_tracks      what holds the tracks of all parts of a parallel run, for `benchmark`; "" for none
-    submission      pattern of the files that the official server takes, "" for none
+    written         how results are written
     summarised      whether figures have a narrow summary
     shows           of scans, maps and images, those that `surroundings` may have
     """
@@ -265,12 +303,7 @@ class DatasetSource(ABC):
     has_truth: ClassVar[bool] = True
     truth_option: ClassVar[str] = ""
     example: ClassVar[str] = ""
-    tracks: ClassVar[str] = "Table of tracks to write: .csv, .ndjson, .jsonl or .parquet (extra [parquet])."
-    tracks_example: ClassVar[str] = "tracks.csv"
-    merged: ClassVar[tuple[str, str]] = ("", "")
-    part_option: ClassVar[str] = ""
-    all_tracks: ClassVar[str] = ""
-    submission: ClassVar[str] = ""
+    written: ClassVar[ResultFormat] = ResultFormat()
     summarised: ClassVar[bool] = False
     shows: ClassVar[tuple[Literal["scans", "maps", "images"], ...]] = ()
 
@@ -316,27 +349,6 @@ class DatasetSource(ABC):
     def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
         """Scans, maps and images of the scenes, of the kinds in `shows`."""
         return Surroundings()
-
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        """Write the result of tracking; it appears when all is done."""
-        from data_tools.datasets.detection_files import write_tracks
-
-        write_tracks(output, scenes)
-
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
-        """Write labels in the dataset's own format to a folder that has the table of labels.
-
-        part  name of a part of a parallel run, whose files go to folder/*/PART.*
-        """
-        return
-
-    def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
-        """Write the result of one part of a parallel run to folder/tracks/STEM.*."""
-        self.write_tracks(folder / "tracks" / f"{stem}{part_suffix(self)}", dataset, scenes)
-
-    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
-        """Join the tracks, or labels, of all parts of a parallel run to the file `merged`."""
-        return
 
     def read_results(self, result: Path) -> Results:
         """The result of any tracker by scene, with ground truth, which scores it.

@@ -101,8 +101,8 @@ def _tracked(source: DatasetSource, settings: TrackConfig, method: Method) -> tu
         runs = track_dataset(
             CheckedDataset(dataset, checks), lambda: settings.new_tracker(method, recorder), progress=progress
         )
-        result = Path(folder) / source.tracks_example
-        source.write_tracks(result, dataset, ((run.scene, run.tracks) for run in runs))
+        result = Path(folder) / source.written.tracks_example
+        source.written.write_tracks(result, dataset, ((run.scene, run.tracks) for run in runs))
         return source.restricted(dataset.scenes).read_results(result), recorder.by_class
 
 
@@ -185,14 +185,14 @@ def _benchmark(
     the official server. A scene that is done is not done again, unless its input, the settings or
     saga-fg have changed.
     """
-    if not source.all_tracks:
+    if not source.written.all_tracks:
         raise InputError(f"benchmark {source.name}: expected a dataset with official results: saga-fg benchmark --help")
     options.apart(output, *input_files(source))
     task = TrackTask(tracker.configured(source.family, config), tracker.method, source)
     run = run_at_scale(source, task, output, scale)
     exit_on_failures(run)
     with working("writing the submission"):
-        files = sorted(output.glob(source.submission)) if source.submission else ()
+        files = sorted(output.glob(source.written.submission)) if source.written.submission else ()
         submission = write_zip(output / "submission.zip", files) if files else None
     if not without_truth:
         with working("scoring"):
@@ -213,5 +213,5 @@ benchmark_app = dataset_commands(
         "benchmark {recordings} --output test --without-truth",
     ),
     lambda source: {"workers": "Process scenes in this many processes.  [default: one per core]"},
-    listed=lambda source: bool(source.all_tracks),
+    listed=lambda source: bool(source.written.all_tracks),
 )

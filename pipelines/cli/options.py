@@ -402,7 +402,7 @@ def _examples(verb: Verb, source: Source, examples: tuple[str, ...]) -> str:
     options = source.example or " ".join(f"--{name.replace('_', '-')} {name.upper()}" for name in required)
     arguments = [f"--{each.name} " for each in fields(source) if each.metadata.get("argument")]
     recordings = f"{source.name} {options}"
-    result = "labels" if verb == "evaluate labels" else source.tracks_example
+    result = "labels" if verb == "evaluate labels" else source.written.tracks_example
     beside = f"{source.name} {result} {''.join(arguments)}{options}"
     if verb == "evaluate" and source.truth_option:
         recordings = f"{source.name} {''.join(arguments)}{options} {source.truth_option} truth.csv"

@@ -33,16 +33,16 @@ def run_at_scale(
 ) -> RunSummary:
     """Do the task, which makes tracks or labels, with all parts of a dataset; print and return what became of them.
 
-    What the parts left becomes the file `DatasetSource.merged`, if all have done it.
+    What the parts left becomes the file `ResultFormat.merged`, if all have done it.
     """
     if output.suffix:
         raise InputError(f"--output {output}: expected the name of a folder, since scenes are done in parallel")
 
     def finish(report: RunSummary) -> None:
         if merged and not report.failed:
-            source.merge(output, [file_name(name) for name in there.names], there.dataset, labels)
+            source.written.merge(output, [file_name(name) for name in there.names], there.dataset, labels)
 
-    merged = source.merged[labels]
+    merged = source.written.merged[labels]
     with source.parts() as there, progress_bar(unit="scenes") as bar:
         if merged:
             (output / merged).unlink(missing_ok=True)
@@ -171,7 +171,7 @@ def _track(
             looked_at = CheckedDataset(dataset, checks)
             runs = summary.counting(track_dataset(looked_at, new_tracker, progress=progress, horizons=horizons))
             with keep_predictions(runs, output, horizons is not None) as kept_runs:
-                source.write_tracks(output, dataset, ((run.scene, run.tracks) for run in kept_runs))
+                source.written.write_tracks(output, dataset, ((run.scene, run.tracks) for run in kept_runs))
     summary.write_record(method, settings, source.kept())
     checks.add(summary.classes)
     checks.finish()
@@ -192,8 +192,8 @@ _TRACK_EXAMPLES = (
 
 def _texts(source: Source) -> dict[str, str]:
     """Help of --output, which names a file unless scenes are processed in parallel."""
-    is_file = bool(Path(source.tracks_example).suffix)
-    return {"output": source.tracks + " With --workers or --ray: a folder." * is_file}
+    is_file = bool(Path(source.written.tracks_example).suffix)
+    return {"output": source.written.tracks + " With --workers or --ray: a folder." * is_file}
 
 
 track_app = dataset_commands("track", "Track recorded detections of a dataset.", _track, _TRACK_EXAMPLES, _texts)
@@ -252,7 +252,7 @@ def _smooth(
                 output,
                 lambda _: smoothing.smooth_dataset(checked, settings, method, progress=progress),
                 table,
-                lambda folder, found: source.write_labels(folder, dataset, found),
+                lambda folder, found: source.written.write_labels(folder, dataset, found),
             )
     _show(output, done)
 

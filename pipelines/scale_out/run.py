@@ -150,7 +150,7 @@ class TrackTask:
         runs, part = _counted(tracked, counts), folder / "tracks" / f"{file_name(name)}{part_suffix(self.source)}"
         part.parent.mkdir()
         with keep_predictions(runs, part, self.horizons is not None) as kept:
-            self.source.write_track_part(folder, file_name(name), dataset, ((run.scene, run.tracks) for run in kept))
+            self.source.written.write_track_part(part, dataset, ((run.scene, run.tracks) for run in kept))
         return counts
 
     @staticmethod
@@ -181,7 +181,7 @@ class SmoothTask:
         labels = [part for run in runs for part in run.parts]
         (folder / "labels").mkdir()
         write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
-        self.source.write_labels(folder, dataset, labels, file_name(name))
+        self.source.written.write_labels(folder, dataset, labels, file_name(name))
         return asdict(LabelCounts.sum(run.counts for run in runs))
 
 

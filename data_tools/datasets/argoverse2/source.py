@@ -43,7 +43,7 @@ from data_tools.datasets.argoverse2.logs import (
 )
 from data_tools.datasets.detection_files import TrackRows, read_detections
 from data_tools.datasets.results import Results, scene_result
-from data_tools.datasets.source import ChosenScenes, Surroundings, TrackedScenes, option
+from data_tools.datasets.source import ChosenScenes, ResultFormat, Surroundings, TrackedScenes, option
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context, is_url, local_copy, local_tree
 from data_tools.files.readers import arrow_arrays
@@ -215,17 +215,34 @@ def _frames(scene: Scene, moments: Sequence[Tracks]) -> Iterator[dict[str, Any]]
         }
 
 
+class ArgoverseFormat(ResultFormat):
+    """Feather, the official submission, or a table."""
+
+    tracks = "File to write: .feather (boxes with track_id), .pkl (official submission), or a table: .csv, .ndjson."
+    tracks_example = "tracks.feather"
+    merged = ("tracks.feather", "")
+    all_tracks = "tracks.feather"
+
+    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+        if output.suffix == ".feather":
+            write_feather_tracks(output, scenes)
+        elif output.suffix == ".pkl":
+            write_submission(output, scenes)
+        else:
+            super().write_tracks(output, dataset, scenes)
+
+    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
+        merge_feather_tracks(output / self.merged[0], [output / "tracks" / f"{stem}.feather" for stem in stems])
+
+
 @dataclass(frozen=True, kw_only=True)
 class ArgoverseSource(AnnotatedSource):
     """Argoverse 2 sensor logs, with detections as Feather in the official format; needs the extra [parquet]."""
 
     name = "argoverse2"
+    written = ArgoverseFormat()
     family = "nuscenes"
     example = "--dataroot data/av2/val --detections detections.feather"
-    tracks = "File to write: .feather (boxes with track_id), .pkl (official submission), or a table: .csv, .ndjson."
-    tracks_example = "tracks.feather"
-    merged = ("tracks.feather", "")
-    all_tracks = "tracks.feather"
     shows = ("maps",)
     dataroot: str = option("Folder of the logs, in each annotations.feather, city_SE3_egovehicle.feather; or its URL.")
     detections: str | None = option(
@@ -249,17 +266,6 @@ class ArgoverseSource(AnnotatedSource):
             with local_copy(self.detections) as path:
                 official = path.suffix == ".feather"
                 yield self._chosen(DetectedLogs(logs, path) if official else AnnotatedLogs(logs, read_detections(path)))
-
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        if output.suffix == ".feather":
-            write_feather_tracks(output, scenes)
-        elif output.suffix == ".pkl":
-            write_submission(output, scenes)
-        else:
-            super().write_tracks(output, dataset, scenes)
-
-    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
-        merge_feather_tracks(output / self.merged[0], [output / "tracks" / f"{stem}.feather" for stem in stems])
 
     def read_results(self, result: Path) -> Results:
         if result.suffix == ".pkl":

@@ -56,6 +56,7 @@ from data_tools.datasets.source import (
     LabelledScenes,
     OpenedPart,
     Parts,
+    ResultFormat,
     Surroundings,
     TrackedScenes,
     file_digest,
@@ -353,19 +354,42 @@ def _cells(f: KittiTrackingMetrics) -> tuple[str, ...]:
     return (*first, cell(f.ids), cell(f.frag), *percent(f.recall, f.precision), *counts, *percent(f.mt, f.ml))
 
 
+class KittiFormat(ResultFormat):
+    """Text of the benchmark's format, and a table."""
+
+    tracks = "Folder to write: NNNN.txt in the benchmark's format, tracks.csv with velocities and covariances."
+    tracks_example = "results"
+    all_tracks = "tracks"
+    submission = "tracks/[0-9]*.txt"
+    merged = (f"tracks/{TRACK_TABLE}", f"results/{TRACK_TABLE}")
+
+    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+        assert isinstance(dataset, KittiTracking)
+        write_kitti_results(output, dataset, scenes)
+
+    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
+        assert isinstance(dataset, KittiTracking)
+        write_kitti_labels(folder / "label_02", dataset, scenes)
+        write_kitti_results(folder / "results", dataset, tracks_of(scenes), f"{part}.csv" if part else TRACK_TABLE)
+
+    def write_track_part(self, part: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+        assert isinstance(dataset, KittiTracking)
+        write_kitti_results(part.parent, dataset, scenes, part.name)
+
+    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
+        merged = output / self.merged[labels]
+        merge_tables(merged, [merged.parent / f"{stem}.csv" for stem in stems])
+
+
 @dataclass(frozen=True, kw_only=True)
 class KittiSource(DatasetSource):
     """KITTI tracking sequences."""
 
     name = "kitti"
+    written = KittiFormat()
     family = "kitti"
     example = "--dataroot data/kitti --detections data/kitti/detections/pointrcnn --sequences 0000,0011"
-    tracks = "Folder to write: NNNN.txt in the benchmark's format, tracks.csv with velocities and covariances."
-    tracks_example = "results"
-    all_tracks = "tracks"
-    submission = "tracks/[0-9]*.txt"
     shows = ("scans", "images")
-    merged = (f"tracks/{TRACK_TABLE}", f"results/{TRACK_TABLE}")
     dataroot: str = option("Folder that holds training/, or oxts/, calib/ and, for scores, label_02/; or its URL.")
     detections: str | None = option(
         "Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.", None, required=TRACKING
@@ -410,23 +434,6 @@ class KittiSource(DatasetSource):
             scans=lambda: {name: KittiScans(root, name, timed=False) for name in there},
             images=lambda: kitti_images(root, scenes),
         )
-
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        assert isinstance(dataset, KittiTracking)
-        write_kitti_results(output, dataset, scenes)
-
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
-        assert isinstance(dataset, KittiTracking)
-        write_kitti_labels(folder / "label_02", dataset, scenes)
-        write_kitti_results(folder / "results", dataset, tracks_of(scenes), f"{part}.csv" if part else TRACK_TABLE)
-
-    def write_track_part(self, folder: Path, stem: str, dataset: Dataset, scenes: TrackedScenes) -> None:
-        assert isinstance(dataset, KittiTracking)
-        write_kitti_results(folder / "tracks", dataset, scenes, f"{stem}.csv")
-
-    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
-        merged = output / self.merged[labels]
-        merge_tables(merged, [merged.parent / f"{stem}.csv" for stem in stems])
 
     def read_results(self, result: Path) -> Results:
         chosen, classes = self._chosen(), names("--classes", self.classes)

@@ -28,7 +28,16 @@ from data_tools.datasets.mcap.dataset import (
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import Recording, definition
 from data_tools.datasets.results import Results, read_table_results, scene_result
-from data_tools.datasets.source import TRACKING, DatasetSource, OpenedPart, Parts, TrackedScenes, file_digest, option
+from data_tools.datasets.source import (
+    TRACKING,
+    DatasetSource,
+    OpenedPart,
+    Parts,
+    ResultFormat,
+    TrackedScenes,
+    file_digest,
+    option,
+)
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import error_context
 from saga_fg.errors import InputError
@@ -107,6 +116,21 @@ def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, 
     )
 
 
+class McapFormat(ResultFormat):
+    """Messages, or a table."""
+
+    tracks = "File to write: .mcap for messages of the type that the detections have; a table: .csv, .ndjson, .parquet."
+    tracks_example = "tracks.mcap"
+    part_option = "table"
+
+    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+        if output.suffix != ".mcap":
+            super().write_tracks(output, dataset, scenes)
+            return
+        assert isinstance(dataset, McapRecording)
+        write_track_messages(output, dataset, scenes)
+
+
 @dataclass(frozen=True, kw_only=True)
 class McapSource(DatasetSource):
     """Recordings of ROS 2 or Foxglove: a file of MCAP or a bag folder; needs the extra [mcap], no installation of ROS.
@@ -117,11 +141,9 @@ class McapSource(DatasetSource):
     """
 
     name = "mcap"
+    written = McapFormat()
     has_truth = False
     example = "drive.mcap --topic /perception/objects"
-    tracks = "File to write: .mcap for messages of the type that the detections have; a table: .csv, .ndjson, .parquet."
-    tracks_example = "tracks.mcap"
-    part_option = "table"
     recording: list[str] | None = option(
         "MCAP file or bag folder. In parallel: several of them.",
         None,
@@ -150,13 +172,6 @@ class McapSource(DatasetSource):
     def parts(self) -> Iterator[Parts]:
         parts = [McapPart(replace(self, recording=[path])) for path in self.recording or ()]
         yield Parts([part.name for part in parts], parts)
-
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        if output.suffix != ".mcap":
-            super().write_tracks(output, dataset, scenes)
-            return
-        assert isinstance(dataset, McapRecording)
-        write_track_messages(output, dataset, scenes)
 
     def kept(self) -> Mapping[str, Any]:
         return {} if self.world is None else {"world": self.world}

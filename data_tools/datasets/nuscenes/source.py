@@ -30,6 +30,7 @@ from data_tools.datasets.source import (
     LabelledScenes,
     OpenedPart,
     Parts,
+    ResultFormat,
     Surroundings,
     TrackedScenes,
     names,
@@ -178,17 +179,46 @@ def _in_range(scene: NuScenesTrackingScene) -> tuple[SceneBoxes, SceneBoxes]:
     return near(scene.truth), near(scene.found)
 
 
+class NuScenesFormat(ResultFormat):
+    """Official tracking-result JSON; labels as tables."""
+
+    tracks = "Official tracking-result JSON to write."
+    tracks_example = "tracks.json"
+    merged = ("tracks.json", "tracking.json")
+    all_tracks = submission = "tracks.json"
+
+    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+        assert isinstance(dataset, NuScenes | NuScenesPart)
+        write_tracking_results(output, scenes, dataset.meta)
+
+    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
+        if part:
+            for kind in ("tracking", "objects"):
+                (folder / kind).mkdir()
+            self.write_tracks(folder / "tracking" / f"{part}.json", dataset, tracks_of(scenes))
+            write_label_part(folder / "objects" / f"{part}.ndjson", scenes)
+            return
+        assert isinstance(dataset, NuScenes)
+        self.write_tracks(folder / self.merged[1], dataset, tracks_of(scenes))
+        write_nuscenes_labels(folder, dataset.dataroot, dataset.version, scenes)
+
+    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
+        assert isinstance(dataset, NuScenes)
+        parts = (output / ("tracking" if labels else "tracks") / f"{stem}.json" for stem in stems)
+        merge_tracking_results(output / self.merged[labels], parts, dataset.meta)
+        if labels:
+            objects = (output / "objects" / f"{stem}.ndjson" for stem in stems)
+            merge_label_parts(output, dataset.dataroot, dataset.version, objects)
+
+
 @dataclass(frozen=True, kw_only=True)
 class NuScenesSource(DatasetSource):
     """nuScenes recordings, with detections as official detection-result JSON, one file a sensor."""
 
     name = "nuscenes"
+    written = NuScenesFormat()
     family = "nuscenes"
     example = "--dataroot data/nuscenes --split mini_train --detections lidar=megvii.json"
-    tracks = "Official tracking-result JSON to write."
-    tracks_example = "tracks.json"
-    merged = ("tracks.json", "tracking.json")
-    all_tracks = submission = "tracks.json"
     shows = ("scans", "maps", "images")
     dataroot: str = option("Folder that holds the folder of tables, or its URL.")
     detections: list[str] | None = option(
@@ -221,29 +251,6 @@ class NuScenesSource(DatasetSource):
             lambda: nuscenes_maps(root, tables, scenes),
             lambda: nuscenes_images(root, tables, scenes),
         )
-
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        assert isinstance(dataset, NuScenes | NuScenesPart)
-        write_tracking_results(output, scenes, dataset.meta)
-
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
-        if part:
-            for kind in ("tracking", "objects"):
-                (folder / kind).mkdir()
-            self.write_tracks(folder / "tracking" / f"{part}.json", dataset, tracks_of(scenes))
-            write_label_part(folder / "objects" / f"{part}.ndjson", scenes)
-            return
-        assert isinstance(dataset, NuScenes)
-        self.write_tracks(folder / self.merged[1], dataset, tracks_of(scenes))
-        write_nuscenes_labels(folder, dataset.dataroot, dataset.version, scenes)
-
-    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
-        assert isinstance(dataset, NuScenes)
-        parts = (output / ("tracking" if labels else "tracks") / f"{stem}.json" for stem in stems)
-        merge_tracking_results(output / self.merged[labels], parts, dataset.meta)
-        if labels:
-            objects = (output / "objects" / f"{stem}.ndjson" for stem in stems)
-            merge_label_parts(output, dataset.dataroot, dataset.version, objects)
 
     def read_results(self, result: Path) -> Results:
         with self._local() as (root, files):
