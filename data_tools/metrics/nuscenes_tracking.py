@@ -34,6 +34,8 @@ from saga_fg.settings import setting, settings_group
 from saga_fg.types.boxes import Boxes
 
 _MIN_RECALL = 0.1  # lowest recall of the sweep
+_RECALLS = 40  # values of recall in the sweep; this and the gate as in `tracking_nips_2019`
+_GATE = 2.0  # m, from which a pair cannot match
 _WORST_MOTP = 2.0  # MOTP of a recall that is not reached, m
 _WORST_FAF = 500.0  # reported for a class that is never matched, false alarms per 100 frames
 _WORST_DURATION = 20.0  # initialisation and gap duration of a class that is never matched, s
@@ -55,8 +57,6 @@ class NuScenesTrackingSettings:
     class_range: Mapping[str, float] = settings_group(
         lambda: dict(CLASS_RANGE), "classes scored, and the distance from the vehicle up to which they are, m"
     )
-    gate: float = setting(2.0, "distance from which a pair cannot match, m")
-    thresholds: int = setting(40, "number of recall values in the sweep")
     sample_period: float = setting(0.5, "time thin one frame counts in TID and LGD, s")
 
 
@@ -116,12 +116,12 @@ def nuscenes_tracking_metrics(
         )
         for name in ("truth", "found")
     )
-    pairs = candidate_pairs(true, found, settings.gate)
+    pairs = candidate_pairs(true, found, _GATE)
     everything = sweep(true, found, pairs, np.full((len(class_range), 1), -np.inf))
-    recalls = np.linspace(_MIN_RECALL, 1, settings.thresholds).round(12)
+    recalls = np.linspace(_MIN_RECALL, 1, _RECALLS).round(12)
     thresholds = np.stack(
         [_thresholds(true, found, everything, label, recalls) for label in range(len(class_range))]
-    ).reshape(len(class_range), settings.thresholds)
+    ).reshape(len(class_range), _RECALLS)
     matched = sweep(true, found, pairs, _without_repeats(thresholds))
     per_class, curves = {}, {}
     for label, name in enumerate(class_range):
