@@ -39,6 +39,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
+from io import SEEK_END
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
@@ -407,17 +408,28 @@ def _arrays(path: Path) -> Columns:
     return columns
 
 
+_LAS_HEADER, _LEAST_LAS, _LAS_RECORD = 247, 227, 54  # bytes: checked of a header, of the shortest one, of a record
+
+
 def _las(path: Path) -> Columns:
     if find_spec("laspy") is None:
         raise MissingExtraError("files .las and .laz need laspy: pip install 'saga-fg[las]'")
+    with open_bytes(path) as file:
+        header, size = file.read(_LAS_HEADER).ljust(_LAS_HEADER, b"\0"), file.seek(0, SEEK_END)
+    start, records = struct.unpack_from("<II", header, 96)
+    extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 else 0
+    if header[:4] != b"LASF" or not _LEAST_LAS <= start <= size or _LAS_RECORD * (records + extended) > size:
+        raise InputError(f"expected a header of LAS, with its records in the {size} bytes of the file")
     return dict(isolated("expected a file that laspy can read", _las_columns, path))
 
 
 def _las_columns(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
     import laspy
 
-    with open_bytes(path) as file:
-        cloud = laspy.read(file)
+    with open_bytes(path) as file, laspy.open(file, closefd=False) as reader:
+        points, cloud = reader.header.point_count, reader.read()
+    if len(cloud.points) != points:
+        raise InputError(f"{path}: expected {points} points as the header says, got {len(cloud.points)}")
     for name in (
         "x",
         "y",

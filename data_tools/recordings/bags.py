@@ -41,6 +41,7 @@ _SENSORS: Mapping[SensorName, str] = {"imu": "sensor_msgs/Imu", "gps": "sensor_m
 _KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # of the datatypes 1 to 8 of a PointField
 _AT_ONCE = 20  # scans that are read ahead
 _CLOCKS = 0.5  # s, more than messages wait before they are logged
+_HIGHEST = 85.0  # deg of latitude
 _FLAT = 0.9  # cosine of the tilt of a planar laser
 _log = logging.getLogger(__name__)
 
@@ -201,16 +202,16 @@ class _Bag:
             by_topic |= {each.topic.name: each for each in kind}
         chosen = self.recording.chosen([*by_topic, *transforms])
         for logged in isolated("not readable", _contents, self.path, self.recording.files, chosen):
-            into = by_topic.get(logged.topic.name)
+            into, log_time = by_topic.get(logged.topic.name), checked_time(logged.log_time)
             if into is None:
-                records += [(record, logged.log_time) for record in logged.message]
+                records += [(record, log_time) for record in logged.message]
                 continue
             stamp, frame, numbers = logged.message
             if into.topic.type == ODOMETRY:
                 numbers, edges = numbers
-                records += [(record, logged.log_time) for record in edges]
-            into.stamps.append(stamp or checked_time(logged.log_time))
-            into.logged.append(logged.log_time)
+                records += [(record, log_time) for record in edges]
+            into.stamps.append(stamp or log_time)
+            into.logged.append(log_time)
             into.frames.append(frame)
             into.numbers.append(numbers)
         return self._one_clock([each for each in by_topic.values() if each.stamps], records)
@@ -225,12 +226,12 @@ class _Bag:
         for each in read:
             shift = each.clock - clock
             if abs(shift) > _CLOCKS * 1e9:
-                each.stamps = [stamp + shift for stamp in each.stamps]
+                each.stamps = [checked_time(stamp + shift) for stamp in each.stamps]
                 others.append(f"{each.topic.name} by {shift / 1e9:+.3f} s")
         moving = [logged - record.time for record, logged in records if not record.static]
         shift = int(np.median(moving)) - clock if moving else 0
         if abs(shift) > _CLOCKS * 1e9:
-            records = [(record._replace(time=record.time + shift), logged) for record, logged in records]
+            records = [(record._replace(time=checked_time(record.time + shift)), logged) for record, logged in records]
             others.append(f"transforms by {shift / 1e9:+.3f} s")
         if others:
             _log.warning(
@@ -332,19 +333,18 @@ def open_bag(path: Path, options: RecordingOptions) -> ScanRecording:
             len(known),
         )
     mounts: dict[SensorName, FloatArray] = {}
-    for name in ("imu", "gps"):
-        messages = bag.of.get(_SENSORS[name], [])
-        if messages and (place := bag.mount(messages[0].frames[0], name)) is not None:
-            mounts[name] = place
-    fixes = [numbers for each in bag.of.get(_SENSORS["gps"], []) for _, numbers in _measured(each)]
 
     def sensors() -> Mapping[SensorName, FloatArray]:
         tables = bag.tables()
+        for name in [name for name in tables if name != "wheels"]:
+            if (place := bag.mount(bag.of[_SENSORS[name]][0].frames[0], name)) is not None:
+                mounts[name] = place
         if "gps" in tables:
-            table = tables["gps"]
-            tables["gps"] = np.column_stack(
-                [table[:, 0], world_position(table[:, 1], table[:, 2], table[:, 3], np.array(fixes[0]))]
-            )
+            time, latitude, longitude, altitude = tables["gps"].T
+            if (np.abs(latitude) > _HIGHEST).any() or (np.abs(longitude) > 180).any():
+                raise InputError(f"{path}: gps: expected latitudes within {_HIGHEST:g} and longitudes within 180 deg")
+            begin = np.array([latitude[0], longitude[0], altitude[0]])
+            tables["gps"] = np.column_stack([time, world_position(latitude, longitude, altitude, begin)])
         return tables
 
     return ScanRecording(

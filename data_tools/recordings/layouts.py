@@ -392,10 +392,25 @@ def hilti(source: Path, options: RecordingOptions) -> ScanRecording:
     Source: https://hilti-challenge.com, 2021 to 2023. The poses are sparse, or those of a part: they are taken where
     each scan has one. Untested on originals.
     """
-    bag = next(path for path in sorted(source.iterdir()) if is_bag(path))
-    found = open_bag(bag, options)
-    truth = read_tum_poses(next(path for path in sorted(source.iterdir()) if path.suffix in (".txt", ".tum")))
-    return replace(found, layout="hilti", world_T_ego=_nearest(truth.timestamps, truth.world_T_ego, found.timestamps))
+    truth = _tum_file(source)
+    found = open_bag(source if is_bag(source) else next(filter(is_bag, sorted(source.iterdir()))), options)
+    if truth is None:
+        return found
+    path = read_tum_poses(truth)
+    return replace(found, layout="hilti", world_T_ego=_nearest(path.timestamps, path.world_T_ego, found.timestamps))
+
+
+def _tum_file(source: Path) -> Path | None:
+    """A file of poses beside a bag; None for none."""
+    if not source.is_dir() or not (is_bag(source) or any(map(is_bag, source.iterdir()))):
+        return None
+    for path in sorted(source.iterdir()):
+        if path.suffix in (".txt", ".tum") and path.is_file():
+            with path.open("rb") as file:
+                words = next((line.split() for line in file.readlines(10_000) if line[:1] not in (b"#", b"\n")), [])
+            if len(words) == len(_TUM) + 1:
+                return path
+    return None
 
 
 def nuscenes(source: Path, options: RecordingOptions) -> ScanRecording:
@@ -442,6 +457,7 @@ def _has(*patterns: str) -> Callable[[Path], bool]:
 
 
 LAYOUTS: Mapping[str, tuple[Callable[[Path], bool], Opener]] = {
+    "hilti": (lambda source: _tum_file(source) is not None, hilti),
     "bag": (is_bag, open_bag),
     "kitti-tracking": (
         lambda source: (
@@ -457,10 +473,6 @@ LAYOUTS: Mapping[str, tuple[Callable[[Path], bool], Opener]] = {
     "helipr": (_has("LiDAR/*/*.bin"), helipr),
     "newer-college": (_has("raw_format/ouster_scan/*.pcd"), newer_college),
     "nuscenes": (_has("v1.0-*/sample_data.json"), nuscenes),
-    "hilti": (
-        lambda source: source.is_dir() and any(map(is_bag, source.iterdir())) and _has("*.t[xu][tm]")(source),
-        hilti,
-    ),
     "folder": (lambda source: True, _folder),
 }
 """Layouts by name: whether a source has it, and how it is opened. The first that fits is taken."""

@@ -65,7 +65,7 @@ class ScanRecording:
     ego_T_lidar  (4, 4) place of the sensor on the vehicle; world_T_ego (K, 4, 4) of the recording, None without
     origin       latitude, longitude (deg) and altitude (m) of that world, None where it is unknown
     sensors      gives tables of the vehicle's sensors by name, as `SensorLog` has them, fixes in that world
-    mounts       ego_T_sensor (4, 4) of sensors, where the recording says them
+    mounts       ego_T_sensor (4, 4) of sensors, where the recording says them; known once `sensors` was called
     objects      gives frames with the detections of a folder, None where there are none
     blind        whether scans have no points, only times
     dropped      points without a place by row, of the scans that were read

@@ -205,8 +205,12 @@ def test_surveyors_files_are_read_by_laspy(tmp_path: Path, monkeypatch: pytest.M
     np.testing.assert_allclose(scan.points, points, atol=1e-4)
     np.testing.assert_allclose(scan.time, time - time[0], atol=1e-6)
     assert scan.intensity[:3].tolist() == [0, 1, 2]
-    with pytest.raises(InputError, match=r"a\.las: expected a file that laspy can read"):
+    with pytest.raises(InputError, match=r"a\.las: expected a header of LAS, with its records in the 4 bytes"):
         read_scan(tmp_path / "a.las")
+    for cut in (100, 10 * cloud.header.point_format.size):
+        (tmp_path / "c.las").write_bytes((tmp_path / "b.las").read_bytes()[:-cut])
+        with pytest.raises(InputError, match=r"c\.las: expected"):
+            read_scan(tmp_path / "c.las")
 
 
 @pytest.mark.parametrize(

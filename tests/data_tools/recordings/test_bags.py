@@ -48,6 +48,11 @@ def scans(drive: SimulatedScans) -> list[Scan]:
     return [drive[k] for k in range(COUNT)]
 
 
+def made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
 def written(folder: Path, form: str, messages: list[tuple]) -> Path:
     if form == "mcap":
         return example.write_mcap(folder / "drive.mcap", messages)
@@ -97,6 +102,20 @@ def test_the_vehicle_s_sensors_and_poses_come_along(tmp_path: Path, drive: Simul
     np.testing.assert_allclose(tables["wheels"][:, 1], 8.0)
     np.testing.assert_allclose(tables["gps"][1, 1:], [0.73, 0, 0], atol=0.01)  # m east of the first
     np.testing.assert_allclose(found.mounts["imu"], on_vehicle, atol=1e-9)
+
+
+def test_poses_beside_a_bag_are_those_of_hilti(tmp_path: Path, scans: list[Scan]) -> None:
+    """The bag itself is found where other text lies beside it."""
+    bag = example.write_bag(made(tmp_path / "exp") / "bag", scan_messages(scans, TIMES, MOUNT))
+    poses = "".join(f"{time:.6f} {k} 0 0 0 0 0 1\n" for k, time in enumerate(TIMES))
+    for folder in (bag, bag.parent):
+        (folder / "notes.txt").write_text("sunny\n")
+        assert folder == bag.parent or open_recording(folder).layout == "bag"
+        (folder / "truth.txt").write_text(f"# time x y z qx qy qz qw\n{poses}")
+        found = open_recording(folder)
+        assert found.layout == "hilti"
+        np.testing.assert_allclose(found.world_T_ego[:, 0, 3], np.arange(COUNT))
+        (folder / "truth.txt").unlink()
 
 
 def test_two_clocks_become_one(tmp_path: Path, scans: list[Scan], caplog: pytest.LogCaptureFixture) -> None:
@@ -152,6 +171,11 @@ def test_what_is_wrong_in_a_recording_is_one_line(
         path.write_bytes(path.read_bytes()[:-500])
         with pytest.raises(InputError, match=r"g\.mcap: .*cut off"):
             open_recording(path)
+    with subtests.test("fixes off the Earth"):
+        messages = scan_messages(scans, TIMES)
+        messages.append(("/fix", FIX, fix_message(BEGIN, 91.0, 8.4, 110.0), round(BEGIN * 1e9)))
+        with pytest.raises(InputError, match=r"i\.mcap: gps: expected latitudes within 85 and longitudes within 180"):
+            open_recording(example.write_mcap(tmp_path / "i.mcap", messages)).sensors()
     with subtests.test("fixes without numbers"):
         messages = scan_messages(scans, TIMES)
         messages.append(("/fix", FIX, fix_message(BEGIN, np.nan, 8.4, 110.0), round(BEGIN * 1e9)))
