@@ -15,9 +15,10 @@ import typer
 
 from benchmarks.class_figures import class_rows, frames_with_two_classes
 from benchmarks.recordings.crossings import simulated_crossings
+from benchmarks.recordings.crowds import RATE, recorded_crowds, simulated_crowds
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
-from benchmarks.recordings.sensed import ABOVE, MAST, VEHICLE, sensed_scene
+from benchmarks.recordings.sensed import ABOVE, MAST, VEHICLE, default_sensors, sensed_scene
 from benchmarks.recordings.sources import TrafficScenes
 from benchmarks.recordings.traffic import Recordings, overlapping
 from benchmarks.runner import chosen
@@ -56,8 +57,9 @@ class RecordingOptions:
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated; confused (classes); ngsim, openacc and crossings "
-            "(simulated, without signals), with made detections.  [default: the first five]",
+            help="Of megvii, centerpoint, camera, kitti, simulated; confused (classes); with made detections ngsim, "
+            "openacc, crossings (simulated, without signals), eth_ucy and crowds (simulated).  "
+            "[default: the first five]",
         ),
     ] = None
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10
@@ -211,12 +213,16 @@ def recording_set(
         return simulated_set(scenes)
     if name == "confused":
         return confused_set(scenes)
+    if name == "crowds":
+        return _crowded(name, simulated_crowds(scenes).middle(longest), viewpoint)
     if name == "crossings":
         return _sensed(name, simulated_crossings(scenes).middle(longest), viewpoint or ABOVE)
     if data is None:
         raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
     if name in SETS:
         return SETS[name](data)
+    if name == "eth_ucy":
+        return _crowded(name, recorded_crowds(data / name).middle(longest), viewpoint)
     traffic, usual = TRAFFIC_SETS[name]
     recordings = traffic(data / name).middle(longest)
     clusters = overlapping(map(recordings.read, recordings.names)) if name == "ngsim" else {}
@@ -228,6 +234,14 @@ def _sensed(
 ) -> RecordingSet:
     sensed = partial(sensed_scene, viewpoint=viewpoint, settings=None, seed=0)
     return exact_set(name, "traffic", TrafficScenes(recordings, sensed), clusters)
+
+
+def _crowded(name: str, recordings: Recordings, viewpoint: str | None) -> RecordingSet:
+    """Pedestrians seen at the rate of annotated recordings."""
+    settings = default_sensors()
+    settings = replace(settings, sensors={key: replace(one, rate=RATE) for key, one in settings.sensors.items()})
+    sensed = partial(sensed_scene, viewpoint=viewpoint or MAST, settings=settings, seed=0)
+    return exact_set(name, "traffic", TrafficScenes(recordings, sensed))
 
 
 def chosen_sets(
@@ -246,11 +260,11 @@ def chosen_sets(
     Raises `InputError` for a recording that no set has, and for options of recorded traffic without it.
     """
     wanted = (
-        chosen("--sets", sets, (*SETS, *TRAFFIC_SETS, "simulated", "confused", "crossings"))
+        chosen("--sets", sets, (*SETS, *TRAFFIC_SETS, "eth_ucy", "simulated", "confused", "crowds", "crossings"))
         if sets
         else (*(SETS if data is not None else ()), "simulated")
     )
-    trajectories = (*TRAFFIC_SETS, "crossings")
+    trajectories = (*TRAFFIC_SETS, "eth_ucy", "crowds", "crossings")
     for option, value in (("--viewpoint", viewpoint), ("--longest", longest)):
         if value is not None and not set(wanted) & set(trajectories):
             raise InputError(f"{option}: expected {' or '.join(trajectories)} among --sets, others do not use it")

@@ -57,6 +57,7 @@ COMPONENTS = (
     Variant("without non-maximum suppression", changes={"tracker.classes.*.nms_distance": 0.0}),
     Variant("without suppression of weak detections", changes={"tracker.classes.*.weak_nms_distance": 0.0}),
     Variant("matching without clutter", changes={"tracker.association.clutter_area": math.inf}),
+    Variant("hard association", changes={"tracker.association.clear_above": 0.0}),
     Variant("greedy matching", changes={"tracker.association.method": "greedy"}),
     Variant("graph matching", changes={"tracker.association.method": "graph"}),
     Variant("scores without hit ratio", changes={"tracker.existence.hit_ratio_weight": 0.0}),

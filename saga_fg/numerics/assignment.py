@@ -68,15 +68,19 @@ _DENSE = 10_000  # pairs of rivals up to which one matrix of all is the fastest
 
 @dataclass(frozen=True, eq=False)
 class Matching(Columns):
-    """track (k,) and detection (k,): rows that belong together; distance (k,): their d^2."""
+    """track (k,) and detection (k,): rows that belong together; distance (k,): their d^2.
+
+    share (k,): probability that the detection is this track's and not another one's
+    """
 
     track: IntArray
     detection: IntArray
     distance: FloatArray
+    share: FloatArray
 
     @classmethod
     def empty(cls) -> Self:
-        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
+        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, eq=False)

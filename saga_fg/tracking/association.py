@@ -17,7 +17,16 @@ cheapest pair first (`greedy`), or registers the observed graph to the predicted
 are then joined by those of `saga_fg.numerics.assignment` between pairs of candidates, of all classes, whose tracks
 have correlated errors.
 
-Source: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2.
+Beside it stand the probabilities p_ij of the pairs over all joint events, each of which weighs as the likelihood that
+goes with these costs, and of a detection the share that is its track's, among the tracks that claim it:
+
+    share_ij = p_ij / ( p_ij + sum of q_k p_kj over other tracks k )     q_k: existence of a confirmed track, else 0
+
+It is 1 almost everywhere, and is taken as 1 from `association.clear_above` on. Below that the update is weighted by it
+(`saga_fg.tracking.update`), and the two tracks may have exchanged their objects (`saga_fg.tracking.encounters`).
+
+Sources: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Williams and Lau, IEEE
+Transactions on Aerospace and Electronic Systems 50(4), 2014: marginals by belief propagation.
 """
 
 from __future__ import annotations
@@ -27,6 +36,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from saga_fg.kernels.identities import association_marginals
 from saga_fg.kernels.pairs import gated_pairs
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, common_numbers
 from saga_fg.numerics.assignment import (
@@ -50,6 +60,8 @@ from saga_fg.types.by_class import class_values
 
 EXISTENCE_WEIGHT, SCORE_WEIGHT = 0.3, 0.5  # a and b above
 MIN_CLUTTER = 0.05  # least expected number of false detections of a class in a frame
+LARGEST_EXACT, SWEEPS = 8, 100  # tracks or detections of a cluster whose joint events are summed; sweeps beyond
+_SURE = 20.0  # log weight of a pair of which both sides are hardly ever apart
 
 
 class CandidatePairs(NamedTuple):
@@ -72,11 +84,12 @@ class CandidatePairs(NamedTuple):
         return CandidatePairs._make(column[rows] for column in self)
 
 
-def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
-    """Match the measurements to the tracks, predicted to the time of the frame."""
+def associate(state: TrackerState, measurements: FrameMeasurements) -> tuple[Matching, IntArray]:
+    """Match the measurements to the tracks, predicted to the time of the frame; and rows (e, 2) of rivals, tracks of
+    which one may have taken the detection of the other."""
     table, association = state.table, state.settings.association
     if len(table) == 0 or len(measurements) == 0:
-        return Matching.empty()
+        return Matching.empty(), np.empty((0, 2), dtype=np.int64)
     sensor, delay, cross = measurements.sensor, measurements.delay, None
     position, P = state.past_positions(delay)
     if association.method == "graph":
@@ -87,9 +100,10 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> Matching:
     expected = table.existence * sensor.detection_chance(table.label)
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
     deferred = over_confirmed(state, predicted)
-    tracks = ExpectedTracks(predicted, P, expected, cross, deferred, state.confused, state.class_belief())
-    found = match(tracks, measurements, state.settings, area)
-    return relinked(state, measurements, found, position, P)
+    real = np.where(table.confirmed, table.existence, 0.0)
+    tracks = ExpectedTracks(predicted, P, expected, real, cross, deferred, state.confused, state.class_belief())
+    found, rivals = match(tracks, measurements, state.settings, area)
+    return relinked(state, measurements, found, position, P), rivals
 
 
 class ExpectedTracks(NamedTuple):
@@ -98,6 +112,7 @@ class ExpectedTracks(NamedTuple):
     boxes     predicted, world
     P         (n, 2, 2) covariance of their positions
     chance    (n,) that the track is detected: its existence times the sensor's detection probability
+    real      (n,) existence of confirmed tracks, 0 of others
     cross     covariances between the positions of tracks, for the method `graph`
     deferred  (n,) tracks that are matched to what the others leave; None: none
     confused  classes that sensors confuse, and the log-beliefs (n, C) in them
@@ -106,6 +121,7 @@ class ExpectedTracks(NamedTuple):
     boxes: Boxes
     P: FloatArray
     chance: FloatArray
+    real: FloatArray
     cross: CrossCovariances | None = None
     deferred: BoolArray | None = None
     confused: ConfusedClasses = NONE_CONFUSED
@@ -114,26 +130,58 @@ class ExpectedTracks(NamedTuple):
 
 def match(
     tracks: ExpectedTracks, measurements: FrameMeasurements, settings: TrackerSettings, clutter_area: float
-) -> Matching:
-    """The assignment of a frame; clutter_area  over which false detections spread, m^2."""
+) -> tuple[Matching, IntArray]:
+    """The assignment of a frame, and its rivals, see `associate`.
+
+    clutter_area: over which false detections spread, m^2
+    """
     found = _candidates(tracks, measurements, settings, clutter_area)
-    if tracks.deferred is None or not tracks.deferred.any():
-        return _chosen(found, settings.association, tracks.cross)
-    late = tracks.deferred[found.track]
-    first = _chosen(found.select(np.flatnonzero(~late)), settings.association, tracks.cross)
-    left = found.select(np.flatnonzero(late & ~np.isin(found.detection, first.detection)))
-    return first.append(_chosen(left, settings.association, tracks.cross))
+    late = np.zeros(len(found.track), dtype=bool) if tracks.deferred is None else tracks.deferred[found.track]
+    first = found if not late.any() else found.select(np.flatnonzero(~late))
+    chosen = _chosen(first, settings.association, tracks.cross)
+    p, share = _shares(first, tracks.real)
+    clear = settings.association.clear_above
+    matching = _matching(first, chosen, np.where(share < clear, share, 1.0))
+    rivals = _rivals(first, matching, p > 1 - clear)
+    if late.any():
+        left = found.select(np.flatnonzero(late & ~np.isin(found.detection, matching.detection)))
+        chosen = _chosen(left, settings.association, tracks.cross)
+        matching = matching.append(_matching(left, chosen, np.ones(len(left.track))))
+    return matching, rivals
 
 
-def _chosen(found: CandidatePairs, association: AssociationSettings, cross: CrossCovariances | None) -> Matching:
+def _chosen(found: CandidatePairs, association: AssociationSettings, cross: CrossCovariances | None) -> IntArray:
     """The pairs of least cost, each track and detection in one at most."""
     if association.method == "graph" and cross is not None:
         pairs = pair_costs(found.track, found.detection, found.innovation, found.S, cross)
-        chosen = QuadraticMatching(found.track, found.detection, found.gain, pairs).solve()
-    else:
-        choose = cheapest_first if association.method == "greedy" else least_total
-        chosen = choose(found.track, found.detection, found.gain)
-    return Matching(found.track[chosen], found.detection[chosen], found.d2[chosen])
+        return QuadraticMatching(found.track, found.detection, found.gain, pairs).solve()
+    choose = cheapest_first if association.method == "greedy" else least_total
+    return choose(found.track, found.detection, found.gain)
+
+
+def _matching(found: CandidatePairs, chosen: IntArray, share: FloatArray) -> Matching:
+    return Matching(found.track[chosen], found.detection[chosen], found.d2[chosen], share[chosen])
+
+
+def _shares(found: CandidatePairs, real: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(K,) probabilities of the pairs, and the share of its detection that is the track's."""
+    if (np.bincount(found.detection) < 2).all():  # nobody has a rival, and no probability is asked for
+        return np.ones(len(found.gain)), np.ones(len(found.gain))
+    log_weight = -found.gain / 2
+    log_weight -= max(log_weight.min() - _SURE, 0.0)  # without clutter no pair is apart
+    p = association_marginals(found.track, found.detection, log_weight, LARGEST_EXACT, SWEEPS)
+    claim = real[found.track] * p
+    of_others = np.bincount(found.detection, claim)[found.detection] - claim
+    return p, p / np.maximum(p + of_others, 1e-9)
+
+
+def _rivals(found: CandidatePairs, matching: Matching, possible: BoolArray) -> IntArray:
+    """(e, 2) rows of two tracks, of which one has a detection that may be the other's by a possible pair (K,)."""
+    owner = np.full(int(found.detection.max(initial=-1)) + 1, -1)
+    owner[matching.detection] = matching.track
+    other = owner[found.detection]
+    doubtful = possible & (other >= 0) & (other != found.track)
+    return np.unique(np.sort(np.column_stack([found.track, other])[doubtful], axis=1), axis=0)
 
 
 def _candidates(

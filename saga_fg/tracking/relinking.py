@@ -44,6 +44,7 @@ tests whether two tracks are of one object, and their fusion, errors taken for i
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def relinked(
     chosen = least_total(t, j, cost)
     t, j = t[chosen], j[chosen]
     distance, _ = mahalanobis_of_pairs(places[j] - position[t], P[t] + noise[j])
-    return matching.append(Matching(t, rows[j], distance))
+    return matching.append(Matching(t, rows[j], distance, np.ones(len(t))))
 
 
 def _pairs(
@@ -188,7 +189,7 @@ def hand_over(state: TrackerState, matching: Matching) -> Matching:
     row, kept = np.arange(len(state)), np.ones(len(state), dtype=bool)
     row[new], kept[new] = old, False
     state.remove(~kept)
-    return Matching((np.cumsum(kept) - 1)[row[matching.track]], matching.detection, matching.distance)
+    return replace(matching, track=(np.cumsum(kept) - 1)[row[matching.track]])
 
 
 def _possible_returns(state: TrackerState, matching: Matching) -> tuple[IntArray, IntArray, IntArray]:

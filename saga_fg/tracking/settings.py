@@ -114,6 +114,11 @@ class AssociationSettings(Settings):
         "area over which false detections spread, m^2; usual 3000 to 10000; higher: more doubtful pairs "
         "match; .inf: all in the gate",
     )
+    clear_above: Fraction = setting(
+        0.95,
+        "probability from which an association counts as certain; below, the update is weighted and identities may be "
+        "exchanged later; usual 0.8 to 0.99; 0: no association is doubted",
+    )
     relink_above: Annotated[float, Range(0, 1, above=True)] = setting(
         0.9,
         "re-link a track that was not detected with a detection that would initiate another one, from this "

@@ -2,7 +2,7 @@
 
     predict (prediction, courses) -> measure (measurements, map_nodes) -> associate (association, relinking)
     -> update, existence (update, unresolved) -> hand over (relinking) -> initiate (initiation)
-    -> delete, report (reporting)
+    -> exchange identities (encounters) -> delete, report (reporting)
 
 (figure 2 of Sani and Anand, arXiv 2411.03702), in brackets the modules of each stage. Without edge rules this is the
 classical tracker of independent Kalman filters, by the same code.
@@ -42,7 +42,13 @@ from saga_fg.tracking.reporting import delete_tracks, report_tracks
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
 from saga_fg.tracking.unresolved import resolve_tracks
-from saga_fg.tracking.update import infer_signals, update_existence, update_tracks
+from saga_fg.tracking.update import (
+    exchange_identities,
+    follow_encounters,
+    infer_signals,
+    update_existence,
+    update_tracks,
+)
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
 from saga_fg.types.track import PredictedTracks, Tracks, checked_horizons
 
@@ -175,9 +181,11 @@ class Tracker:
         state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
         self._notify("measure", state, frame.sensor, measurements)
 
-        matching = associate(state, measurements)
+        matching, rivals = associate(state, measurements)
         self._notify("associate", state, frame.sensor, measurements, matching)
 
+        if delay == 0:
+            follow_encounters(state, measurements, matching, rivals, state.time - before)
         update_tracks(state, measurements, matching)
         if delay == 0:
             infer_signals(state, matching)
@@ -196,6 +204,8 @@ class Tracker:
         ids = np.concatenate([state.table.id[matching.track], state.table.id[len(state) - len(rows) :]])
         state.assignment = Assignment(ids, measurements.row[np.concatenate([matching.detection, rows])])
 
+        if delay == 0:
+            exchange_identities(state)
         delete_tracks(state)
         self._notify("delete", state, frame.sensor, measurements, matching)
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
 from saga_fg.tracking.edge_record import EdgeRecord
+from saga_fg.tracking.encounters import Encounters
 from saga_fg.tracking.halting_places import HaltingPlaces
 from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past_position
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
@@ -61,6 +62,7 @@ class TrackerSnapshot:
     graph         scene graph of the latest interval, None before the first
     edge_record   how well edges have predicted
     halting       where vehicles halt with nobody before them
+    encounters    pairs of tracks that may have exchanged their objects
     start         time from which all others in here are counted, s
     time          of the state, s
     origin        (2,) of local positions in the world, m
@@ -80,6 +82,7 @@ class TrackerSnapshot:
     graph: SceneGraph | None
     edge_record: EdgeRecord
     halting: HaltingPlaces
+    encounters: Encounters
     start: float
     time: float
     origin: FloatArray
@@ -127,7 +130,7 @@ class TrackerState:
         read = MAP_CLASSES if self.providers else classes_read(self.rules)
         self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.from_settings(settings)
         self.traffic = Traffic(settings.traffic)
-        self.edge_record, self.halting = EdgeRecord(), HaltingPlaces()
+        self.edge_record, self.halting, self.encounters = EdgeRecord(), HaltingPlaces(), Encounters.empty()
 
     def __len__(self) -> int:
         return len(self.table)
@@ -173,6 +176,19 @@ class TrackerState:
         (speed,) = self.class_values(label[changed], "initial_speed_deviation")
         self.joint.reclassify(self.table.id[changed], self.table.label[changed], label[changed], speed)
         self.table.label = label
+
+    def exchange(self, a: int, b: int) -> None:
+        """Give each of two tracks, by id, all that is known of the other; both lose their correlation with others."""
+        rows = self.table.rows(np.array([a, b]))
+        ids, label = self.table.id[rows], self.table.label[rows]
+        now, order = self.joint.kinematics_of(ids, label), np.arange(len(self))
+        self.joint.remove(ids)
+        self.joint.add(ids[::-1], label, now)
+        order[rows] = rows[::-1]
+        self.table = replace(self.table.select(order), id=self.table.id)
+        matched = self.assignment.id
+        renamed = np.where(matched == a, b, np.where(matched == b, a, matched))
+        self.assignment = Assignment(renamed, self.assignment.detection)
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""

@@ -1,6 +1,13 @@
 """Update: matched measurements correct the state, and existence follows from all that was seen.
 
-The matched measurements correct position and velocity, box, stationarity and class of their tracks.
+The matched measurements correct position and velocity, box, stationarity and class of their tracks. Where a detection
+may be another track's, with the share w < 1 (`saga_fg.tracking.association`), the gain of its update is w times the
+usual one, by a noise of
+
+    R_w = S / w - H P H^T = R / w + (1 - w) / w H P H^T
+
+so that a wrong detection turns no track, and the mean of two detections, of which the tracks of a pair would both make
+one, is never taken (the coalescence of JPDA: Bar-Shalom and Li, Multitarget-Multisensor Tracking, 1995, section 6.2).
 
 Where they are, and how fast, is remembered for the paths and speeds of others (`saga_fg.tracking.traffic`).
 
@@ -24,15 +31,16 @@ from factors import RangeRate
 from saga_fg.kernels.components import existences
 from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.numerics.arrays import IntArray, StrArray
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.gating import chi_square_quantile
 from saga_fg.tracking.joint_state import moved_to_present
 from saga_fg.tracking.measurements import FrameMeasurements
-from saga_fg.tracking.track_filters import MOVING
+from saga_fg.tracking.track_filters import MOVING, Kinematics
 from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 from saga_fg.tracking.traffic import Passages
 
+MIN_SHARE = 0.02  # of a detection, by which its track is still updated
 MIN_RANGE = 1.0  # m; nearer, the direction of the line of sight is not known well enough for a range rate
 
 
@@ -42,6 +50,9 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     t, d = matching.track, matching.detection
     z = np.concatenate([boxes.position[d, :2] - state.origin, boxes.velocity[d]], axis=1)
     R, with_velocity = measurements.R[d], measurements.with_velocity[d]
+    doubtful = (matching.share < 1).nonzero()[0]
+    if len(doubtful):
+        R[doubtful] = doubted(R[doubtful], matching.share[doubtful], state.kinematics().select(t[doubtful]))
     if state.settings.stationary_share > 0:
         position, P = state.past_positions(delay)
         moving = state.kinematics()._replace(position=position, P=P).select(t)
@@ -68,6 +79,48 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
             )
             state.traffic.update(passing, state.time)
     state.reclassify()
+
+
+def doubted(R: FloatArray, share: FloatArray, now: Kinematics) -> FloatArray:
+    """R_w (k, 4, 4) of measurements of noise R (k, 4, 4) with shares (k,) of tracks that are predicted at `now`."""
+    w, P = np.maximum(share, MIN_SHARE)[:, None, None], np.zeros_like(R)
+    P[:, :2, :2], P[:, 2:, 2:] = now.P, now.P_velocity
+    return np.asarray(R / w + (1 - w) / w * P)
+
+
+def follow_encounters(
+    state: TrackerState, measurements: FrameMeasurements, matching: Matching, rivals: IntArray, elapsed: float
+) -> None:
+    """Begin the encounters of `rivals` (e, 2), rows of predicted tracks, and follow all; elapsed: s since the frame
+    before."""
+    table, joint, known = state.table, state.joint, state.encounters.live(state.table.id, state.time)
+    if len(rivals):
+        places = joint.places(table.label)
+        rivals = rivals[(places[rivals] >= 0).all(axis=(1, 2))]
+        x, P = joint.estimator.planar_marginals(table.id[rivals.ravel()], places[rivals.ravel()])
+        known = known.begun(table.id[rivals], x.reshape(-1, 2, 4), P.reshape(-1, 2, 4, 4), state.time)
+    if len(known):
+        rows, detection = table.rows(known.ids), np.full(len(table), -1)
+        detection[matching.track] = matching.detection
+        d = detection[rows]
+        seen, z, R = d >= 0, np.zeros((len(known), 2, 2)), np.zeros((len(known), 2, 2, 2))
+        z[seen] = measurements.boxes.position[d[seen], :2] - state.origin
+        R[seen] = measurements.R[d[seen], :2, :2]
+        first = rows[:, 0]
+        of_type = zip(joint.types_of(table.label[first]), joint.places(table.label[first])[:, 2].tolist(), strict=True)
+        noise = np.array([own_motion(node_type, 1.0)[1][at, at] for node_type, at in of_type])
+        known = known.followed(noise, np.where(known.since < state.time, elapsed, 0.0), z, R, seen)
+    state.encounters = known
+
+
+def exchange_identities(state: TrackerState) -> None:
+    """Exchange the tracks of encounters that have probably exchanged their objects."""
+    if len(state.encounters):
+        table = state.table
+        pairs = state.encounters.exchanges(table.id[table.coasting(state.time) == 0])
+        for a, b in pairs:
+            state.exchange(a, b)
+        state.encounters = state.encounters.without(pairs)
 
 
 def infer_signals(state: TrackerState, matching: Matching) -> None:

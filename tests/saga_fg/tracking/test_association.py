@@ -50,8 +50,8 @@ def pairs(tracks, found, probability=0.9, expected=0.8, sigma=1.0, classes=None,
     )
     P = np.tile(sigma**2 * np.eye(2), (n, 1, 1))
     cross = CrossCovariances(*np.triu_indices(n, 1), np.tile(shared * sigma**2 * np.eye(2), (n * (n - 1) // 2, 1, 1)))
-    expected_tracks = ExpectedTracks(tracks, P, np.broadcast_to(expected, n), cross)
-    matching = match(expected_tracks, measured(found, probability), settings, settings.association.clutter_area)
+    expected_tracks = ExpectedTracks(tracks, P, np.broadcast_to(expected, n), np.ones(n), cross)
+    matching, _ = match(expected_tracks, measured(found, probability), settings, settings.association.clutter_area)
     return sorted(zip(matching.track.tolist(), matching.detection.tolist(), strict=True))
 
 
