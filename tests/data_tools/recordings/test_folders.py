@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 from benchmarks.scans import SimulatedScans
 from data_tools.lidar import Scan
 from data_tools.recordings import RecordingOptions, open_recording
+from data_tools.recordings.layouts import GROUP
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform
 from tests.data_tools.kitti_example import write_sequence
@@ -292,6 +294,9 @@ def test_a_layout_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, s
         open_recording(tmp_path, layout="own_scans:wrong")
     with pytest.raises(InputError, match="unknown layout 'kitty'"):
         open_recording(tmp_path, layout="kitty")
+    point = EntryPoint("ours", "own_scans:opened", GROUP)
+    monkeypatch.setattr("data_tools.recordings.layouts.entry_points", lambda group: [point] if group == GROUP else [])
+    assert len(open_recording(tmp_path, layout="ours")) == 3
     sys.modules.pop("own_scans")
 
 
