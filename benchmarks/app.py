@@ -7,8 +7,8 @@ from importlib import import_module
 from benchmarks.runner import application
 
 NAMES = (
-    *("endurance", "estimators", "gaps", "geometry", "joint", "kills", "landmarks", "loops", "metrics", "modes"),
-    *("pose_graphs", "scaling", "service", "settling", "slam", "smoothing", "speed", "streaming", "tracking"),
+    *("endurance", "estimators", "gaps", "geometry", "joint", "kills", "labels", "landmarks", "loops", "metrics"),
+    *("modes", "pose_graphs", "scaling", "service", "settling", "slam", "smoothing", "speed", "streaming", "tracking"),
 )
 
 app = application(getattr(import_module(f"benchmarks.{name}"), name) for name in NAMES)

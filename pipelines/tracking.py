@@ -182,7 +182,7 @@ def scene_with_frames(dataset: Dataset, name: str) -> Scene:
     """Read a scene. Raises `InputError` for one without any frame of detections."""
     scene = dataset.scene(name)
     if not scene.frames:
-        raise InputError(f"scene {name}: expected frames of detections, there are none")
+        raise InputError(f"scene {name}: expected frames of detections (option --detections), there are none")
     return scene
 
 

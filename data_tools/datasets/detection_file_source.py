@@ -134,6 +134,9 @@ class DetectionFileSource(DatasetSource):
             with self._true_scenes() as dataset:
                 yield dataset
             return
+        if not self.detections:
+            yield NoScenes()
+            return
         with local_copy(self._table(), self._hosts) as path:
             dataset = read_detections(path, self.how)
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{path}: --scenes")
@@ -154,13 +157,13 @@ class DetectionFileSource(DatasetSource):
         with local_copy(self._table(), self._hosts) as path:
             yield read_scenes_in_parts(path, scenes=chosen, how=self.how)
 
-    def read_results(self, result: Path) -> Results:
-        return Results(self._results(result), _score)
+    def read_results(self, result: Path, truth: bool = True) -> Results:
+        return Results(self._results(result, truth), _score)
 
-    def _results(self, result: Path) -> Mapping[str, SceneResult]:
-        if self.truth is not None:
-            with self._true_scenes() as truth:
-                return read_table_results(result, truth, self.scenes is not None, self.how, judged=True)
+    def _results(self, result: Path, truth: bool) -> Mapping[str, SceneResult]:
+        if truth and self.truth is not None:
+            with self._true_scenes() as true_scenes:
+                return read_table_results(result, true_scenes, self.scenes is not None, self.how, judged=True)
         if self.detections is None:
             return read_table_results(result, None, how=self.how)
         with self.open() as dataset:
@@ -207,7 +210,8 @@ class DetectionFileSource(DatasetSource):
     def _table(self) -> str:
         if len(self.detections or ()) != 1:
             raise InputError(
-                "expected one table of detections; several need --workers N or --ray, and a folder as --output"
+                "expected one table of detections, or tracks to smooth; several tables need --workers N or --ray, "
+                "and a folder as --output"
             )
         return (self.detections or [""])[0]
 
@@ -217,6 +221,16 @@ def _score(
 ) -> Evaluation:
     """All figures that can be computed here."""
     return clear_figures(scenes, hota or find_spec("trackeval") is not None, innovations, sweep=True)
+
+
+class NoScenes:
+    """A dataset without recordings: tables of tracks bring their own."""
+
+    scenes: tuple[str, ...] = ()
+
+    def scene(self, name: str) -> Scene:
+        """Raises `InputError`: there is none."""
+        raise InputError(f"scene {name}: expected a table of detections, there is none")
 
 
 class DetectedTruth:

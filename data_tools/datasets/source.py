@@ -57,8 +57,8 @@ Verb = Literal[
     "track", "smooth", "evaluate", "evaluate labels", "benchmark", "report", "view", "learn noise", "learn interactions"
 ]
 
-TRACKING: tuple[Verb, ...] = ("track", "smooth", "evaluate labels", "benchmark", "learn noise")
-"""Verbs that need detections."""
+TRACKING: tuple[Verb, ...] = ("track", "evaluate labels", "benchmark", "learn noise")
+"""Verbs that need detections; `smooth` takes tracks as well."""
 
 TrackedScenes = Iterable[tuple[Scene, Sequence["Tracks"]]]
 """Scenes with one `Tracks` for each of their timestamps."""
@@ -146,7 +146,8 @@ def scene_digests(scene: Scene) -> dict[str, str]:
             boxes = frame.detections.boxes
             frames.update(repr((frame.timestamp, frame.coordinates, frame.token, boxes.label.tolist())).encode())
             pose = np.empty(0) if frame.world_T_ego is None else frame.world_T_ego
-            for array in (pose, boxes.position, boxes.size, boxes.yaw, boxes.velocity, frame.detections.score):
+            columns = (boxes.position, boxes.size, boxes.yaw, boxes.velocity, frame.detections.score)
+            for array in (pose, *columns, frame.detections.identity.astype(np.float64)):
                 frames.update(np.ascontiguousarray(array).tobytes())
         digests[sensor] = frames.hexdigest()
     return digests
@@ -350,17 +351,18 @@ class DatasetSource(ABC):
         """Scans, maps and images of the scenes, of the kinds in `shows`."""
         return Surroundings()
 
-    def read_results(self, result: Path) -> Results:
-        """The result of any tracker by scene, with ground truth, which scores it.
+    def read_results(self, result: Path, truth: bool = True) -> Results:
+        """The result of any tracker by scene, which scores itself where there is ground truth.
 
         Raises `InputError` for one missing or broken.
 
-        The scenes are those the result has; where the field `scenes` names some, all of these.
+        The scenes are those the result has; where the field `scenes` names some, all of these. truth: with ground
+        truth, if there is some
         """
         from data_tools.datasets.results import Results, read_table_results
 
         named = isinstance(getattr(self, "scenes", None), str)
-        with self.open(truth=self.has_truth) as dataset:
+        with self.open(truth=truth and self.has_truth) as dataset:
             return Results(read_table_results(result, dataset, every_scene=named))
 
 

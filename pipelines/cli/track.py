@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from data_tools.datasets.given_tracks import GivenTracks, TrackedRecordings, read_given_tracks, tracked_parts
 from data_tools.datasets.source import DatasetSource, input_files
 from pipelines import smoothing
 from pipelines.checks import CheckedDataset, Checks
@@ -29,11 +30,17 @@ FAILED_SCENES = 1  # exit code
 
 
 def run_at_scale(
-    source: DatasetSource, task: SceneTask, output: Path, scale: ScaleOptions, labels: bool = False
+    source: DatasetSource,
+    task: SceneTask,
+    output: Path,
+    scale: ScaleOptions,
+    labels: bool = False,
+    given: GivenTracks = (),
 ) -> RunSummary:
     """Do the task, which makes tracks or labels, with all parts of a dataset; print and return what became of them.
 
-    What the parts left becomes the file `ResultFormat.merged`, if all have done it.
+    What the parts left becomes the file `ResultFormat.merged`, if all have done it. given: tracks of other trackers,
+    to be labelled
     """
     if output.suffix:
         raise InputError(f"--output {output}: expected the name of a folder, since scenes are done in parallel")
@@ -43,7 +50,8 @@ def run_at_scale(
             source.written.merge(output, [file_name(name) for name in there.names], there.dataset, labels)
 
     merged = source.written.merged[labels]
-    with source.parts() as there, progress_bar(unit="scenes") as bar:
+    with source.parts() as parts, progress_bar(unit="scenes") as bar:
+        there = tracked_parts(parts, given) if given else parts
         if merged:
             (output / merged).unlink(missing_ok=True)
         report = run_scenes(
@@ -206,6 +214,15 @@ class LabelOptions:
     method: options.MethodOption = "saga"
     association: options.AssociationOption = None
     interactions: options.InteractionsOption = None
+    tracks: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--tracks",
+            help="Result of a tracker, as `saga-fg evaluate` reads it, whose tracks are refined to labels, in place of "
+            "detections or beside them; repeatable: several trackers become one result.",
+            metavar="FILE",
+        ),
+    ] = None
     table: Annotated[
         Literal["csv", "ndjson", "parquet"],
         typer.Option("--table", help="Format of the table of boxes; parquet needs the extra [parquet]."),
@@ -222,22 +239,26 @@ def _smooth(
 ) -> None:
     """Label recordings: a table of boxes, a summary, and the labels in the dataset's own format if it has one.
 
-    Tables of detections are smoothed as they are read: memory does not grow with their length.
+    Tables of detections are smoothed as they are read: memory does not grow with their length. With --tracks, the
+    tracks of other trackers are refined: joined, cut, filled and smoothed.
     """
     method = labels.method
     options.association_fits(method, labels.association)
     settings = smoothing.load_smooth_config(source.family, config)
     tracking = options.with_interactions(settings.tracking, method, labels.interactions)
     settings = replace(settings, tracking=tracking.with_association(labels.association))
+    options.apart(output, *(labels.tracks or ()))
+    given = read_given_tracks(source, labels.tracks or ())
+    settings = smoothing.for_given_tracks(settings, given)
     usual = smoothing.load_smooth_config(source.family).tracking
     checks = Checks(settings.tracking.of_method(method), usual, source.option_for)
     if scale.wanted:
         checks.see_first(source)
         task = SmoothTask(settings, method, source, f".{labels.table}")
-        report = run_at_scale(source, task, output, scale, labels=True)
+        report = run_at_scale(source, task, output, scale, labels=True, given=given)
         exit_on_failures(report)
         return
-    stream, table = source.stream(), f".{labels.table}"
+    stream, table = None if given else source.stream(), f".{labels.table}"
     if stream is not None:
         with stream as parts, progress_bar() as progress:
             done = smoothing.write_labels(
@@ -247,7 +268,8 @@ def _smooth(
             )
     else:
         with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
-            checked = CheckedDataset(dataset, checks)
+            recordings = TrackedRecordings(dataset, given) if given else dataset
+            checked = CheckedDataset(recordings, checks)
             done = smoothing.write_labels(
                 output,
                 lambda _: smoothing.smooth_dataset(checked, settings, method, progress=progress),
@@ -260,6 +282,7 @@ def _smooth(
 _SMOOTH_EXAMPLES = (
     "smooth {recordings} --output labels",
     "smooth {recordings} --output labels --workers 0   # all cores",
+    "smooth {recordings} --tracks theirs --output labels   # refines the tracks of another tracker",
 )
 smooth_app = dataset_commands(
     "smooth",

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Protocol
 
 from data_tools.datasets.detection_files import write_label_table
+from data_tools.datasets.given_tracks import TrackedRecordings
 from data_tools.datasets.source import DatasetSource, Part, part_suffix
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
@@ -181,7 +182,8 @@ class SmoothTask:
         labels = [part for run in runs for part in run.parts]
         (folder / "labels").mkdir()
         write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
-        self.source.written.write_labels(folder, dataset, labels, file_name(name))
+        recordings = dataset.recordings if isinstance(dataset, TrackedRecordings) else dataset
+        self.source.written.write_labels(folder, recordings, labels, file_name(name))
         return asdict(LabelCounts.sum(run.counts for run in runs))
 
 

@@ -12,7 +12,8 @@ scores suggest, so that it fits any detector. A track of low existence can't tak
 all among many weak ones, and of two detections the more probable one is preferred.
 
 Candidates are the pairs of one class, or of classes that a sensor confuses, with a cost of their own
-(`saga_fg.tracking.class_belief`), inside its gate. The assignment is the one of least total cost (`hungarian`), is made
+(`saga_fg.tracking.class_belief`), inside its gate. Identities that a sensor gives add theirs
+(`saga_fg.tracking.given_identities`). The assignment is the one of least total cost (`hungarian`), is made
 cheapest pair first (`greedy`), or registers the observed graph to the predicted graph (`graph`): the costs above
 are then joined by those of `saga_fg.numerics.assignment` between pairs of candidates, of all classes, whose tracks
 have correlated errors.
@@ -50,6 +51,7 @@ from saga_fg.numerics.assignment import (
 )
 from saga_fg.numerics.gating import near_pairs
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
+from saga_fg.tracking.given_identities import identity_cost
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.relinking import relinked
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
@@ -96,13 +98,15 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> tuple[Mat
         cross = state.past_cross_covariances(delay)
     if measurements.relative is not None:
         P = relative_covariances(state.joint, table.id, table.label)
+    last = state.identities.tracks(measurements.name, measurements.identity)
     predicted = state.boxes(position, np.full_like(position, np.nan))
     expected = table.existence * sensor.detection_chance(table.label)
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
     deferred = over_confirmed(state, predicted)
     real = np.where(table.confirmed, table.existence, 0.0)
-    tracks = ExpectedTracks(predicted, P, expected, real, cross, deferred, state.confused, state.class_belief())
-    found, rivals = match(tracks, measurements, state.settings, area)
+    belief = state.class_belief()
+    tracks = ExpectedTracks(predicted, P, expected, real, cross, deferred, state.confused, belief, table.id)
+    found, rivals = match(tracks, measurements, state.settings, area, last)
     return relinked(state, measurements, found, position, P), rivals
 
 
@@ -116,6 +120,7 @@ class ExpectedTracks(NamedTuple):
     cross     covariances between the positions of tracks, for the method `graph`
     deferred  (n,) tracks that are matched to what the others leave; None: none
     confused  classes that sensors confuse, and the log-beliefs (n, C) in them
+    id        (n,) of the tracks; needed where detections have identities
     """
 
     boxes: Boxes
@@ -126,16 +131,24 @@ class ExpectedTracks(NamedTuple):
     deferred: BoolArray | None = None
     confused: ConfusedClasses = NONE_CONFUSED
     class_belief: FloatArray | None = None
+    id: IntArray | None = None
 
 
 def match(
-    tracks: ExpectedTracks, measurements: FrameMeasurements, settings: TrackerSettings, clutter_area: float
+    tracks: ExpectedTracks,
+    measurements: FrameMeasurements,
+    settings: TrackerSettings,
+    clutter_area: float,
+    last: IntArray | None = None,
 ) -> tuple[Matching, IntArray]:
     """The assignment of a frame, and its rivals, see `associate`.
 
-    clutter_area: over which false detections spread, m^2
+    clutter_area  over which false detections spread, m^2
+    last          (m,) the track that last had the identity of each detection, -1 for none
     """
     found = _candidates(tracks, measurements, settings, clutter_area)
+    if last is not None and tracks.id is not None and (last >= 0).any():
+        found = found._replace(gain=found.gain + identity_cost(found.track, found.detection, tracks.id, last))
     late = np.zeros(len(found.track), dtype=bool) if tracks.deferred is None else tracks.deferred[found.track]
     first = found if not late.any() else found.select(np.flatnonzero(~late))
     chosen = _chosen(first, settings.association, tracks.cross)

@@ -65,6 +65,7 @@ class FrameMeasurements:
     covariance_scale             (m,) factor on the reported deviation of positions, see `saga_fg.tracking.reporting`
     position_bias                 (m,) part of the reported error of positions that does not average out, m
     class_likelihood             (m, C) of the confused classes
+    identity                     (m,) given by the sensor, -1 for none
     delay                        time by which the frame is older than the state, s
     relative                     positions seen from a vehicle whose pose is estimated, else None
     """
@@ -85,6 +86,7 @@ class FrameMeasurements:
     covariance_scale: FloatArray
     position_bias: FloatArray
     class_likelihood: FloatArray
+    identity: IntArray
     delay: float = 0.0
     relative: RelativePositions | None = None
 
@@ -138,6 +140,7 @@ def frame_measurements(
         covariance_scale=covariance_scale,
         position_bias=position_bias,
         class_likelihood=likelihood,
+        identity=detections.identity,
     )
 
 

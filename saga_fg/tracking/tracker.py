@@ -202,7 +202,10 @@ class Tracker:
         state.joint.set_frame(None, state.origin)
         self._notify("initiate", state, frame.sensor, measurements, matching, rows)
         ids = np.concatenate([state.table.id[matching.track], state.table.id[len(state) - len(rows) :]])
-        state.assignment = Assignment(ids, measurements.row[np.concatenate([matching.detection, rows])])
+        detections = np.concatenate([matching.detection, rows])
+        state.assignment = Assignment(ids, measurements.row[detections])
+        given = measurements.identity[detections]
+        state.identities = state.identities.updated(frame.sensor, given, ids, state.table.id)
 
         if delay == 0:
             exchange_identities(state)

@@ -33,6 +33,7 @@ from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
 from saga_fg.tracking.edge_record import EdgeRecord
 from saga_fg.tracking.encounters import Encounters
+from saga_fg.tracking.given_identities import GivenIdentities, exchanged
 from saga_fg.tracking.halting_places import HaltingPlaces
 from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past_position
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
@@ -72,6 +73,7 @@ class TrackerSnapshot:
     time_verdict  on the timestamp of the latest frame
     late_frames   number of frames left out because they came late
     assignment    of the latest frame
+    identities    that the sensors give
     joint         the estimator's state
     """
 
@@ -92,6 +94,7 @@ class TrackerSnapshot:
     time_verdict: TimeVerdict
     late_frames: int
     assignment: Assignment
+    identities: GivenIdentities
     joint: Any
 
 
@@ -131,6 +134,7 @@ class TrackerState:
         self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.from_settings(settings)
         self.traffic = Traffic(settings.traffic)
         self.edge_record, self.halting, self.encounters = EdgeRecord(), HaltingPlaces(), Encounters.empty()
+        self.identities = GivenIdentities()
 
     def __len__(self) -> int:
         return len(self.table)
@@ -186,9 +190,8 @@ class TrackerState:
         self.joint.add(ids[::-1], label, now)
         order[rows] = rows[::-1]
         self.table = replace(self.table.select(order), id=self.table.id)
-        matched = self.assignment.id
-        renamed = np.where(matched == a, b, np.where(matched == b, a, matched))
-        self.assignment = Assignment(renamed, self.assignment.detection)
+        self.assignment = Assignment(exchanged(self.assignment.id, a, b), self.assignment.detection)
+        self.identities = self.identities.exchanged(a, b)
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""

@@ -14,6 +14,7 @@ from saga_fg.errors import InputError, require_type
 from saga_fg.numerics.arrays import (
     Columns,
     FloatArray,
+    IntArray,
     checked,
     checked_covariances,
     from_upper_triangle,
@@ -161,7 +162,7 @@ class Detection:
 
     position: centre (x, y, z), m; size: (length, width, height), m; yaw: rad about z; velocity: (vx, vy), m/s over
     ground; score: the detector's confidence, any finite number (probability or logit: see the sensor's model);
-    range_rate: m/s, position_covariance: (xx, xy, yy), m^2, see `Detections`.
+    range_rate: m/s, position_covariance: (xx, xy, yy), m^2, identity: see `Detections`.
     """
 
     label: str
@@ -172,6 +173,7 @@ class Detection:
     score: float = 1.0
     range_rate: float = NAN
     position_covariance: tuple[float, float, float] = (NAN, NAN, NAN)
+    identity: int = -1
 
     def __post_init__(self) -> None:
         Detections.of([self])
@@ -179,7 +181,7 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class Detections(Columns):
-    """N detections as columns: `boxes`, `score` (N,), `range_rate` (N,), `position_covariance` (N, 2, 2).
+    """N detections: `boxes`, `score` (N,), `range_rate` (N,), `position_covariance` (N, 2, 2), `identity` (N,).
 
     Iterating gives `Detection`s.
 
@@ -189,12 +191,16 @@ class Detections(Columns):
 
     A covariance of the horizontal position, m^2, in the coordinates of the boxes, is reported by some detectors; it
     takes the place of the noise of the sensor's model. NaN, as by default: not reported.
+
+    A sensor that follows objects by itself, or another tracker, gives each an identity: a number from 0 on, once in a
+    frame; -1, as by default, for none. It is evidence for the association.
     """
 
     boxes: Boxes
     score: FloatArray
     range_rate: FloatArray = field(default_factory=lambda: np.array(NAN))  # a single number serves all
     position_covariance: FloatArray = field(default_factory=lambda: np.array(NAN))
+    identity: IntArray = field(default_factory=lambda: np.array(-1))
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
@@ -205,6 +211,7 @@ class Detections(Columns):
             raise InputError(f"range_rate[{row}]: expected numbers within {MAX_SPEED:g}, got {rate[row]:g}")
         vars(self).update(score=checked("score", self.score, (n,)), range_rate=rate)
         vars(self)["position_covariance"] = _position_covariances(self.position_covariance, n)
+        vars(self)["identity"] = _identities(self.identity, n)
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> Self:
@@ -225,7 +232,8 @@ class Detections(Columns):
         entries = [d.position_covariance for d in detections]
         covariance = from_upper_triangle(checked("position_covariance", entries, (n, 3), "finite-or-nan"))
         score = checked("score", [d.score for d in detections], (n,))
-        return cls(boxes, score, rate, covariance)
+        identity = np.array([d.identity for d in detections], dtype=np.int64)
+        return cls(boxes, score, rate, covariance, identity)
 
     @classmethod
     def from_pandas(cls, table: Table) -> Self:
@@ -257,6 +265,7 @@ class Detections(Columns):
             score=float(self.score[row]),
             range_rate=float(self.range_rate[row]),
             position_covariance=tuple(upper_triangle(self.position_covariance[[row]])[0].tolist()),
+            identity=int(self.identity[row]),
         )
 
     def __iter__(self) -> Iterator[Detection]:
@@ -284,7 +293,25 @@ class Detections(Columns):
         """The detections in target coordinates."""
         R = target_T_source[:2, :2]
         covariance = R @ self.position_covariance @ R.T
-        return type(self)(self.boxes.transformed(target_T_source), self.score, self.range_rate, covariance)
+        return type(self)(
+            self.boxes.transformed(target_T_source), self.score, self.range_rate, covariance, self.identity
+        )
+
+
+def _identities(value: IntArray, n: int) -> IntArray:
+    """Numbers (n,), -1 for none. Raises `InputError` for one below, and for one that occurs twice."""
+    if np.ndim(value) == 0:
+        return np.full(n, value, dtype=np.int64)
+    numbers = np.asarray(value)
+    if numbers.shape != (n,) or (n and numbers.dtype.kind not in "iu"):
+        raise InputError(f"identity: expected {n} whole numbers, got {numbers.dtype} of shape {numbers.shape}")
+    given = np.sort(numbers[numbers != -1])
+    twice = given[1:][given[1:] == given[:-1]]
+    if len(given) and given[0] < 0:
+        raise InputError(f"identity: expected numbers from 0 on, or -1 for none, got {given[0]}")
+    if len(twice):
+        raise InputError(f"identity: expected each number once in a frame, {twice[0]} occurs twice")
+    return numbers.astype(np.int64)
 
 
 def _position_covariances(value: FloatArray, n: int) -> FloatArray:

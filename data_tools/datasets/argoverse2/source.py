@@ -267,15 +267,15 @@ class ArgoverseSource(AnnotatedSource):
                 official = path.suffix == ".feather"
                 yield self._chosen(DetectedLogs(logs, path) if official else AnnotatedLogs(logs, read_detections(path)))
 
-    def read_results(self, result: Path) -> Results:
+    def read_results(self, result: Path, truth: bool = True) -> Results:
         if result.suffix == ".pkl":
             raise InputError(
                 f"{result}: expected .feather or a table; a .pkl is not read, as that would run its content"
             )
         if result.suffix != ".feather":
-            return super().read_results(result)
+            return super().read_results(result, truth)
         there = dict.fromkeys(arrow_arrays(result, ("log_id",), KINDS)["log_id"].tolist())
-        with self.open(truth=True) as dataset:
+        with self.open(truth) as dataset:
             names = [name for name in dataset.scenes if self.scenes is not None or not there or name in there]
             if not names:
                 raise InputError(f"{result}: log_id: expected one of the logs, such as {dataset.scenes[0]}")

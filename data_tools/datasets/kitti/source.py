@@ -224,20 +224,25 @@ def scored_sequences(result: str | Path, dataset: KittiTracking) -> dict[str, Sc
 
 
 def _scored(path: Path, name: str, dataset: KittiTracking, table: TrackRows | None) -> ScoredSequence:
-    if not path.is_file():
-        raise InputError(f"{path}: expected the results of sequence {name}, there is no such file")
     scene = dataset.scene(name)
-    result = read_kitti_labels(path)
-    if len(result) and result.frame.max() >= len(scene):
-        raise InputError(f"{path}: frame {result.frame.max()}: expected frames 0 to {len(scene) - 1} only")
-    world_T_camera = scene.world_T_ego @ inverse_transform(dataset.calibration(name).camera_T_imu)
-    with error_context(str(path)):
-        found = _in_world(result, world_T_camera)
+    result, found = placed_result(path, scene, dataset)
     if table is not None:
         found = _with_motion(found, table, name)
     assert scene.ground_truth is not None
     truth = SceneBoxes.of_annotations(scene.ground_truth)
     return ScoredSequence(scene, found, dataset.labels(name), result, truth)
+
+
+def placed_result(path: Path, scene: Scene, dataset: KittiTracking) -> tuple[KittiObjects, SceneBoxes]:
+    """The lines of a result, and its boxes in the world. Raises as `read_scored_sequences` does."""
+    if not path.is_file():
+        raise InputError(f"{path}: expected the results of sequence {scene.name}, there is no such file")
+    result = read_kitti_labels(path)
+    if len(result) and result.frame.max() >= len(scene):
+        raise InputError(f"{path}: frame {result.frame.max()}: expected frames 0 to {len(scene) - 1} only")
+    world_T_camera = scene.world_T_ego @ inverse_transform(dataset.calibration(scene.name).camera_T_imu)
+    with error_context(str(path)):
+        return result, _in_world(result, world_T_camera)
 
 
 def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> SceneBoxes:
@@ -435,10 +440,14 @@ class KittiSource(DatasetSource):
             images=lambda: kitti_images(root, scenes),
         )
 
-    def read_results(self, result: Path) -> Results:
+    def read_results(self, result: Path, truth: bool = True) -> Results:
         chosen, classes = self._chosen(), names("--classes", self.classes)
         chosen = result_sequences(result) if chosen is None else chosen
-        with self.restricted(chosen).open(truth=True) as dataset:
+        with self.restricted(chosen).open(truth) as dataset:
+            if not truth:
+                scenes = [dataset.scene(name) for name in dataset.scenes]
+                placed = {scene.name: placed_result(result / f"{scene.name}.txt", scene, dataset) for scene in scenes}
+                return Results({scene.name: SceneResult(scene, placed[scene.name][1]) for scene in scenes})
             scored = scored_sequences(result, dataset)
         ious, exempt = overlaps(self.iou), self.persons == "exempt"
         return Results(scored, lambda some, hota, nis: evaluate_kitti(some, classes, ious, hota, nis, exempt))

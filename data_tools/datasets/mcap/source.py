@@ -179,7 +179,7 @@ class McapSource(DatasetSource):
     def with_kept(self, kept: Mapping[str, Any]) -> Self:
         return self if self.world is not None or "world" not in kept else replace(self, world=str(kept["world"]))
 
-    def read_results(self, result: Path) -> Results:
+    def read_results(self, result: Path, truth: bool = True) -> Results:
         with self.open() as dataset:
             if result.suffix != ".mcap":
                 return Results(read_table_results(result, dataset, every_scene=True))

@@ -20,7 +20,7 @@ from data_tools.datasets.nuscenes.results import (
     read_tracking_results,
     write_tracking_results,
 )
-from data_tools.datasets.nuscenes.tables import SceneRecord, read_annotations, split_scenes
+from data_tools.datasets.nuscenes.tables import read_annotations, split_scenes
 from data_tools.datasets.nuscenes.writer import merge_label_parts, write_label_part, write_nuscenes_labels
 from data_tools.datasets.results import Results, SceneResult
 from data_tools.datasets.source import (
@@ -95,33 +95,38 @@ def read_scored_scenes(
     for name in dataset.scenes:
         scene = dataset.scene(name)
         truth = scene.ground_truth or ()
-        tracking = _scored(str(result), dataset.records[name], truth, [each.boxes for each in racks[name]], found)
+        tracking = _scored(str(result), scene, truth, [each.boxes for each in racks[name]], found)
         scored[name] = ScoredScene(scene, tracking.found, tracking)
     return scored
 
 
 def _scored(
     path: str,
-    record: SceneRecord,
+    scene: Scene,
     truth: Sequence[Annotations],
     racks: Sequence[Boxes],
-    found: Mapping[str, ResultBoxes],
+    samples: Mapping[str, ResultBoxes],
 ) -> NuScenesTrackingScene:
-    for token in record.tokens:
-        if token not in found:
-            raise InputError(f"{path}: expected every sample of scene {record.name}, {token} is missing")
-        if len(found[token]) > MAX_BOXES:
-            raise InputError(f"{path}: sample {token}: expected at most {MAX_BOXES} boxes")
-    samples = [found[token] for token in record.tokens]
-    tracks = ResultBoxes.concatenate(samples)
-    frame = np.repeat(np.arange(len(samples)), [len(sample) for sample in samples])
     return NuScenesTrackingScene(
-        timestamps=record.timestamps,
-        ego_position=record.world_T_ego[:, :2, 3],
+        timestamps=scene.timestamps,
+        ego_position=scene.world_T_ego[:, :2, 3],
         truth=SceneBoxes.of_annotations(truth, hidden=False),
-        found=SceneBoxes(frame, tracks.id, tracks.boxes, tracks.score, tracks.position_covariance),
+        found=_found(path, scene, samples),
         racks=racks,
     )
+
+
+def _found(path: str, scene: Scene, found: Mapping[str, ResultBoxes]) -> SceneBoxes:
+    """The tracks of a scene among those of all samples."""
+    for token in scene.tokens:
+        if token not in found:
+            raise InputError(f"{path}: expected every sample of scene {scene.name}, {token} is missing")
+        if len(found[token]) > MAX_BOXES:
+            raise InputError(f"{path}: sample {token}: expected at most {MAX_BOXES} boxes")
+    samples = [found[token] for token in scene.tokens]
+    tracks = ResultBoxes.concatenate(samples)
+    frame = np.repeat(np.arange(len(samples)), [len(sample) for sample in samples])
+    return SceneBoxes(frame, tracks.id, tracks.boxes, tracks.score, tracks.position_covariance)
 
 
 REACH = 1  # keyframes to either side for a label's velocity, 0.5 s
@@ -252,7 +257,11 @@ class NuScenesSource(DatasetSource):
             lambda: nuscenes_images(root, tables, scenes),
         )
 
-    def read_results(self, result: Path) -> Results:
+    def read_results(self, result: Path, truth: bool = True) -> Results:
+        if not truth:
+            with self.open() as dataset:
+                samples, scenes = read_tracking_results(result).samples, [dataset.scene(n) for n in dataset.scenes]
+            return Results({each.name: SceneResult(each, _found(str(result), each, samples)) for each in scenes})
         with self._local() as (root, files):
             scored = read_scored_scenes(result, root, self.version, self._chosen(root), files)
         return Results(scored, evaluate_nuscenes)

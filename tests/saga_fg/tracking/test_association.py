@@ -38,6 +38,7 @@ def measured(found, probability, noise=0.3):
         covariance_scale=flat,
         position_bias=flat,
         class_likelihood=np.empty((n, 0)),
+        identity=np.full(n, -1),
         viewpoint=None,
     )
 

@@ -1,0 +1,85 @@
+"""Labels from detections, and from the tracks of other trackers: as they are, refined, with shuffled identities.
+
+as given    tracks of the method, whose table says which boxes are predictions
+refined     `saga-fg smooth --tracks`; shuffled: after the identities of every frame were exchanged at random, so that
+            the boxes alone are left
+together    both methods' tracks refined to one result
+detections  labels from the detections that all of them had, by `saga-fg smooth`; tracked: by `saga-fg track`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.recording_sets import RecordingOptions, RecordingSet, chosen_sets
+from benchmarks.runner import Data, Row, Rows, Seed, each
+from data_tools.datasets.given_tracks import with_tracks
+from data_tools.datasets.results import SceneResult
+from data_tools.metrics import LabelErrors, SceneBoxes, error_summary
+from pipelines.config import Method, load_config
+from pipelines.smoothing import for_given_tracks, load_smooth_config, smooth_scene
+from pipelines.tracking import TrackedScene, track_scene
+from saga_fg.types.dataset import Scene
+from saga_fg.types.track import Tracks
+
+METHODS: tuple[Method, ...] = ("centerpoint", "kf")
+GRAPH: Method = "saga"
+
+
+def labels(*, data: Data = None, recorded: RecordingOptions, seed: Seed = 0) -> Rows:
+    """Refine the tracks of the methods centerpoint and kf, and label the same detections.
+
+    \b
+    Examples:
+      python -m benchmarks labels --sets simulated --scenes 4
+      python -m benchmarks labels --data data --sets megvii,centerpoint,kitti
+    """
+    for recordings in chosen_sets(recorded.sets, data, recorded.scenes, recorded.test, recorded.viewpoint):
+        yield from set_rows(recordings, seed)
+
+
+def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
+    """A row for each way to the labels."""
+    runs: dict[str, dict[str, TrackedScene]] = {}
+    online, offline = load_config(recordings.family), load_smooth_config(recordings.family)
+    rng = np.random.default_rng(seed)
+    for name in each(recordings.dataset.scenes, recordings.name):
+        scene = recordings.scene(name)
+        given: dict[str, SceneResult] = {}
+        for method in (GRAPH, *METHODS):
+            run = track_scene(scene, online.of_method(method).new_tracker(method))
+            runs.setdefault("detections, tracked" if method == GRAPH else f"{method}, as given", {})[name] = run
+            coasting = np.concatenate([each.coasting for each in run.tracks])
+            given[method] = SceneResult(scene, SceneBoxes.of_tracks(run.tracks), coasting=coasting)
+        del given[GRAPH]
+        runs.setdefault("detections, labels", {})[name] = as_run(scene, smooth_scene(scene, offline).tracks)
+        wanted = {f"{method}, refined": [result] for method, result in given.items()}
+        wanted |= {f"{method}, shuffled": [shuffled(result, rng)] for method, result in given.items()}
+        for variant, results in (wanted | {"together, refined": list(given.values())}).items():
+            settings = for_given_tracks(offline, [{name: result} for result in results])
+            labelled = smooth_scene(with_tracks(results, replace(scene, frames=())), settings)
+            runs.setdefault(variant, {})[name] = as_run(scene, labelled.tracks)
+    for variant, found in sorted(runs.items()):
+        yield f"{recordings.name}: {len(found)} scenes", {"labels": variant, **figures(recordings, found)}
+
+
+def as_run(scene: Scene, tracks: Sequence[Tracks]) -> TrackedScene:
+    """Labels as a tracker's output."""
+    return TrackedScene(scene, tuple(tracks), ())
+
+
+def figures(recordings: RecordingSet, found: Mapping[str, TrackedScene]) -> dict[str, float]:
+    """The figures of a set, and the errors at labels, m and m/s."""
+    score = recordings.score(found)
+    errors = error_summary(LabelErrors.pool(score.errors))
+    return {**score.figures_of(range(len(found))), "position": errors.position, "velocity": errors.velocity}
+
+
+def shuffled(result: SceneResult, rng: np.random.Generator) -> SceneResult:
+    """The result with the identities of each frame exchanged at random."""
+    found = result.found
+    order = np.lexsort((rng.random(len(found)), found.frame))
+    return replace(result, found=replace(found, id=found.id[order]))

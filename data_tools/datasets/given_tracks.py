@@ -1,0 +1,143 @@
+"""Tracks of other trackers as recordings: their boxes are detections with identities, each result is a sensor.
+
+A track's velocity is no measurement, it follows from the boxes; so it is left out. So are boxes that are known to be
+predictions, where the table says so (`coasting`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.datasets.results import SceneResult
+from data_tools.datasets.source import DatasetSource, OpenedPart, Part, Parts, scene_digests
+from saga_fg.errors import InputError
+from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types.frame import Detections, Frame
+
+SENSOR = "tracks"
+"""Name of the first result as a sensor; the others are tracks_2, tracks_3, ..."""
+
+GivenTracks = Sequence[Mapping[str, SceneResult]]
+"""The results of several trackers, by scene."""
+
+
+def read_given_tracks(source: DatasetSource, files: Sequence[Path]) -> GivenTracks:
+    """Read results of trackers for the chosen scenes of a dataset, whose ground truth is not read.
+
+    Raises `InputError` for one that is missing or broken, or that has no track in these scenes.
+    """
+    results = []
+    for file in files:
+        found = source.read_results(file, truth=False).scenes
+        if not any(len(each.found) for each in found.values()):
+            raise InputError(f"--tracks {file}: expected tracks of the chosen scenes, there are none")
+        results.append(found)
+    return results
+
+
+def sensor_names(results: GivenTracks) -> list[str]:
+    """The names of results as sensors."""
+    return [SENSOR if number == 1 else f"{SENSOR}_{number}" for number in range(1, len(results) + 1)]
+
+
+def with_tracks(results: Sequence[SceneResult], scene: Scene | None = None) -> Scene:
+    """A scene with the boxes of results as frames, beside the frames it has.
+
+    Its moments are those of all results. scene: with frames of detections; that of the first result if left out
+    """
+    scene = results[0].scene if scene is None else scene
+    timestamps = np.concatenate([each.scene.timestamps for each in results])
+    timestamps, first = np.unique(timestamps, return_index=True)
+    poses = np.concatenate([each.scene.world_T_ego for each in results])[first]
+    tokens = [token for each in results for token in each.scene.tokens]
+    frames = list(scene.frames)
+    for name, each in zip(sensor_names([{} for _ in results]), results, strict=True):
+        frames += _frames(name, each)
+    frames.sort(key=lambda frame: frame.timestamp)
+    return replace(
+        scene,
+        timestamps=timestamps,
+        world_T_ego=poses,
+        tokens=tuple(tokens[row] for row in first.tolist()),
+        frames=tuple(frames),
+        ground_truth=None,
+    )
+
+
+def _frames(sensor: str, result: SceneResult) -> Iterator[Frame]:
+    """A frame for every moment."""
+    found, scene = result.found, result.scene
+    if result.coasting is not None:
+        found = found.select(np.flatnonzero(~(result.coasting > 0)))
+    _, identity = np.unique(found.id, return_inverse=True)
+    boxes = replace(found.boxes, velocity=np.full((len(found), 2), np.nan))
+    bounds = np.searchsorted(found.frame, np.arange(len(scene) + 1)).tolist()
+    for k, time in enumerate(scene.timestamps.tolist()):
+        rows = np.arange(bounds[k], bounds[k + 1])
+        seen = Detections(boxes.select(rows), found.score[rows], identity=identity[rows])
+        yield Frame(time, sensor, seen, scene.world_T_ego[k])
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedRecordings:
+    """Scenes with the boxes of results as frames; those of `recordings` that no result has are left out.
+
+    recordings: the dataset; one without scenes leaves them to the results
+    """
+
+    recordings: Dataset
+    results: GivenTracks
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The names of scenes that some result has."""
+        named = dict.fromkeys(name for result in self.results for name in result)
+        return tuple(name for name in self.recordings.scenes or named if name in named)
+
+    def scene(self, name: str) -> Scene:
+        """A scene with its own frames, and those of the results."""
+        own = self.recordings.scene(name) if self.recordings.scenes else None
+        return with_tracks([result[name] for result in self.results if name in result], own)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPart:
+    """A part of a dataset with the boxes of results; read where it is needed."""
+
+    part: Part
+    results: GivenTracks
+
+    @property
+    def name(self) -> str:
+        """That of the part."""
+        return self.part.name
+
+    @contextmanager
+    def opened(self) -> Iterator[OpenedPart]:
+        """Open with the digests of the results too."""
+        given = {
+            f"{SENSOR} {name} {number}": digest
+            for number, result in enumerate(self.results)
+            for name, each in result.items()
+            for digest in (scene_digests(replace(each.scene, frames=tuple(_frames(SENSOR, each))))[SENSOR],)
+        }
+        with self.part.opened() as part:
+            yield OpenedPart({**part.digests, **given}, lambda: TrackedRecordings(part.read(), self.results))
+
+
+def tracked_parts(parts: Parts, results: GivenTracks) -> Parts:
+    """The parts of a dataset with the boxes of results; parts that are one scene each."""
+    there = {name for result in results for name in result}
+
+    def chosen() -> Iterator[Part]:
+        for part in parts.parts:
+            if part.name in there:
+                own = [{name: result[name] for name in [part.name] if name in result} for result in results]
+                yield TrackedPart(part, own)
+
+    return Parts([name for name in parts.names if name in there], chosen(), parts.dataset)

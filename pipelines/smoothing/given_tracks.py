@@ -1,0 +1,51 @@
+"""Models of trackers as sensors, for labels from their tracks.
+
+Several trackers of one recording mostly saw the same detections: their errors are one error. So each has the variance
+of n sensors, and together they tell as much as one.
+
+Scores of which all lie in [0, 1] are probabilities, whatever the detector's scores are: trackers turn them into such.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from data_tools.datasets.given_tracks import GivenTracks, sensor_names
+from pipelines.smoothing.passes import SmoothConfig
+from saga_fg.model.sensor import ScoreCalibration, Sensor, sensor_model
+from saga_fg.types.by_class import DEFAULT
+
+
+def for_given_tracks(config: SmoothConfig, results: GivenTracks) -> SmoothConfig:
+    """The configuration with a model of each tracker, from the sensor's that it names for all others."""
+    scores = [np.concatenate([each.found.score for each in result.values()]) for result in results]
+    probable = [bool(((score >= 0) & (score <= 1)).all()) for score in scores]
+
+    def models(sensors: Mapping[str, Sensor]) -> dict[str, Sensor]:
+        named = zip(sensor_names(results), probable, strict=True)
+        usual = {name: _tracker(sensor_model(sensors, name), sure, len(results)) for name, sure in named}
+        return {**usual, **sensors}
+
+    tracking = replace(config.tracking, sensors=models(config.tracking.sensors))
+    return replace(config, tracking=tracking, sensors=models(config.sensors))
+
+
+def _tracker(sensor: Sensor, probable: bool, count: int) -> Sensor:
+    """A tracker of `count`; probable: its scores are probabilities."""
+    scale = float(np.sqrt(count))
+    noise = {
+        label: replace(
+            model,
+            position=scale * model.position,
+            range_noise=scale * model.range_noise,
+            bearing_noise=scale * model.bearing_noise,
+        )
+        for label, model in sensor.noise.items()
+    }
+    sensor = replace(sensor, noise=noise)
+    if probable and sensor.score == "logit":
+        sensor = replace(sensor, score="probability", calibration={DEFAULT: ScoreCalibration()})
+    return sensor
