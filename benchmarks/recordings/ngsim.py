@@ -49,6 +49,8 @@ def ngsim_windows(root: Path, road: Road = "signals") -> Recordings:
 
     def read(name: str) -> RecordedTraffic:
         rows = scenario == name
+        if not rows.any():
+            raise InputError(f"{whole.path}: scenario: expected rows of {name!r}, there are none")
         table = TextTable(whole.path, whole.values[rows], whole.line[rows])
         step = table.integers(3, "step", 0, _STEPS)
         numbers = table.numbers(slice(4, None), _NUMBERS, _LARGEST)

@@ -197,6 +197,9 @@ def headings_against_motion(label: StrArray, yaw: FloatArray, velocity: FloatArr
     return Finding("headings", what, expected, Mend(units={"angle": _UNIT_OF[unit][best]}))
 
 
+MIN_STEP = 1e-6  # s between two frames, of which a velocity can be told
+
+
 def velocities_between_frames(time: FloatArray, label: StrArray, position: FloatArray) -> FloatArray:
     """Velocities (n, 2) of detections at times (n,), s, and places (n, 2) in the world; NaN where they are not clear.
 
@@ -215,6 +218,7 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
             distance, nearest = cKDTree(position[later]).query(position[now], k=2)
             _, back = cKDTree(position[now]).query(position[later])
             clear = (back[nearest[:, 0]] == np.arange(len(now))) & (distance[:, 1] > 3 * distance[:, 0])
+            clear &= time[later[0]] - time[now[0]] > MIN_STEP
             rows, to = now[clear], later[nearest[clear, 0]]
             found[rows] = (position[to] - position[rows]) / (time[to] - time[rows])[:, None]
     return found

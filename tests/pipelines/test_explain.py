@@ -165,6 +165,8 @@ def test_methods_and_tables_without_predictions_are_refused(run, tmp_path):
     for row, why in [
         ("0,,1,1,1", "horizon: expected a number, got none"),
         ("0,1,1,x,1", "x: expected a number, got 'x'"),
+        ("0,1,-1e300,1,1", "id: expected a whole number"),
+        ("0,1,1.5,1,1", "id: expected a whole number"),
     ]:
         predictions_path(tmp_path / "t.csv").write_text(f"timestamp,horizon,id,x,y\n{row}\n")
         with pytest.raises(InputError, match=why):

@@ -434,6 +434,9 @@ def predictions_path(result: Path) -> Path:
     return result.with_name(f"{result.name}{SUFFIX}")
 
 
+_LARGEST_ID = 2**53  # beyond, numbers are not exact
+
+
 def read_predictions(result: Path) -> dict[str, PredictionRows]:
     """The predictions kept with a result, by scene; none where the run kept none.
 
@@ -454,6 +457,10 @@ def _read_table(path: Path) -> dict[str, PredictionRows]:
     for name in numbers:
         if np.isnan(columns[name]).any():
             raise raw.fault(int(np.argmax(np.isnan(columns[name]))), f"{name}: expected a number, got none")
+    odd = (columns["id"] != np.rint(columns["id"])) | (np.abs(columns["id"]) > _LARGEST_ID)
+    if odd.any():
+        row = int(np.argmax(odd))
+        raise raw.fault(row, f"id: expected a whole number within {_LARGEST_ID}, got {columns['id'][row]:g}")
     rows = PredictionRows(
         columns["timestamp"],
         columns["horizon"],

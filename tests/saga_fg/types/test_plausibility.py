@@ -85,6 +85,8 @@ def test_velocities_between_frames_are_those_of_objects_that_cannot_be_mistaken(
     assert np.isnan(found[12:]).all()
     crowd = np.concatenate([0.3 * np.arange(3)[:, None] * [1.0, 0.0] + t for t in np.arange(5) * 0.2])
     assert np.isnan(velocities_between_frames(time, np.full(15, "car"), crowd)).all()
+    at_once = velocities_between_frames(np.array([0.0, 0.0, 1e-308, 1e-308]), np.full(4, "car"), place[[0, 1, 3, 4]])
+    assert np.isnan(at_once).all()
 
 
 def test_scores_beyond_one(subtests):
