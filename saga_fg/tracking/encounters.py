@@ -22,8 +22,8 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.kernels.identities import exchanged_tracks
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
+from saga_fg.numerics.assignment import mahalanobis_of_pairs
 
 LIKELY, UNLIKELY = 2.0, -5.0  # log odds; 1.5 to 2.5 exchange alike
 MEMORY = 2.0  # s; 1 to 3 exchange alike
@@ -53,8 +53,6 @@ class Encounters(Columns):
 
     def live(self, tracks: IntArray, time: float) -> Self:
         """Those that are open at a time, s, of the tracks (n,) that are left."""
-        if len(self) == 0:
-            return self
         there = np.isin(self.ids, tracks).all(axis=1)
         return self.select(there & (time - self.since <= MEMORY) & (self.log_odds > UNLIKELY))
 
@@ -64,21 +62,29 @@ class Encounters(Columns):
 
     def begun(self, ids: IntArray, x: FloatArray, P: FloatArray, time: float) -> Self:
         """With new ones, of tracks `ids` (e, 2) predicted to x (e, 2, 4), P (e, 2, 4, 4)."""
-        both = np.concatenate([x, x], axis=1), np.concatenate([P, P], axis=1)
-        return self.append(type(self)(ids, *both, np.full(len(ids), time), np.zeros(len(ids))))
+        since = np.full(len(ids), time)
+        return self.append(type(self)(ids, np.tile(x, (1, 2, 1)), np.tile(P, (1, 2, 1, 1)), since, 0 * since))
 
     def followed(self, noise: FloatArray, dt: FloatArray, z: FloatArray, R: FloatArray, seen: BoolArray) -> Self:
         """After a frame: noise (E,) m^2/s^3; dt (E,) s before; z (E, 2, 2), R (E, 2, 2, 2) where `seen` (E, 2)."""
-        evidence, x, P = exchanged_tracks(self.x, self.P, noise, dt, z, R, seen)
-        return replace(self, x=x, P=P, log_odds=self.log_odds + evidence)
+        F, Q = np.eye(4) + dt[:, None, None] * np.eye(4, k=2), np.zeros((len(self), 4, 4))
+        for i, j, power in ((0, 0, 3), (0, 2, 2), (2, 0, 2), (2, 2, 1)):
+            Q[:, [i, i + 1], [j, j + 1]] = (noise * dt**power / power)[:, None]
+        F, Q, crossed = F[:, None], Q[:, None], [0, 1, 1, 0]  # the detection of each filter
+        x, P = (F @ self.x[..., None])[..., 0], F @ self.P @ np.swapaxes(F, 2, 3) + Q
+        innovation, S = (
+            z[:, crossed] - x[..., :2],
+            P[..., :2, :2] + np.where(seen[..., None, None], R, np.eye(2))[:, crossed],
+        )
+        told = seen[:, crossed]
+        log_density = np.where(told, -0.5 * np.sum(mahalanobis_of_pairs(innovation, S), axis=0), 0.0)
+        K = np.where(told[..., None, None], P[..., :2] @ np.linalg.inv(S), 0.0)
+        x, P = x + (K @ innovation[..., None])[..., 0], P - K @ P[..., :2, :]
+        return replace(self, x=x, P=P, log_odds=self.log_odds + log_density @ [-1.0, -1.0, 1.0, 1.0])
 
     def exchanges(self, seen: IntArray) -> list[tuple[int, int]]:
-        """The pairs of tracks, each in one at most, of which it is likely and both are `seen` (k,) now."""
-        likely = (self.log_odds >= LIKELY) & np.isin(self.ids, seen).all(axis=1)
-        rows, done = likely.nonzero()[0], set[int]()
-        found = []
-        for a, b in self.ids[rows[np.argsort(-self.log_odds[rows], kind="stable")]].tolist():
-            if not done & {a, b}:
-                found.append((a, b))
-                done |= {a, b}
-        return found
+        """The likeliest pair of tracks, if it is likely, of those of which both are `seen` (k,) now."""
+        odds = np.where(np.isin(self.ids, seen).all(axis=1), self.log_odds, -np.inf)
+        return (
+            [(int(a), int(b)) for a, b in self.ids[odds.argmax() :][:1]] if odds.max(initial=-np.inf) >= LIKELY else []
+        )

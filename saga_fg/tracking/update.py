@@ -114,13 +114,11 @@ def follow_encounters(
 
 
 def exchange_identities(state: TrackerState) -> None:
-    """Exchange the tracks of encounters that have probably exchanged their objects."""
-    if len(state.encounters):
-        table = state.table
-        pairs = state.encounters.exchanges(table.id[table.coasting(state.time) == 0])
-        for a, b in pairs:
-            state.exchange(a, b)
-        state.encounters = state.encounters.without(pairs)
+    """Exchange the tracks of the encounter that have probably exchanged their objects, one a frame."""
+    pairs = state.encounters.exchanges(state.table.id[state.table.coasting(state.time) == 0])
+    for a, b in pairs:
+        state.exchange(a, b)
+    state.encounters = state.encounters.without(pairs)
 
 
 def infer_signals(state: TrackerState, matching: Matching) -> None:
