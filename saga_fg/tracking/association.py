@@ -180,8 +180,7 @@ def _shares(found: CandidatePairs, real: FloatArray) -> tuple[FloatArray, FloatA
     """(K,) probabilities of the pairs, and the share of its detection that is the track's."""
     if (np.bincount(found.detection) < 2).all():  # nobody has a rival, and no probability is asked for
         return np.ones(len(found.gain)), np.ones(len(found.gain))
-    log_weight = -found.gain / 2
-    log_weight -= max(log_weight.min() - _SURE, 0.0)  # without clutter no pair is apart
+    log_weight = -found.gain / 2 - max(-found.gain.max() / 2 - _SURE, 0.0)  # without clutter no pair is apart
     p = association_marginals(found.track, found.detection, log_weight, LARGEST_EXACT, SWEEPS)
     claim = real[found.track] * p
     of_others = np.bincount(found.detection, claim)[found.detection] - claim

@@ -8,7 +8,7 @@ constant velocity follow the two objects by the same detections, from the tracks
 
 with ' where the detections are exchanged; the noise of the acceleration is what the motion of the class adds to its
 velocity in a second. From `LIKELY` on, in a frame that detects both, the tracks exchange all that is known of them but
-their ids. An encounter ends below `UNLIKELY`, after `MEMORY`, and with one of its tracks.
+their ids, one pair a frame. An encounter ends below `UNLIKELY`, after `MEMORY`, and with one of its tracks.
 
 Source: Reid, An Algorithm for Tracking Multiple Targets, IEEE Transactions on Automatic Control 24(6), 1979; of its
 hypotheses those of one pair alone.
@@ -16,7 +16,6 @@ hypotheses those of one pair alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -56,9 +55,9 @@ class Encounters(Columns):
         there = np.isin(self.ids, tracks).all(axis=1)
         return self.select(there & (time - self.since <= MEMORY) & (self.log_odds > UNLIKELY))
 
-    def without(self, pairs: Sequence[tuple[int, int]]) -> Self:
-        """Those of no track of some pairs."""
-        return self.select(np.asarray(~np.isin(self.ids, pairs).any(axis=1))) if pairs else self
+    def without(self, a: int, b: int) -> Self:
+        """Those of neither of two tracks."""
+        return self.select(np.asarray(~np.isin(self.ids, [a, b]).any(axis=1)))
 
     def begun(self, ids: IntArray, x: FloatArray, P: FloatArray, time: float) -> Self:
         """With new ones, of tracks `ids` (e, 2) predicted to x (e, 2, 4), P (e, 2, 4, 4)."""
@@ -85,6 +84,4 @@ class Encounters(Columns):
     def exchanges(self, seen: IntArray) -> list[tuple[int, int]]:
         """The likeliest pair of tracks, if it is likely, of those of which both are `seen` (k,) now."""
         odds = np.where(np.isin(self.ids, seen).all(axis=1), self.log_odds, -np.inf)
-        return (
-            [(int(a), int(b)) for a, b in self.ids[odds.argmax() :][:1]] if odds.max(initial=-np.inf) >= LIKELY else []
-        )
+        return [(a, b) for a, b in self.ids[odds == odds.max(initial=LIKELY)][:1].tolist()]

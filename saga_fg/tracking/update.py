@@ -115,10 +115,9 @@ def follow_encounters(
 
 def exchange_identities(state: TrackerState) -> None:
     """Exchange the tracks of the encounter that have probably exchanged their objects, one a frame."""
-    pairs = state.encounters.exchanges(state.table.id[state.table.coasting(state.time) == 0])
-    for a, b in pairs:
+    for a, b in state.encounters.exchanges(state.table.id[state.table.coasting(state.time) == 0]):
         state.exchange(a, b)
-    state.encounters = state.encounters.without(pairs)
+        state.encounters = state.encounters.without(a, b)
 
 
 def infer_signals(state: TrackerState, matching: Matching) -> None:

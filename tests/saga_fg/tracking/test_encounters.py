@@ -115,7 +115,7 @@ def test_what_follows_tells_whether_two_tracks_exchanged_their_objects(swapped):
     assert known.exchanges(np.array([4, 7])) == ([(4, 7)] if swapped else [])
     assert known.exchanges(np.array([4])) == []
     assert [len(known.live(np.array(ids), 1.9)) for ids in ([4, 7], [4, 8])] == [swapped, 0]
-    assert len(known.live(np.array([4, 7]), 2.1)) == len(known.without([(2, 4)])) == 0
+    assert len(known.live(np.array([4, 7]), 2.1)) == len(known.without(2, 4)) == 0
 
 
 def test_tracks_that_exchange_have_all_of_each_other_but_the_id():
