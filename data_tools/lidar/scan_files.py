@@ -80,6 +80,8 @@ def read_columns(path: str | Path) -> Columns:
     suffix = next((suffix for suffix in SUFFIXES if name.endswith(suffix)), None)
     if suffix is None:
         raise InputError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
+    if path.is_file() and not path.stat().st_size:  # without points, in every format
+        return {axis: np.empty(0) for axis in "xyz"}
     with error_context(str(path)):
         return _READERS[suffix](path)
 
@@ -179,8 +181,6 @@ def columns_of_records(content: bytes) -> Columns:
 
     So few points that statistics tell nothing are taken for KITTI's, where their size allows it.
     """
-    if not content:
-        return {axis: np.empty(0) for axis in "xyz"}
     if len(content) < _FEW * KITTI.itemsize and len(content) % KITTI.itemsize == 0:
         return record_columns(content, KITTI)
     for kind in _FLOATS:
@@ -388,6 +388,8 @@ def _fault(expected: str) -> NoReturn:
 def _array(path: Path) -> Columns:
     with open_bytes(path) as file:
         array = load_array(file)
+    if array.shape == (0,):
+        array = array.reshape(0, 3)
     if array.ndim != 2 or not 3 <= array.shape[1] <= MOST_VALUES or array.dtype.kind not in "fiu":
         raise InputError(f"expected numbers (N, 3) or wider, got {array.dtype} {array.shape}")
     return _named(array) if len(array) else {axis: array[:, k] for k, axis in enumerate("xyz")}

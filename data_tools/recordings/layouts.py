@@ -86,11 +86,12 @@ def _opener(layout: str) -> Opener:
 def _folder(source: Path, options: RecordingOptions) -> ScanRecording:
     """Scans in files of one format, with times in a table (`times.txt`, ... there or above) or in their names.
 
-    A table has a time on each line, or the name of a file before it. Times are s, ms, us or ns, known by their size, or
-    dates. Names with less than a time in them are numbers of scans, `period` s apart.
+    A table has a time on each line, in the order of the numbers in the names, or the name of a file before it. Times
+    are s, ms, us or ns, known by their size, or dates. Names with less than a time in them are numbers of scans,
+    `period` s apart.
     """
-    there = sorted(source.iterdir()) if source.is_dir() else [source]
-    files = [path for path in there if path.name.lower().endswith(SUFFIXES)]
+    there = list(source.iterdir()) if source.is_dir() else [source]
+    files = _in_order(path for path in there if path.name.lower().endswith(SUFFIXES))
     if not files:
         if any(path.suffix == ".bag" for path in there):
             raise InputError("expected a bag of ROS 2 or MCAP: convert that of ROS 1 first: rosbags-convert --src FILE")
@@ -100,12 +101,12 @@ def _folder(source: Path, options: RecordingOptions) -> ScanRecording:
         raise InputError(f"expected scans of one format, there are {', '.join(kinds)}")
     table = next((each for at in (source, source.parent) for name in _TABLES if (each := at / name).is_file()), None)
     if table is not None and source.is_dir():
-        times, lines = _times_of_table(table, files)
+        times, lines, by_name = _times_of_table(table, files)
+        if by_name:
+            order = np.argsort(times, kind="stable").tolist()
+            files, times, lines = [files[k] for k in order], times[order], [lines[k] for k in order]
         return _of_files("folder", files, times, _read_alike(files), clock=lambda row: f"{table}: line {lines[row]}")
-    times = _times_of_names(files, options.period)
-    order = np.argsort(times, kind="stable").tolist()
-    files = [files[k] for k in order]
-    return _of_files("folder", files, times[order], _read_alike(files))
+    return _of_files("folder", files, _times_of_names(files, options.period), _read_alike(files))
 
 
 def _read_alike(files: Sequence[Path]) -> Callable[[Path], Scan]:
@@ -155,8 +156,30 @@ def _seconds(text: str) -> float:
     return value * next(unit for least, unit in _UNITS.items() if abs(value) >= least)
 
 
-def _times_of_names(files: Sequence[Path], period: float) -> FloatArray:
-    """Times (K,), s: 1583836591_182590976, 0.25, 1532402927647951 or 1403715273262142976 at the end of a name."""
+def _in_order(files: Iterable[Path]) -> list[Path]:
+    """Files by the times or numbers at the end of their names; where these tell them not apart, by all numbers."""
+
+    def words(path: Path) -> list[tuple[str, int]]:
+        found = re.split(r"(\d+)", _stem(path))  # text and numbers by turns
+        return [(text, int(number)) for text, number in zip(found[::2], [*found[1::2], "-1"], strict=True)]
+
+    there = sorted(sorted(files), key=words)
+    values, _ = _ends_of_names(there)
+    return there if _twins(values) else [there[k] for k in np.argsort(values).tolist()]
+
+
+def _twins(values: FloatArray) -> tuple[int, int] | None:
+    """The first two rows of one value."""
+    order = np.argsort(values, kind="stable")
+    same = np.flatnonzero(np.diff(values[order]) == 0)
+    return (int(order[same[0]]), int(order[same[0] + 1])) if len(same) else None
+
+
+def _ends_of_names(files: Sequence[Path]) -> tuple[FloatArray, bool]:
+    """Times (K,), s, and True, else numbers of scans, and False.
+
+    Times: 1583836591_182590976, 0.25, 1532402927647951 or 1403715273262142976 at the end of a name.
+    """
     times, numbers = list[float](), list[int]()
     for path in files:
         if found := re.search(r"(\d+)\.(\d+)$|(\d{9,})[_-](\d{9})$|(\d{12,20})$", _stem(path)):
@@ -168,16 +191,28 @@ def _times_of_names(files: Sequence[Path], period: float) -> FloatArray:
         elif number := re.search(r"(\d{1,11})$", _stem(path)):
             numbers.append(int(number[1]))
     if len(times) == len(files):
-        return np.array(times)
-    at = np.array(numbers if len(numbers) == len(files) else range(len(files)), dtype=np.float64)
+        return np.array(times), True
+    return np.array(numbers if len(numbers) == len(files) else range(len(files)), dtype=np.float64), False
+
+
+def _times_of_names(files: Sequence[Path], period: float) -> FloatArray:
+    """Times (K,), s, of files in order. Raises `InputError` for two files of one time or number."""
+    values, timed = _ends_of_names(files)
+    if same := _twins(values):
+        raise InputError(
+            f"expected scans of one sensor, of different {'times' if timed else 'numbers'}, "
+            f"got {values[same[0]]:.15g} twice: {files[same[0]].name} and {files[same[1]].name}"
+        )
+    if timed:
+        return values
     _log.warning(
         "%s: no times in the names and no table: the scans are taken to be %g s apart", files[0].parent, period
     )
-    return np.asarray(period * (at - at[0] if len(numbers) == len(files) else at))
+    return np.asarray(period * (values - values[0]))
 
 
-def _times_of_table(table: Path, files: Sequence[Path]) -> tuple[FloatArray, list[int]]:
-    """Times (K,), s, of the files in their order, and the lines that say them."""
+def _times_of_table(table: Path, files: Sequence[Path]) -> tuple[FloatArray, list[int], bool]:
+    """Times (K,), s, of the files in their order, the lines that say them, and whether these name files."""
     times, lines = list[float](), list[int]()
     by_name: dict[str, tuple[float, int]] = {}
     for number, line in enumerate(read_lines(table), start=1):
@@ -204,7 +239,7 @@ def _times_of_table(table: Path, files: Sequence[Path]) -> tuple[FloatArray, lis
         lines.append(found[1])
     if len(times) != len(files):
         raise InputError(f"{table}: expected {len(files)} times, one for each scan, got {len(times)}")
-    return np.array(times), lines
+    return np.array(times), lines, bool(by_name)
 
 
 def _one_of(what: str, chosen: str | None, there: Iterable[str]) -> str:
@@ -279,9 +314,9 @@ def kitti_odometry(source: Path, options: RecordingOptions) -> ScanRecording:
     if (source / "sequences").is_dir():
         there = (path.name for path in (source / "sequences").iterdir() if (path / "velodyne").is_dir())
         source = source / "sequences" / _one_of("sequence", options.sequence, there)
-    files = sorted((source / "velodyne").glob("*.bin"))
+    files = _in_order((source / "velodyne").glob("*.bin"))
     table = source / "times.txt"
-    times, lines = _times_of_table(table, files)
+    times, lines, _ = _times_of_table(table, files)
     poses, truth = None, source.parents[1] / "poses" / f"{source.name}.txt" if len(source.parts) > 1 else source
     if truth.is_file():
         camera_T_lidar = read_transform(source / "calib.txt", "Tr")
@@ -304,7 +339,7 @@ def mulran(source: Path, options: RecordingOptions) -> ScanRecording:
     Sources: Kim et al., MulRan, ICRA 2020; https://sites.google.com/view/mulran-pr, whose calib_base2ouster.txt the
     place of the LiDAR is from. Untested on originals.
     """
-    files = sorted((source / "Ouster").glob("*.bin"), key=lambda path: int(path.stem))
+    files = _in_order((source / "Ouster").glob("*.bin"))
     times, poses = _times_of_names(files, options.period), None
     if (table := source / "global_pose.csv").is_file():
         numbers = read_rows(table, (13,), "time, r11, ..., tz", ",").numbers(slice(0, 13), ("pose",) * 13, np.inf)
@@ -339,7 +374,7 @@ def helipr(source: Path, options: RecordingOptions) -> ScanRecording:
     """
     there = (path.name for path in (source / "LiDAR").iterdir() if path.name in _HELIPR)
     sensor = _one_of("sensor", options.sequence, there)
-    files = sorted((source / "LiDAR" / sensor).glob("*.bin"), key=lambda path: int(path.stem))
+    files = _in_order((source / "LiDAR" / sensor).glob("*.bin"))
     times, poses = _times_of_names(files, options.period), None
     if (truth := source / "LiDAR_GT" / f"global_{sensor}_gt.txt").is_file():
         names = ("time", *_TUM)
@@ -360,10 +395,8 @@ def newer_college(source: Path, options: RecordingOptions) -> ScanRecording:
     Sources: Ramezani et al., The Newer College Dataset, IROS 2020; https://ori-drs.github.io/newer-college-dataset.
     Untested on originals.
     """
-    files = sorted((source / "raw_format" / "ouster_scan").glob("*.pcd"))
+    files = _in_order((source / "raw_format" / "ouster_scan").glob("*.pcd"))
     times, poses = _times_of_names(files, options.period), None
-    order = np.argsort(times, kind="stable").tolist()
-    files, times = [files[k] for k in order], times[order]
     if (truth := source / "ground_truth" / "registered_poses.csv").is_file():
         names = ("sec", "nsec", *_TUM)
         numbers = read_rows(truth, (9,), ", ".join(names), ",", "#").numbers(slice(0, 9), names, np.inf)

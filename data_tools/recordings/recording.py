@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -16,7 +17,7 @@ from typing import Self
 import numpy as np
 
 from data_tools.files.input_files import error_context
-from data_tools.lidar.scan import Scan
+from data_tools.lidar.scan import Scan, ScanSequence
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.numerics.geometry import checked_transform
@@ -147,3 +148,8 @@ class ScanRecording:
                 "of another sensor?",
                 self.place(row), *now, *first,
             )  # fmt: skip
+
+
+def scan_context(scans: ScanSequence, row: int) -> AbstractContextManager[None]:
+    """Prefix every `InputError` of the block with what the recording calls the scan, if it is one."""
+    return error_context(scans.place(row)) if isinstance(scans, ScanRecording) else nullcontext()

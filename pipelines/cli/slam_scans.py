@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -196,6 +197,9 @@ def scans(
         raise InputError("--map: expected without --objects, --no-landmarks and --odometry recorded")
     if earlier.known_map is not None and earlier.known_map.resolve() == output.resolve():
         raise InputError("--output: expected another folder than that of --map, whose run would lose its files")
+    place = os.path.realpath(source)
+    if os.path.realpath(output) in (place, str(Path(place).parent), os.path.realpath(source.parent)):
+        raise InputError(f"--output {output}: expected another folder than SOURCE and the one that it is in")
     if logged.seed is not None and not logged.sensors:
         raise InputError("--seed: expected with --sensors only")
     window = online_window(online, lag)
@@ -270,7 +274,7 @@ def scans(
         typer.echo(f"{what} against the recording: ATE {e['ate']:.3f} m, {relative}, end {e['end_error']:.3f} m")
     for span in figures["degenerate"]:
         typer.echo(f"scans {span['first']} to {span['last']} leave open: {', '.join(span['motions'])}")
-    if not recording.blind:
+    if np.isfinite(figures["scan_to_map_residual"]):
         typer.echo(f"mean scan-to-map residual: {1e3 * figures['scan_to_map_residual']:.1f} mm")
     if recording.dropped:
         typer.echo(

@@ -25,6 +25,7 @@ import numpy as np
 
 from data_tools.lidar import Scan, Submap, voxel_downsample
 from data_tools.lidar.scan import ScanSequence, without_objects
+from data_tools.recordings.recording import scan_context
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.slam.loop_closures import ClosedSubmaps, LoopSettings, PlaceLoops, SubmapLoops
@@ -372,7 +373,8 @@ def lidar_slam(
     )
     for k, (time, ego) in enumerate(log.until(scans.timestamps)):
         detections = None if (frame := seen[k]) is None else frame.detections
-        slam.step(scans[k], time, imu=ego.imu, gps=ego.gps, detections=detections, wheels=ego.wheels)
+        with scan_context(scans, k):
+            slam.step(scans[k], time, imu=ego.imu, gps=ego.gps, detections=detections, wheels=ego.wheels)
         if progress is not None:
             progress("slam", k + 1, len(scans))
     return slam.finish()

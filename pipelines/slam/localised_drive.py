@@ -21,6 +21,7 @@ from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
+from data_tools.recordings.recording import scan_context
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.lidar_results import LIDAR_FILES, reference, write_paths
@@ -69,7 +70,8 @@ def localise(
     start = None if guess is None else guess @ scans.ego_T_lidar
     localiser = Localiser(slam_map, start, settings, Vehicle(scans.ego_T_lidar, tuple(log.tables), log.settings))
     for k, (time, ego) in enumerate(log.until(scans.timestamps)):
-        localiser.step(scans[k], time, ego.imu, ego.gps, ego.wheels)
+        with scan_context(scans, k):
+            localiser.step(scans[k], time, ego.imu, ego.gps, ego.wheels)
         if progress is not None:
             progress("localising", k + 1, len(scans))
     localiser.finish()

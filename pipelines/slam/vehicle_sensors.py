@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 
 from data_tools.lidar.scan import ScanSequence
+from data_tools.recordings.recording import scan_context
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -226,7 +227,8 @@ def start_by_fixes(
     odometry, places = LidarOdometry(settings), list[FloatArray]()
     lidar_T_ego = inverse_transform(scans.ego_T_lidar)
     for k, time in enumerate(scans.timestamps.tolist()):
-        pose = scans.ego_T_lidar @ odometry.step(scans[k], time).map_T_lidar @ lidar_T_ego
+        with scan_context(scans, k):
+            pose = scans.ego_T_lidar @ odometry.step(scans[k], time).map_T_lidar @ lidar_T_ego
         places.append(pose[:3, :3] @ antenna + pose[:3, 3])
         if np.linalg.norm(places[-1] - places[0]) > _BASELINE:
             break

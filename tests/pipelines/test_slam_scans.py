@@ -152,6 +152,38 @@ def test_options_that_are_wrong_are_named(tmp_path: Path, drive: SimulatedScans)
         assert not (tmp_path / "run").exists()
 
 
+def test_results_are_not_written_among_the_scans(
+    tmp_path: Path, drive: SimulatedScans, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_scans(tmp_path / "scans", "bin", [drive[0], drive[1]], times(drive)[:2])
+    monkeypatch.chdir(folder)
+    for source, output in ((folder, folder), (folder, tmp_path), (".", "."), (".", tmp_path), (".", "../scans")):
+        code, said = run("scans", source, "--output", output)
+        assert code != 0
+        assert f"--output {output}: expected another folder than SOURCE and the one that it is in" in said
+    assert sorted(path.suffix for path in tmp_path.rglob("*")) == ["", ".bin", ".bin"]
+
+
+def test_scans_that_cannot_be_placed_are_named(
+    tmp_path: Path, drive: SimulatedScans, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for k in range(3):
+        np.save(folder / f"{k}.npy", drive[0].points * (0.01 if k == 0 else 1.0))
+    code, output = run("scans", folder, "--output", tmp_path / "run")
+    assert code != 0
+    assert "0.npy: scan at 0.000 s: expected points in metres" in output
+    np.save(folder / "0.npy", drive[0].points)
+    for k in (1, 2):
+        (folder / f"{k}.npy").write_bytes(b"")
+    code, output = run("scans", folder, "--no-landmarks", "--output", tmp_path / "run")
+    assert code == 0, output
+    assert "scan at 0.100 s: " in caplog.text
+    assert "3 scans" in output
+    assert "nan" not in output
+
+
 def test_a_drive_whose_heading_fixes_cannot_tell_is_refused(drive: SimulatedScans, tmp_path: Path) -> None:
     folder = write_scans(tmp_path / "scans", "npz", [drive[k] for k in range(4)], times(drive)[:4])
     table = tmp_path / "gps.csv"

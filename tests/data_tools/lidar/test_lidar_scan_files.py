@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.scans import SimulatedScans
 from data_tools.lidar import Scan, read_scan, write_cloud
-from data_tools.lidar.scan_files import load_open3d, relative_times
+from data_tools.lidar.scan_files import SUFFIXES, load_open3d, relative_times
 from saga_fg.errors import InputError, MissingExtraError
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.5, 0.25, -1.75], [10.0, -20.0, 0.5]])
@@ -89,7 +89,6 @@ def test_damaged_files_say_what_is_wrong(tmp_path: Path, subtests: pytest.Subtes
         ("a.pcd", PCD.replace("10 -20", "1e7 -2e8").replace("1 2 3", "1e5 2 3").encode(), r"the median is 1e\+05"),
         ("a.npy", b"no array", r"a\.npy: expected NumPy's format, with plain arrays and no pickled"),
         ("a.npz", b"no archive", r"a\.npz: expected NumPy's format, with plain arrays and no pickled"),
-        ("a.pcd", b"", r"a\.pcd: expected a header that ends in a line DATA"),
         ("a.pcd", b"rubbish", r"a\.pcd: expected a header that ends in a line DATA"),
         ("a.ply", b"rubbish", r"a\.ply: expected a header that ends in a line end_header"),
         ("a.txt", b"", r"a\.txt: expected a name that ends in \.pcd\.bin, \.bin"),
@@ -116,8 +115,11 @@ def test_points_without_a_place_are_dropped_and_counted(tmp_path: Path, subtests
             assert np.isnan(scan.intensity[1])
             assert scan.dropped == 2
     assert scan.time.tolist() == [0.0, 0.03]
-    (tmp_path / "none.bin").write_bytes(b"")
-    assert len(read_scan(tmp_path / "none.bin")) == 0
+    for suffix in SUFFIXES:
+        (tmp_path / f"none{suffix}").write_bytes(b"")
+        assert len(read_scan(tmp_path / f"none{suffix}")) == 0
+    np.save(tmp_path / "none.npy", [])
+    assert len(read_scan(tmp_path / "none.npy")) == 0
 
 
 def simulated() -> tuple[np.ndarray, np.ndarray]:

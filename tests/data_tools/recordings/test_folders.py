@@ -94,6 +94,37 @@ def test_times_of_a_table(tmp_path: Path, scans: list[Scan], table: str) -> None
         place.unlink()
 
 
+@pytest.mark.parametrize(
+    ("stems", "table"),
+    [
+        ([str(k) for k in range(1, 13)], "{time}\n"),
+        ([f"{k}_top" for k in range(1, 13)], "{time}\n"),
+        ([f"run_2_scan_{k}" for k in range(1, 13)], ""),
+        ([f"{k}_top" for k in range(1, 13)], ""),
+        ([f"0.{k:02d}" for k in range(1, 13)], "{time}\n"),
+        ([str(k) for k in range(12, 0, -1)], "{stem}.bin {time}\n"),
+    ],
+)
+def test_scans_are_in_the_order_of_their_numbers_or_of_named_times(
+    tmp_path: Path, scans: list[Scan], stems: list[str], table: str
+) -> None:
+    for stem in stems:
+        write_scan(tmp_path / f"{stem}.bin", scans[0], timed=False)
+    for folder in (tmp_path, tmp_path / "velodyne"):  # also that of KITTI
+        if folder != tmp_path:
+            if not table.startswith("{time}"):
+                break
+            folder.mkdir()
+            for stem in stems:
+                (tmp_path / f"{stem}.bin").rename(folder / f"{stem}.bin")
+        if table:
+            lines = [table.format(stem=stem, time=0.1 * k) for k, stem in enumerate(stems)]
+            (tmp_path / "times.txt").write_text("".join(lines))
+        found = open_recording(tmp_path)
+        assert [Path(found.place(row)).name.removesuffix(".bin") for row in range(12)] == stems
+        np.testing.assert_allclose(found.timestamps, 0.1 * np.arange(12), atol=1e-9)
+
+
 def folder_of(folder: Path, scans: list[Scan], count: int = 3) -> Path:
     folder.mkdir()
     for k in range(count):
@@ -129,6 +160,12 @@ def test_what_is_wrong_in_a_folder_is_one_line(
         folder = folder_of(tmp_path / "mixed", scans)
         write_scan(folder / "000003.npy", scans[3], timed=False)
         with pytest.raises(InputError, match=r"expected scans of one format, there are \.bin, \.npy"):
+            open_recording(folder)
+    with subtests.test("two sensors"):
+        folder = folder_of(tmp_path / "two", scans, 0)
+        for name in ("front_0", "front_1", "rear_0", "rear_1"):
+            write_scan(folder / f"{name}.bin", scans[0], timed=False)
+        with pytest.raises(InputError, match=r"different numbers, got 0 twice: front_0\.bin and rear_0\.bin"):
             open_recording(folder)
     with subtests.test("empty scan"):
         folder = folder_of(tmp_path / "hole", scans)
