@@ -164,6 +164,10 @@ class ModeTable:
         """Some nodes."""
         return ModeTable(self.mixture, *(column[rows] for column in self._columns))
 
+    def renamed(self, ids: IntArray) -> ModeTable:
+        """With other ids (n,)."""
+        return ModeTable(self.mixture, ids, *self._columns[1:])
+
     @property
     def _columns(self) -> tuple[Any, ...]:
         return self.ids, self.weight, self.mean, self.P, self.shift, self.spread

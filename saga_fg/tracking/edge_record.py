@@ -47,6 +47,7 @@ MIN_PRIOR = 1e-9
 MIN_SUM = 0.05  # a record below is forgotten
 
 Key = tuple[int, ...]
+_PAIR_KEY = 4  # numbers: rule, whether the source is faster, target, source; a place has more, a rule has less
 
 
 class Memory(NamedTuple):
@@ -75,6 +76,11 @@ class Trials(NamedTuple):
     acceleration: FloatArray
     rate: FloatArray
 
+    def select(self, rows: list[int]) -> Trials:
+        """Some trials."""
+        pair, place, *columns = tuple[Any, ...](self)
+        return Trials(tuple(pair[k] for k in rows), tuple(place[k] for k in rows), *(one[rows] for one in columns))
+
 
 @dataclass(frozen=True, eq=False)
 class EdgeRecord:
@@ -93,6 +99,14 @@ class EdgeRecord:
         """Sums of log-likelihood ratios (k,) of keys, faded until `time`."""
         found = (self.sums.get(key) for key in keys)
         return np.array([0.0 if one is None else one[0] * math.exp((one[1] - time) / memory.time) for one in found])
+
+    def without(self, nodes: set[int]) -> EdgeRecord:
+        """Without the pairs of any of some nodes."""
+        sums = {key: one for key, one in self.sums.items() if len(key) != _PAIR_KEY or nodes.isdisjoint(key[2:])}
+        places = {node: place for node, place in self.places.items() if node not in nodes}
+        kept = ([k for k, key in enumerate(one.pair) if nodes.isdisjoint(key[2:])] for one in self.trials)
+        trials = tuple(one.select(rows) for one, rows in zip(self.trials, kept, strict=True))
+        return EdgeRecord(sums, self.time, places, trials)
 
     def governing(
         self, rules: Sequence[EdgeRule], halting: HaltingPlaces, prior: float, time: float

@@ -7,8 +7,9 @@ constant velocity follow the two objects by the same detections, from the tracks
     log odds = sum over frames and both objects of   log N(z; H x', S') - log N(z; H x, S)
 
 with ' where the detections are exchanged; the noise of the acceleration is what the motion of the class adds to its
-velocity in a second. From `LIKELY` on, in a frame that detects both, the tracks exchange all that is known of them but
-their ids, one pair a frame. An encounter ends below `UNLIKELY`, after `MEMORY`, and with one of its tracks.
+velocity in a second. From `LIKELY` on, in a frame that detects both, the tracks exchange states, rows of the table,
+and passages since then, but no ids, one pair a frame. An encounter ends below `UNLIKELY`, after `MEMORY`, and with one
+of its tracks.
 
 Source: Reid, An Algorithm for Tracking Multiple Targets, IEEE Transactions on Automatic Control 24(6), 1979; of its
 hypotheses those of one pair alone.
@@ -81,7 +82,8 @@ class Encounters(Columns):
         x, P = x + (K @ innovation[..., None])[..., 0], P - K @ P[..., :2, :]
         return replace(self, x=x, P=P, log_odds=self.log_odds + log_density @ [-1.0, -1.0, 1.0, 1.0])
 
-    def exchanges(self, seen: IntArray) -> list[tuple[int, int]]:
-        """The likeliest pair of tracks, if it is likely, of those of which both are `seen` (k,) now."""
+    def exchanges(self, seen: IntArray) -> list[tuple[int, int, float]]:
+        """The likeliest pair of tracks, if it is likely, of those of which both are `seen` (k,) now; since when, s."""
         odds = np.where(np.isin(self.ids, seen).all(axis=1), self.log_odds, -np.inf)
-        return [(a, b) for a, b in self.ids[odds == odds.max(initial=LIKELY)][:1].tolist()]
+        best = np.flatnonzero(odds == odds.max(initial=LIKELY))[:1]
+        return [(*self.ids[k].tolist(), float(self.since[k])) for k in best]

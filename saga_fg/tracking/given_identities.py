@@ -13,7 +13,7 @@ a tracker gives its number to the nearest box, be it a false one. Numbers of dif
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,9 +25,10 @@ _NOBODY = np.empty(0, dtype=np.int64)
 
 @dataclass(frozen=True, eq=False)
 class GivenIdentities:
-    """By sensor: its numbers (n,), ascending, and the ids (n,) of the tracks that had them last."""
+    """By sensor: its numbers (n,), ascending, and the ids (n,) of the tracks that had them last; when that was, s."""
 
     known: Mapping[str, tuple[IntArray, IntArray]] = field(default_factory=dict)
+    newest: Mapping[str, float] = field(default_factory=dict)
 
     def tracks(self, sensor: str, identity: IntArray) -> IntArray:
         """(m,) the ids of the tracks that last had these numbers (m,), -1 for none."""
@@ -37,23 +38,27 @@ class GivenIdentities:
         at = np.minimum(np.searchsorted(numbers, identity), len(numbers) - 1)
         return np.where((numbers[at] == identity) & (identity >= 0), tracks[at], -1)
 
-    def updated(self, sensor: str, identity: IntArray, track: IntArray, alive: IntArray) -> GivenIdentities:
+    def updated(
+        self, sensor: str, identity: IntArray, track: IntArray, alive: IntArray, time: float
+    ) -> GivenIdentities:
         """After tracks (m,) took detections of these numbers (m,), -1 for none; those of dead tracks are forgotten.
 
-        alive: the ids of the live tracks
+        alive: the ids of the live tracks; a frame of a `time`, s, before the sensor's newest one changes nothing
         """
         given = identity >= 0
-        if not given.any():
+        if not given.any() or time < self.newest.get(sensor, time):
             return self
         numbers, tracks = self.known.get(sensor, (_NOBODY, _NOBODY))
         others = np.isin(tracks, alive) & ~np.isin(numbers, identity[given])
         numbers, tracks = np.append(numbers[others], identity[given]), np.append(tracks[others], track[given])
         order = np.argsort(numbers)
-        return GivenIdentities({**self.known, sensor: (numbers[order], tracks[order])})
+        known = {**self.known, sensor: (numbers[order], tracks[order])}
+        return GivenIdentities(known, {**self.newest, sensor: time})
 
     def exchanged(self, a: int, b: int) -> GivenIdentities:
         """After two tracks, by id, have exchanged their objects."""
-        return GivenIdentities({name: (own, exchanged(tracks, a, b)) for name, (own, tracks) in self.known.items()})
+        known = {name: (own, exchanged(tracks, a, b)) for name, (own, tracks) in self.known.items()}
+        return replace(self, known=known)
 
 
 def exchanged(ids: IntArray, a: int, b: int) -> IntArray:

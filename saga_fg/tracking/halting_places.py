@@ -71,6 +71,12 @@ class HaltingPlaces:
     halted: frozenset[tuple[int, int]] = frozenset()
     beyond: Mapping[int, FloatArray] = field(default_factory=dict)
 
+    def without(self, nodes: set[int]) -> HaltingPlaces:
+        """Without what is known of some vehicles; lines stay."""
+        since = {node: then for node, then in self.since.items() if node not in nodes}
+        beyond = {node: far for node, far in self.beyond.items() if node not in nodes}
+        return HaltingPlaces(self.lines, since, frozenset(p for p in self.halted if p[0] not in nodes), beyond)
+
     def across(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """(E,) probability that a line ends the edge from `source` to `target`, rows of nodes: halts between them."""
         if len(self.lines) == 0:

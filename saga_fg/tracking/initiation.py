@@ -34,7 +34,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     kinematics, stationary = initial_kinematics(state, measurements, rows, boxes)
     relative = None if measurements.relative is None else measurements.relative.select(rows)
     state.joint.add(ids, boxes.label, kinematics, delay, relative, appended=True)
-    update_range_rates(state, measurements, rows, ids, boxes.label)
+    update_range_rates(state, measurements, rows, ids, boxes.label, np.ones(k))
     time = state.time - delay
     z_noise, yaw_noise = measurements.z_noise[rows], measurements.yaw_noise[rows]
     new = TrackTable(

@@ -31,6 +31,7 @@ from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct, shallow_copy
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.providers import RelativeDetections
+from saga_fg.tracking.given_identities import exchanged
 from saga_fg.tracking.track_filters import Kinematics, RelativePositions
 from saga_fg.types.frame import Frame
 
@@ -147,6 +148,20 @@ class JointTrackState:
             now = now._replace(P_velocity=np.where(fixed[:, None, None], unknown, now.P_velocity))
             self.remove(ids[apart])
             self.add(ids[apart], new[apart], now)
+
+    def exchange(self, ids: IntArray, label: StrArray) -> None:
+        """Give each of two tracks, ids (2,) of classes `label` (2,), the state and the modes of the other.
+
+        They take each other's class, are to a smoother as initiated now, and lose their correlation with others.
+        """
+        (a, b), estimator, modes = ids.tolist(), self.estimator, self._modes
+        states = [(estimator.mean(ids[k : k + 1]), estimator.covariance(ids[k : k + 1])) for k in range(2)]
+        self.remove(ids)
+        for k, (mean, P) in enumerate(states):
+            to = ids[1 - k : 2 - k]
+            self._estimator_to_change().add_unchecked(to, mean, P, {int(to[0]): str(label[k])})
+        self._modes = {k: table.renamed(exchanged(table.ids, a, b)) for k, table in modes.items()}
+        self._initiated.update(dict.fromkeys((a, b), self.estimator.time))
 
     def predict(self, graph: SceneGraph, dt: float) -> None:
         """Move all tracks by `dt` s under the graph's dynamics."""

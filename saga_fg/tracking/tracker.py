@@ -1,8 +1,8 @@
 """The graph-aware tracker: one frame of one sensor at a time, from any sensor at any time.
 
     predict (prediction, courses) -> measure (measurements, map_nodes) -> associate (association, relinking)
-    -> update, existence (update, unresolved) -> hand over (relinking) -> initiate (initiation)
-    -> exchange identities (encounters) -> delete, report (reporting)
+    -> follow encounters (update, encounters) -> update, existence (update, unresolved) -> hand over (relinking)
+    -> initiate (initiation) -> exchange identities (update) -> delete, report (reporting)
 
 (figure 2 of Sani and Anand, arXiv 2411.03702), in brackets the modules of each stage. Without edge rules this is the
 classical tracker of independent Kalman filters, by the same code.
@@ -205,10 +205,10 @@ class Tracker:
         detections = np.concatenate([matching.detection, rows])
         state.assignment = Assignment(ids, measurements.row[detections])
         given = measurements.identity[detections]
-        state.identities = state.identities.updated(frame.sensor, given, ids, state.table.id)
+        state.identities = state.identities.updated(frame.sensor, given, ids, state.table.id, time)
 
         if delay == 0:
-            exchange_identities(state)
+            matching = exchange_identities(state, matching)
         delete_tracks(state)
         self._notify("delete", state, frame.sensor, measurements, matching)
 

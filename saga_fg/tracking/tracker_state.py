@@ -181,17 +181,22 @@ class TrackerState:
         self.joint.reclassify(self.table.id[changed], self.table.label[changed], label[changed], speed)
         self.table.label = label
 
-    def exchange(self, a: int, b: int) -> None:
-        """Give each of two tracks, by id, all that is known of the other; both lose their correlation with others."""
-        rows = self.table.rows(np.array([a, b]))
-        ids, label = self.table.id[rows], self.table.label[rows]
-        now, order = self.joint.kinematics_of(ids, label), np.arange(len(self))
-        self.joint.remove(ids)
-        self.joint.add(ids[::-1], label, now)
+    def exchange(self, a: int, b: int, since: float) -> IntArray:
+        """Give each of two tracks, by id, the state and the row of the other, and its passages `since` a time, s.
+
+        What edges and lights learn of both begins anew. Returns the row (n,) from which each now has what is known.
+        """
+        rows, order = self.table.rows(np.array([a, b])), np.arange(len(self))
+        self.joint.exchange(self.table.id[rows], self.table.label[rows])
         order[rows] = rows[::-1]
         self.table = replace(self.table.select(order), id=self.table.id)
         self.assignment = Assignment(exchanged(self.assignment.id, a, b), self.assignment.detection)
         self.identities = self.identities.exchanged(a, b)
+        self.traffic.exchange(a, b, since)
+        self.edge_record, self.halting = self.edge_record.without({a, b}), self.halting.without({a, b})
+        drivers = self.map_nodes.drivers
+        self.map_nodes.drivers = drivers.select(~np.isin(drivers.id, [a, b]))
+        return order
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks, in the world, at local positions (n, 2) with velocities (n, 2)."""

@@ -35,7 +35,7 @@ of the moving ones, with the weights 1 - b_0 and k_j (1 - b_j).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -47,6 +47,7 @@ from saga_fg.kernels.tracks import prior_of_traffic
 from saga_fg.model.interactions import Paths
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, common_numbers, shallow_copy
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
+from saga_fg.tracking.given_identities import exchanged
 from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.types.road_map import Lane
 
@@ -240,6 +241,15 @@ class Traffic:
             left, marked = left.append(new), marked.select(_others(marked.id, new.id)).append(new)
             marked = marked.select(np.argsort(marked.id))
         self.left, self.marked = left, marked
+
+    def exchange(self, a: int, b: int, since: float) -> None:
+        """Two tracks, by id, have had each other's objects `since` a time, s."""
+
+        def told_apart(known: Passages) -> Passages:
+            return replace(known, id=np.where(known.time >= since, exchanged(known.id, a, b), known.id))
+
+        self.left, self.latest, self._trails = told_apart(self.left), told_apart(self.latest), None
+        self.marked = self.marked.select(~np.isin(self.marked.id, [a, b]))
 
     def add_lanes(self, lanes: Sequence[Lane]) -> None:
         """Take in lanes that are not known yet; one of a known name with another centre line replaces that."""

@@ -6,8 +6,9 @@ usual one, by a noise of
 
     R_w = S / w - H P H^T = R / w + (1 - w) / w H P H^T
 
-so that a wrong detection turns no track, and the mean of two detections, of which the tracks of a pair would both make
-one, is never taken (the coalescence of JPDA: Bar-Shalom and Li, Multitarget-Multisensor Tracking, 1995, section 6.2).
+so that a wrong detection hardly turns a track, and the mean of two detections, of which the tracks of a pair would
+both make one, is never taken (the coalescence of JPDA: Bar-Shalom and Li, Multitarget-Multisensor Tracking, 1995,
+section 6.2).
 
 Where they are, and how fast, is remembered for the paths and speeds of others (`saga_fg.tracking.traffic`).
 
@@ -24,6 +25,7 @@ Association, IEEE Transactions on Automatic Control 39(6), 1994.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,7 +37,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.gating import chi_square_quantile
 from saga_fg.tracking.joint_state import moved_to_present
-from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.track_filters import MOVING, Kinematics
 from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 from saga_fg.tracking.traffic import Passages
@@ -50,16 +52,23 @@ def update_tracks(state: TrackerState, measurements: FrameMeasurements, matching
     t, d = matching.track, matching.detection
     z = np.concatenate([boxes.position[d, :2] - state.origin, boxes.velocity[d]], axis=1)
     R, with_velocity = measurements.R[d], measurements.with_velocity[d]
+    relative = None if measurements.relative is None else measurements.relative.select(d)
     doubtful = (matching.share < 1).nonzero()[0]
     if len(doubtful):
-        R[doubtful] = doubted(R[doubtful], matching.share[doubtful], state.kinematics().select(t[doubtful]))
+        now = state.kinematics().select(t[doubtful])
+        if relative is not None:
+            at = t[doubtful]
+            now = now._replace(P=relative_covariances(state.joint, table.id[at], table.label[at]))
+        R[doubtful] = doubted(R[doubtful], matching.share[doubtful], now)
+        if relative is not None and measurements.world_T_ego is not None:
+            turn = measurements.world_T_ego[:2, :2]
+            relative = replace(relative, R=turn.T @ R[:, :2, :2] @ turn)
     if state.settings.stationary_share > 0:
         position, P = state.past_positions(delay)
         moving = state.kinematics()._replace(position=position, P=P).select(t)
         table.stationarity.update(t, z, R, moving, with_velocity)
-    relative = None if measurements.relative is None else measurements.relative.select(d)
     state.joint.update(table.id[t], table.label[t], z, R, with_velocity, delay, relative)
-    update_range_rates(state, measurements, d, table.id[t], table.label[t])
+    update_range_rates(state, measurements, d, table.id[t], table.label[t], matching.share)
     p, z_noise, yaw_noise = measurements.probability[d], measurements.z_noise[d], measurements.yaw_noise[d]
     table.box.update(t, boxes.size[d], p, boxes.position[d, 2], z_noise, boxes.yaw[d], yaw_noise)
     table.turn.update(t, boxes.yaw[d], yaw_noise)
@@ -92,10 +101,10 @@ def follow_encounters(
     state: TrackerState, measurements: FrameMeasurements, matching: Matching, rivals: IntArray, elapsed: float
 ) -> None:
     """Begin the encounters of `rivals` (e, 2), rows of predicted tracks, and follow all; elapsed: s since the frame
-    before."""
-    table, joint, known = state.table, state.joint, state.encounters.live(state.table.id, state.time)
+    before. Those of tracks that have no velocity, or no longer, end."""
+    table, joint, places = state.table, state.joint, state.joint.places(state.table.label)
+    known = state.encounters.live(table.id[(places >= 0).all(axis=1)], state.time)
     if len(rivals):
-        places = joint.places(table.label)
         rivals = rivals[(places[rivals] >= 0).all(axis=(1, 2))]
         x, P = joint.estimator.planar_marginals(table.id[rivals.ravel()], places[rivals.ravel()])
         known = known.begun(table.id[rivals], x.reshape(-1, 2, 4), P.reshape(-1, 2, 4, 4), state.time)
@@ -107,17 +116,20 @@ def follow_encounters(
         z[seen] = measurements.boxes.position[d[seen], :2] - state.origin
         R[seen] = measurements.R[d[seen], :2, :2]
         first = rows[:, 0]
-        of_type = zip(joint.types_of(table.label[first]), joint.places(table.label[first])[:, 2].tolist(), strict=True)
+        of_type = zip(joint.types_of(table.label[first]), places[first, 2].tolist(), strict=True)
         noise = np.array([own_motion(node_type, 1.0)[1][at, at] for node_type, at in of_type])
         known = known.followed(noise, np.where(known.since < state.time, elapsed, 0.0), z, R, seen)
     state.encounters = known
 
 
-def exchange_identities(state: TrackerState) -> None:
-    """Exchange the tracks of the encounter that have probably exchanged their objects, one a frame."""
-    for a, b in state.encounters.exchanges(state.table.id[state.table.coasting(state.time) == 0]):
-        state.exchange(a, b)
+def exchange_identities(state: TrackerState, matching: Matching) -> Matching:
+    """Exchange the tracks of the encounter that have probably exchanged their objects, one a frame; returns the
+    matching by the rows that then have the detections."""
+    for a, b, since in state.encounters.exchanges(state.table.id[state.table.coasting(state.time) == 0]):
+        order = state.exchange(a, b, since)
+        matching = replace(matching, track=order[matching.track])
         state.encounters = state.encounters.without(a, b)
+    return matching
 
 
 def infer_signals(state: TrackerState, matching: Matching) -> None:
@@ -130,18 +142,23 @@ def infer_signals(state: TrackerState, matching: Matching) -> None:
 
 
 def update_range_rates(
-    state: TrackerState, measurements: FrameMeasurements, rows: IntArray, ids: IntArray, label: StrArray
+    state: TrackerState,
+    measurements: FrameMeasurements,
+    rows: IntArray,
+    ids: IntArray,
+    label: StrArray,
+    share: FloatArray,
 ) -> None:
     """Take in the range rates of the measurements `rows` (k,) of tracks `ids` (k,), after their positions.
 
     Every estimator takes the same linear measurement: the range rate linearised at the present estimate, moved back by
-    the delay of the frame along own motion. Left out are tracks within `MIN_RANGE` of the sensor, and range rates
-    outside the gate of the class.
+    the delay of the frame along own motion, doubted by its `share` (k,). Left out are tracks within `MIN_RANGE` of
+    the sensor, and range rates outside the gate of the class.
     """
     measured = np.isfinite(measurements.range_rate[rows])
     if measurements.viewpoint is None or not measured.any():
         return
-    rows, ids, label = rows[measured], ids[measured], label[measured]
+    rows, ids, label, share = rows[measured], ids[measured], label[measured], np.maximum(share[measured], MIN_SHARE)
     rate, variance = measurements.range_rate[rows], measurements.range_rate_variance[rows]
     gate = np.array([chi_square_quantile(share, 1) for share in state.class_values(label, "gate")[0]])
     viewpoint, delay, joint = measurements.viewpoint - state.origin, measurements.delay, state.joint
@@ -163,6 +180,7 @@ def update_range_rates(
         S = H_now @ joint.estimator.covariance(ids[chosen]) @ np.swapaxes(H_now, 1, 2) + R_now
         likely = innovation[:, 0] ** 2 <= gate[chosen] * S[:, 0, 0]
         z = innovation + (H @ x[:, :, None])[:, :, 0]
+        R = R + (1 / share[chosen, None, None] - 1) * S  # R_w, as S = R + H P H^T
         joint.measure(node_type, ids[chosen][likely], z[likely], H[likely], R[likely], delay)
 
 

@@ -71,11 +71,19 @@ def test_a_tracker_that_goes_on_from_its_pickle_knows_the_numbers() -> None:
 
 
 def test_numbers_of_dead_tracks_are_forgotten() -> None:
-    known = GivenIdentities().updated("radar", np.array([4, 9]), np.array([1, 2]), np.array([1, 2]))
-    later = known.updated("radar", np.array([9]), np.array([2]), np.array([2]))
+    known = GivenIdentities().updated("radar", np.array([4, 9]), np.array([1, 2]), np.array([1, 2]), 1.0)
+    later = known.updated("radar", np.array([9]), np.array([2]), np.array([2]), 1.1)
     assert later.tracks("radar", np.array([4, 9, -1])).tolist() == [-1, 2, -1]
     assert later.tracks("lidar", np.array([9])).tolist() == [-1]
     assert known.exchanged(1, 2).tracks("radar", np.array([4, 9])).tolist() == [2, 1]
+
+
+def test_a_late_frame_of_a_sensor_does_not_say_who_had_its_numbers_last() -> None:
+    number, alive = np.array([4]), np.array([1, 2])
+    known = GivenIdentities().updated("radar", number, alive[:1], alive, 1.0)
+    known = known.updated("camera", number, alive[1:], alive, 0.8)  # always late, but newer than its own
+    known = known.updated("radar", number, alive[1:], alive, 0.9)
+    assert [known.tracks(name, number).tolist() for name in ("radar", "camera")] == [[1], [2]]
 
 
 @pytest.mark.parametrize(
