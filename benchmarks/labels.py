@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, chosen_sets
 from benchmarks.runner import Data, Row, Rows, Seed, each
-from data_tools.datasets.given_tracks import with_tracks
+from data_tools.datasets.given_tracks import sensor_names, with_tracks
 from data_tools.datasets.results import SceneResult
 from data_tools.metrics import LabelErrors, SceneBoxes, error_summary
 from pipelines.config import Method, load_config
@@ -60,7 +60,8 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
         wanted |= {f"{method}, shuffled": [shuffled(result, rng)] for method, result in given.items()}
         for variant, results in (wanted | {"together, refined": list(given.values())}).items():
             settings = for_given_tracks(offline, [{name: result} for result in results])
-            labelled = smooth_scene(with_tracks(results, replace(scene, frames=())), settings)
+            named = dict(zip(sensor_names(len(results)), results, strict=True))
+            labelled = smooth_scene(with_tracks(named, replace(scene, frames=())), settings)
             runs.setdefault(variant, {})[name] = as_run(scene, labelled.tracks)
     for variant, found in sorted(runs.items()):
         yield f"{recordings.name}: {len(found)} scenes", {"labels": variant, **figures(recordings, found)}

@@ -81,7 +81,9 @@ class Checks:
     def see_first(self, source: DatasetSource) -> None:
         """Look at the first part of recordings that are done elsewhere; what cannot be read is said there."""
         with suppress(InputError), source.parts() as there:
-            first = next(iter(there.parts))
+            first = next(iter(there.parts), None)
+            if first is None:  # tracks of other trackers alone
+                return
             with first.opened() as part:
                 dataset = part.read()
                 self._tell(findings_of(Sample.from_frames(dataset.scene(dataset.scenes[0]).frames), self._logits))

@@ -148,6 +148,9 @@ class DetectionFileSource(DatasetSource):
     def parts(self) -> Iterator[Parts]:
         if self.scenes is not None:
             raise InputError("--scenes: all scenes of a file are done with --workers or --ray")
+        if not self.detections:
+            yield Parts((), (), NoScenes())
+            return
         parts = [DetectionFilePart(url, self.how, self._hosts) for url in expanded(self.detections or (), self._hosts)]
         yield Parts([part.name for part in parts], parts)
 
@@ -167,7 +170,7 @@ class DetectionFileSource(DatasetSource):
         if self.detections is None:
             return read_table_results(result, None, how=self.how)
         with self.open() as dataset:
-            return read_table_results(result, dataset, every_scene=True, how=self.how)
+            return read_table_results(result, dataset, every_scene=truth, how=self.how, own_times=not truth)
 
     def option_for(self, mend: Mend) -> str:
         names: Mapping[str, str] = {}

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.results import SceneResult
-from data_tools.datasets.source import DatasetSource, OpenedPart, Part, Parts, scene_digests
+from data_tools.datasets.source import DatasetSource, HeldScene, OpenedPart, Part, Parts, scene_digests
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Detections, Frame
@@ -31,7 +31,10 @@ def read_given_tracks(source: DatasetSource, files: Sequence[Path]) -> GivenTrac
 
     Raises `InputError` for one that is missing or broken, or that has no track in these scenes.
     """
-    results = []
+    for number, file in enumerate(files):
+        if file.resolve() in [other.resolve() for other in files[:number]]:
+            raise InputError(f"--tracks {file}: expected each result once")
+    results: list[Mapping[str, SceneResult]] = []
     for file in files:
         found = source.read_results(file, truth=False).scenes
         if not any(len(each.found) for each in found.values()):
@@ -40,23 +43,30 @@ def read_given_tracks(source: DatasetSource, files: Sequence[Path]) -> GivenTrac
     return results
 
 
-def sensor_names(results: GivenTracks) -> list[str]:
-    """The names of results as sensors."""
-    return [SENSOR if number == 1 else f"{SENSOR}_{number}" for number in range(1, len(results) + 1)]
+def sensor_names(count: int) -> list[str]:
+    """The names of so many results as sensors."""
+    return [SENSOR if number == 1 else f"{SENSOR}_{number}" for number in range(1, count + 1)]
 
 
-def with_tracks(results: Sequence[SceneResult], scene: Scene | None = None) -> Scene:
-    """A scene with the boxes of results as frames, beside the frames it has.
+def of_scene(results: GivenTracks, scene: str) -> dict[str, SceneResult]:
+    """The results of those that have a scene, by their names as sensors."""
+    named = zip(sensor_names(len(results)), results, strict=True)
+    return {name: result[scene] for name, result in named if scene in result}
+
+
+def with_tracks(results: Mapping[str, SceneResult], scene: Scene | None = None) -> Scene:
+    """A scene with the boxes of results, by their names as sensors, as frames beside the frames it has.
 
     Its moments are those of all results. scene: with frames of detections; that of the first result if left out
     """
-    scene = results[0].scene if scene is None else scene
-    timestamps = np.concatenate([each.scene.timestamps for each in results])
+    given = list(results.values())
+    scene = given[0].scene if scene is None else scene
+    timestamps = np.concatenate([each.scene.timestamps for each in given])
     timestamps, first = np.unique(timestamps, return_index=True)
-    poses = np.concatenate([each.scene.world_T_ego for each in results])[first]
-    tokens = [token for each in results for token in each.scene.tokens]
+    poses = np.concatenate([each.scene.world_T_ego for each in given])[first]
+    tokens = [token for each in given for token in each.scene.tokens]
     frames = list(scene.frames)
-    for name, each in zip(sensor_names([{} for _ in results]), results, strict=True):
+    for name, each in results.items():
         frames += _frames(name, each)
     frames.sort(key=lambda frame: frame.timestamp)
     return replace(
@@ -102,7 +112,7 @@ class TrackedRecordings:
     def scene(self, name: str) -> Scene:
         """A scene with its own frames, and those of the results."""
         own = self.recordings.scene(name) if self.recordings.scenes else None
-        return with_tracks([result[name] for result in self.results if name in result], own)
+        return with_tracks(of_scene(self.results, name), own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +141,10 @@ class TrackedPart:
 
 
 def tracked_parts(parts: Parts, results: GivenTracks) -> Parts:
-    """The parts of a dataset with the boxes of results; parts that are one scene each."""
-    there = {name for result in results for name in result}
+    """The parts of a dataset with the boxes of results; parts that are one scene each, and these if there is none."""
+    there = dict.fromkeys(name for result in results for name in result)
+    if not parts.names:
+        return Parts([*there], (HeldScene(with_tracks(of_scene(results, name))) for name in there), parts.dataset)
 
     def chosen() -> Iterator[Part]:
         for part in parts.parts:

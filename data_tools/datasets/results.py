@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from data_tools.datasets.detection_files import TableImport, TrackRows, read_tracks
-from data_tools.files.input_files import unknown_name
+from data_tools.files.input_files import error_context, unknown_name
 from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -78,6 +78,7 @@ def read_table_results(
     every_scene: bool = False,
     how: TableImport | None = None,
     judged: bool = False,
+    own_times: bool = False,
 ) -> dict[str, SceneResult]:
     """A table of tracks in those scenes of a dataset that it has; rows of other scenes are left out.
 
@@ -85,6 +86,7 @@ def read_table_results(
     how          what it takes to understand the table, if saga-fg did not write it
     judged       these are anybody's tracks beside the ground truth of the dataset: rows at other times are left out,
                  and the only scene of the one is that of the other
+    own_times    the times of rows are moments too, whether or not they are some of the scene
 
     Without a dataset, the scenes are those of the table: their moments are the times of its rows, and the vehicle
     stands amid all tracks. Logs a warning where scenes are left out. Raises `InputError` for a broken table, for one
@@ -107,10 +109,28 @@ def read_table_results(
     results = {}
     for name in chosen:
         scene = dataset.scene(name)
+        scene = _with_times(scene, rows) if own_times else scene
         results[name] = scene_result(scene, _at_moments(rows, scene, path) if judged else rows, path)
     if judged:
         _warn_of_classes(results, path, how or TableImport())
     return results
+
+
+def _with_times(scene: Scene, rows: TrackRows) -> Scene:
+    """The scene with the times of its rows as further moments, the vehicle where it is at the nearest one."""
+    times = np.unique(rows.timestamp[rows.scene == scene.name])
+    if not len(times) or not len(scene):
+        return scene
+    new = times[np.abs(_nearest(scene.timestamps, times) - times) > _SAME_TIME]
+    order = np.argsort(np.append(scene.timestamps, new))
+    at = np.searchsorted(scene.timestamps, _nearest(scene.timestamps, new))
+    return replace(
+        scene,
+        timestamps=np.append(scene.timestamps, new)[order],
+        world_T_ego=np.concatenate([scene.world_T_ego, scene.world_T_ego[at]])[order],
+        tokens=tuple([*scene.tokens, *[""] * len(new)][k] for k in order.tolist()),
+        ground_truth=None,
+    )
 
 
 def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> TrackRows:
@@ -186,5 +206,6 @@ def scene_result(scene: Scene, rows: TrackRows, path: str | Path) -> SceneResult
     chosen = mine[order]
     boxes = rows.boxes.select(chosen)
     boxes = replace(boxes, velocity=known_velocities(boxes.velocity, rows.velocity_covariance[chosen]))
-    found = SceneBoxes(moment[order], rows.id[chosen], boxes, rows.score[chosen], rows.position_covariance[chosen])
+    with error_context(f"{path}: scene {scene.name}"):
+        found = SceneBoxes(moment[order], rows.id[chosen], boxes, rows.score[chosen], rows.position_covariance[chosen])
     return SceneResult(scene, found, coasting=rows.coasting[chosen])

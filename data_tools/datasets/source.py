@@ -146,8 +146,8 @@ def scene_digests(scene: Scene) -> dict[str, str]:
             boxes = frame.detections.boxes
             frames.update(repr((frame.timestamp, frame.coordinates, frame.token, boxes.label.tolist())).encode())
             pose = np.empty(0) if frame.world_T_ego is None else frame.world_T_ego
-            columns = (boxes.position, boxes.size, boxes.yaw, boxes.velocity, frame.detections.score)
-            for array in (pose, *columns, frame.detections.identity.astype(np.float64)):
+            frames.update(frame.detections.identity.tobytes())
+            for array in (pose, boxes.position, boxes.size, boxes.yaw, boxes.velocity, frame.detections.score):
                 frames.update(np.ascontiguousarray(array).tobytes())
         digests[sensor] = frames.hexdigest()
     return digests

@@ -22,11 +22,12 @@ from saga_fg.types.by_class import DEFAULT
 def for_given_tracks(config: SmoothConfig, results: GivenTracks) -> SmoothConfig:
     """The configuration with a model of each tracker, from the sensor's that it names for all others."""
     scores = [np.concatenate([each.found.score for each in result.values()]) for result in results]
+    together = max((sum(name in result for result in results) for one in results for name in one), default=1)
     probable = [bool(((score >= 0) & (score <= 1)).all()) for score in scores]
 
     def models(sensors: Mapping[str, Sensor]) -> dict[str, Sensor]:
-        named = zip(sensor_names(results), probable, strict=True)
-        usual = {name: _tracker(sensor_model(sensors, name), sure, len(results)) for name, sure in named}
+        named = zip(sensor_names(len(results)), probable, strict=True)
+        usual = {name: _tracker(sensor_model(sensors, name), sure, together) for name, sure in named}
         return {**usual, **sensors}
 
     tracking = replace(config.tracking, sensors=models(config.tracking.sensors))

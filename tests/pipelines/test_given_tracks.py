@@ -9,15 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_tools.datasets.detection_file_source import NoScenes
 from data_tools.datasets.detection_files import write_tracks
-from data_tools.datasets.given_tracks import with_tracks
+from data_tools.datasets.given_tracks import TrackedRecordings, sensor_names, with_tracks
+from data_tools.datasets.kitti.source import KittiSource
 from data_tools.datasets.results import SceneResult
 from data_tools.metrics import SceneBoxes, scene_metrics
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import Method, load_config
 from pipelines.smoothing import for_given_tracks, load_smooth_config, smooth_scene
 from pipelines.tracking import track_scene
-from saga_fg import Scene, Tracks
+from saga_fg import InputError, Scene, Tracks
+from tests.data_tools.kitti_example import write_sequence
 from tests.pipelines.command import saga_fg
 
 OPTIONS = ("simulated", "--scenes", "2", "--seed", "3")
@@ -41,7 +44,8 @@ def given(scene: Scene, tracks: tuple[Tracks, ...]) -> SceneResult:
 
 def refined(scene: Scene, *results: SceneResult) -> tuple[Tracks, ...]:
     settings = for_given_tracks(load_smooth_config("simulated"), [{scene.name: each} for each in results])
-    return smooth_scene(with_tracks(results, replace(scene, frames=())), settings).tracks
+    named = dict(zip(sensor_names(len(results)), results, strict=True))
+    return smooth_scene(with_tracks(named, replace(scene, frames=())), settings).tracks
 
 
 def renamed(result: SceneResult, new: Callable[[str, int], str]) -> SceneResult:
@@ -95,7 +99,7 @@ def test_what_a_table_marks_as_predicted_and_all_velocities_are_no_evidence(
     scene, tracks = recording
     result = given(scene, tracks)
     coasting = np.where(np.arange(len(result.found)) % 3 == 0, 0.4, 0.0)
-    scene_with = with_tracks([replace(result, coasting=coasting)])
+    scene_with = with_tracks({"tracks": replace(result, coasting=coasting)})
     boxes = [frame.detections.boxes for frame in scene_with.frames]
     assert sum(map(len, boxes)) == int((coasting == 0).sum())
     assert all(np.isnan(each.velocity).all() for each in boxes)
@@ -111,6 +115,7 @@ def test_the_command_refines_a_table_alone_beside_a_dataset_and_in_workers(tmp_p
         ("smooth", *recordings, "--tracks", tracks, "--output", tmp_path / "beside"),
         ("smooth", *recordings, "--tracks", tracks, "--output", tmp_path / "workers", "--workers", "2"),
         ("smooth", "file", "--tracks", tracks, "--output", tmp_path / "alone"),
+        ("smooth", "file", "--tracks", tracks, "--output", tmp_path / "alone in workers", "--workers", "1"),
     ):
         done = saga_fg(*words)
         assert done.exit_code == 0, done.output
@@ -125,14 +130,59 @@ def test_results_that_cannot_be_refined_are_one_line(
     scene, tracks = recording
     empty = tmp_path / "empty.csv"
     write_tracks(empty, [(scene, [each.select(np.empty(0, dtype=int)) for each in tracks])])
+    twice = tmp_path / "twice.csv"
+    twice.write_text("timestamp,id,label,x,y\n0,7,car,1,2\n0,7,car,9,2\n")
     for files, expected in (
         ((tmp_path / "none.csv",), "none.csv"),
         ((empty,), "expected tracks of the chosen scenes, there are none"),
         ((), "expected one table of detections, or tracks"),
+        ((empty, tmp_path / "." / "empty.csv"), "expected each result once"),
+        ((twice,), "twice.csv: scene twice: id[1]: expected unique ids"),
     ):
         options = [word for file in files for word in ("--tracks", file)]
-        source = OPTIONS if files else ("file",)
+        source = OPTIONS if empty in files else ("file",)
         failed = saga_fg("smooth", *source, *options, "--output", tmp_path / "labels")
         assert failed.exit_code == 2
         assert expected in failed.output
         assert not (tmp_path / "labels").exists()
+
+
+def test_a_result_is_the_same_sensor_in_every_scene_and_counts_where_it_is(
+    recording: tuple[Scene, tuple[Tracks, ...]],
+) -> None:
+    scene, tracks = recording
+    result = given(scene, tracks)
+    logits = replace(result, found=replace(result.found, score=4 * result.found.score - 1))
+    files = [{"a": result}, {"b": logits}]
+    assert [frame.sensor for frame in TrackedRecordings(NoScenes(), files).scene("b").frames][:1] == ["tracks_2"]
+    usual = load_smooth_config("kitti")
+    found = for_given_tracks(usual, files).sensors
+    assert (found["tracks"].score, found["tracks_2"].score) == ("probability", "logit")
+    assert found["tracks_2"].noise == usual.sensors["default"].noise
+
+
+def test_tracks_at_moments_without_a_detection_beside_a_table(tmp_path: Path) -> None:
+    rows = [f"{k / 10},car,{k},0" for k in range(30) if k % 5]
+    (tmp_path / "d.csv").write_text("\n".join(["timestamp,label,x,y", *rows]) + "\n")
+    rows = [f"{k / 10},1,car,{k},0.2" for k in range(40)]
+    (tmp_path / "t.csv").write_text("\n".join(["timestamp,id,label,x,y", *rows]) + "\n")
+    done = saga_fg(
+        "smooth", "file", tmp_path / "d.csv", "--tracks", tmp_path / "t.csv", "--output", tmp_path / "labels"
+    )
+    assert done.exit_code == 0, done.output
+    assert len((tmp_path / "labels" / "labels.csv").read_text().splitlines()) == 41
+
+
+def test_kitti_text_without_scores_is_sure_and_boxes_that_its_table_predicts_are_left_out(tmp_path: Path) -> None:
+    source, theirs = KittiSource(dataroot=str(write_sequence(tmp_path)), sequences="0007"), tmp_path / "theirs"
+    theirs.mkdir()
+    lines = [f"{k} 3 Car 0 0 -1.5 500 150 600 250 1.5 1.6 4 2 1.75 10 -1.5\n" for k in range(3)]
+    (theirs / "0007.txt").write_text("".join(lines))
+    result = source.read_results(theirs, truth=False).scenes["0007"]
+    assert result.found.score.tolist() == [1.0] * 3
+    rows = [f"0007,{k / 10},3,car,{k},0,{0.1 * k}" for k in range(3)]
+    (theirs / "tracks.csv").write_text("\n".join(["scene,timestamp,id,label,x,y,coasting", *rows]) + "\n")
+    result = source.read_results(theirs, truth=False).scenes["0007"]
+    assert [len(frame) for frame in with_tracks({"tracks": result}).frames] == [1, 0, 0]
+    with pytest.raises(InputError, match="expected a folder with results"):
+        source.read_results(theirs / "0007.txt", truth=False)

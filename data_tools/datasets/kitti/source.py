@@ -83,7 +83,7 @@ from data_tools.metrics import (
     whole_tracks,
 )
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.track import Tracks, known_velocities
@@ -218,9 +218,15 @@ def result_sequences(result: str | Path) -> tuple[str, ...]:
 
 def scored_sequences(result: str | Path, dataset: KittiTracking) -> dict[str, ScoredSequence]:
     """The sequences of a dataset with ground truth, each with its result; raises as `read_scored_sequences` does."""
-    folder = Path(result)
-    table = read_tracks(folder / TRACK_TABLE) if (folder / TRACK_TABLE).exists() else None
+    folder, table = Path(result), _table_of(Path(result))
     return {name: _scored(folder / f"{name}.txt", name, dataset, table) for name in dataset.scenes}
+
+
+def _table_of(folder: Path) -> TrackRows | None:
+    """The tracks in full beside the text of a result, None where there are none. Raises `InputError` for no folder."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder with results NNNN.txt")
+    return read_tracks(folder / TRACK_TABLE) if (folder / TRACK_TABLE).exists() else None
 
 
 def _scored(path: Path, name: str, dataset: KittiTracking, table: TrackRows | None) -> ScoredSequence:
@@ -245,6 +251,17 @@ def placed_result(path: Path, scene: Scene, dataset: KittiTracking) -> tuple[Kit
         return result, _in_world(result, world_T_camera)
 
 
+def given_result(path: Path, scene: Scene, dataset: KittiTracking, table: TrackRows | None) -> SceneResult:
+    """A result without ground truth; boxes without a score are sure. table: the tracks in full, where there are some"""
+    result, found = placed_result(path, scene, dataset)
+    if np.isnan(result.score).all():
+        found = replace(found, score=np.ones(len(found)))
+    if table is None:
+        return SceneResult(scene, found)
+    at = _rows_of(found, table, scene.name)
+    return SceneResult(scene, found, coasting=np.where(at >= 0, table.coasting[at], np.nan) if len(table) else None)
+
+
 def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> SceneBoxes:
     """Objects with a 3D box; `world_T_camera` (K, 4, 4) of the frames."""
     objects = objects.select(has_box(objects) & (objects.track_id >= 0))
@@ -253,13 +270,18 @@ def _in_world(objects: KittiObjects, world_T_camera: FloatArray) -> SceneBoxes:
     return SceneBoxes(objects.frame, objects.track_id.astype(np.str_), boxes, np.nan_to_num(objects.score))
 
 
-def _with_motion(found: SceneBoxes, table: TrackRows, scene: str) -> SceneBoxes:
-    """The boxes with velocities and covariances of the rows of the same frame and track."""
+def _rows_of(found: SceneBoxes, table: TrackRows, scene: str) -> IntArray:
+    """(N,) the rows of the same frames and tracks in a table, -1 for none."""
     rows = np.flatnonzero(table.scene == scene)
     frame = np.rint(table.timestamp[rows] / FRAME_PERIOD).astype(np.int64)
     row_of = dict(zip(zip(frame.tolist(), table.id[rows].tolist(), strict=True), rows.tolist(), strict=True))
     wanted = zip(found.frame.tolist(), found.id.tolist(), strict=True)
-    at = np.array([row_of.get(key, -1) for key in wanted], dtype=np.int64)
+    return np.array([row_of.get(key, -1) for key in wanted], dtype=np.int64)
+
+
+def _with_motion(found: SceneBoxes, table: TrackRows, scene: str) -> SceneBoxes:
+    """The boxes with velocities and covariances of the rows of the same frame and track."""
+    at = _rows_of(found, table, scene)
     known = at >= 0
     velocity, covariance = found.boxes.velocity.copy(), found.position_covariance.copy()
     velocity[known] = known_velocities(table.boxes.velocity[at[known]], table.velocity_covariance[at[known]])
@@ -445,9 +467,9 @@ class KittiSource(DatasetSource):
         chosen = result_sequences(result) if chosen is None else chosen
         with self.restricted(chosen).open(truth) as dataset:
             if not truth:
-                scenes = [dataset.scene(name) for name in dataset.scenes]
-                placed = {scene.name: placed_result(result / f"{scene.name}.txt", scene, dataset) for scene in scenes}
-                return Results({scene.name: SceneResult(scene, placed[scene.name][1]) for scene in scenes})
+                scenes, table = [dataset.scene(name) for name in dataset.scenes], _table_of(result)
+                given = (given_result(result / f"{scene.name}.txt", scene, dataset, table) for scene in scenes)
+                return Results({each.scene.name: each for each in given})
             scored = scored_sequences(result, dataset)
         ious, exempt = overlaps(self.iou), self.persons == "exempt"
         return Results(scored, lambda some, hota, nis: evaluate_kitti(some, classes, ious, hota, nis, exempt))
