@@ -202,7 +202,11 @@ SIZES = {
     "scan, PCD": 2,
     "scan, PLY": 2,
     "scan, NumPy": 3,
-    "list of files": 2,
+    "scan, PCD of bytes": 2,
+    "scan, archive": 4,
+    "scan, records": 200,
+    "scans in a folder": 2,
+    "list of files": 3,
     "log of a sensor": 2,
     "laser logs": 3,
     "predictions": 1,
@@ -222,8 +226,9 @@ def valid(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
 def test_what_is_whole_is_read(valid):
     read: dict[str, Any] = {name: target.read() for name, target in valid.items()}
     assert len(read.pop("Argoverse", "ab")) == len(read.pop("OpenACC", "ab")) == 2  # need pyarrow
-    for name in ("recording, MCAP", "recording, SQLite"):
+    for name in ("recording, MCAP", "recording, SQLite", "scans, MCAP", "scans, SQLite"):
         assert len(read.pop(name, "ab")) == 2  # need the packages that write them
+    assert len(read.pop("scan, LAS", "abcd")) == 4  # needs laspy
     for name in ("detections, Parquet", "detections, Feather", "image"):
         assert len(read.pop(name, "a")) == 1
     assert json.loads(read.pop("state"))["type"] == "tracks"
