@@ -161,7 +161,7 @@ def _robotlaser(where: str, fields: list[str]) -> tuple[FloatArray, FloatArray, 
 
 def _count(where: str, fields: list[str], at: int, least: int = _LEAST_READINGS) -> int:
     text = fields[at] if at < len(fields) else "nothing"
-    if not text.isdigit() or not least <= int(text) <= 10**5:
+    if not text.isdecimal() or len(text) > 6 or not least <= int(text) <= 10**5:
         raise InputError(f"{where}: expected a number of readings from {least}, got {text[:40]!r}")
     return int(text)
 

@@ -352,7 +352,7 @@ def _header(content: bytes, last: bytes) -> tuple[list[str], bytes]:
 
 
 def _numbers(what: str, words: Sequence[str], count: int, most: int, least: int = 1) -> list[int]:
-    if len(words) != count or not all(word.isdigit() and least <= int(word[:20]) <= most for word in words):
+    if len(words) != count or not all(word.isdecimal() and least <= int(word[:20]) <= most for word in words):
         _fault(f"{what} to be {count} whole numbers from {least} to {most}")
     return [int(word) for word in words]
 

@@ -383,7 +383,7 @@ class KittiScans:
 
 def _files(folder: Path, records: int) -> tuple[Path, ...]:
     """The scans in a folder, in order."""
-    files = tuple(sorted(path for path in folder.glob("*.bin") if path.stem.isdigit()))
+    files = tuple(sorted(path for path in folder.glob("*.bin") if path.stem.isdecimal()))
     if not files:
         raise InputError(f"{folder}: expected LiDAR scans KKKKKK.bin, there are none")
     if int(files[-1].stem) >= records:

@@ -329,7 +329,7 @@ def _autoware_size(shape: Any) -> tuple[float, float, float]:
 def _class_number(name: str) -> int:
     if name in AUTOWARE_CLASSES:
         return AUTOWARE_CLASSES.index(name)
-    return int(name) if name.isdecimal() and int(name) < 256 else 0
+    return int(name) if name.isdecimal() and len(name) < 4 and int(name) < 256 else 0
 
 
 _VISION_FIELDS = {

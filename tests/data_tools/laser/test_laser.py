@@ -120,6 +120,8 @@ def test_other_lasers_are_named_and_left_out(tmp_path, caplog):
         (FLASER.replace("1.50", "nan"), "line 1: expected finite numbers .*'nan'"),
         (FLASER.replace("FLASER 11", "FLASER 12"), "line 1: expected 22 values after FLASER, for 12 readings, got 21"),
         (FLASER.replace("FLASER 11", "FLASER many"), "line 1: expected a number of readings from 10, got 'many'"),
+        (FLASER.replace("FLASER 11", "FLASER ²"), "line 1: expected a number of readings from 10, got '²'"),
+        (FLASER.replace("FLASER 11", f"FLASER {'9' * 5000}"), "line 1: expected a number of readings from 10, got '9"),
         (ROBOT.replace(" 17.5 nohost", " nohost"), "line 1: expected 34 values after ROBOTLASER1, got 33"),
     ],
 )
