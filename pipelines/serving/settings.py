@@ -85,7 +85,7 @@ def parse_address(text: str) -> Address:
     if "/" in text:
         return Address(path=Path(text))
     host, colon, port = text.rpartition(":")
-    if not colon or not port.isascii() or not port.isdigit() or int(port) > 65535:
+    if not colon or not port.isascii() or not port.isdecimal() or len(port) > 5 or int(port) > 65535:
         raise InputError(f"{text}: expected HOST:PORT, or a path with a slash for a Unix socket")
     return Address(host.strip("[]") or "127.0.0.1", int(port))
 

@@ -254,7 +254,7 @@ def test_addresses():
         address = parse_address(text)
         assert (address.host, address.port, address.is_local) == (host, port, local)
     assert parse_address("/tmp/x.sock").is_local
-    for text in ("nowhere", "host:", "host:99999", "host:-1", "host:²"):
+    for text in ("nowhere", "host:", "host:99999", "host:-1", "host:²", f"host:{'9' * 5000}"):
         with pytest.raises(InputError, match="expected HOST:PORT"):
             parse_address(text)
 
