@@ -214,6 +214,9 @@ class _Bag:
             into.logged.append(log_time)
             into.frames.append(frame)
             into.numbers.append(numbers)
+        if self.main is not None and not self.main.stamps:
+            what = f"{self.main.topic.count} messages, as its summary tells"
+            raise InputError(f"{self.path}: {self.main.topic.name}: expected {what}, there are none")
         return self._one_clock([each for each in by_topic.values() if each.stamps], records)
 
     def _one_clock(

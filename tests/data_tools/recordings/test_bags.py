@@ -132,7 +132,11 @@ def test_two_clocks_become_one(tmp_path: Path, scans: list[Scan], caplog: pytest
 
 
 def test_what_is_wrong_in_a_recording_is_one_line(
-    tmp_path: Path, scans: list[Scan], subtests: pytest.Subtests, caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    scans: list[Scan],
+    subtests: pytest.Subtests,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with subtests.test("missing transforms"):
         path = example.write_mcap(tmp_path / "a.mcap", scan_messages(scans, TIMES))
@@ -171,6 +175,12 @@ def test_what_is_wrong_in_a_recording_is_one_line(
         path.write_bytes(path.read_bytes()[:-500])
         with pytest.raises(InputError, match=r"g\.mcap: .*cut off"):
             open_recording(path)
+    with subtests.test("a summary of other messages"):
+        path = example.write_mcap(tmp_path / "j.mcap", scan_messages(scans, TIMES))
+        monkeypatch.setattr("data_tools.recordings.bags.isolated", lambda *_: iter(()))
+        with pytest.raises(InputError, match=r"j\.mcap: /points: expected 6 messages, as its summary tells, there are"):
+            open_recording(path)
+        monkeypatch.undo()
     with subtests.test("fixes off the Earth"):
         messages = scan_messages(scans, TIMES)
         messages.append(("/fix", FIX, fix_message(BEGIN, 91.0, 8.4, 110.0), round(BEGIN * 1e9)))
