@@ -131,13 +131,17 @@ class TrackedPart:
     def opened(self) -> Iterator[OpenedPart]:
         """Open with the digests of the results too."""
         given = {
-            f"{SENSOR} {name} {number}": digest
+            f"{SENSOR} {name} {number}": _digest(each)
             for number, result in enumerate(self.results)
             for name, each in result.items()
-            for digest in (scene_digests(replace(each.scene, frames=tuple(_frames(SENSOR, each))))[SENSOR],)
         }
         with self.part.opened() as part:
             yield OpenedPart({**part.digests, **given}, lambda: TrackedRecordings(part.read(), self.results))
+
+
+def _digest(result: SceneResult) -> str:
+    """SHA-256 of the boxes as frames."""
+    return scene_digests(with_tracks({SENSOR: result}, replace(result.scene, frames=())))[SENSOR]
 
 
 def tracked_parts(parts: Parts, results: GivenTracks) -> Parts:

@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from saga_fg.kernels.compilation import FloatArray, IntArray, kernel, kernel_part
-
-
-@kernel_part
-def _root(parent: IntArray, i: int) -> int:
-    while parent[i] != i:
-        i = parent[i]
-    return i
+from saga_fg.kernels.components import root_of
 
 
 @kernel_part
@@ -87,9 +81,9 @@ def association_marginals(
         n, m = max(n, track[k] + 1), max(m, detection[k] + 1)
     parent, component, result = np.arange(n + m), np.empty(K, dtype=np.int64), np.empty(K)
     for k in range(K):
-        parent[_root(parent, n + detection[k])] = _root(parent, track[k])
+        parent[root_of(parent, n + detection[k])] = root_of(parent, track[k])
     for k in range(K):
-        component[k] = _root(parent, track[k])
+        component[k] = root_of(parent, track[k])
     order, number, at = np.argsort(component, kind="mergesort"), np.full(n + m, -1), 0
     while at < K:
         end, counts = at, [0, 0]
