@@ -17,10 +17,10 @@ from benchmarks.runner import Rows, Seed, each
 from data_tools.metrics import paired_bootstrap
 from data_tools.simulator import SimulatedTraffic
 from pipelines.cli.options import Config
-from pipelines.smoothing import load_smooth_config, smooth_known_objects
+from pipelines.smoothing import load_smooth_config
 from pipelines.tracking import one_thread
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.smoothing import Evidence, StateTable, assign_detections, gather_evidence
+from saga_fg.smoothing import Evidence, StateTable, assign_detections, gather_evidence, smooth_known_objects
 from saga_fg.types.dataset import Scene
 
 NEAR = 2.0  # largest distance between a detection and its true object, m

@@ -19,9 +19,9 @@ import typer
 
 from benchmarks.runner import Rows, Seed
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts
-from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream, write_labels
+from pipelines.smoothing import load_smooth_config, smooth_scene, smooth_stream, write_labels
 from pipelines.tracking import one_thread, peak_memory, resident_memory
-from saga_fg.smoothing import Labels
+from saga_fg.smoothing import ChunkSettings, Labels
 from saga_fg.types.dataset import Scene
 
 PLATOON, GAP = 5, 15.0  # cars, and m between them

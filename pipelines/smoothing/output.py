@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from data_tools.datasets.detection_files import write_label_table
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory
-from pipelines.smoothing.labelling import SmoothedScene
+from pipelines.smoothing.streaming import SmoothedScene
 from saga_fg.smoothing import LabelCounts, Labels
 from saga_fg.types.dataset import Scene
 

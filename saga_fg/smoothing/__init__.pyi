@@ -21,6 +21,9 @@ from .boxes import (
     smooth_walks,
     weighted_medians,
 )
+from .labelling import RecordingLabels
+from .passes import smooth_known_objects
+from .recording import ChunkSettings, LabelBuilder, LabelModel
 from .settings import (
     OfflineClass,
     SmoothingSettings,
@@ -28,15 +31,19 @@ from .settings import (
 from .states import LabelCounts, Labels, Lifespans, Quality, SmoothedEdges, Source, StateTable, lifespans_of, quality_of
 
 __all__ = [
+    "ChunkSettings",
     "Evidence",
     "EvidenceFrame",
     "Headings",
+    "LabelBuilder",
     "LabelCounts",
+    "LabelModel",
     "Labels",
     "Lifespans",
     "ObjectMotion",
     "OfflineClass",
     "Quality",
+    "RecordingLabels",
     "SmoothedEdges",
     "SmoothingSettings",
     "Source",
@@ -58,6 +65,7 @@ __all__ = [
     "scalar_readings",
     "size_weights",
     "smooth_headings",
+    "smooth_known_objects",
     "smooth_states",
     "smooth_walks",
     "stationary_states",

@@ -20,10 +20,10 @@ from benchmarks.sampled_traffic import providers
 from benchmarks.settling import APART, EVADING, MIXED, NEAR, SILENT, STRAIGHT, largest_difference, sample_scene
 from benchmarks.smoothing import true_objects
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from pipelines.smoothing import load_smooth_config, smooth_known_objects
+from pipelines.smoothing import load_smooth_config
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import OBJECT
-from saga_fg.smoothing import gather_evidence
+from saga_fg.smoothing import gather_evidence, smooth_known_objects
 
 
 @pytest.fixture(scope="module")

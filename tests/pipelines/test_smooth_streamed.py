@@ -9,10 +9,11 @@ from typer.testing import CliRunner
 
 from data_tools.datasets.detection_files import read_detections, read_scenes_in_parts, read_tracks
 from pipelines.cli import app
-from pipelines.smoothing import ChunkSettings, load_smooth_config, smooth_scene, smooth_stream
-from pipelines.smoothing.labelling import Identities, ObjectSummary, median_sizes
-from pipelines.smoothing.streaming import Backlog, TrackedFrame
+from pipelines.smoothing import load_smooth_config, smooth_scene, smooth_stream
 from saga_fg import Detections, Frame, InputError
+from saga_fg.smoothing import ChunkSettings
+from saga_fg.smoothing.labelling import Identities, ObjectSummary, median_sizes
+from saga_fg.smoothing.recording import Backlog, TrackedFrame
 from tests.pipelines.command import done
 
 HEADER = "timestamp,label,x,y,length,width,height,yaw,score"

@@ -13,8 +13,7 @@ from data_tools.simulator import SimulatedTraffic, SimulatorSettings, lidar, rad
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration.reading import read_settings
 from pipelines.learning import learn_noise, learned_fragment
-from pipelines.smoothing import smooth_scene
-from pipelines.smoothing.passes import load_smooth_config
+from pipelines.smoothing import load_smooth_config, smooth_scene
 from pipelines.tracking import track_scene
 from saga_fg import Detection, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.errors import InputError

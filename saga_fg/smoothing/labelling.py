@@ -11,34 +11,29 @@ of the tracklet that reaches furthest towards the chunk, so that an object's nam
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
-from pipelines.smoothing.passes import SmoothedObjects
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.smoothing import (
-    Evidence,
+from saga_fg.smoothing.association import Evidence
+from saga_fg.smoothing.boxes import (
     Headings,
-    LabelCounts,
-    Labels,
-    OfflineClass,
-    SmoothingSettings,
-    StateTable,
     is_reversed,
-    quality_of,
     scalar_readings,
     smooth_headings,
     smooth_walks,
     weighted_medians,
 )
+from saga_fg.smoothing.passes import SmoothedObjects
+from saga_fg.smoothing.settings import OfflineClass, SmoothingSettings
+from saga_fg.smoothing.states import Labels, StateTable, quality_of
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
-from saga_fg.types.dataset import Scene
 from saga_fg.types.track import Tracks
 
 HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, m
@@ -266,18 +261,22 @@ class Identities:
         return old + sorted((track for track in tracks if first[track] >= begin), key=lambda track: first[track])
 
 
-LabelledParts = Iterable[tuple[Scene, tuple[Labels, ...]]]
-"""Parts of a recording, with the labels of each of their timestamps."""
+class LabelParts(Protocol):
+    """Where the labels of a recording wait, chunk by chunk, as named arrays: a list, or files."""
+
+    def append(self, part: Mapping[str, Any], /) -> None:
+        """Add a chunk."""
+        ...
+
+    def __iter__(self) -> Iterator[Mapping[str, Any]]: ...
 
 
-class LabelSpool:
-    """The labels of a recording, added chunk by chunk, and read back when it is over: iterating gives them chunk by
-    chunk, a part of the scene without frames or poses, and one table a moment."""
+class RecordingLabels:
+    """The labels of a recording, added chunk by chunk, and read back when it is over: iterating gives those of each
+    chunk, one table a moment."""
 
-    def __init__(self, folder: Path, name: str) -> None:
-        folder.mkdir()
-        self._folder, self._name = folder, name
-        self._chunks = 0
+    def __init__(self, parts: LabelParts) -> None:
+        self._parts = parts
         self._id = np.empty(0, dtype=np.int64)  # of all objects, ascending; then their attributes
         self._size, self._score, self._turned = np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.bool_)
 
@@ -297,14 +296,14 @@ class LabelSpool:
         rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(span.start, span.stop) for span in spans)])
         ids = labelled.states.id[rows].tolist()
         columns = replace(labelled.columns.select(rows), id=np.array([names[id_] for id_ in ids], dtype=np.int64))
-        np.savez(
-            self._folder / f"{self._chunks:06d}.npz",
-            time=wanted,
-            bounds=np.cumsum([0, *(span.stop - span.start for span in spans)]),
-            reversed=np.array([signs[id_] < 0 for id_ in ids], dtype=np.bool_),
-            **vars(columns),
+        self._parts.append(
+            {
+                "time": wanted,
+                "bounds": np.cumsum([0, *(span.stop - span.start for span in spans)]),
+                "reversed": np.array([signs[id_] < 0 for id_ in ids], dtype=np.bool_),
+                **vars(columns),
+            }
         )
-        self._chunks += 1
 
     def finish(self, summaries: Mapping[int, ObjectSummary], prior: float) -> None:
         """Take the final attributes of all objects.
@@ -319,10 +318,9 @@ class LabelSpool:
         )
         self._turned = is_reversed(np.array([each.path for each in found]), np.array([each.votes for each in found]))
 
-    def __iter__(self) -> Iterator[tuple[Scene, tuple[Labels, ...]]]:
-        for number in range(self._chunks):
-            with np.load(self._folder / f"{number:06d}.npz", allow_pickle=False) as file:
-                stored = dict(file)
+    def __iter__(self) -> Iterator[tuple[Labels, ...]]:
+        for part in self._parts:
+            stored = dict(part)
             times, bounds, backward = (stored.pop(name) for name in ("time", "bounds", "reversed"))
             at = np.searchsorted(self._id, stored["id"])
             turned = backward ^ self._turned[at]
@@ -330,32 +328,4 @@ class LabelSpool:
             columns, size, score = LabelColumns(**{**stored, "yaw": yaw}), self._size[at], self._score[at]
             rows = [slice(a, b) for a, b in pairwise(bounds.tolist())]
             moments = zip(times.tolist(), rows, strict=True)
-            labels = tuple(columns.select(mine).labels(time, size[mine], score[mine]) for time, mine in moments)
-            yield Scene(self._name, times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), ()), labels
-
-
-@dataclass(frozen=True, eq=False)
-class SmoothedScene:
-    """A recording that was smoothed.
-
-    parts    its parts, and their labels; they may be read again and again
-    counts   where its boxes come from
-    frames   frames taken in
-    seconds  time spent
-    """
-
-    name: str
-    parts: LabelledParts
-    counts: LabelCounts
-    frames: int
-    seconds: float
-
-    @property
-    def labels(self) -> tuple[Labels, ...]:
-        """The labels of all timestamps, in memory."""
-        return tuple(moment for _, part in self.parts for moment in part)
-
-    @property
-    def tracks(self) -> tuple[Tracks, ...]:
-        """The labels as tracks."""
-        return tuple(moment.tracks for moment in self.labels)
+            yield tuple(columns.select(mine).labels(time, size[mine], score[mine]) for time, mine in moments)

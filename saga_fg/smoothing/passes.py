@@ -1,6 +1,4 @@
-"""The passes over a recording, online and smoothing, and their configuration.
-
-The passes over a recording, online and smoothing; each uses the results of the one before.
+"""The passes over a recording, online and smoothing; each uses the results of the one before.
 
 0. the tracker, frame by frame: which detections its tracks rest on;
 1. tracklets without edges, reaching beyond both ends; weak ones, with little evidence, are put aside;
@@ -16,45 +14,38 @@ are weak. Its low score puts it at the end of the ranking.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
-from pipelines.config import TrackConfig, load_config, shipped_settings
-from pipelines.configuration import load_settings, read_settings
-from pipelines.tracking import OnlineTracker, Progress
 from saga_fg.graph import FactorProvider
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.settings import settings_group
-from saga_fg.smoothing import (
+from saga_fg.smoothing.association import (
     Evidence,
-    Lifespans,
-    ObjectMotion,
-    SmoothedEdges,
-    SmoothingSettings,
-    StateTable,
-    StationaryStates,
     assign_detections,
     assign_free_detections,
-    constant_sizes,
     evidence_scores,
     measured_in_order,
+    stitch_tracklets,
+)
+from saga_fg.smoothing.batch_states import (
+    GraphOf,
+    ObjectMotion,
+    StationaryStates,
     no_edges,
     robust_weights,
     smooth_states,
     stationary_states,
-    stitch_tracklets,
 )
-from saga_fg.smoothing.batch_states import GraphOf
-from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME
-from saga_fg.smoothing.states import MEDIUM_SCORE
-from saga_fg.tracking import TrackerSettings
+from saga_fg.smoothing.boxes import constant_sizes
+from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
+from saga_fg.smoothing.states import MEDIUM_SCORE, Lifespans, SmoothedEdges, StateTable
+from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings
 from saga_fg.tracking.by_name import new_provider
 from saga_fg.tracking.settings import ClassSettings
-from saga_fg.types.by_class import DEFAULT, class_values
+from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
 
 _REWEIGHTINGS = 1  # repetitions of loss weights and edges at the final states
@@ -66,17 +57,16 @@ EXTENSION = 1.5  # time by which the search for detections of an object reaches 
 
 
 def track_evidence(
-    name: str,
     frames: Sequence[Frame],
-    tracker: OnlineTracker,
+    tracker: Tracker | GreedyTracker,
     evidence: Evidence,
     sensors: Mapping[str, Sensor],
     classes: Mapping[str, ClassSettings],
-    progress: Progress | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> IntArray:
     """(N,) the track of each detection, -1 for none: the likeliest of the reported tracks that its frame updated.
 
-    evidence: that of these frames, or of the next ones of a recording; `name` of the recording, for `progress`
+    evidence: that of these frames, or of the next ones of a recording; progress: called with the frames done so far
     """
     track_of = np.full(len(evidence), -1, dtype=np.int64)
     ordered = measured_in_order(frames, sensors)
@@ -95,7 +85,7 @@ def track_evidence(
         )
         track_of[detections] = updated.id[objects]
         if progress is not None:
-            progress(name, count + 1, len(ordered))
+            progress(count + 1)
     return track_of
 
 
@@ -243,27 +233,3 @@ class _Passes:
         known = np.isfinite(boxes.yaw[rows])
         yaw[owner[known]] = boxes.yaw[rows[known]]
         return SmoothedEdges(self.tracker.edges, self.tracker.explained_noise, lifespans, states, yaw, size[:, 0])
-
-
-@dataclass(frozen=True)
-class SmoothConfig:
-    """Configuration of labels: the online pass in `tracking`, the rest in `smoothing`."""
-
-    tracking: TrackConfig = settings_group(TrackConfig, "online pass: trackers and sensors")
-    sensors: Mapping[str, Sensor] = settings_group(
-        lambda: {DEFAULT: Sensor()},
-        "models of the sensors offline, with noise as measured, without margin for association",
-    )
-    smoothing: SmoothingSettings = settings_group(SmoothingSettings, "smoothing of its tracks to labels")
-
-
-def load_smooth_config(family: str | Path, path: Path | None = None) -> SmoothConfig:
-    """The defaults shipped for a kind of data, with what a YAML file overrides; kinds are those of `load_config`.
-
-    Raises `InputError` for a kind that has none, and naming the file and the dotted key of what is wrong in it.
-    """
-    shipped = shipped_settings("file" if isinstance(family, Path) else family, "smoothing")
-    tracking = load_config(family)
-    config = SmoothConfig(tracking=tracking, sensors=tracking.sensors)
-    config = read_settings(SmoothConfig, shipped.read_text(encoding="utf-8"), shipped.name, config)
-    return config if path is None else load_settings(SmoothConfig, path, config)
