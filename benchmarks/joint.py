@@ -25,24 +25,32 @@ from typing import Annotated
 import gtsam
 import numpy as np
 import typer
+from scipy.spatial.transform import Rotation
 
 from benchmarks.runner import Row, Rows, each
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.metrics import paired_bootstrap
-from data_tools.simulator import simulate_scene
-from data_tools.trajectories import Trajectory, trajectory_errors
+from data_tools.simulator import SimulatorSettings, simulate_scene
+from data_tools.trajectories import Trajectory, TrajectoryErrors, trajectory_errors
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
-from pipelines.slam.joint import degraded_drive, path_tracker, run_joint, street
+from pipelines.slam.joint import path_tracker
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, Additions, GraphView
 from saga_fg.model.landmarks import PoleLandmark
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Assignment, assign
 from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.slam.joint import JointSettings, Observations, OnlineEstimator, estimate_jointly
+from saga_fg.slam.joint import (
+    JointSettings,
+    Observations,
+    OdometryIncrements,
+    OdometryNoise,
+    OnlineEstimator,
+    estimate_jointly,
+)
 from saga_fg.slam.joint.graph import ObjectStates
-from saga_fg.slam.joint.record import in_ego
+from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame
@@ -172,33 +180,81 @@ def joint_rows(scenes: Sequence[Scene], seeds: Sequence[int], run: Callable[...,
             yield "changes of pooled errors of objects", {**about, **changes}
 
 
+def street(parked: bool = True, duration: float = 20.0) -> SimulatorSettings:
+    """Simulated scenes with cars parked on both sides of the road, or on none."""
+    return SimulatorSettings(parking_probability=1.0 if parked else 0.0, duration=duration)
+
+
+def degraded_drive(
+    scene: Scene, settings: JointSettings, sensor: str, seed: int
+) -> tuple[list[Frame], Trajectory, OdometryIncrements]:
+    """The frames of one sensor, `KEYFRAME_PERIOD` apart, their true path, and odometry degraded as `settings.odometry`
+    says."""
+    frames = list[Frame]()
+    for frame in scene.frames:
+        if frame.sensor == sensor and (not frames or frame.timestamp > frames[-1].timestamp + KEYFRAME_PERIOD):
+            frames.append(frame)
+    poses = np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None])
+    truth = Trajectory(np.array([frame.timestamp for frame in frames]), poses)
+    exact = OdometryIncrements.of(truth.timestamps, poses)
+    return frames, truth, degraded_odometry(exact, settings.odometry, np.random.default_rng(seed))
+
+
+def degraded_odometry(
+    odometry: OdometryIncrements, noise: OdometryNoise, rng: np.random.Generator
+) -> OdometryIncrements:
+    """Odometry with errors sampled from `noise`: independent ones, and random walks of scale, bias and course."""
+    n, dt = len(odometry.a_T_b), odometry.dt
+    deviations = np.sqrt(np.diagonal(noise.covariances(odometry.distance, dt), axis1=1, axis2=2))
+    sampled = deviations * rng.standard_normal(deviations.shape)
+    slow = rng.standard_normal(3) * [noise.scale, noise.bias, noise.course] + np.cumsum(sampled[:, 6:], axis=0)
+    bias = np.zeros((n, 3))
+    bias[:, 2] = slow[:, 1] * dt
+    a_T_b = odometry.a_T_b.copy()
+    a_T_b[:, :3, :3] = _rotations(bias) @ a_T_b[:, :3, :3] @ _rotations(sampled[:, :3])
+    course = np.zeros((n, 3))
+    course[:, 2] = slow[:, 2]
+    turned = (_rotations(course) @ a_T_b[:, :3, 3, None])[:, :, 0]
+    a_T_b[:, :3, 3] = turned * (1 + slow[:, :1]) + sampled[:, 3:6]
+    return OdometryIncrements(odometry.timestamps, a_T_b)
+
+
+def _rotations(vector: FloatArray) -> FloatArray:
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+
 def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, poles: bool = False) -> Outcome:
     """From the whole recording; with `poles` once more with those beside the road."""
-    run, outcome = run_joint(scene, config, settings, SENSOR, seed), Outcome()
-    errors, n = run.errors(), len(run.frames)
-    outcome.figures["path, m"] = errors["odometry"].path_length
-    outcome.add_path("decoupled", "ATE, m: decoupled", errors["odometry"].ate, n)
-    outcome.add_path("joint", "joint", errors["joint"].ate, n)
-    relative = (errors[name].relative_translation for name in ("odometry", "joint"))
+    frames, truth, odometry = degraded_drive(scene, settings, SENSOR, seed)
+    outcome, n, driven, tracker = Outcome(), len(frames), odometry.path(truth.world_T_ego[0]), path_tracker(config)
+    once, new = replace(settings, passes=1), partial(path_tracker, config)
+    solved = partial(estimate_jointly, frames, odometry, new)
+    estimate = solved(settings, driven[0])
+
+    def errors(path: FloatArray) -> TrajectoryErrors:
+        return trajectory_errors(Trajectory(truth.timestamps, path), truth)
+
+    alone, joined = errors(driven), errors(estimate.world_T_ego)
+    outcome.figures["path, m"] = alone.path_length
+    outcome.add_path("decoupled", "ATE, m: decoupled", alone.ate, n)
+    outcome.add_path("joint", "joint", joined.ate, n)
+    relative = (one.relative_translation for one in (alone, joined))
     outcome.figures |= dict(zip(("m per 10 m: decoupled", "m per 10 m: joint"), relative, strict=True))
     if poles:
-        see = partial(poles_at, seed=seed)
-        again = run_joint(scene, config, settings, SENSOR, seed, see)
-        outcome.add_path("with poles", "ATE with poles", again.errors()["joint"].ate, n)
-    driven, tracker = run.odometry.world_T_ego, path_tracker(config)
-    once, new = replace(settings, passes=1), partial(path_tracker, config)
-    held = estimate_jointly(run.frames, run.increments, new, once, driven[0], new_providers=lambda: [HeldPath(driven)])
+        again = solved(settings, driven[0], poles_at(frames, seed))
+        outcome.add_path("with poles", "ATE with poles", errors(again.world_T_ego).ate, n)
+    held = solved(once, driven[0], new_providers=lambda: [HeldPath(driven)])
 
     def at(k: int, frame: Frame, found: Detections) -> dict[str, State]:
         tracks = tracker.step(Frame(frame.timestamp, frame.sensor, found, driven[k], "ego"))
         states: dict[str, State] = {"decoupled": (tracks.id, _planar(tracks.boxes), driven[k], tracker.assignment)}
-        for name, one in (("held", held), ("joint", run.estimate)):
+        for name, one in (("held", held), ("joint", estimate)):
             now = one.objects[k]
             states[name] = now.id, _planar(now), one.world_T_ego[k], one.assignment(k)
         return states
 
     if scene.ground_truth is not None:
-        outcome.objects = object_sums(scene, run.frames, run.truth.world_T_ego, config, at)
+        outcome.objects = object_sums(scene, frames, truth.world_T_ego, config, at)
     return outcome
 
 

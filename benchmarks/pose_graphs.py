@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 import typer
 
+from benchmarks.generated_graphs import Generated, city, torus
 from benchmarks.runner import Rows, each
 from data_tools.files.input_files import error_context
 from data_tools.pose_graphs import read_g2o
@@ -27,24 +28,29 @@ from saga_fg.slam.pose_graph import (
 from saga_fg.slam.pose_graph.optimisation import SOLVER, graph_values, landmark_factors, placed
 
 
-def pose_graphs(files: Annotated[list[Path], typer.Argument(help="Pose graphs in the g2o format.")]) -> Rows:
+def pose_graphs(
+    graphs: Annotated[list[str], typer.Argument(help="Files in the g2o format, torus:POSES, city:POSES.")],
+) -> Rows:
     """Solve pose graphs from the guess in the file and from the chordal start, beside GTSAM's optimiser.
 
     \b
     Example:
-      python -m benchmarks pose-graphs data/slam/MIT.g2o data/slam/sphere2500.g2o
+      python -m benchmarks pose-graphs data/slam/MIT.g2o data/slam/sphere2500.g2o torus:5000
     """
-    for file in each(files, "graphs"):
-        with error_context(str(file)):
-            for row in from_same_starts(read_g2o(file)):
+    for name in each(graphs, "graphs"):
+        shape, _, poses = name.partition(":")
+        with error_context(name):
+            graph = GENERATED[shape](int(poses), seed=0)[0] if shape in GENERATED else read_g2o(name)
+            for row in from_same_starts(graph):
                 errors = {"error, saga-fg": row.error, "GTSAM": row.gtsam_error}
                 seconds = {"CPU s, saga-fg": row.seconds, "ratio to GTSAM": row.seconds / row.gtsam_seconds}
                 yield (
                     "pose graphs: half the sum of squares",
-                    {"graph": file.stem, "start": row.start, **errors, **seconds},
+                    {"graph": Path(name).stem, "start": row.start, **errors, **seconds},
                 )
 
 
+GENERATED: dict[str, Callable[..., Generated]] = {"city": city, "torus": torus}
 _MOST_RUNS, _LONG = 5, 0.5  # that are timed, and CPU seconds of them all
 _Result = TypeVar("_Result")
 

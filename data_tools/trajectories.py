@@ -1,4 +1,4 @@
-"""Trajectories of the vehicle: formats, alignment, errors, and odometry of a poor device.
+"""Trajectories of the vehicle: formats, alignment and errors.
 
 Alignment of trajectories by the rigid motion with the least squared distances.
 
@@ -51,7 +51,6 @@ from data_tools.files.readers import read_table
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import inverse_transform, is_rotation, quaternion_norms, quaternion_rotation
-from saga_fg.slam.joint import OdometryIncrements, OdometryNoise
 
 __all__ = [
     "Alignment",
@@ -59,7 +58,6 @@ __all__ = [
     "TrajectoryErrors",
     "absolute_errors",
     "aligned",
-    "degraded_odometry",
     "matched",
     "read_kitti_poses",
     "read_tum_poses",
@@ -193,31 +191,6 @@ def aligned(estimate: Trajectory, truth: Trajectory, alignment: Alignment = "rig
         case "none":
             return estimate
     raise InputError(f"alignment: expected one of {', '.join(get_args(Alignment))}, got {alignment!r}")
-
-
-def degraded_odometry(
-    odometry: OdometryIncrements, noise: OdometryNoise, rng: np.random.Generator
-) -> OdometryIncrements:
-    """Odometry with errors sampled from `noise`: independent ones, and random walks of scale, bias and course."""
-    n, dt = len(odometry.a_T_b), odometry.dt
-    if n == 0:
-        return odometry
-    deviations = np.sqrt(np.diagonal(noise.covariances(odometry.distance, dt), axis1=1, axis2=2))
-    sampled = deviations * rng.standard_normal(deviations.shape)
-    slow = rng.standard_normal(3) * [noise.scale, noise.bias, noise.course] + np.cumsum(sampled[:, 6:], axis=0)
-    bias = np.zeros((n, 3))
-    bias[:, 2] = slow[:, 1] * dt
-    a_T_b = odometry.a_T_b.copy()
-    a_T_b[:, :3, :3] = _rotations(bias) @ a_T_b[:, :3, :3] @ _rotations(sampled[:, :3])
-    course = np.zeros((n, 3))
-    course[:, 2] = slow[:, 2]
-    turned = (_rotations(course) @ a_T_b[:, :3, 3, None])[:, :, 0]
-    a_T_b[:, :3, 3] = turned * (1 + slow[:, :1]) + sampled[:, 3:6]
-    return OdometryIncrements(odometry.timestamps, a_T_b)
-
-
-def _rotations(vector: FloatArray) -> FloatArray:
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 @dataclass(frozen=True)

@@ -7,24 +7,29 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 from concept_pictures import write_concept_pictures
 from heterogeneous_picture import write_heterogeneous_picture
 from running_graph_picture import write_running_graph_pictures
 from scaling_picture import write_scaling_picture
 from slam_loops_picture import write_loops_picture
 
+from benchmarks.joint import degraded_drive, street
 from benchmarks.scans import SimulatedScans, laser_drive
+from data_tools.files.atomic_files import write_bytes
+from data_tools.plots import paths_from_above, png
 from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
 from pipelines.demo import run_demo
-from pipelines.slam.joint import run_joint, street
+from pipelines.slam.joint import path_tracker
 from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.lidar_results import write_lidar_slam
 from pipelines.slam.lidar_slam import lidar_slam
-from pipelines.slam.results import write_joint, write_laser_slam
-from saga_fg.slam.joint import JointSettings
+from pipelines.slam.results import confirmed_paths, write_laser_slam
+from saga_fg.slam.joint import JointSettings, estimate_jointly
 
 HERE = Path(__file__).parent
 
@@ -56,9 +61,13 @@ def main() -> None:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         shutil.copy(result.picture, HERE / "birds_eye.png")
         screenshot(result.page, HERE / "report.png", 1300, 920)
-        run = run_joint(simulate_scene(street(), 0), load_config("simulated"), JointSettings(), "lidar", 0)
-        write_joint(Path(folder) / "joint", run)
-        shutil.copy(Path(folder) / "joint" / "above.png", HERE / "joint_above.png")
+        frames, truth, odometry = degraded_drive(simulate_scene(street(), 0), JointSettings(), "lidar", 0)
+        start, config = truth.world_T_ego[0], load_config("simulated")
+        joint = estimate_jointly(frames, odometry, partial(path_tracker, config), JointSettings(), start)
+        paths = {"truth": truth.positions, "odometry": odometry.path(start)[:, :3, 3]}
+        paths["joint"] = joint.world_T_ego[:, :3, 3]
+        last = np.array([path[-1] for path in confirmed_paths(joint).values()])
+        write_bytes(HERE / "joint_above.png", png(paths_from_above(paths, {"objects": last})))
         scans = SimulatedScans(seed=0, count=40, curbs=True)
         write_lidar_slam(Path(folder) / "slam", lidar_slam(scans), scans)
         shutil.copy(Path(folder) / "slam" / "above.png", HERE / "slam_above.png")

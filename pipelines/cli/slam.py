@@ -4,35 +4,29 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 import typer
 
-from data_tools import pose_graphs
 from data_tools.files.atomic_files import check_writable_folder
 from data_tools.files.input_files import error_context
 from data_tools.laser import read_carmen
+from data_tools.pose_graphs import read_g2o
 from data_tools.recordings import RecordingOptions, is_bag, read_bag_laser
-from data_tools.simulator import simulate_scene
 from factors import Robust
 from pipelines.cli.console import counted, new_group, progress_bar, working
-from pipelines.cli.options import Config, Lag, Online, Verbose, as_command, online_window
+from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.cli.slam_scans import scans
-from pipelines.slam.configuration import load_laser_settings, load_slam_config
-from pipelines.slam.joint import run_joint, street
+from pipelines.slam.configuration import load_laser_settings
 from pipelines.slam.laser_slam import laser_slam
-from pipelines.slam.results import write_joint, write_laser_slam, write_pose_graph
-from saga_fg import Frame, InputError
+from pipelines.slam.results import write_laser_slam, write_pose_graph
+from saga_fg import InputError
 from saga_fg.numerics.arrays import IntArray
-from saga_fg.slam.joint import Observations
 from saga_fg.slam.pose_graph import consensus, graph_error, optimise_poses
 
 Loss = Literal["consensus", "huber", "cauchy", "geman-mcclure", "tukey"]
-Shape = Literal["city", "torus", "sphere", "grid", "cube"]
 
 
 def g2o(
@@ -82,7 +76,7 @@ def g2o(
     check_writable_folder(output)
     rejected: list[str] = []
     loss = None if robust is None or robust == "consensus" else Robust(robust, scale)
-    graph = pose_graphs.read_g2o(file)
+    graph = read_g2o(file)
     rows = _rows(covariances, graph.ids)
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
         guess = graph_error(graph, loss)
@@ -123,33 +117,6 @@ def _rows(chosen: str, ids: IntArray) -> IntArray:
         if name not in known:
             raise InputError(f"--covariances: expected all, last, none or ids of poses with commas, got {name!r:.40}")
     return np.array([known[name] for name in names])
-
-
-def generate(
-    shape: Annotated[Shape, typer.Argument(help="city, grid: in the plane; torus, sphere, cube: in space.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="g2o file to write.")],
-    poses: Annotated[int, typer.Option("--poses", min=2, help="Number of poses.")] = 10000,
-    noise: Annotated[float, typer.Option("--noise", help="Standard deviation of a measurement, m.")] = 0.05,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same graph.")] = 0,
-    verbose: Verbose = False,
-) -> None:
-    """Make a pose graph with loop closures, whose guess is dead reckoning.
-
-    \b
-    Example:
-      saga-fg slam generate city --poses 10000 --output city.g2o
-      saga-fg slam g2o city.g2o --output city
-    """
-    try:
-        graph, _ = getattr(pose_graphs, shape)(poses, seed, noise=noise)
-    except InputError as error:
-        raise InputError(f"--{error}") from None
-    pose_graphs.write_g2o(output, graph)
-    residuals, free = graph.information.shape[1] * len(graph.first), graph.information.shape[1] * (len(graph) - 1)
-    typer.echo(
-        f"{output}: {counted(len(graph), 'pose')}, {counted(len(graph.first), 'measurement')}; "
-        f"expected error of the optimum {(residuals - free) / 2:g}"
-    )
 
 
 def laser(
@@ -201,47 +168,6 @@ def laser(
     typer.echo(f"{used} of CPU, {figures['times_real_time']:.0f} times real time")
 
 
-def simulated(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the scene and of the odometry's errors.")] = 0,
-    duration: Annotated[float, typer.Option("--duration", min=2.0, help="Length of the drive, s.")] = 20.0,
-    online: Online = False,
-    lag: Lag = None,
-    config: Config = None,
-    verbose: Verbose = False,
-) -> None:
-    """Drive down a simulated street with poor odometry; the path and all objects are estimated in one graph.
-
-    With --online once more, frame by frame, in a window of the last seconds.
-
-    Writes the paths (TUM, KITTI), the covariances of the poses, the tracks of the objects (tracks.csv), landmarks
-    (landmarks.json), errors.json and a picture from above (above.png).
-
-    \b
-    Example:
-      saga-fg slam simulated --seed 3 --output street
-      saga-fg slam simulated --seed 3 --online --lag 2 --output street
-    """
-    window = online_window(online, lag)
-    check_writable_folder(output)
-    settings = load_slam_config("simulated", config)
-    slam, detectors = settings.slam, settings.slam.new_detectors()
-
-    def landmarks(frames: Sequence[Frame]) -> Observations:
-        return [[seen for detector in detectors for seen in detector.observations(frame)] for frame in frames]
-
-    scene = simulate_scene(replace(street(), duration=duration), seed)
-    with working("estimating"):
-        run = run_joint(scene, settings, slam.joint, "lidar", seed, landmarks, window, slam.new_providers)
-        write_joint(output, run)
-    errors = run.errors()
-    joint = errors["joint"]
-    typer.echo(f"{output}: {joint.poses} poses over {joint.path_length:.0f} m")
-    typer.echo(f"ATE: odometry {errors['odometry'].ate:.3f} m, joint {joint.ate:.3f} m")
-    for name in [name for name in errors if name not in ("odometry", "joint")]:
-        typer.echo(f"{name} (lag {window:g} s): ATE {errors[name].ate:.3f} m")
-
-
 slam_app = new_group("Estimate where the vehicle was and what stands around it, in one factor graph.")
-for run in (scans, g2o, generate, laser, simulated):
+for run in (scans, g2o, laser):
     slam_app.command()(as_command(run))

@@ -41,7 +41,7 @@ FIRST = {
         "sensors.*.noise.*.position",
     ),
     "slam": (
-        "slam.joint.odometry.distance_noise",
+        "slam.laser.largest_range",
         "slam.lidar.odometry.surfel_size",
         "slam.lidar.loops.drift",
         "slam.lidar.landmarks",

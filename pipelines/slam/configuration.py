@@ -26,20 +26,18 @@ from saga_fg.model.landmarks import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.providers.odometry import mounting
 from saga_fg.settings import setting, settings_group
-from saga_fg.slam.joint import JointSettings
 from saga_fg.slam.sensors import SensorName, SensorSettings
 from saga_fg.tracking.by_name import made_by_name, new_provider
 
 
 @dataclass(frozen=True)
 class SlamSettings:
-    """Settings of `saga-fg slam simulated` and `saga-fg slam scans`."""
+    """Settings of `saga-fg slam`."""
 
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, asked at every pose"
     )
     landmarks: tuple[str, ...] = setting((), "your own detectors of landmarks, MODULE:NAME, asked at every pose")
-    joint: JointSettings = settings_group(JointSettings, "simulated: ego path and objects together")
     sensors: SensorSettings = settings_group(SensorSettings, "scans: GPS, IMU and wheels of the vehicle, also in a map")
     lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "scans: LiDAR SLAM, with objects")
     localisation: LocaliserSettings = settings_group(LocaliserSettings, "scans --map: localisation in a map")

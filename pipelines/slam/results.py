@@ -2,7 +2,7 @@
 
 All runs share the forms of these:
 
-*.tum             a path in the TUM format; *.kitti, joint.txt, trajectory.txt in KITTI's
+*.tum             a path in the TUM format; trajectory.txt in KITTI's
 landmarks.json    each landmark: number, kind, coordinates (m), covariance of its tangent, number of observations
 landmarks.ply     landmarks for viewers of point clouds
 covariances.csv   of each pose: its name, then the upper triangle in the pose's own frame, rad and m: (x, y, heading) or
@@ -21,7 +21,6 @@ map.png         occupancy, with the path; figures.json: counts, entropy of the m
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +31,7 @@ from data_tools.files.atomic_files import atomic_directory, write_bytes, write_t
 from data_tools.laser import LaserLog, OccupancyGrid
 from data_tools.plots import occupancy_picture, paths_from_above, png
 from data_tools.pose_graphs import write_g2o
-from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
-from pipelines.slam.joint import JointRun
+from data_tools.trajectories import Trajectory, write_tum_poses
 from pipelines.slam.laser_slam import LaserPath
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import transforms
@@ -107,22 +105,6 @@ def planar_trajectory(time: FloatArray, world_T_pose: FloatArray) -> Trajectory:
     poses[:, :2, :2] = world_T_pose[:, :2, :2]
     poses[:, :2, 3] = world_T_pose[:, :2, 2]
     return Trajectory(time, poses)
-
-
-def write_joint(output: Path, run: JointRun) -> None:
-    """Write the results of a simulated scene: the paths of the run as NAME.tum, and errors.json against the truth."""
-    last = np.array([path[-1] for path in confirmed_paths(run.estimate).values()]).reshape(-1, 2)
-    drawn = {name: path.positions for name, path in run.paths.items() if name != "settled"}
-    with atomic_directory(output, known=("online.tum", "settled.tum")) as folder:
-        for name, path in run.paths.items():
-            write_tum_poses(folder / f"{name}.tum", path)
-        write_kitti_poses(folder / "joint.txt", run.paths["joint"], folder / "times.txt")
-        times = [f"{time:.6f}" for time in run.estimate.timestamps.tolist()]
-        write_covariances(folder / "covariances.csv", "timestamp", times, run.estimate.pose_covariances)
-        write_objects(folder / "tracks.csv", run.estimate)
-        write_figures(folder / "errors.json", {name: asdict(errors) for name, errors in run.errors().items()})
-        write_figures(folder / "landmarks.json", landmark_rows(run.estimate.landmarks))
-        write_bytes(folder / "above.png", png(paths_from_above(drawn, {"objects": last})))
 
 
 def write_pose_graph(

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from benchmarks.pose_graphs import from_same_starts
 from data_tools.pose_graphs import read_g2o, write_g2o
-from pipelines.cli import app
 from saga_fg.slam.pose_graph import chordal_minimum, chordal_poses, factor_graph, optimise_poses, pose_values
 from tests.data_tools.test_pose_graphs import PLANAR
 from tests.pipelines.command import done, refused
@@ -162,10 +160,3 @@ def test_public_graphs_reach_the_lower_of_gtsams_errors(name: str) -> None:
     assert optimised.error <= 1.01 * min(row.gtsam_error for row in from_same_starts(graph))
     if name == "MIT":  # where the guess in the file leads astray
         assert optimised.errors["guess"] > 10 * optimised.error
-
-
-def test_the_command_that_generates_names_its_option(tmp_path: Path) -> None:
-    arguments = ["slam", "generate", "torus", "--poses", "3", "--output", str(tmp_path / "torus.g2o")]
-    outcome = CliRunner().invoke(app, arguments)
-    assert "--poses: expected at least 80" in str(outcome.exception) + outcome.output
-    assert not (tmp_path / "torus.g2o").exists()

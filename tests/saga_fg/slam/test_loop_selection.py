@@ -8,8 +8,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from benchmarks.generated_graphs import city, torus
 from benchmarks.loops import with_false_loops
-from data_tools.pose_graphs import city, read_g2o, torus
+from data_tools.pose_graphs import read_g2o
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import (
