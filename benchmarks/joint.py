@@ -43,7 +43,6 @@ from saga_fg.numerics.assignment import Assignment, assign
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.slam.joint import (
     JointSettings,
-    Observations,
     OdometryIncrements,
     OdometryNoise,
     OnlineEstimator,
@@ -51,6 +50,7 @@ from saga_fg.slam.joint import (
 )
 from saga_fg.slam.joint.graph import ObjectStates
 from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
+from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame
@@ -241,7 +241,7 @@ def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSetti
     relative = (one.relative_translation for one in (alone, joined))
     outcome.figures |= dict(zip(("m per 10 m: decoupled", "m per 10 m: joint"), relative, strict=True))
     if poles:
-        again = solved(settings, driven[0], poles_at(frames, seed))
+        again = solved(settings, driven[0], new_providers=lambda: [poles_at(frames, driven, seed)])
         outcome.add_path("with poles", "ATE with poles", errors(again.world_T_ego).ate, n)
     held = solved(once, driven[0], new_providers=lambda: [HeldPath(driven)])
 
@@ -266,23 +266,21 @@ def online_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSett
     driven, outcome = odometry.path(path.world_T_ego[0]), Outcome()
     alone, joined = path_tracker(config), path_tracker(config)
     estimator = OnlineEstimator(joined, lag, settings, start=path.world_T_ego[0])
-    newest, settled = list[FloatArray](), list[FloatArray]()
+    newest = list[FloatArray]()
 
     def at(k: int, frame: Frame, found: Detections) -> dict[str, State]:
         tracks = alone.step(Frame(frame.timestamp, frame.sensor, found, driven[k], "ego"))
         step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
-        newest.append(step.newest.world_T_ego[-1])
-        settled.extend([] if step.settled is None else step.settled.world_T_ego)
-        now = step.newest.objects[-1]
+        newest.append(step.world_T_ego[-1])
+        now = step.objects[-1]
         return {
             "decoupled": (tracks.id, _planar(tracks.boxes), driven[k], alone.assignment),
             "joint": (now.id, _planar(now), newest[-1], joined.assignment),
         }
 
     outcome.objects = object_sums(scene, frames, path.world_T_ego, config, at)
-    settled += [*estimator.window().world_T_ego]
-    for name, poses in (("decoupled", list(driven)), ("joint", newest), ("settled", settled)):
-        ate = trajectory_errors(Trajectory(path.timestamps, np.stack(poses)), path).ate
+    for name, poses in (("decoupled", driven), ("joint", np.stack(newest))):
+        ate = trajectory_errors(Trajectory(path.timestamps, poses), path).ate
         outcome.add_path(name, f"ATE, m: {name}", ate, len(frames))
     return outcome
 
@@ -369,8 +367,8 @@ class HeldPath:
         return Additions(factors=[gtsam.PriorFactorPose3(view.key(EGO_POSE, 0), pose, noise)])
 
 
-def poles_at(frames: Sequence[Frame], seed: int) -> Observations:
-    """Observe poles beside the driven path, 1.5 m high, at frames with true poses."""
+def poles_at(frames: Sequence[Frame], path: FloatArray, seed: int) -> LandmarkObservations:
+    """Observations of poles beside the path, 1.5 m high, at frames with true poses; path: (n, 4, 4) by odometry."""
     poses = np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None])
     rng, places = np.random.default_rng(seed), []
     driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
@@ -381,10 +379,12 @@ def poles_at(frames: Sequence[Frame], seed: int) -> Observations:
             row = min(int(np.searchsorted(driven, s)), len(driven) - 1)
             ahead, across = s - driven[row], side * (OFFSET + rng.normal(0, 1.0))
             places.append(transform_points(poses[row], np.array([[ahead, across, 1.5]]))[0])
-    kind, R, result = PoleLandmark(), NOISE**2 * np.eye(2), []
-    for pose in poses:
+    kind, R, start = PoleLandmark(), NOISE**2 * np.eye(2), dict[int, FloatArray]()
+    seen: dict[int, list[tuple[int, Observation]]] = {}
+    for k, pose in enumerate(poses):
         local = transform_points(inverse_transform(pose), np.stack(places))
         near = (np.hypot(*local[:, :2].T) <= REACH) & (rng.random(len(local)) < SEEN)
         local[:, :2] += NOISE * rng.standard_normal((len(local), 2))
-        result.append([Observation(kind, point, R) for point in local[near]])
-    return result
+        seen[k] = [(number, Observation(kind, local[number], R)) for number in np.flatnonzero(near).tolist()]
+        start |= {number: kind.initialise(path[k], one.value) for number, one in seen[k] if number not in start}
+    return LandmarkObservations(seen, start)

@@ -34,21 +34,9 @@ Config = Annotated[
     Path | None, typer.Option("--config", help="YAML file over the defaults; see `saga-fg config`.", metavar="FILE")
 ]
 
-Online = Annotated[
-    bool, typer.Option("--online", help="Estimate online too, with a fixed-lag smoother, beside the full batch.")
-]
-Lag = Annotated[float | None, typer.Option("--lag", min=0.0, help="Length of the window of --online, s.  [default: 3]")]
-
 Result = Annotated[
     Path, typer.Argument(help="Result of any tracker, in the format that `saga-fg track` writes for the dataset.")
 ]
-
-
-def online_window(online: bool, lag: float | None) -> float | None:
-    """Length of the window, s, None without --online. Raises `InputError` where --lag would have no effect."""
-    if lag is not None and not online:
-        raise InputError(f"--lag {lag:g}: expected with --online only")
-    return (3.0 if lag is None else lag) if online else None
 
 
 def apart(output: Path, *inputs: Path, option: str = "--output") -> None:

@@ -16,7 +16,7 @@ from data_tools.recordings import LAYOUTS, RecordingOptions, ScanRecording, open
 from data_tools.recordings.recording import PERIOD
 from data_tools.sensor_logs import SensorLog
 from pipelines.cli.console import counted, progress_bar, working
-from pipelines.cli.options import Config, Lag, Online, Verbose, online_window
+from pipelines.cli.options import Config, Verbose
 from pipelines.slam.configuration import load_slam_config, sensor_log
 from pipelines.slam.joint import path_tracker, with_objects
 from pipelines.slam.lidar_results import write_lidar_slam
@@ -157,8 +157,6 @@ def scans(
     drive: DriveOptions,
     logged: LoggedOptions,
     earlier: MapOptions,
-    online: Online = False,
-    lag: Lag = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -189,8 +187,6 @@ def scans(
     """
     if drive.detections is not None and not drive.objects:
         raise InputError("--detections: expected with --objects only")
-    if online and not drive.objects:
-        raise InputError("--online: expected with --objects; without them the poses are estimated online in any case")
     if earlier.known_map is None and earlier.guess is not None:
         raise InputError("--guess: expected with --map only")
     if earlier.known_map is not None and (drive.objects or drive.odometry == "recorded" or not drive.landmarks):
@@ -202,7 +198,6 @@ def scans(
         raise InputError(f"--output {output}: expected another folder than SOURCE and the one that it is in")
     if logged.seed is not None and not logged.sensors:
         raise InputError("--seed: expected with --sensors only")
-    window = online_window(online, lag)
     check_writable_folder(output)
     settings = load_slam_config("kitti", config)
     slam, slam_map = settings.slam, None if earlier.known_map is None else read_map(earlier.known_map)
@@ -254,7 +249,7 @@ def scans(
         )
     if drive.objects:
         with working("objects"):
-            result = with_objects(result, recording, frames, settings, lidar, window, slam.new_providers, log)
+            result = with_objects(result, recording, frames, settings, lidar, slam.new_providers, log)
     figures = write_lidar_slam(output, result, recording, settings=lidar, origin=recording.origin)
     counts = [counted(len(recording), "scan"), counted(figures["keyframes"], "keyframe")]
     counts += [counted(number, name) for name, number in figures["landmarks"].items()]
@@ -264,7 +259,7 @@ def scans(
     typer.echo(f"{output}: {', '.join(counts)}")
     compared = ["odometry", "online", *(["without_objects"] if drive.objects else []), "trajectory"]
     if drive.odometry == "recorded":  # these are the recording itself
-        compared = [*(["online"] if online else []), "trajectory"]
+        compared = ["trajectory"]
     for name in compared if recording.world_T_ego is not None else ():
         e, what = figures[name], name.replace("_", " ")
         relative = f"no RPE on a path shorter than {e['relative_distance']:g} m"

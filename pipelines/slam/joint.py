@@ -23,17 +23,11 @@ from pipelines.slam.scan_content import frames_at
 from pipelines.slam.submaps import world_T_submap
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.slam.joint import (
-    OdometryIncrements,
-    OnlineEstimator,
-    estimate_jointly,
-    estimate_online,
-)
+from saga_fg.slam.joint import OdometryIncrements, estimate_jointly
 from saga_fg.slam.joint.record import KEYFRAME_PERIOD
 from saga_fg.slam.sensors import sensor_providers
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
-from saga_fg.types.landmark import Observation
 
 
 def path_tracker(config: TrackConfig) -> Tracker:
@@ -47,13 +41,11 @@ def with_objects(
     frames: Sequence[Frame],
     config: TrackConfig,
     settings: LidarSlamSettings | None = None,
-    lag: float | None = None,
     new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
     log: SensorLog | None = None,
 ) -> LidarSlamResult:
     """Solve again with the objects in `frames`, which cover the times of all scans; config: of the tracker.
 
-    lag: s, to estimate poses, landmarks and objects online as well, in a window so long; `online` is then by that.
     new_providers: gives fresh providers of other factors; log: of the vehicle's sensors, as of `lidar_slam`.
     Raises `InputError` for a scan without a frame.
     """
@@ -78,7 +70,7 @@ def with_objects(
     )
     poses = result.drive.carried(estimate.world_T_ego, rows) @ lidar_T_ego
     placed = estimate.world_T_ego[at]
-    slam = replace(
+    return replace(
         result,
         trajectory=Trajectory(scans.timestamps, poses),
         covariances=estimate.pose_covariances[at],
@@ -88,15 +80,6 @@ def with_objects(
         objects=estimate,
         alone=result.trajectory,
     )
-    if lag is not None:
-        observed: list[list[tuple[int, Observation]]] = [[] for _ in rows]
-        for one in result.observations:
-            observed[at[one.pose]].append((one.landmark, one.observation))
-        estimator = OnlineEstimator(new_tracker(), lag, s.objects, start, [*of_sensors, *new_providers()])
-        online = estimate_online(seen, odometry, estimator, observed)
-        placed = result.drive.carried(online.newest, rows) @ lidar_T_ego
-        slam = replace(slam, online=Trajectory(scans.timestamps, placed))
-    return slam
 
 
 def _with_sensors(frames: Sequence[Frame], log: SensorLog | None) -> list[Frame]:

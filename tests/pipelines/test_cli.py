@@ -16,8 +16,10 @@ import yaml
 from click import Context
 from typer.main import get_command
 
+from benchmarks.generated_graphs import torus
 from data_tools.datasets.nuscenes.source import sensor_locations
 from data_tools.datasets.source import names
+from data_tools.pose_graphs import write_g2o
 from pipelines.cli import app
 from pipelines.cli.commands import PAGES, location
 from pipelines.cli.start import FIRST
@@ -295,10 +297,11 @@ def test_while_the_output_is_written(tmp_path, arguments):
 
 
 def test_while_slam_writes_its_folder(tmp_path):
-    process = start(tmp_path, "slam", "simulated", "--duration", "2", "--output", tmp_path / "street")
-    assert terminate(process, lambda: there(tmp_path, ".street.*.tmp/*")) == LINE
+    write_g2o(tmp_path / "torus.g2o", torus(400, seed=0)[0])
+    process = start(tmp_path, "slam", "g2o", tmp_path / "torus.g2o", "--output", tmp_path / "solved")
+    assert terminate(process, lambda: there(tmp_path, ".solved.*.tmp/*")) == LINE
     assert left_behind(tmp_path) == []
-    assert [path.name for path in tmp_path.iterdir()] == ["tmp"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tmp", "torus.g2o"]
 
 
 def test_with_workers(tmp_path):

@@ -1,4 +1,4 @@
-"""What is inferred beside the joint estimate: identities of detections and landmarks, objects at rest.
+"""What is inferred beside the joint estimate: identities of detections, objects at rest.
 
 Identity of detections: the probability that each one is of the object that it is assigned to.
 
@@ -13,12 +13,6 @@ The estimate of the objects comes from the whole window, so that what an object 
 the graph the detection has a share p_i of its information: one that fits a neighbour as well hardly bends the path.
 Source of the probabilities: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation
 (2001), section 6.6, probabilistic data association.
-
-Association of landmarks of unknown identity.
-
-An observation belongs to the nearest landmark of its kind, by its last observation along the path assumed so far,
-within `reach`, else to a new one: a pose drifts little between two views of one thing. Association is repeated along
-the path that was found; online the path is that of the window.
 
 Stationarity of objects: the probability that each one is at rest, from its detections along a path.
 
@@ -48,16 +42,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, motion_covariances
-from saga_fg.slam.mapping import LandmarkObservations, landmark_key
 from saga_fg.types.by_class import class_numbers
-from saga_fg.types.landmark import LandmarkType, Observation
 
 _SPREAD = 0.2  # m, standard deviation of the estimated positions of objects
 _LEAST = 0.01  # so that no object is without information
@@ -97,57 +88,6 @@ def with_all_identities(
         with_identities(now, pose, position, clutter_area)
         for now, pose, position in zip(record, path, positions, strict=True)
     ]
-
-
-Seen = Observation | tuple[int, Observation]
-Observations = Sequence[Sequence[Seen]]
-"""Observations at each epoch, all with the numbers of their landmarks or none."""
-
-
-class NearestLandmarks:
-    """Landmarks along a path; reach: m, within which an observation is of the nearest one of its kind."""
-
-    def __init__(self, reach: float = 2.5) -> None:
-        self._reach, self._numbers = reach, 0
-        self._last: dict[int, tuple[LandmarkType, FloatArray, int]] = {}  # type, place (2,) and epoch
-
-    def observe(self, epoch: int, pose: FloatArray, observations: Sequence[Seen]) -> LandmarkObservations:
-        """Associate the observations from a pose (4, 4), those without a number."""
-        start, seen = dict[int, Any](), list[tuple[int, Observation]]()
-        for one in observations:
-            number, observation = one if isinstance(one, tuple) else (None, one)
-            kind, state = observation.kind, observation.kind.initialise(pose, observation.value)
-            where = kind.coordinates(state)
-            place = np.array([where["x"], where["y"]])
-            number = self._nearest(kind, place) if number is None else number
-            if number not in self._last:
-                start[number] = state
-            self._last[number] = kind, place, epoch
-            seen.append((number, observation))
-        return LandmarkObservations({epoch: seen} if seen else {}, start)
-
-    def _nearest(self, kind: LandmarkType, place: FloatArray) -> int:
-        """The number of the landmark at a place (2,); that of a new one if none is near."""
-        alike = {number: there for number, (other, there, _) in self._last.items() if other == kind}
-        apart = {number: float(np.linalg.norm(there - place)) for number, there in alike.items()}
-        number = min(apart, key=apart.__getitem__, default=-1)
-        if apart.get(number, np.inf) <= self._reach:
-            return number
-        self._numbers += 1
-        return self._numbers
-
-    def observe_all(self, path: FloatArray, observations: Observations) -> LandmarkObservations:
-        """Associate the observations of n epochs along a path (n, 4, 4)."""
-        found = [self.observe(epoch, *each) for epoch, each in enumerate(zip(path, observations, strict=True))]
-        seen = {epoch: now for one in found for epoch, now in one.seen.items()}
-        return LandmarkObservations(seen, {number: state for one in found for number, state in one.start.items()})
-
-    def forget(self, first: int) -> list[int]:
-        """Let landmarks leave that were last observed before the epoch `first`; returns their keys."""
-        gone = [number for number, (_, _, last) in self._last.items() if last < first]
-        for number in gone:
-            del self._last[number]
-        return list(map(landmark_key, gone))
 
 
 _CREEPING = 0.3  # speed of creeping traffic, as a share of the usual one

@@ -9,7 +9,6 @@ when associations repeat.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,8 +17,6 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.joint.association import (
-    NearestLandmarks,
-    Observations,
     SlowErrors,
     stationary_probabilities,
     with_all_identities,
@@ -39,19 +36,20 @@ def estimate_jointly(
     new_tracker: Callable[[], Tracker],
     settings: JointSettings | None = None,
     start: FloatArray | None = None,
-    landmarks: Observations | None = None,
     new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
 ) -> JointEstimate:
     """Estimate the path (n poses) and the objects of n frames, in increasing order of time.
 
     odometry: between the frames' times; new_tracker: gives a new tracker, which associates detections; start: first
-    pose (4, 4), by default the identity; landmarks: observations at each of the n epochs; new_providers: gives new
-    providers of other factors, asked with each frame (`saga_fg.slam.mapping.LandmarkObservations` for landmarks of
-    known identity). Detections are in ego or sensor coordinates, or in those of the world with the pose they were
-    transformed by. Raises `InputError` where frames, odometry and landmarks do not fit together.
+    pose (4, 4), by default the identity; new_providers: gives new providers of other factors, asked with each frame
+    (`saga_fg.slam.mapping.LandmarkObservations` for landmarks). Detections are in ego or sensor coordinates, or in
+    those of the world with the pose they were transformed by. Raises `InputError` where frames and odometry do not fit
+    together.
     """
     settings = settings or JointSettings()
-    landmarks = checked_landmarks(frames, odometry, landmarks)
+    times = np.array([frame.timestamp for frame in frames])
+    if len(times) != len(odometry) or not np.allclose(times, odometry.timestamps, atol=1e-6):
+        raise InputError(f"frames: expected one at each of the {len(odometry)} times of the odometry, got {len(times)}")
     path = odometry.path(start)
     slow = SlowErrors.at_start(settings)
     estimate = None
@@ -62,31 +60,13 @@ def estimate_jointly(
         before, links = links, [now.seen.id.tolist() for now in record]
         if links == before:
             break
-        seen = NearestLandmarks().observe_all(path, landmarks)
         clutter = tracker.settings.association.clutter_area
         start_moving = estimate is None
-        providers = [seen, *new_providers()]
         epochs = VehicleAndObjects(record, path, settings)
-        estimate = _solve(epochs, frames, slow, start_moving, clutter, providers)
-        estimate = replace(estimate, observations=seen)
+        estimate = _solve(epochs, frames, slow, start_moving, clutter, new_providers())
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
     return estimate
-
-
-def checked_landmarks(
-    frames: Sequence[Frame], odometry: OdometryIncrements, landmarks: Observations | None
-) -> Observations:
-    """The observations at each frame, none by default.
-
-    Raises `InputError` unless odometry and landmarks are of the times of the frames.
-    """
-    times = np.array([frame.timestamp for frame in frames])
-    if len(times) != len(odometry) or not np.allclose(times, odometry.timestamps, atol=1e-6):
-        raise InputError(f"frames: expected one at each of the {len(odometry)} times of the odometry, got {len(times)}")
-    if landmarks is not None and len(landmarks) != len(frames):
-        raise InputError(f"landmarks: expected observations at {len(frames)} times, got {len(landmarks)}")
-    return landmarks or [()] * len(frames)
 
 
 def _solve(

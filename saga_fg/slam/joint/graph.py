@@ -58,8 +58,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.slam.joint.association import SlowErrors
 from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, RecordedObjects, motion_covariances
-from saga_fg.slam.mapping import LandmarkObservations, pose_key
-from saga_fg.types.landmark import Landmark
+from saga_fg.slam.mapping import pose_key
 
 _START_NOISE = 1e-3  # standard deviation of the first pose, m and rad
 _LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
@@ -286,7 +285,6 @@ class JointEstimate:
     objects       n tables
     converged     whether the last step was short enough
     solution      of the graph, with the keys of this module
-    observations  of landmarks, associated along the path
     """
 
     timestamps: FloatArray
@@ -296,7 +294,6 @@ class JointEstimate:
     converged: bool
     solution: Solution | GraphSolution
     _record: Record
-    observations: LandmarkObservations | None = None
 
     @cached_property
     def pose_covariances(self) -> FloatArray:
@@ -316,11 +313,6 @@ class JointEstimate:
         """Objects and their detections at a row of the estimate."""
         seen = self._record[row].seen
         return Assignment(seen.id, seen.row)
-
-    @cached_property
-    def landmarks(self) -> list[Landmark]:
-        """Landmarks that were associated along the path."""
-        return [] if self.observations is None else self.observations.landmarks(self.solution)
 
     @cached_property
     def slow_errors(self) -> SlowErrors:

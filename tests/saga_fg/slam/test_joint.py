@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from factors import prior_factor
 from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
-from saga_fg.graph import EGO_VELOCITY, LANDMARK, Additions, GraphView, NewVariable
+from saga_fg.graph import EGO_VELOCITY, Additions, GraphView, NewVariable
 from saga_fg.model.landmarks import PoleLandmark
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.sensor import NoiseModel
@@ -20,11 +20,11 @@ from saga_fg.slam.joint import (
     OdometryNoise,
     OnlineEstimator,
     estimate_jointly,
-    estimate_online,
 )
 from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities, with_identities
 from saga_fg.slam.joint.graph import motion_factors, new_streams
 from saga_fg.slam.joint.record import RecordedDetections, RecordedEpoch, RecordedObjects, record_epochs
+from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.landmark import Observation
@@ -55,14 +55,15 @@ def off_path(estimate, poses):
 
 
 def seen_poles(poses, rng, noise=0.05):
-    """Places of five poles, and observations of those near each pose."""
+    """Provider of observations of five poles, of those near each pose."""
     poles = np.column_stack([np.arange(4.0, 40, 8), np.tile([6.0, -6.0, 7.0], 2)[:5], np.full(5, 1.0)])
-    kind, seen = PoleLandmark(), []
-    for pose in poses:
+    kind, seen = PoleLandmark(), {}
+    for k, pose in enumerate(poses):
         local = (inverse_transform(pose) @ np.column_stack([poles, np.ones(5)]).T).T[:, :3]
         local[:, :2] += rng.normal(0, noise, (5, 2))
-        seen.append([Observation(kind, z, noise**2 * np.eye(2)) for z in local if np.hypot(*z[:2]) < 20])
-    return poles[:, :2], seen
+        R = noise**2 * np.eye(2)
+        seen[k] = [(n, Observation(kind, z, R)) for n, z in enumerate(local) if np.hypot(*z[:2]) < 20]
+    return LandmarkObservations(seen, dict(enumerate(poles[:, :2] + 1.0)))
 
 
 @pytest.fixture(scope="module")
@@ -212,12 +213,10 @@ def test_odometry_is_put_together_and_apart():
 def test_poles_correct_the_odometry_where_nothing_else_stands():
     frames, odometry, poses, _ = drive(n=25, parked=0, moving=0)
     reported = worse(odometry, np.random.default_rng(2))
-    _, seen = seen_poles(poses, np.random.default_rng(3))
-    estimate = estimate_jointly(frames, reported, new_tracker, JointSettings(POOR), poses[0], seen)
+    seen = seen_poles(poses, np.random.default_rng(3))
+    estimate = estimate_jointly(frames, reported, new_tracker, JointSettings(POOR), poses[0], lambda: [seen])
     alone, joint = (off_path(found, poses) for found in (reported.path(poses[0]), estimate.world_T_ego))
     assert joint.max() < min(0.2, alone.max() / 3)
-    with pytest.raises(InputError, match="landmarks: expected observations at 25 times, got 24"):
-        estimate_jointly(frames, reported, new_tracker, landmarks=seen[1:])
 
 
 # The vehicle, landmarks and objects online: what a window loses against the batch, and what it must not
@@ -229,20 +228,24 @@ def rms(found, poses):
     return np.sqrt(np.mean(off_path(found, poses) ** 2))
 
 
+def online(frames, odometry, estimator):
+    """The newest pose and its covariance at every frame."""
+    steps = [estimator.step(frame, odometry.a_T_b[k - 1] if k else None) for k, frame in enumerate(frames)]
+    poses = np.array([step.world_T_ego[-1] for step in steps])
+    return poses, np.array([step.pose_covariances[-1] for step in steps])
+
+
 def test_a_window_of_seconds_is_nearly_the_batch():
     frames, odometry, poses, _ = drive(n=35)
     reported = worse(odometry, np.random.default_rng(1))
     batch = estimate_jointly(frames, reported, new_tracker, SETTINGS, poses[0])
-    online = estimate_online(frames, reported, OnlineEstimator(new_tracker(), 2.0, SETTINGS, start=poses[0]))
-    alone = rms(reported.path(poses[0]), poses)
-    assert rms(online.newest, poses) < alone / 3
-    assert rms(online.settled, poses) < max(1.5 * rms(batch.world_T_ego, poses), 0.15)
-    assert len(online.settled) == len(frames)
-    P = online.covariances[-1]
+    newest, covariances = online(frames, reported, OnlineEstimator(new_tracker(), 2.0, SETTINGS, start=poses[0]))
+    assert rms(newest, poses) < rms(reported.path(poses[0]), poses) / 3
+    P = covariances[-1]
     np.testing.assert_allclose(np.sqrt(np.diag(P)), np.sqrt(np.diag(batch.pose_covariances[-1])), rtol=0.1)
-    errors = np.array([inverse_transform(f) @ p for f, p in zip(online.newest, poses, strict=True)])
+    errors = np.array([inverse_transform(f) @ p for f, p in zip(newest, poses, strict=True)])
     planar = np.stack([errors[:, 1, 0], errors[:, 0, 3], errors[:, 1, 3]], axis=1)
-    squares = [e @ np.linalg.solve(P[2:5, 2:5], e) for e, P in zip(planar, online.covariances, strict=True)]
+    squares = [e @ np.linalg.solve(P[2:5, 2:5], e) for e, P in zip(planar, covariances, strict=True)]
     assert np.mean(squares[5:]) < chi2.ppf(0.999, 3)
 
 
@@ -251,7 +254,7 @@ def test_variables_of_providers_leave_the_window_with_their_epoch():
     estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS, start=poses[0], providers=[_Speeds()])
     for k, frame in enumerate(frames):
         estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
-    graph, window = estimator._window._smoother.graph(), estimator._window.record
+    graph, window = estimator._smoother.graph(), estimator._record
     assert all(graph.of(EGO_VELOCITY, now.epoch) for now in window)
     assert not any(graph.of(EGO_VELOCITY, k) for k in range(window[0].epoch))
 
@@ -272,40 +275,21 @@ def test_what_leaves_the_window_stays_in_the_prior():
     frames, odometry, poses, _ = drive(n=14, parked=0, moving=3)
     reported = worse(odometry, np.random.default_rng(2))
     linear = replace(SETTINGS, outlier_scale=np.inf, moving_speed={DEFAULT: 1e-6})  # nobody stands, no robust loss
-    _, seen = seen_poles(poses, np.random.default_rng(4))
-    short, long = (
-        estimate_online(frames, reported, OnlineEstimator(new_tracker(), lag, linear, start=poses[0]), seen)
-        for lag in (0.5, 60.0)
+    (short, P_short), (long, P_long) = (
+        online(frames, reported, OnlineEstimator(new_tracker(), lag, linear, start=poses[0])) for lag in (0.5, 60.0)
     )
-    sigma = np.sqrt(np.diag(long.covariances[-1]))[3:5]
-    assert (np.abs((short.newest - long.newest)[-1, :2, 3]) < 0.1 * sigma).all()
-    np.testing.assert_allclose(short.covariances[-1], long.covariances[-1], rtol=0.02, atol=1e-6)
+    sigma = np.sqrt(np.diag(P_long[-1]))[3:5]
+    assert (np.abs((short - long)[-1, :2, 3]) < 0.1 * sigma).all()
+    np.testing.assert_allclose(P_short[-1], P_long[-1], rtol=0.02, atol=1e-6)
 
 
-def test_landmarks_are_told_apart_and_leave_with_the_window():
-    frames, odometry, poses, _ = drive(n=30, parked=0, moving=0)
-    reported = worse(odometry, np.random.default_rng(2))
-    poles, seen = seen_poles(poses, np.random.default_rng(3))
-    estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS, start=poses[0])
-    online = estimate_online(frames, reported, estimator, seen)
-    graph = estimator._window._smoother.graph()
-    left = [graph.state(one.key) for one in graph.of(LANDMARK, None).values()]
-    assert 0 < len(left) < len(poles)
-    assert max(np.linalg.norm(poles - place, axis=1).min() for place in left) < 0.5
-    assert rms(online.newest, poses) < rms(reported.path(poses[0]), poses) / 3
-
-
-def test_every_moment_settles_once_and_the_window_holds_the_lag():
+def test_the_window_holds_the_lag():
     frames, odometry, poses, _ = drive(n=9)
-    estimator, times = OnlineEstimator(new_tracker(), 0.6, SETTINGS, start=poses[0]), []
+    estimator = OnlineEstimator(new_tracker(), 0.6, SETTINGS, start=poses[0])
     for k, frame in enumerate(frames):
         step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
-        assert step.newest.timestamps.tolist() == [frame.timestamp]
-        if step.settled is not None:
-            times += step.settled.timestamps.tolist()
+        assert step.timestamps.tolist() == [frame.timestamp]
         assert frame.timestamp - estimator.window().timestamps[0] < 0.6 + 0.2 + 1e-9
-    times += estimator.window().timestamps.tolist()
-    np.testing.assert_allclose(times, [frame.timestamp for frame in frames])
     assert estimator.window().object_covariances(0).shape[1:] == (4, 4)
 
 
@@ -315,12 +299,10 @@ def test_what_cannot_be_is_refused():
     estimator = OnlineEstimator(new_tracker(), 1.0)
     with pytest.raises(InputError, match="expected a frame before"):
         estimator.window()
-    frames, odometry, _, _ = drive(n=3)
+    frames, *_ = drive(n=3)
     estimator.step(frames[1])
     with pytest.raises(InputError, match="expected one after"):
         estimator.step(frames[0], np.eye(4))
-    with pytest.raises(InputError, match="expected observations at 3 times, got 1"):
-        estimate_online(frames, odometry, OnlineEstimator(new_tracker(), 1.0), [()])
 
 
 def test_a_motion_that_is_none_does_not_reach_the_graph(subtests):
@@ -401,10 +383,10 @@ def test_a_wrong_association_does_not_bend_the_path():
     assert off[1] < off[0] + 0.1
     seen = [now.seen.probability for now in wrong._record]
     assert all((p[:2] < 0.1).all() for p in seen[10:15])
-    online = OnlineEstimator(confused(), 3.0, SETTINGS, start=poses[0])
+    estimator = OnlineEstimator(confused(), 3.0, SETTINGS, start=poses[0])
     for k, frame in enumerate(frames):
-        step = online.step(frame, odometry.a_T_b[k - 1] if k else None)
-    assert np.linalg.norm((step.newest.world_T_ego[-1] - poses[-1])[:2, 3]) < off[0] + 0.3
+        step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
+    assert np.linalg.norm((step.world_T_ego[-1] - poses[-1])[:2, 3]) < off[0] + 0.3
 
 
 def test_objects_say_how_probably_they_are_stationary():
@@ -413,9 +395,9 @@ def test_objects_say_how_probably_they_are_stationary():
     middle = estimate.objects[len(poses) // 2]
     nearest = np.linalg.norm(middle.position[:, None] - cars[len(poses) // 2][None], axis=2).argmin(axis=1)
     np.testing.assert_array_equal(middle.stationary > 0.5, nearest < 6)
-    online = OnlineEstimator(new_tracker(), 3.0, SETTINGS, start=poses[0])
+    estimator = OnlineEstimator(new_tracker(), 3.0, SETTINGS, start=poses[0])
     for k, frame in enumerate(frames):
-        last = online.step(frame, odometry.a_T_b[k - 1] if k else None).newest.objects[-1]
+        last = estimator.step(frame, odometry.a_T_b[k - 1] if k else None).objects[-1]
     assert (last.stationary > 0.5).sum() >= 3
     assert (last.stationary[np.hypot(*last.velocity.T) > 3] < 0.1).all()
 
