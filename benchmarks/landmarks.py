@@ -21,7 +21,6 @@ from benchmarks.recordings.ranges import compared, map_beacons
 from benchmarks.runner import Rows, each
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, check_writable_folder, write_bytes
-from data_tools.lidar import write_cloud
 from data_tools.plots import paths_from_above, png
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
 from pipelines.slam.results import landmark_row, landmark_rows, planar_trajectory
@@ -107,7 +106,7 @@ def write_landmark_map(
     figures: Mapping[str, object],
     others: Mapping[str, FloatArray] | None = None,
 ) -> None:
-    """Write trajectory.tum, trajectory.kitti, landmarks.json, landmarks.ply, figures.json and above.png.
+    """Write trajectory.tum, trajectory.kitti, landmarks.json, figures.json and above.png.
 
     landmarks: rows of landmarks.json; others: further paths (n, 2 or 3) for the picture, by name
     """
@@ -117,7 +116,6 @@ def write_landmark_map(
         write_tum_poses(folder / "trajectory.tum", trajectory)
         write_kitti_poses(folder / "trajectory.kitti", trajectory)
         write_figures(folder / "landmarks.json", landmarks)
-        write_cloud(folder / "landmarks.ply", places)
         write_figures(folder / "figures.json", dict(figures))
         write_bytes(folder / "above.png", png(picture))
 

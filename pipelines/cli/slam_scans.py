@@ -166,8 +166,8 @@ def scans(
     (tracking or odometry), MulRan, HeLiPR, Newer College, Hilti or nuScenes.
 
     Writes the path (trajectory.txt with times.txt, trajectory.tum), those to compare it with (odometry.tum, online.tum,
-    reference.tum), covariances.csv, the points (map.ply; map/ for --map), the landmarks (landmarks.csv, landmarks.json,
-    landmarks.ply), the graph (graph.g2o, observations.csv), with --objects the objects in the world (tracks.csv), a
+    reference.tum), covariances.csv, the points (map.ply; map/ for --map), the landmarks (landmarks.csv,
+    landmarks.json), the graph (graph.g2o, observations.csv), with --objects the objects in the world (tracks.csv), a
     picture from above (above.png) and the errors against the recording's poses, if it has any (metrics.json).
 
     With --map it writes the path in the frame of that map (trajectory.txt with times.txt, trajectory.tum),

@@ -7,9 +7,10 @@ covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
 reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
 map/                        the points of each submap (PLY or PCD) and its place (`pipelines.slam.submaps`)
-graph.g2o, observations.csv keyframes, odometry, loops, landmarks: the whole graph (`pipelines.slam.saved_graph`)
+graph.g2o                   poses as estimated, the first one's prior, odometry and loops as in the solution
+observations.csv            keyframe, landmark, kind, value, covariance: all observations of landmarks of the map, value
+                            as the kind has it (a wall nx ny nz d, a pole x y z), the covariance as its upper triangle
 landmarks.json              each landmark; landmarks.csv: the same as a table, with shapes as WKT
-landmarks.ply               points along the poles and on the observed pieces of the walls
 tracks.csv                  objects, where there are any
 above.png                   map, paths, landmarks and the objects' tracks from above
 metrics.json                errors of the trajectories against the recording's own poses, the map's sharpness, scans
@@ -22,20 +23,22 @@ World coordinates are those of the recording (KITTI: x east, y north, z up, from
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from data_tools.figures import write_figures
-from data_tools.files.atomic_files import atomic_directory, write_bytes
+from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.lidar import scan_to_map_residual, write_cloud
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
+from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
-from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings
+from pipelines.slam.lidar_slam import START, LidarSlamResult, LidarSlamSettings
 from pipelines.slam.odometry import KeyframeClouds, OdometrySettings
 from pipelines.slam.results import (
     confirmed_paths,
@@ -44,27 +47,25 @@ from pipelines.slam.results import (
     write_covariances,
     write_objects,
 )
-from pipelines.slam.saved_graph import write_graph, write_landmark_table
 from pipelines.slam.scan_content import LINE, WALL
 from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.slam.pose_graph import PoseGraph, PosePriors
 from saga_fg.types.landmark import Landmark
 
 # all that a run may write, also in a map of an earlier one: a folder holds the files of its last run
 LIDAR_FILES = (
     *("trajectory.txt", "times.txt", "trajectory.tum", "odometry.tum", "online.tum", "reference.tum"),
     *("map.ply", "map/submaps.csv", "map/origin.csv", "map/[0-9]*.ply", "map/[0-9]*.pcd"),
-    *("graph.g2o", "observations.csv", "landmarks.json", "landmarks.csv", "landmarks.ply"),
+    *("graph.g2o", "observations.csv", "landmarks.json", "landmarks.csv"),
     *("covariances.csv", "tracks.csv", "above.png", "metrics.json"),
 )
-HEIGHT = 3.0  # m above the first pose, to which poles and walls are drawn
 _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
 _MOVES, _TELLING = 1.0, 10.0  # m/s; m of way that tell where ahead is
 _ONE_WAY, _SIDEWAYS = 0.9, 20.0  # length of the mean direction; deg off the axis
 _log = logging.getLogger(__name__)
 _LINED = (WALL.name, LINE.name)
-POLE_COLOUR, WALL_COLOUR, LINE_COLOUR = (255, 127, 14), (214, 39, 40), (148, 103, 189)
 
 
 def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySettings | None = None) -> dict[str, Any]:
@@ -166,7 +167,8 @@ def write_lidar_slam(
         times = result.trajectory.timestamps[result.keyframes].tolist()
         write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
         if result.landmarks:
-            _write_landmarks(folder, result, lines)
+            write_figures(folder / "landmarks.json", landmark_rows(result.landmarks))
+            write_landmark_table(folder / "landmarks.csv", result.landmarks, lines)
         paths = {} if truth is None else {"reference": truth.positions}
         paths["trajectory"] = result.trajectory.positions
         if objects is not None:
@@ -184,26 +186,6 @@ def write_paths(folder: Path, trajectory: Trajectory, **others: Trajectory | Non
     for name, path in {"trajectory": trajectory, **others}.items():
         if path is not None:
             write_tum_poses(folder / f"{name}.tum", path)
-
-
-def _write_landmarks(folder: Path, result: LidarSlamResult, lines: Mapping[int, FloatArray]) -> None:
-    write_figures(folder / "landmarks.json", landmark_rows(result.landmarks))
-    write_landmark_table(folder / "landmarks.csv", result.landmarks, lines)
-    ground, kinds = float(result.world_T_lidar[0, 2, 3]), _by_kind(lines, result.landmarks)
-    poles, walls = np.arange(ground - 1.5, ground + HEIGHT, 0.1), np.arange(ground - 1.0, ground + HEIGHT, 0.4)
-    shapes = [(pole[None], poles, POLE_COLOUR) for pole in _poles(result.landmarks)]
-    shapes += [(_sampled(*ends), np.array([ground - 1.7]), LINE_COLOUR) for ends in kinds["road lines"]]
-    shapes += [(_sampled(*ends), walls, WALL_COLOUR) for ends in kinds["walls"]]
-    points, colours = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.uint8)]
-    for foot, z, colour in shapes:
-        points.append(np.column_stack([np.repeat(foot, len(z), axis=0), np.tile(z, len(foot))]))
-        colours.append(np.full((len(points[-1]), 3), colour, dtype=np.uint8))
-    write_cloud(folder / "landmarks.ply", np.concatenate(points), np.concatenate(colours))
-
-
-def _sampled(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Places (n, 2) from a to b, 0.2 m apart at most."""
-    return np.linspace(a, b, max(2, int(np.linalg.norm(b - a) / 0.2)))
 
 
 def _lines(result: LidarSlamResult) -> dict[int, FloatArray]:
@@ -249,3 +231,59 @@ def covered_spans(spans: Sequence[tuple[float, float]]) -> list[tuple[float, flo
         else:
             covered.append((low, high))
     return covered
+
+
+def pose_graph_of(result: LidarSlamResult) -> PoseGraph:
+    """Keyframes 0 .. M - 1 with the odometry between them and the loops; M > 1."""
+    odometry = result.motions(result.drive.keyframes)
+    pairs = [*pairwise(range(len(result.keyframes))), *((loop.first, loop.second) for loop in result.loops)]
+    measured = [*(T for T, _ in odometry), *(loop.first_T_second for loop in result.loops)]
+    covariances = np.array([*(P for _, P in odometry), *(loop.covariance for loop in result.loops)])
+    information = np.linalg.inv(covariances)
+    first, second = np.array(pairs, dtype=np.int64).T
+    return PoseGraph(
+        np.arange(len(result.keyframes), dtype=np.int64),
+        result.world_T_lidar,
+        first,
+        second,
+        np.array(measured),
+        (information + information.swapaxes(1, 2)) / 2,
+        priors=PosePriors(np.zeros(1, dtype=np.int64), result.drive.poses[0][None], np.linalg.inv(START)[None]),
+    )
+
+
+def write_landmark_table(path: Path, landmarks: Iterable[Landmark], pieces: Mapping[int, FloatArray]) -> None:
+    """Write number, kind, observations, standard deviations of the state, and the geometry as WKT, in x and y, m.
+
+    pieces: (n, 2, 2) ends of what was seen of walls and lines, by the number of the landmark; others are points
+    """
+    rows = ["number,kind,observations,deviations,geometry"]
+    for mark in landmarks:
+        deviations = " ".join(f"{x:.4g}" for x in np.sqrt(np.diag(mark.covariance)))
+        if mark.number in pieces:
+            lines = ", ".join(f"({', '.join(f'{x:.3f} {y:.3f}' for x, y in ends)})" for ends in pieces[mark.number])
+            shape = f"MULTILINESTRING ({lines})" if lines else "MULTILINESTRING EMPTY"
+        else:
+            place = mark.kind.coordinates(mark.state)
+            shape = f"POINT ({place['x']:.3f} {place['y']:.3f})" if "x" in place else "POINT EMPTY"
+        rows.append(f'{mark.number},{mark.kind.name},{mark.observations},{deviations},"{shape}"')
+    write_text(path, "\n".join(rows) + "\n")
+
+
+_OBSERVED = ("keyframe", "landmark", "kind", "value", "covariance")
+
+
+def write_graph(folder: Path, result: LidarSlamResult) -> None:
+    """Write graph.g2o and observations.csv to a folder that exists; a graph of one keyframe is none."""
+    if len(result.keyframes) < 2:
+        return
+    write_g2o(folder / "graph.g2o", pose_graph_of(result))
+    marks = {mark.number for mark in result.landmarks}
+    rows = [",".join(_OBSERVED)]
+    for one in result.observations:
+        if one.landmark in marks:
+            z, P = one.observation.value, one.observation.covariance
+            fields = (z, P[np.triu_indices(len(P))])
+            value, covariance = (" ".join(f"{x:.17g}" for x in field) for field in fields)
+            rows.append(f"{one.pose},{one.landmark},{one.observation.kind.name},{value},{covariance}")
+    write_text(folder / "observations.csv", "\n".join(rows) + "\n")

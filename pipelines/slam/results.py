@@ -4,7 +4,6 @@ All runs share the forms of these:
 
 *.tum             a path in the TUM format; trajectory.txt in KITTI's
 landmarks.json    each landmark: number, kind, coordinates (m), covariance of its tangent, number of observations
-landmarks.ply     landmarks for viewers of point clouds
 covariances.csv   of each pose: its name, then the upper triangle in the pose's own frame, rad and m: (x, y, heading) or
                   (rotation vector, translation)
 tracks.csv        a row for each object and moment: timestamp (s), id, class, x, y (m), vx, vy (m/s) in world

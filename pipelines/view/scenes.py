@@ -23,7 +23,7 @@ Results of `saga-fg slam scans` as drawings: paths, the map, landmarks with thei
 
     ROOT/trajectory, ROOT/odometry, ROOT/online   paths, those that are there
     ROOT/pose                                     a moving frame along the trajectory; ROOT/pose/body: the vehicle
-    ROOT/map, ROOT/landmarks                      points of map.ply and landmarks.ply
+    ROOT/map                                      points of map.ply
     ROOT/names                                    kind and number of landmarks with a place (planes have none)
 
 Metres, about `origin`.
@@ -251,13 +251,13 @@ MAP, LANDMARK = one_colour((130, 130, 130)), one_colour((240, 100, 40))
 
 @dataclass(frozen=True, eq=False)
 class SlamView:
-    """paths: trajectories by name; points: clouds (N, 3) of `map` and `landmarks`; names, places (M, 3) of landmarks.
+    """paths: trajectories by name; points: (N, 3) of the map, None without it; names, places (M, 3) of landmarks.
 
     A landmark known in the plane alone is at height 0.
     """
 
     paths: Mapping[str, Trajectory]
-    points: Mapping[str, FloatArray]
+    points: FloatArray | None
     names: tuple[str, ...]
     places: FloatArray
 
@@ -267,9 +267,9 @@ def read_slam_view(folder: Path) -> SlamView:
     if not (folder / "trajectory.tum").is_file():
         raise InputError(f"{folder}: expected trajectory.tum, as `saga-fg slam scans` writes")
     paths = {name: read_tum_poses(file) for name in PATHS if (file := folder / f"{name}.tum").is_file()}
-    clouds = {name: file for name in ("map", "landmarks") if (file := folder / f"{name}.ply").is_file()}
+    points = read_scan(file).points if (file := folder / "map.ply").is_file() else None
     names, places = _named(folder / "landmarks.json")
-    return SlamView(paths, {name: read_scan(file).points for name, file in clouds.items()}, names, places)
+    return SlamView(paths, points, names, places)
 
 
 def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> Iterator[Drawing]:
@@ -281,9 +281,8 @@ def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> It
     origin = trajectory.positions[0] if origin is None else origin
     for name, path in view.paths.items():
         yield Drawing(root, name, Lines([path.positions - origin], PATHS[name], np.array([0.08])))
-    for name, points in view.points.items():
-        radius, colour = (0.03, MAP) if name == "map" else (0.08, LANDMARK)
-        yield Drawing(root, name, Points(points - origin, colour, radius))
+    if view.points is not None:
+        yield Drawing(root, "map", Points(view.points - origin, MAP, 0.03))
     if view.names:
         yield Drawing(root, "names", Points(view.places - origin, LANDMARK, 0.15, view.names))
     body = Solids(np.zeros((1, 3)), np.array([VEHICLE]), np.zeros(1), PATHS["trajectory"])

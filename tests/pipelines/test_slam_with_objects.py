@@ -129,7 +129,7 @@ def test_the_command_with_and_without_scans(recordings: Path, tmp_path: Path, op
     assert figures["objects"] > 0
     assert (figures["scan_to_map_residual"] is None) == ("0004" in options)
     written = {file.name for file in (tmp_path / "run").iterdir()}
-    assert {"map", "map.ply", "landmarks.ply"}.isdisjoint(written) == ("0004" in options)
+    assert {"map", "map.ply", "landmarks.csv"}.isdisjoint(written) == ("0004" in options)
     assert (tmp_path / "run" / "tracks.csv").read_text().count("\n") > 10
 
 

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.datasets.nuscenes import NuScenes, nuscenes_scans
-from data_tools.lidar import Scan, write_cloud
+from data_tools.lidar import Scan
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.trajectories import Trajectory, write_tum_poses
 from pipelines.cli import app
@@ -123,7 +123,6 @@ def test_kitti_with_scans_and_a_map(tmp_path):
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 1.0
     write_tum_poses(slam / "trajectory.tum", Trajectory(np.array([0.0, 0.1]), poses))
-    write_cloud(slam / "landmarks.ply", np.array([[3.0, 4.0, 0.5]]))
     marks = [{"number": 2, "kind": "pole", "x": 3.0, "y": 4.0}, {"number": 3, "kind": "wall", "x": 0.0, "nx": 1.0}]
     (slam / "landmarks.json").write_text(json.dumps(marks))
     file = tmp_path / "k.rrd"
