@@ -20,7 +20,7 @@ from data_tools.pose_graphs import read_g2o
 from factors import PlanarPose, SpatialPose, Vector, residual_factor, solve
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import (
-    LandmarkObservations,
+    PointLandmarks,
     PoseGraph,
     chordal_poses,
     factor_graph,
@@ -73,9 +73,8 @@ def from_same_starts(graph: PoseGraph) -> list[FromStart]:
     factors, seen = factor_graph(graph), landmark_factors(graph)
     native = factor_graph(graph)
     if graph.landmarks is not None:
-        for observations in graph.landmarks.observations:
-            for factor in _native_factors(observations, len(graph)):
-                native.add(factor)
+        for factor in _native_factors(graph.landmarks, len(graph)):
+            native.add(factor)
     starts = {"guess": graph}
     if not graph.with_frame_as_pose().components().any():
         starts["chordal"] = placed(graph, chordal_poses(graph))
@@ -109,23 +108,13 @@ def _levenberg_marquardt() -> gtsam.LevenbergMarquardtParams:
     return params
 
 
-def _native_factors(seen: LandmarkObservations, poses: int) -> Iterator[gtsam.NonlinearFactor]:
-    """GTSAM's own factors where it has them, else callbacks."""
+def _native_factors(seen: PointLandmarks, poses: int) -> Iterator[gtsam.NonlinearFactor]:
+    """GTSAM has no factor of a point seen from a pose: callbacks."""
     variables = (PlanarPose() if seen.z.shape[1] < 3 else SpatialPose(), Vector(seen.z.shape[1]))
-    for pose_row, landmark, z, information in zip(
-        seen.pose.tolist(), seen.landmark.tolist(), seen.z, seen.information, strict=True
-    ):
-        keys = (pose_row, poses + landmark)
-        if seen.kind == "point":
-            covariance = np.linalg.inv(information)
-            residual = partial(_point_residual, z)
-            yield from residual_factor(keys, variables, residual, (covariance + covariance.T) / 2).custom_factors()
-        elif seen.kind == "bearing":
-            model = gtsam.noiseModel.Gaussian.Information(information)
-            yield gtsam.BearingFactor2D(*keys, gtsam.Rot2(z[0]), model)
-        else:  # GTSAM has the bearing first
-            model = gtsam.noiseModel.Gaussian.Information(np.ascontiguousarray(information[::-1, ::-1]))
-            yield gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(z[1]), z[0], model)
+    covariances = np.linalg.inv(seen.information)
+    for row, landmark, z, P in zip(seen.pose.tolist(), seen.landmark.tolist(), seen.z, covariances, strict=True):
+        residual = partial(_point_residual, z)
+        yield from residual_factor((row, poses + landmark), variables, residual, (P + P.T) / 2).custom_factors()
 
 
 def _point_residual(z: FloatArray, at: gtsam.Pose2 | gtsam.Pose3, point: FloatArray) -> FloatArray:

@@ -17,11 +17,10 @@ Records of the g2o format: their columns, and arrays of them.
     EDGE_PRIOR_SE2_XY pose x y I                         EDGE_SE3_XYZ_PRIOR pose offset x y z I
     VERTEX_XY id x y                                     VERTEX_TRACKXYZ id x y z
     EDGE_SE2_XY pose landmark x y I                      EDGE_SE3_TRACKXYZ pose landmark offset x y z I
-    EDGE_BEARING_SE2_XY pose landmark bearing I          PARAMS_SE3OFFSET id x y z qx qy qz qw
-    BR pose landmark bearing range sigma sigma           FIX id
+    FIX id                                               PARAMS_SE3OFFSET id x y z qx qy qz qw
 
-m and rad. I is the upper triangle of an information matrix, row by row, ordered as the values before it are. BR is
-GTSAM's, with standard deviations of bearing and range. EDGE_SE2_PRIOR is another spelling of EDGE_PRIOR_SE2.
+m and rad. I is the upper triangle of an information matrix, row by row, ordered as the values before it are.
+EDGE_SE2_PRIOR is another spelling of EDGE_PRIOR_SE2.
 """
 
 from __future__ import annotations
@@ -41,8 +40,6 @@ from saga_fg.numerics import geometry
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import adjoint, quaternion_norms, quaternion_rotation, rotation_quaternion
 from saga_fg.slam.pose_graph import (
-    LandmarkObservations,
-    ObservationKind,
     PointLandmarks,
     PoseGraph,
     PosePriors,
@@ -52,18 +49,17 @@ from saga_fg.types.boxes import MAX_POSITION
 
 _UNIT = 1e-3  # what the norm of a quaternion may be off 1
 _SLIGHT = 1e-4  # share of the largest eigenvalue by which the smallest may be negative: four digits are rounded so
-_LEAST_SIGMA = 1e-7  # m and rad; the information is then below the largest number
 _LEAST = 1e-9  # share of the largest eigenvalue that it is then raised to
 
 
 @dataclass(frozen=True)
 class Record:
-    """Columns of a record in `dim` dimensions: ids, values, and their information matrix or standard deviations."""
+    """Columns of a record in `dim` dimensions: ids, values, and their information matrix if it has one."""
 
     dim: int
     ids: tuple[str, ...]
     values: tuple[str, ...]
-    weight: str = ""  # "information", "sigmas" or none
+    weighed: bool = False
 
     @property
     def order(self) -> int:
@@ -74,7 +70,7 @@ class Record:
     def columns(self) -> int:
         """Number of values on a line."""
         k = self.order
-        return len(self.ids) + len(self.values) + {"": 0, "information": k * (k + 1) // 2, "sigmas": k}[self.weight]
+        return len(self.ids) + len(self.values) + self.weighed * k * (k + 1) // 2
 
 
 _SE2 = ("x", "y", "heading")
@@ -82,19 +78,17 @@ _SE3 = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _OBSERVED_VERTICES = ("pose", "landmark")
 RECORDS = {
     "VERTEX_SE2": Record(2, ("id",), _SE2),
-    "EDGE_SE2": Record(2, ("first", "second"), _SE2, "information"),
+    "EDGE_SE2": Record(2, ("first", "second"), _SE2, True),
     "VERTEX_SE3:QUAT": Record(3, ("id",), _SE3),
-    "EDGE_SE3:QUAT": Record(3, ("first", "second"), _SE3, "information"),
-    "EDGE_PRIOR_SE2": Record(2, ("pose",), _SE2, "information"),
-    "EDGE_SE3_PRIOR": Record(3, ("pose", "offset"), _SE3, "information"),
-    "EDGE_PRIOR_SE2_XY": Record(2, ("pose",), _SE2[:2], "information"),
-    "EDGE_SE3_XYZ_PRIOR": Record(3, ("pose", "offset"), _SE3[:3], "information"),
+    "EDGE_SE3:QUAT": Record(3, ("first", "second"), _SE3, True),
+    "EDGE_PRIOR_SE2": Record(2, ("pose",), _SE2, True),
+    "EDGE_SE3_PRIOR": Record(3, ("pose", "offset"), _SE3, True),
+    "EDGE_PRIOR_SE2_XY": Record(2, ("pose",), _SE2[:2], True),
+    "EDGE_SE3_XYZ_PRIOR": Record(3, ("pose", "offset"), _SE3[:3], True),
     "VERTEX_XY": Record(2, ("id",), _SE2[:2]),
     "VERTEX_TRACKXYZ": Record(3, ("id",), _SE3[:3]),
-    "EDGE_SE2_XY": Record(2, _OBSERVED_VERTICES, _SE2[:2], "information"),
-    "EDGE_BEARING_SE2_XY": Record(2, _OBSERVED_VERTICES, ("bearing",), "information"),
-    "BR": Record(2, _OBSERVED_VERTICES, ("bearing", "range"), "sigmas"),
-    "EDGE_SE3_TRACKXYZ": Record(3, (*_OBSERVED_VERTICES, "offset"), _SE3[:3], "information"),
+    "EDGE_SE2_XY": Record(2, _OBSERVED_VERTICES, _SE2[:2], True),
+    "EDGE_SE3_TRACKXYZ": Record(3, (*_OBSERVED_VERTICES, "offset"), _SE3[:3], True),
     "PARAMS_SE3OFFSET": Record(3, ("id",), _SE3),
 }
 _SPELLED = {"EDGE_SE2_PRIOR": "EDGE_PRIOR_SE2"}
@@ -129,7 +123,7 @@ def read_records(file: Path) -> tuple[dict[str, TextTable], list[int]]:
 def record_values(table: TextTable, record: Record) -> FloatArray:
     """The values (n, c) of a record."""
     start, names = len(record.ids), record.values
-    largest = tuple(MAX_POSITION if name in ("x", "y", "z", "range") else LARGEST for name in names)
+    largest = tuple(MAX_POSITION if name in ("x", "y", "z") else LARGEST for name in names)
     return table.numbers(slice(start, start + len(names)), names, largest)
 
 
@@ -153,13 +147,6 @@ def transforms(table: TextTable, record: Record) -> FloatArray:
 def information(table: TextTable, record: Record) -> FloatArray:
     """Information matrices (n, k, k) of a record, ordered as in the file; nearly definite ones are projected."""
     k, start = record.order, len(record.ids) + len(record.values)
-    if record.weight == "sigmas":
-        names = tuple(f"sigma of the {name}" for name in record.values)
-        sigmas = table.numbers(slice(start, start + k), names)
-        if (small := (sigmas < _LEAST_SIGMA).any(axis=1)).any():
-            row, least = int(np.argmax(small)), float(sigmas[small][0].min())
-            raise table.fault(row, f"expected standard deviations of at least {_LEAST_SIGMA:g}, got {least:g}")
-        return np.asarray(np.eye(k) / sigmas[:, None] ** 2)
     upper = np.triu_indices(k)
     names = tuple(f"I{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))
     entries = table.numbers(slice(start, start + len(names)), names)
@@ -192,12 +179,7 @@ _EDGE = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 _PRIOR = {2: "EDGE_PRIOR_SE2", 3: "EDGE_SE3_PRIOR"}
 _PLACE = {2: "EDGE_PRIOR_SE2_XY", 3: "EDGE_SE3_XYZ_PRIOR"}
 _LANDMARK = {2: "VERTEX_XY", 3: "VERTEX_TRACKXYZ"}
-_OBSERVED: dict[str, ObservationKind] = {
-    "EDGE_SE2_XY": "point",
-    "EDGE_BEARING_SE2_XY": "bearing",
-    "BR": "range bearing",
-    "EDGE_SE3_TRACKXYZ": "point",
-}
+_OBSERVED = {2: "EDGE_SE2_XY", 3: "EDGE_SE3_TRACKXYZ"}
 _TANGENT = {2: [0, 1, 2], 3: [3, 4, 5, 0, 1, 2]}  # where each entry of our tangent is found in the file's
 _OFFSET, _LARGEST_ID = "PARAMS_SE3OFFSET", 2**63 - 1
 log = logging.getLogger(__name__)
@@ -280,45 +262,28 @@ def _places(tables: Tables, d: int, ids: IntArray) -> PositionPriors | None:
 
 def _landmarks(tables: Tables, graph: PoseGraph, guessed: bool) -> PointLandmarks | None:
     """The landmarks; their places are those of the file if all of them and the poses are in it."""
-    d, tag = graph.dim, _LANDMARK[graph.dim]
-    observed = {tag: tables[tag] for tag in _OBSERVED if tag in tables}
-    named = {tag: table.integers(1, "landmark", 0, _LARGEST_ID) for tag, table in observed.items()}
-    if not named:
+    d, tag = graph.dim, _OBSERVED[graph.dim]
+    if tag not in tables:
         return None
-    ids = np.unique(np.concatenate(list(named.values())))
-    places = None
-    if tag in tables:
-        vertices = tables[tag]
-        given, order = _unique_ids(vertices)
-        for kind, table in observed.items():
-            _rows(table, named[kind], "landmark", given)
+    table, position = tables[tag], None
+    named = table.integers(1, "landmark", 0, _LARGEST_ID)
+    ids, landmark = np.unique(named, return_inverse=True)
+    if (vertex := _LANDMARK[d]) in tables:
+        given, order = _unique_ids(tables[vertex])
+        _rows(table, named, "landmark", given)
         if guessed:
-            kept = np.searchsorted(given, ids)
-            places = record_values(vertices, RECORDS[tag])[order][kept]
-    for kind, table in observed.items():
-        both = np.isin(named[kind], graph.ids)
-        if both.any():
-            row = int(np.argmax(both))
-            raise table.fault(row, f"landmark: {named[kind][row]} is a pose")
-    observations = tuple(_observations(tables, kind, table, graph.ids, ids) for kind, table in observed.items())
-    return PointLandmarks(ids, observations, np.full((len(ids), d), np.nan) if places is None else places)
-
-
-def _observations(
-    tables: Tables, tag: str, table: TextTable, poses: IntArray, landmarks: IntArray
-) -> LandmarkObservations:
-    pose = _rows(table, table.integers(0, "pose", 0, _LARGEST_ID), "pose", poses)
-    landmark = np.searchsorted(landmarks, table.integers(1, "landmark", 0, _LARGEST_ID))
+            position = record_values(tables[vertex], RECORDS[vertex])[order][np.searchsorted(given, ids)]
+    if (both := np.isin(named, graph.ids)).any():
+        row = int(np.argmax(both))
+        raise table.fault(row, f"landmark: {named[row]} is a pose")
+    pose = _rows(table, table.integers(0, "pose", 0, _LARGEST_ID), "pose", graph.ids)
     z, weights = record_values(table, RECORDS[tag]), information(table, RECORDS[tag])
-    if tag == "BR":
-        if (z[:, 1] <= 0).any():
-            raise table.fault(int(np.argmax(z[:, 1] <= 0)), "range: expected a number > 0")
-        z, weights = z[:, ::-1], weights[:, ::-1, ::-1]
-    if tag == "EDGE_SE3_TRACKXYZ":
+    if d == 3:
         T = _offsets(tables, table, 2)
         R = T[:, :3, :3]
         z, weights = (R @ z[:, :, None])[:, :, 0] + T[:, :3, 3], R @ weights @ R.swapaxes(1, 2)
-    return LandmarkObservations(_OBSERVED[tag], pose, landmark.astype(np.int64), z, weights)
+    position = np.full((len(ids), d), np.nan) if position is None else position
+    return PointLandmarks(ids, position, pose, landmark.astype(np.int64), z, weights)
 
 
 def _offsets(tables: Tables, table: TextTable, column: int) -> FloatArray:
@@ -358,25 +323,10 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
         i, j = np.triu_indices(d)
         lines += _lines(_PLACE[d], pose, places.position, places.information[:, i, j])
     if marks is not None:
-        lines += [line for seen in marks.observations for line in _observation_lines(seen, names, marks.ids, d)]
+        seen = np.column_stack([names[marks.pose], marks.ids[marks.landmark], np.zeros_like(marks.pose)])[:, :d]
+        i, j = np.triu_indices(d)
+        lines += _lines(_OBSERVED[d], seen, marks.z, marks.information[:, i, j])
     write_text(path, "\n".join(lines) + "\n")
-
-
-def _observation_lines(seen: LandmarkObservations, poses: IntArray, landmarks: IntArray, d: int) -> list[str]:
-    ends = np.stack([poses[seen.pose], landmarks[seen.landmark]], axis=1)
-    if seen.kind == "range bearing":
-        correlated = np.flatnonzero(seen.information[:, 0, 1] != 0)
-        if len(correlated):
-            row = int(correlated[0])
-            named = f"pose {poses[seen.pose[row]]}, landmark {landmarks[seen.landmark[row]]}"
-            raise InputError(f"{named}: expected range and bearing of independent errors, BR has no room for others")
-        sigma = 1 / np.sqrt(np.diagonal(seen.information, axis1=1, axis2=2))
-        return _lines("BR", ends, seen.z[:, ::-1], sigma[:, ::-1])
-    tag = "EDGE_BEARING_SE2_XY" if seen.kind == "bearing" else "EDGE_SE2_XY" if d == 2 else "EDGE_SE3_TRACKXYZ"
-    if d == 3:
-        ends = np.column_stack([ends, np.zeros(len(ends), dtype=np.int64)])
-    i, j = np.triu_indices(seen.z.shape[1])
-    return _lines(tag, ends, seen.z, seen.information[:, i, j])
 
 
 def _lines(tag: str, ids: IntArray, values: FloatArray, weights: FloatArray) -> list[str]:

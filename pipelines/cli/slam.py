@@ -94,7 +94,7 @@ def g2o(
     count += sum(len(one.pose) for one in (graph.priors, graph.places) if one is not None)
     if graph.landmarks is not None:
         poses += f", {counted(len(graph.landmarks.ids), 'landmark')}"
-        count += sum(len(seen.pose) for seen in graph.landmarks.observations)
+        count += len(graph.landmarks.pose)
     typer.echo(
         f"{output}: {poses}, {counted(count, 'measurement')}, error {optimised.error:.6g} (at the start {guess:.6g})"
     )

@@ -4,8 +4,6 @@ from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import ChordalCost, chordal_poses, nearest_rotations
 from saga_fg.slam.pose_graph.consensus import Consensus, consensus
 from saga_fg.slam.pose_graph.graph import (
-    LandmarkObservations,
-    ObservationKind,
     PointLandmarks,
     PoseGraph,
     PosePriors,
@@ -25,8 +23,6 @@ __all__ = [
     "ChordalCost",
     "ChordalMinimum",
     "Consensus",
-    "LandmarkObservations",
-    "ObservationKind",
     "OptimisedPoses",
     "PointLandmarks",
     "PoseGraph",

@@ -220,10 +220,7 @@ class ChordalMinimum:
 
 
 def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
-    """The minimum of the chordal cost by the staircase; start: poses (N, d + 1, d + 1).
-
-    Raises `InputError` for landmarks seen by bearings.
-    """
+    """The minimum of the chordal cost by the staircase; start: poses (N, d + 1, d + 1)."""
     cost, d = ChordalCost.of(graph), graph.dim
     if graph.anchored:
         start = np.concatenate([start, np.eye(d + 1)[None]])

@@ -53,7 +53,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.slam.pose_graph.graph import PointLandmarks, PoseGraph
+from saga_fg.slam.pose_graph.graph import PoseGraph
 
 _FASTER = 15.0  # operations of a factorisation in the time of one of a product, from grids to loops
 _FLOOR = 1e-9  # of the largest diagonal entry of M, added to make it definite: rotations and positions are relative
@@ -85,7 +85,7 @@ class ChordalCost:
 
     @classmethod
     def of(cls, graph: PoseGraph) -> Self:
-        """The cost of all measurements of a graph. Raises `InputError` for landmarks seen by bearings."""
+        """The cost of all measurements of a graph."""
         graph = graph.with_frame_as_pose()
         d, (kappa, tau) = graph.dim, edge_weights(graph)
         T = graph.first_T_second
@@ -95,9 +95,9 @@ class ChordalCost:
         points = 0 if graph.landmarks is None else len(graph.landmarks.ids)
         M = block_diag([M, csc_array((points,) * 2)], format="csc") if points else M
         size, n = M.shape[0], len(graph)
-        if graph.landmarks is not None:
-            pose, landmark, z, W = _points_seen(graph.landmarks, d)
-            M = M + _point_form(size, d, pose, n * (d + 1) + landmark, z, W)
+        if (seen := graph.landmarks) is not None:
+            weight = d / np.trace(np.linalg.inv(seen.information), axis1=1, axis2=2)
+            M = M + _point_form(size, d, seen.pose, n * (d + 1) + seen.landmark, seen.z, weight)
         if (places := graph.places) is not None:
             frame = np.full(len(places.pose), n - 1)
             M = M + _point_form(size, d, frame, places.pose * (d + 1) + d, places.position, places.weight)
@@ -165,23 +165,6 @@ class ChordalCost:
     @cached_property
     def _solver(self) -> SuperLU:
         return factorised(self.M + _FLOOR * self.M.diagonal().max() * diags_array(np.ones(self.M.shape[0])))
-
-
-def _points_seen(landmarks: PointLandmarks, d: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Rows of the poses and of the landmarks (S,) of S observations, z (S, d), and their weights (S,)."""
-    for seen in landmarks.observations:
-        if seen.kind != "point":
-            name = int(landmarks.ids[seen.landmark[0]])
-            raise InputError(
-                f"landmark {name}: expected a point, seen by coordinates; the chordal cost knows no {seen.kind}"
-            )
-    pose, point = (
-        np.concatenate([getattr(seen, end) for seen in landmarks.observations]) for end in ("pose", "landmark")
-    )
-    z, information = (
-        np.concatenate([getattr(seen, name) for seen in landmarks.observations]) for name in ("z", "information")
-    )
-    return pose, point, z, d / np.trace(np.linalg.inv(information), axis1=1, axis2=2)
 
 
 def _point_form(size: int, d: int, pose: IntArray, column: IntArray, z: FloatArray, weight: FloatArray) -> csc_array:

@@ -7,27 +7,21 @@
 The tangent lies in the second pose's own frame, m and rad, ordered as in GTSAM: (x, y, heading) in the plane, (rotation
 vector, translation) in space.
 
-Points seen from the poses of a graph, and poses and places known from outside.
+Points seen from the poses of a graph, and poses and places known from outside. A landmark l is seen at
 
-    point           z = R^T (l - t) + v                     world_T_pose = (R, t), landmark l
-    bearing         z = direction of R^T (l - t) + v        in the plane
-    range bearing   z = (|| l - t ||, that direction) + v
+    z = R^T (l - t) + v,      world_T_pose = (R, t),       v of information Omega
 
-For given poses the places are the weighted least squares of
-
-    point   || R z + t - l ||^2_{R Omega R^T}        bearing   ( n . (l - t) )^2 Omega / rho^2,    n across the bearing
-
-with rho the distance found without it.
+and for given poses its place is the minimum of the sum of  || R z + t - l ||^2_{R Omega R^T}.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factors import Bearing, RangeBearing, ResidualFactors, relative_factors
+from factors import ResidualFactors, relative_factors
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import (
     BoolArray,
@@ -42,8 +36,7 @@ from saga_fg.numerics.arrays import (
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-ObservationKind = Literal["point", "bearing", "range bearing"]
-_FLAT = 1e-9  # ratio of eigenvalues below which bearings are parallel
+_FLAT = 1e-9  # of the largest coordinate, below which known places lie on one line
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,107 +90,50 @@ class PositionPriors:
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkObservations:
-    """kind; pose, landmark (n,): rows; z (n, m) in the frame of the pose, m and rad; information (n, m, m).
+class PointLandmarks:
+    """L points, and S observations of them.
+
+    ids             (L,) unique; position (L, d), m, NaN where there is no guess
+    pose, landmark  (S,) rows of an observation; z (S, d) in the frame of the pose, m; information (S, d, d)
 
     Raises `InputError` where these do not fit together.
     """
 
-    kind: ObservationKind
+    ids: IntArray
+    position: FloatArray
     pose: IntArray
     landmark: IntArray
     z: FloatArray
     information: FloatArray
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(ObservationKind):
-            raise InputError(f"kind: expected one of {', '.join(get_args(ObservationKind))}, got {self.kind!r}")
-        n = len(checked_rows("pose", self.pose))
-        checked_rows("landmark", self.landmark, n)
-        z = checked("z", self.z, (n, {"bearing": 1, "range bearing": 2}.get(self.kind)))
+        ids, n = checked_ids("ids", self.ids), len(checked_rows("pose", self.pose))
+        landmark = checked_rows("landmark", self.landmark, n)
+        if ((landmark < 0) | (landmark >= len(ids))).any():
+            raise InputError(f"landmark: expected rows of the {len(ids)} landmarks, from 0")
+        z = checked("z", self.z, (n, np.asarray(self.position).shape[-1]))
         checked_covariances("information", self.information, n, z.shape[1])
-
-    def factors(self, landmark_key: int) -> ResidualFactors:
-        """Factors of the keys of a graph: poses from 0, landmarks from `landmark_key`."""
-        keys = np.stack([self.pose, self.landmark + landmark_key], axis=1)
-        covariances = np.linalg.inv(self.information)
-        covariances = (covariances + covariances.swapaxes(1, 2)) / 2
-        if self.kind == "point":
-            return relative_factors(keys, self.z, covariances, self.z.shape[1], range(self.z.shape[1]))
-        model = Bearing(2) if self.kind == "bearing" else RangeBearing(2)
-        return relative_factors(keys, self.z, covariances, 2, model=model)
-
-    def normal_equations(self, world_T_pose: FloatArray, places: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        """H (n, d, d) and H l (n, d) of each observation; places (L, d): where the landmarks are about."""
-        d = world_T_pose.shape[-1] - 1
-        T = world_T_pose[self.pose]
-        R, t = T[:, :d, :d], T[:, :d, d]
-        if self.kind == "point":
-            H, local = self.information, self.z
-        else:
-            bearing = self.z[:, -1]
-            along = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-            across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-            if self.kind == "bearing":
-                rho = np.ones(len(t)) if places is None else np.linalg.norm(places[self.landmark] - t, axis=1)
-                local = np.zeros_like(t)
-                H = (
-                    self.information
-                    / np.maximum(rho, 1e-6)[:, None, None] ** 2
-                    * across[:, :, None]
-                    * across[:, None, :]
-                )
-            else:
-                local = self.z[:, :1] * along
-                J = np.stack([along, across / self.z[:, :1]], axis=1)
-                H = J.swapaxes(1, 2) @ self.information @ J
-        H = R @ H @ R.swapaxes(1, 2)
-        place = (R @ local[:, :, None])[:, :, 0] + t
-        return H, (H @ place[:, :, None])[:, :, 0]
-
-
-@dataclass(frozen=True, eq=False)
-class PointLandmarks:
-    """ids (L,) unique; observations; position (L, d), m, NaN where there is no guess."""
-
-    ids: IntArray
-    observations: tuple[LandmarkObservations, ...]
-    position: FloatArray
-
-    def __post_init__(self) -> None:
-        ids = checked_ids("ids", self.ids)
-        for seen in self.observations:
-            if ((seen.landmark < 0) | (seen.landmark >= len(ids))).any():
-                raise InputError(f"landmark: expected rows of the {len(ids)} landmarks, from 0")
 
     def at(self, position: FloatArray) -> PointLandmarks:
         """A copy with the landmarks at other places."""
         return replace(self, position=position)
 
+    def factors(self, landmark_key: int) -> ResidualFactors:
+        """Factors of the keys of a graph: poses from 0, landmarks from `landmark_key`."""
+        keys = np.stack([self.pose, self.landmark + landmark_key], axis=1)
+        covariances = np.linalg.inv(self.information)
+        dim = self.z.shape[1]
+        return relative_factors(keys, self.z, (covariances + covariances.swapaxes(1, 2)) / 2, dim, range(dim))
+
     def placed(self, world_T_pose: FloatArray) -> PointLandmarks:
-        """The landmarks where they are seen from these poses.
-
-        Raises `InputError` for one whose observations do not determine it, as a single bearing.
-        """
-        places = None
-        for _ in range(2):
-            places = self._solved(world_T_pose, places)
-        assert places is not None
-        return self.at(places)
-
-    def _solved(self, world_T_pose: FloatArray, places: FloatArray | None) -> FloatArray:
-        d = world_T_pose.shape[-1] - 1
-        H, b = np.zeros((len(self.ids), d, d)), np.zeros((len(self.ids), d))
-        for seen in self.observations:
-            each_H, each_b = seen.normal_equations(world_T_pose, places)
-            np.add.at(H, seen.landmark, each_H)
-            np.add.at(b, seen.landmark, each_b)
-        values = np.linalg.eigvalsh(H)
-        bad = values[:, 0] <= _FLAT * values[:, -1]
-        if bad.any():
-            name = int(self.ids[np.argmax(bad)])
-            raise InputError(f"landmark {name}: expected bearings that cross, or a range: its place is not determined")
-        return np.asarray(np.linalg.solve(H, b[:, :, None])[:, :, 0])
+        """The landmarks where they are seen from these poses (least squares)."""
+        d = self.z.shape[1]
+        R, t = world_T_pose[self.pose, :d, :d], world_T_pose[self.pose, :d, d:]
+        each = R @ self.information @ R.swapaxes(1, 2)
+        H, b = np.zeros((len(self.ids), d, d)), np.zeros((len(self.ids), d, 1))
+        np.add.at(H, self.landmark, each)
+        np.add.at(b, self.landmark, each @ (R @ self.z[:, :, None] + t))
+        return self.at(np.asarray(np.linalg.solve(H, b)[:, :, 0]))
 
 
 _ORTHONORMAL = 1e-6

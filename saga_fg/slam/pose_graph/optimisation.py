@@ -83,7 +83,7 @@ def optimise_poses(graph: PoseGraph, robust: Robust | None = None, certify: bool
     then are robust costs. certify: find the global minimum of the chordal cost too, and start from there as well; if it
     is proven, starts that are worse than where it leads are left out.
     Raises `InputError` for a graph that is not connected, or too badly conditioned, and, to be certified, for
-    landmarks seen by bearings and poses that landmarks alone connect.
+    poses that landmarks alone connect.
     """
     factors = factor_graph(graph, robust)
     starts, chordal = {"guess": graph}, None
@@ -117,7 +117,7 @@ def placed(graph: PoseGraph, world_T_pose: FloatArray) -> PoseGraph:
 
 def landmark_factors(graph: PoseGraph) -> list[ResidualFactors]:
     """Factors of the landmarks, whose keys follow those of the poses."""
-    return [] if graph.landmarks is None else [seen.factors(len(graph)) for seen in graph.landmarks.observations]
+    return [] if graph.landmarks is None else [graph.landmarks.factors(len(graph))]
 
 
 def graph_error(graph: PoseGraph, robust: Robust | None = None) -> float:

@@ -14,7 +14,6 @@ from data_tools.pose_graphs import read_g2o
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import (
-    LandmarkObservations,
     PointLandmarks,
     PoseGraph,
     PosePriors,
@@ -201,8 +200,8 @@ def test_priors_and_landmarks_take_part_and_are_kept():
     away[:2, 2] = [300.0, -40.0]
     pose, point = np.arange(0, 200, 10), np.zeros(20, dtype=np.int64)
     z = (np.linalg.inv(true[pose]) @ np.array([5.0, 6.0, 1.0]))[:, :2]
-    seen = LandmarkObservations("point", pose, point, z, np.tile(np.eye(2), (20, 1, 1)))
-    landmarks = PointLandmarks(np.array([999]), (seen,), np.array([[0.0, 0.0]]))
+    information = np.tile(np.eye(2), (20, 1, 1))
+    landmarks = PointLandmarks(np.array([999]), np.array([[0.0, 0.0]]), pose, point, z, information)
     priors = PosePriors(np.array([7, 150]), away @ true[[7, 150]], np.tile(100 * np.eye(3), (2, 1, 1)))
     spoilt = replace(with_false_loops(graph, 0.5, seed=3), priors=priors, landmarks=landmarks)
     agreed, edges = consensus(spoilt), len(graph.first)

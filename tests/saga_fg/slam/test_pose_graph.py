@@ -12,7 +12,6 @@ from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.pose_graph import (
     ChordalCost,
-    LandmarkObservations,
     PointLandmarks,
     PoseGraph,
     PosePriors,
@@ -207,16 +206,16 @@ def seen_from_outside(dim: int, noise: float, seed: int = 0) -> tuple[PoseGraph,
     R, t = true[pose, :dim, :dim], true[pose, :dim, dim]
     z = (R.swapaxes(1, 2) @ (points[landmark] - t)[:, :, None])[:, :, 0] + noise * rng.normal(size=(len(pose), dim))
     information = np.tile(np.diag(np.arange(1.0, dim + 1)), (len(pose), 1, 1))
-    seen = LandmarkObservations("point", pose, landmark, z, information)
     priors = PosePriors(np.array([3, 9]), true[[3, 9]], np.tile(100 * np.eye(k), (2, 1, 1)))
-    landmarks = PointLandmarks(1000 + np.arange(4), (seen,), np.full((4, dim), np.nan))
+    landmarks = PointLandmarks(1000 + np.arange(4), np.full((4, dim), np.nan), pose, landmark, z, information)
     return replace(graph, priors=priors).with_landmarks(landmarks), true, points
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_points_and_priors_are_part_of_the_cost(dim):
     graph, true, points = seen_from_outside(dim, noise=0.2)
-    (seen,) = graph.landmarks.observations  # type: ignore[union-attr]
+    seen = graph.landmarks
+    assert seen is not None
     T = true[seen.pose]
     off = points[seen.landmark] - T[:, :dim, dim] - (T[:, :dim, :dim] @ seen.z[:, :, None])[:, :, 0]
     tau = dim / np.trace(np.linalg.inv(seen.information), axis1=1, axis2=2)
@@ -237,16 +236,6 @@ def test_a_graph_with_points_and_priors_is_certified_in_the_frame_of_the_priors(
     for poses in (optimised.chordal.world_T_pose, chordal_poses(graph)):
         assert np.abs((poses - true)[:, :dim, dim]).max() < 0.5
     assert optimised.landmarks is not None
-
-
-def test_landmarks_seen_by_bearings_are_refused_by_name():
-    graph, _, _ = seen_from_outside(2, noise=0.0)
-    (seen,) = graph.landmarks.observations  # type: ignore[union-attr]
-    bearing = np.arctan2(seen.z[:, 1], seen.z[:, 0])[:, None]
-    seen = LandmarkObservations("bearing", seen.pose, seen.landmark, bearing, np.ones((len(bearing), 1, 1)))
-    other = graph.with_landmarks(replace(graph.landmarks, observations=(seen,)))  # type: ignore[type-var]
-    with pytest.raises(InputError, match=r"landmark 1000: expected a point.* the chordal cost knows no bearing"):
-        optimise_poses(other, certify=True)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
