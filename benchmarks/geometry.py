@@ -13,7 +13,7 @@ import typer
 from scipy.spatial import cKDTree
 
 from benchmarks.runner import Rows, in_turn
-from data_tools.datasets.kitti import KittiScans
+from data_tools.datasets.kitti import kitti_scans
 from data_tools.lidar import SurfelMap, extract_walls, register, segment_ground, voxel_downsample
 from data_tools.lidar.registration import surfels_of
 from data_tools.lidar.scan import clusters_from_above
@@ -52,7 +52,7 @@ def geometry(
     Example:
       python -m benchmarks geometry --dataroot data/kitti
     """
-    open3d, recorded, odometry = load_open3d(), KittiScans(dataroot, sequence), LidarOdometry()
+    open3d, recorded, odometry = load_open3d(), kitti_scans(dataroot, sequence), LidarOdometry()
     placed = [odometry.step(recorded[k], float(time)) for k, time in enumerate(recorded.timestamps)]
     cases, off = [], dict[str, list[float]](ours=[], theirs=[])
     for k in range(_BEFORE, len(placed), _EVERY):

@@ -33,7 +33,7 @@ from benchmarks.course import SimulatedCourse
 from benchmarks.landmark_mapper import LandmarkMapper
 from benchmarks.runner import Row, Rows, Seed, clocked, each, in_turn, timed
 from benchmarks.scans import ScannerSettings
-from data_tools.datasets.kitti import KittiScans
+from data_tools.datasets.kitti import kitti_scans
 from data_tools.lidar import Scan, constant_velocity, deskewed, scan_to_map_residual
 from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory, trajectory_errors
@@ -94,7 +94,7 @@ def slam(
     if sum(one is not None for one in (dataroot, landmarks, dense)) != 1:
         raise InputError("expected one of --dataroot, --landmarks and --dense")
     if dataroot is not None:
-        recorded = KittiScans(dataroot, sequence, most=scans)
+        recorded = kitti_scans(dataroot, sequence, most=scans)
         yield from odometry_rows(recorded, kiss)
         yield from all_in_rows(recorded)
     elif dense is not None:

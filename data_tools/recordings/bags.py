@@ -30,8 +30,8 @@ from data_tools.datasets.mcap.recording import SUFFIXES, LoggedMessage, Recordin
 from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.isolated_reading import isolated
 from data_tools.laser.carmen import LaserLog, padded
+from data_tools.lidar.recording import RecordingOptions, ScanRecording
 from data_tools.lidar.scan_files import Columns, scan_columns, scan_of_columns
-from data_tools.recordings.recording import RecordingOptions, ScanRecording
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.sensors import SensorName

@@ -19,17 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.kitti import KittiScans, KittiTracking
+from data_tools.datasets.kitti import KittiTracking, kitti_scans
 from data_tools.datasets.kitti.dataset import read_origin, read_transform
-from data_tools.datasets.nuscenes.dataset import file_below
-from data_tools.datasets.nuscenes.tables import read_scenes, read_table, rigid_transform, table_folder
+from data_tools.datasets.nuscenes.dataset import nuscenes_scans
+from data_tools.datasets.nuscenes.tables import read_table, table_folder
 from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.readers import read_lines
 from data_tools.files.readers import read_table as read_rows
+from data_tools.lidar.recording import RecordingOptions, ScanRecording
 from data_tools.lidar.scan import Scan
-from data_tools.lidar.scan_files import KITTI, NUSCENES, SUFFIXES, read_columns, read_records, scan_of_columns
+from data_tools.lidar.scan_files import KITTI, SUFFIXES, read_columns, read_records, scan_of_columns
 from data_tools.recordings.bags import is_bag, open_bag
-from data_tools.recordings.recording import RecordingOptions, ScanRecording
 from data_tools.sensor_logs import kitti_sensor_log
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg.errors import InputError
@@ -287,18 +287,11 @@ def kitti_tracking(source: Path, options: RecordingOptions) -> ScanRecording:
     blind = options.blind and not (root / "velodyne" / str(options.sequence)).is_dir()
     there = (root / "oxts").glob("*.txt") if blind else (root / "velodyne").glob("*")
     name = _one_of("sequence", options.sequence, (path.stem for path in there))
-    scans = KittiScans(source, name, options.timed, blind=blind)
-    records, files = root / "oxts" / f"{name}.txt", root / "velodyne" / name
-    return ScanRecording(
-        "kitti-tracking",
-        scans.timestamps,
-        scans.__getitem__,
-        lambda row: str(files / f"{scans.frames[row]:06d}.bin"),
-        scans.ego_T_lidar,
-        scans.world_T_ego,
-        read_origin(records),
-        lambda: kitti_sensor_log(records, ("imu", "wheels", "gps"), options.seed).tables,
-        blind=blind,
+    records = root / "oxts" / f"{name}.txt"
+    return replace(
+        kitti_scans(source, name, blind=blind),
+        origin=read_origin(records),
+        sensors=lambda: kitti_sensor_log(records, ("imu", "wheels", "gps"), options.seed).tables,
         objects=lambda folder: (
             KittiTracking(source, folder or source / "detections" / "pointrcnn", [name]).scene(name).frames
         ),
@@ -454,35 +447,10 @@ def nuscenes(source: Path, options: RecordingOptions) -> ScanRecording:
     """
     folder = table_folder(source, next(path.name for path in sorted(source.glob("v1.0-*")) if path.is_dir()))
     scene = _one_of("scene", options.sequence, (name for (name,) in read_table(folder, "scene", ("name",))))
-    samples = set(read_scenes(folder, [scene]).records[scene].tokens)
-    fields = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp")
-    rows = {
-        float(time) * 1e-6: (file_below(source, folder, sample, name), pose, mount)
-        for sample, pose, mount, name, time in read_table(folder, "sample_data", fields)
-        if sample in samples and "LIDAR_TOP" in str(name)
-    }
-    times = np.array(sorted(time for time, (path, _, _) in rows.items() if path.is_file()))
-    if not len(times):
-        raise InputError(
-            f"expected scans of LIDAR_TOP of {scene}, none of the {len(rows)} that the tables name is there"
-        )
-    files, poses, mounts = zip(*(rows[time] for time in times.tolist()), strict=True)
-
-    def transforms(table: str, wanted: Sequence[str]) -> FloatArray:
-        every = {token: place for token, *place in read_table(folder, table, ("token", "translation", "rotation"))}
-        with error_context(str(folder / f"{table}.json")):
-            if lacking := [token for token in wanted if token not in every]:
-                raise InputError(f"expected a record {lacking[0]}, there is none")
-            return np.array([rigid_transform(*every[token]) for token in wanted])
-
-    return _of_files(
-        "nuscenes",
-        files,
-        times,
-        lambda path: read_records(path, NUSCENES),
-        ego_T_lidar=transforms("calibrated_sensor", mounts[:1])[0],
-        world_T_ego=transforms("ego_pose", poses),
-    )
+    found = nuscenes_scans(source, folder, scene)
+    if found is None:
+        raise InputError(f"expected scans of LIDAR_TOP of {scene}, none of those that the tables name is there")
+    return found
 
 
 def _has(*patterns: str) -> Callable[[Path], bool]:

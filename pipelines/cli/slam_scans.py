@@ -11,9 +11,9 @@ import numpy as np
 import typer
 
 from data_tools.files.atomic_files import check_writable_folder
+from data_tools.lidar.recording import PERIOD
 from data_tools.lidar.scan import ScanSequence
 from data_tools.recordings import LAYOUTS, RecordingOptions, ScanRecording, open_recording
-from data_tools.recordings.recording import PERIOD
 from data_tools.sensor_logs import SensorLog
 from pipelines.cli.console import counted, progress_bar, working
 from pipelines.cli.options import Config, Verbose

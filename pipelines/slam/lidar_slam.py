@@ -24,8 +24,8 @@ from typing import Literal
 import numpy as np
 
 from data_tools.lidar import Scan, Submap, voxel_downsample
+from data_tools.lidar.recording import scan_context
 from data_tools.lidar.scan import ScanSequence, without_objects
-from data_tools.recordings.recording import scan_context
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.slam.loop_closures import ClosedSubmaps, LoopSettings, PlaceLoops, SubmapLoops

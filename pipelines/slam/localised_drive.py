@@ -19,9 +19,9 @@ import numpy as np
 
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes
+from data_tools.lidar.recording import scan_context
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
-from data_tools.recordings.recording import scan_context
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.lidar_results import LIDAR_FILES, reference, write_paths

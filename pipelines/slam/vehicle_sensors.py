@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
+from data_tools.lidar.recording import scan_context
 from data_tools.lidar.scan import ScanSequence
-from data_tools.recordings.recording import scan_context
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider

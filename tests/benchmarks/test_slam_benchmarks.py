@@ -15,7 +15,7 @@ from benchmarks.joint import batch_run, degraded_drive, degraded_odometry, joint
 from benchmarks.loops import odometry_of
 from benchmarks.scans import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, ranges, simulate_scan
 from benchmarks.slam import all_in_rows, odometry_rows
-from data_tools.datasets.kitti import KittiScans
+from data_tools.datasets.kitti import kitti_scans
 from data_tools.lidar import deskewed
 from data_tools.pose_graphs import write_g2o
 from data_tools.simulator import simulate_scene
@@ -280,7 +280,7 @@ def test_both_are_measured_on_the_same_scans():
 
 def test_the_command_on_recorded_scans(bench, recordings):
     kitti = recordings / "kitti"
-    assert len(KittiScans(kitti, "0000")) == 90
+    assert len(kitti_scans(kitti, "0000")) == 90
     rows = bench("slam --scans 20 --no-kiss", "--dataroot", str(kitti))
     assert [row["scans"] for row in rows if row.get("method") == "saga-fg"] == ["as recorded", "de-skewed"]
     assert any(row["table"] == "SLAM all in, CPU time" for row in rows)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.datasets.kitti import KittiScans
+from data_tools.datasets.kitti import kitti_scans
 from data_tools.kitti_objects import CameraBoxes, camera_boxes_to_world, world_boxes_to_camera
 from data_tools.sensor_logs import SensorLog, kitti_sensor_log, read_sensor_log
 from saga_fg import InputError
@@ -138,7 +138,7 @@ def test_a_log_is_fed_as_time_goes_on():
 
 def test_the_records_of_kitti(recordings):
     """Speeds and turn rates of the records agree with their poses."""
-    scans = KittiScans(recordings / "kitti", "0000", blind=True)
+    scans = kitti_scans(recordings / "kitti", "0000", blind=True)
     path = recordings / "kitti" / "training" / "oxts" / "0000.txt"
     log = kitti_sensor_log(path, ("gps", "imu", "wheels"), seed=0)
     driven = np.linalg.norm(np.diff(scans.world_T_ego[:, :3, 3], axis=0), axis=1) / 0.1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from data_tools.datasets.nuscenes import NuScenes, nuscenes_scans
+from data_tools.datasets.nuscenes import nuscenes_scans
 from data_tools.lidar import Scan
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.trajectories import Trajectory, write_tum_poses
@@ -150,19 +150,22 @@ def test_scans_of_nuscenes_are_found_where_their_files_are(tmp_path):
     content = tables()
     for row in content["calibrated_sensor"]:
         row |= {"translation": [0.9, 0.0, 1.8], "rotation": [1.0, 0.0, 0.0, 0.0]}
-    for row in content["sample_data"]:
-        row["filename"] = f"samples/LIDAR_TOP/{row['sample_token']}.pcd.bin"
+    for k, row in enumerate(content["sample_data"]):
+        folder, name = ("samples", row["sample_token"]) if row["is_key_frame"] else ("sweeps", row["token"])
+        channel = {"c-lidar": "LIDAR_TOP", "c-cam": "CAM_FRONT"}[row["calibrated_sensor_token"]]
+        row |= {"filename": f"{folder}/{channel}/{name}.pcd.bin", "timestamp": 10**15 + k}
     root = write_tables(tmp_path, content)
     (root / "samples" / "LIDAR_TOP").mkdir(parents=True)
     np.array([[1, 2, 3, 0.5, 7]], dtype="<f4").tofile(root / "samples" / "LIDAR_TOP" / "a1.pcd.bin")
-    (name, scans), = nuscenes_scans(NuScenes(root, VERSION, {}), root).items()  # fmt: skip
-    assert (name, len(scans)) == ("scene-0103", 1)
+    scans = nuscenes_scans(root, root / VERSION, "scene-0103")
+    assert scans is not None
+    assert len(scans) == 1
     assert scans[0].points.tolist() == [[1, 2, 3]]
     assert scans.world_T_ego[0, :3, 3].tolist() == [5, 0, 0]
     assert scans.ego_T_lidar[:3, 3].tolist() == [0.9, 0, 1.8]
-    content["sample_data"][0]["filename"] = "../../etc/passwd"
+    content["sample_data"][0]["filename"] = "../../LIDAR_TOP/passwd"
     with pytest.raises(InputError, match="expected a file below the dataroot"):
-        nuscenes_scans(NuScenes(write_tables(tmp_path, content), VERSION, {}), root)
+        nuscenes_scans(root, write_tables(tmp_path, content) / VERSION, "scene-0103")
 
 
 def test_broken_slam_results_are_refused(tmp_path):

@@ -1,13 +1,13 @@
-from .dataset import Calibration, KittiScans, KittiTracking, local_kitti, read_calibration, read_poses
+from .dataset import Calibration, KittiTracking, kitti_scans, local_kitti, read_calibration, read_poses
 from .labels import image_boxes, observation_angles, read_kitti_labels
 from .source import kitti_result_text, write_kitti_results
 
 __all__ = [
     "Calibration",
-    "KittiScans",
     "KittiTracking",
     "image_boxes",
     "kitti_result_text",
+    "kitti_scans",
     "local_kitti",
     "observation_angles",
     "read_calibration",

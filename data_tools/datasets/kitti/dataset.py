@@ -35,7 +35,7 @@ The LiDAR scans of a KITTI tracking sequence: velodyne/NNNN/KKKKKK.bin, one for 
 
 The Velodyne turns clockwise, ten times a second, and looks ahead when the cameras are triggered, which is the time of
 the frame. Its points carry no times; those of their azimuths are given here, for scans that are not compensated for the
-vehicle's motion. A copy of the dataset does not say whether its scans are: `timed=False` leaves the times out. Sources:
+vehicle's motion. A copy of the dataset does not say whether its scans are. Sources:
 Geiger et al., Vision meets robotics: the KITTI dataset, IJRR 2013; KISS-ICP, which takes azimuths for times as well.
 """
 
@@ -61,6 +61,7 @@ from data_tools.files.input_files import error_context, local_tree, unknown_name
 from data_tools.files.readers import TextTable, read_lines, read_table
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.lidar import Scan, azimuth_times
+from data_tools.lidar.recording import ScanRecording
 from data_tools.lidar.scan_files import KITTI, read_records
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -340,45 +341,36 @@ def local_kitti(
         yield KittiTracking(root, boxes, sequences, ground_truth)
 
 
-class KittiScans:
-    """The scans of a sequence, the first `most` or all of them, read one at a time; `timed`: with times of points.
+def kitti_scans(dataroot: str | Path, sequence: str, most: int | None = None, blind: bool = False) -> ScanRecording:
+    """The scans of a sequence, the first `most` or all of them, with times of points, and poses by GPS/IMU.
 
     With `blind` there is one for each GPS/IMU record, without any points, for what needs none.
-
-    frames         (K,) their frame numbers, in order; timestamps (K,) s
-    ego_T_lidar    (4, 4) place of the sensor on the vehicle
-    world_T_ego    (K, 4, 4) pose of the vehicle by GPS/IMU at each scan
-
     Raises `InputError` where there are none, and for a scan without a GPS/IMU record.
     """
+    root = Path(dataroot)
+    root = root / "training" if (root / "training").is_dir() else root
+    dataset = KittiTracking(dataroot, sequences=[sequence])
+    calibration, poses = dataset.calibration(sequence), dataset.scene(sequence).world_T_ego
+    folder, rows = root / "velodyne" / sequence, np.arange(len(poses))
+    if not blind:
+        rows = np.array([int(path.stem) for path in _files(folder, len(poses))])
+    rows = rows[:most]
 
-    def __init__(
-        self, dataroot: str | Path, sequence: str, timed: bool = True, most: int | None = None, blind: bool = False
-    ) -> None:
-        root = Path(dataroot)
-        root = root / "training" if (root / "training").is_dir() else root
-        dataset = KittiTracking(dataroot, sequences=[sequence])
-        calibration = dataset.calibration(sequence)
-        poses = dataset.scene(sequence).world_T_ego
-        self._files = () if blind else _files(root / "velodyne" / sequence, len(poses))[:most]
-        frames = range(len(poses))[:most] if blind else [int(path.stem) for path in self._files]
-        self.frames = np.array(frames, dtype=np.int64)
-        self.timestamps: FloatArray = self.frames.astype(np.float64) * FRAME_PERIOD
-        self.world_T_ego: FloatArray = poses[self.frames]
-        self.ego_T_lidar: FloatArray = inverse_transform(calibration.camera_T_imu) @ calibration.camera_T_velodyne
-        self._timed = timed
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, row: int) -> Scan:
-        if not self._files:
+    def read(row: int) -> Scan:
+        if blind:
             return Scan(np.empty((0, 3)), np.empty(0))
-        scan = read_records(self._files[row], KITTI)
-        return replace(scan, time=azimuth_times(scan.points, FRAME_PERIOD)) if self._timed else scan
+        scan = read_records(folder / f"{rows[row]:06d}.bin", KITTI)
+        return replace(scan, time=azimuth_times(scan.points, FRAME_PERIOD))
 
-    def __iter__(self) -> Iterator[Scan]:
-        return (self[row] for row in range(len(self)))
+    return ScanRecording(
+        "kitti-tracking",
+        np.asarray(rows * FRAME_PERIOD),
+        read,
+        lambda row: str(folder / f"{rows[row]:06d}.bin"),
+        inverse_transform(calibration.camera_T_imu) @ calibration.camera_T_velodyne,
+        poses[rows],
+        blind=blind,
+    )
 
 
 def _files(folder: Path, records: int) -> tuple[Path, ...]:

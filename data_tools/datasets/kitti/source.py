@@ -37,9 +37,9 @@ from data_tools.datasets.detection_files.tracks import merge_tables
 from data_tools.datasets.kitti.dataset import (
     FRAME_PERIOD,
     Calibration,
-    KittiScans,
     KittiTracking,
     kitti_images,
+    kitti_scans,
     local_kitti,
 )
 from data_tools.datasets.kitti.labels import (
@@ -458,7 +458,7 @@ class KittiSource(DatasetSource):
         root = root / "training" if (root / "training").is_dir() else root
         there = [name for name in scenes if (root / "velodyne" / name).is_dir()]
         return Surroundings(
-            scans=lambda: {name: KittiScans(root, name, timed=False) for name in there},
+            scans=lambda: {name: kitti_scans(root, name) for name in there},
             images=lambda: kitti_images(root, scenes),
         )
 

@@ -1,4 +1,4 @@
-from .dataset import NuScenes, NuScenesScans, nuscenes_scans
+from .dataset import NuScenes, nuscenes_scans
 from .results import (
     ResultMeta,
     merge_tracking_results,
@@ -14,7 +14,6 @@ __all__ = [
     "DETECTION_CLASSES",
     "TRACKING_CLASSES",
     "NuScenes",
-    "NuScenesScans",
     "ResultMeta",
     "ScoredScene",
     "merge_tracking_results",

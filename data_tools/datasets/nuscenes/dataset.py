@@ -21,8 +21,7 @@ Format: https://github.com/nutonomy/nuscenes-devkit/blob/master/docs/schema_nusc
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -42,7 +41,8 @@ from data_tools.datasets.nuscenes.tables import (
 from data_tools.datasets.source import AreaMap, Images, Kind, map_points
 from data_tools.files.input_files import error_context, read_bytes, unknown_name
 from data_tools.files.readers import parsed_json
-from data_tools.lidar import Scan, read_scan
+from data_tools.lidar.recording import ScanRecording
+from data_tools.lidar.scan_files import NUSCENES, read_records
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Annotations, Scene
@@ -141,53 +141,39 @@ class NuScenes:
                 )
 
 
-@dataclass(frozen=True, eq=False)
-class NuScenesScans:
-    """The K scans of a scene, read one at a time.
+def nuscenes_scans(dataroot: Path, folder: Path, scene: str, sweeps: bool = True) -> ScanRecording | None:
+    """The scans of a scene whose files are there, by the tables in `folder`; None without any.
 
-    timestamps   (K,) s; world_T_ego (K, 4, 4) poses of the vehicle at them
-    ego_T_lidar  (4, 4) place of the sensor on the vehicle
+    sweeps: those between keyframes as well. Raises `InputError` for broken tables, and for names of files outside the
+    dataroot.
     """
+    samples = set(read_scenes(folder, [scene]).records[scene].tokens)
+    fields = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp", "is_key_frame")
+    rows = {
+        float(time) * 1e-6: (file_below(dataroot, folder, sample, name), pose, mount)
+        for sample, pose, mount, name, time, key in read_table(folder, "sample_data", fields)
+        if sample in samples and LIDAR in str(name) and (sweeps or key)
+    }
+    times = np.array(sorted(time for time, (path, _, _) in rows.items() if path.is_file()))
+    if not len(times):
+        return None
+    files, poses, mounts = zip(*(rows[time] for time in times.tolist()), strict=True)
 
-    files: Sequence[Path]
-    timestamps: FloatArray
-    world_T_ego: FloatArray
-    ego_T_lidar: FloatArray
+    def transforms(table: str, wanted: Sequence[str]) -> FloatArray:
+        every = {token: place for token, *place in read_table(folder, table, ("token", "translation", "rotation"))}
+        with error_context(str(folder / f"{table}.json")):
+            if lacking := [token for token in wanted if token not in every]:
+                raise InputError(f"expected a record {lacking[0]}, there is none")
+            return np.array([rigid_transform(*every[token]) for token in wanted])
 
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def __getitem__(self, row: int) -> Scan:
-        return read_scan(self.files[row])
-
-    def __iter__(self) -> Iterator[Scan]:
-        return (self[row] for row in range(len(self)))
-
-
-def nuscenes_scans(dataset: NuScenes, dataroot: str | Path) -> dict[str, NuScenesScans]:
-    """The scans of the dataset's scenes, by name; scenes without any are left out.
-
-    Raises `InputError` for broken tables, and for names of files outside the dataroot.
-    """
-    wanted = {token for record in dataset.records.values() for token in record.tokens}
-    taken: dict[str, tuple[Path, str]] = {}
-    for sample, _, sensor, name in keyframes(dataset.folder, (LIDAR,), wanted, "filename"):
-        file = file_below(Path(dataroot), dataset.folder, sample, name)
-        if file.is_file():
-            taken[sample] = (file, sensor)
-    mounts = read_table(dataset.folder, "calibrated_sensor", ("token", "translation", "rotation"))
-    place_of = {token: place for token, *place in mounts}
-    scans = {}
-    for scene, record in dataset.records.items():
-        rows = [k for k, token in enumerate(record.tokens) if token in taken]
-        if not rows:
-            continue
-        sensor = taken[record.tokens[rows[0]]][1]
-        with error_context(f"{dataset.folder / 'calibrated_sensor.json'}: record {sensor}"):
-            ego_T_lidar = rigid_transform(*place_of[sensor])
-        files = [taken[record.tokens[k]][0] for k in rows]
-        scans[scene] = NuScenesScans(files, record.timestamps[rows], record.world_T_ego[np.array(rows)], ego_T_lidar)
-    return scans
+    return ScanRecording(
+        "nuscenes",
+        times,
+        lambda row: read_records(files[row], NUSCENES),
+        lambda row: str(files[row]),
+        transforms("calibrated_sensor", mounts[:1])[0],
+        transforms("ego_pose", poses),
+    )
 
 
 def file_below(dataroot: Path, folder: Path, sample: str, name: object) -> Path:

@@ -252,7 +252,7 @@ class NuScenesSource(DatasetSource):
             return Surroundings()
         root, tables = Path(self.dataroot), Path(self.dataroot) / self.version
         return Surroundings(
-            lambda: nuscenes_scans(NuScenes(self.dataroot, self.version, {}, scenes), self.dataroot),
+            lambda: {k: found for k in scenes if (found := nuscenes_scans(root, tables, k, False)) is not None},
             lambda: nuscenes_maps(root, tables, scenes),
             lambda: nuscenes_images(root, tables, scenes),
         )
