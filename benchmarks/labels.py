@@ -5,6 +5,7 @@ refined     `saga-fg smooth --tracks`; shuffled: after the identities of every f
             the boxes alone are left
 together    both methods' tracks refined to one result
 detections  labels from the detections that all of them had, by `saga-fg smooth`; tracked: by `saga-fg track`
+doubt       of these labels: how often what they say with a probability is so
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.annotator import Answers, judged
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, chosen_sets
 from benchmarks.runner import Data, Row, Rows, Seed, each
 from data_tools.datasets.given_tracks import sensor_names, with_tracks
@@ -45,7 +47,7 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
     """A row for each way to the labels."""
     runs: dict[str, dict[str, TrackedScene]] = {}
     online, offline = load_config(recordings.family), load_smooth_config(recordings.family)
-    rng = np.random.default_rng(seed)
+    rng, answers = np.random.default_rng(seed), Answers()
     for name in each(recordings.dataset.scenes, recordings.name):
         scene = recordings.scene(name)
         given: dict[str, SceneResult] = {}
@@ -55,7 +57,9 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
             coasting = np.concatenate([each.coasting for each in run.tracks])
             given[method] = SceneResult(scene, SceneBoxes.of_tracks(run.tracks), coasting=coasting)
         del given[GRAPH]
-        runs.setdefault("detections, labels", {})[name] = as_run(scene, smooth_scene(scene, offline).tracks)
+        made = smooth_scene(scene, offline)
+        answers.add(judged(scene, made.labels), made.labels)
+        runs.setdefault("detections, labels", {})[name] = as_run(scene, made.tracks)
         wanted = {f"{method}, refined": [result] for method, result in given.items()}
         wanted |= {f"{method}, shuffled": [shuffled(result, rng)] for method, result in given.items()}
         for variant, results in (wanted | {"together, refined": list(given.values())}).items():
@@ -65,6 +69,8 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
             runs.setdefault(variant, {})[name] = as_run(scene, labelled.tracks)
     for variant, found in sorted(runs.items()):
         yield f"{recordings.name}: {len(found)} scenes", {"labels": variant, **figures(recordings, found)}
+    for row in answers.rows():
+        yield f"{recordings.name}: doubt", row
 
 
 def as_run(scene: Scene, tracks: Sequence[Tracks]) -> TrackedScene:

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
-from data_tools.datasets.detection_files import write_label_table
+from data_tools.datasets.detection_files import write_label_table, write_review
 from data_tools.datasets.given_tracks import TrackedRecordings
 from data_tools.datasets.source import DatasetSource, Part, part_suffix
 from pipelines.config import Method, TrackConfig
@@ -162,7 +162,8 @@ class TrackTask:
 
 @dataclass(frozen=True)
 class SmoothTask:
-    """Label the scenes of a part: labels/NAME with a suffix .csv, .ndjson or .parquet, and what the dataset writes."""
+    """Label the scenes of a part: labels/NAME with a suffix .csv, .ndjson or .parquet, review/NAME.csv, and what
+    the dataset writes."""
 
     settings: SmoothConfig
     method: Method
@@ -182,6 +183,8 @@ class SmoothTask:
         labels = [part for run in runs for part in run.parts]
         (folder / "labels").mkdir()
         write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
+        (folder / "review").mkdir()
+        write_review(folder / "review" / f"{file_name(name)}.csv", {run.name: run.review for run in runs})
         recordings = dataset.recordings if isinstance(dataset, TrackedRecordings) else dataset
         self.source.written.write_labels(folder, recordings, labels, file_name(name))
         return asdict(LabelCounts.sum(run.counts for run in runs))

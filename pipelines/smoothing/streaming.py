@@ -19,7 +19,7 @@ from pipelines.config import Method
 from pipelines.smoothing.configuration import SmoothConfig
 from pipelines.tracking import Progress, one_thread, scene_with_frames
 from saga_fg.graph import FactorProvider
-from saga_fg.smoothing import ChunkSettings, LabelBuilder, LabelCounts, LabelModel, Labels, RecordingLabels
+from saga_fg.smoothing import ChunkSettings, LabelBuilder, LabelCounts, LabelModel, Labels, RecordingLabels, Review
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.track import Tracks
 
@@ -32,6 +32,7 @@ class SmoothedScene:
     """A recording that was smoothed.
 
     parts    its parts, and their labels; they may be read again and again
+    review   its objects, those first that are most worth a look
     counts   where its boxes come from
     frames   frames taken in
     seconds  time spent
@@ -39,6 +40,7 @@ class SmoothedScene:
 
     name: str
     parts: LabelledParts
+    review: Review
     counts: LabelCounts
     frames: int
     seconds: float
@@ -146,7 +148,8 @@ def _labelled(name: str, parts: Iterable[Scene], builder: LabelBuilder, progress
     begin = time.perf_counter()
     with one_thread():
         labels, counts = builder.finish(advance)
-    return SmoothedScene(name, _Spooled(name, labels), counts, frames, seconds + time.perf_counter() - begin)
+    seconds += time.perf_counter() - begin
+    return SmoothedScene(name, _Spooled(name, labels), labels.review(), counts, frames, seconds)
 
 
 @dataclass(frozen=True, eq=False)

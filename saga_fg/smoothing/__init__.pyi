@@ -21,16 +21,30 @@ from .boxes import (
     smooth_walks,
     weighted_medians,
 )
-from .labelling import RecordingLabels
+from .doubt import Review
 from .passes import smooth_known_objects
 from .recording import ChunkSettings, LabelBuilder, LabelModel
+from .recording_labels import RecordingLabels
 from .settings import (
     OfflineClass,
     SmoothingSettings,
 )
-from .states import LabelCounts, Labels, Lifespans, Quality, SmoothedEdges, Source, StateTable, lifespans_of, quality_of
+from .states import (
+    PROBABILITIES,
+    LabelCounts,
+    Labels,
+    Lifespans,
+    Probabilities,
+    Quality,
+    SmoothedEdges,
+    Source,
+    StateTable,
+    lifespans_of,
+    quality_of,
+)
 
 __all__ = [
+    "PROBABILITIES",
     "ChunkSettings",
     "Evidence",
     "EvidenceFrame",
@@ -42,8 +56,10 @@ __all__ = [
     "Lifespans",
     "ObjectMotion",
     "OfflineClass",
+    "Probabilities",
     "Quality",
     "RecordingLabels",
+    "Review",
     "SmoothedEdges",
     "SmoothingSettings",
     "Source",

@@ -80,6 +80,7 @@ class Evidence:
     z_noise, yaw_noise (N,)   standard deviations, m and rad
     distance     (N,)         from the vehicle, m; NaN where its place is unknown
     confused     classes that the sensors confuse; class_likelihood (N, C) of each detection in them
+    corrected    (N,)         boxes that a person gave
     """
 
     times: FloatArray
@@ -95,6 +96,7 @@ class Evidence:
     distance: FloatArray
     confused: ConfusedClasses
     class_likelihood: FloatArray
+    corrected: BoolArray
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -166,6 +168,7 @@ def gather_evidence(
         distance=np.hypot(*(boxes.position[:, :2] - np.reshape(places, (-1, 2))[number]).T),
         confused=confused,
         class_likelihood=column("class_likelihood", len(confused)),
+        corrected=np.zeros(len(boxes), dtype=np.bool_),
     )
 
 

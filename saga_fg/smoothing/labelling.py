@@ -11,27 +11,25 @@ of the tracklet that reaches furthest towards the chunk, so that an object's nam
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
-from typing import Any, Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.boxes import (
     Headings,
-    is_reversed,
+    constant_sizes,
     scalar_readings,
     smooth_headings,
     smooth_walks,
     weighted_medians,
 )
+from saga_fg.smoothing.doubt import step_doubt
 from saga_fg.smoothing.passes import SmoothedObjects
 from saga_fg.smoothing.settings import OfflineClass, SmoothingSettings
-from saga_fg.smoothing.states import Labels, StateTable, quality_of
+from saga_fg.smoothing.states import Labels, Probabilities, StateTable, quality_of
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 from saga_fg.types.track import Tracks
@@ -58,21 +56,27 @@ class LabelColumns(Columns):
     coasting: FloatArray
     source: StrArray
 
-    def labels(self, time: float, size: FloatArray, score: FloatArray) -> Labels:
-        """All rows as the labels of one moment, at `time` s; size (R, 3), m, and score (R,) of their objects."""
+    def labels(self, time: float, size: FloatArray, score: FloatArray, probability: Probabilities) -> Labels:
+        """All rows as the labels of one moment, at `time` s; of their objects size (R, 3), m, score (R,) and doubt."""
         boxes = Boxes(self.label, self.position, size, self.yaw, self.velocity)
         P, P_velocity = self.position_covariance, self.velocity_covariance
         tracks = Tracks(time, self.id, boxes, score, P, P_velocity, self.coasting)
-        return Labels(tracks, self.yaw_variance, self.source, quality_of(score, P))
+        return Labels(tracks, self.yaw_variance, self.source, quality_of(score, P), probability)
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledStates:
-    """R smoothed states, their headings, and their labels as columns."""
+    """R smoothed states, their headings, and their labels as columns.
+
+    log_step  log P that the detections before a state and at it are of one object, 0 without one
+    rival     whether a better object of another class is at the same place
+    """
 
     states: StateTable
     headings: Headings
     columns: LabelColumns
+    log_step: FloatArray
+    rival: BoolArray
 
 
 def label_states(
@@ -105,7 +109,10 @@ def label_states(
         coasting=gap,
         source=_sources(evidence, objects, wanted),
     )
-    return LabelledStates(states, headings, columns)
+    mine, boxes = lifespans.rows_of(objects.object_of[rows]), evidence.boxes
+    size = constant_sizes(mine, len(lifespans), boxes.size[rows], evidence.probability[rows], evidence.distance[rows])
+    doubt = step_doubt(evidence, objects.object_of, lifespans, states, size[:, 0])
+    return LabelledStates(states, headings, columns, *doubt)
 
 
 def source_counts(source: StrArray) -> dict[str, int]:
@@ -162,6 +169,8 @@ class ObjectSummary:
     """One object so far: sums for the score and the front, and its sizes.
 
     yaw, sign  latest heading written, rad, and -1 where the latest headings are half a turn off those at its start
+    log_one    log P that it is one object all along; weakest: of its least certain step, and when that is, s
+    boxes, rivals  number of its labels, and of those at the place of a better object of another class
     sizes      lengths, widths and heights: of each, measured values, m, and their weights (2, m)
     """
 
@@ -172,6 +181,10 @@ class ObjectSummary:
     votes: float = 0.0
     yaw: float = np.nan
     sign: float = 1.0
+    log_one: float = 0.0
+    weakest: tuple[float, float] = (0.0, np.nan)
+    boxes: int = 0
+    rivals: int = 0
     sizes: list[FloatArray] = field(default_factory=lambda: [np.empty((2, 0))] * 3)
 
     def heading_sign(self, yaw: float) -> float:
@@ -200,6 +213,12 @@ class ObjectSummary:
         self.path += sign * path
         self.votes += sign * votes
         self.sign, self.yaw = sign, yaw
+
+    def add_steps(self, log_right: FloatArray, time: FloatArray) -> None:
+        """Add steps (m,) from a detection to the next, at s: log P that both are of the object."""
+        self.log_one += float(log_right.sum())
+        k = int(np.argmin(log_right))
+        self.weakest = min(self.weakest, (float(log_right[k]), float(time[k])))
 
     def close(self) -> None:
         """Keep the medians of the sizes alone, weighted by the number of detections."""
@@ -259,73 +278,3 @@ class Identities:
         """Tracklets from before a chunk, the latest first; then those that begin in it, the earliest first."""
         old = sorted((track for track in tracks if first[track] < begin), key=lambda track: -first[track])
         return old + sorted((track for track in tracks if first[track] >= begin), key=lambda track: first[track])
-
-
-class LabelParts(Protocol):
-    """Where the labels of a recording wait, chunk by chunk, as named arrays: a list, or files."""
-
-    def append(self, part: Mapping[str, Any], /) -> None:
-        """Add a chunk."""
-        ...
-
-    def __iter__(self) -> Iterator[Mapping[str, Any]]: ...
-
-
-class RecordingLabels:
-    """The labels of a recording, added chunk by chunk, and read back when it is over: iterating gives those of each
-    chunk, one table a moment."""
-
-    def __init__(self, parts: LabelParts) -> None:
-        self._parts = parts
-        self._id = np.empty(0, dtype=np.int64)  # of all objects, ascending; then their attributes
-        self._size, self._score, self._turned = np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.bool_)
-
-    def add(
-        self,
-        wanted: FloatArray,
-        at: IntArray,
-        labelled: LabelledStates,
-        names: Mapping[int, int],
-        signs: Mapping[int, float],
-    ) -> None:
-        """Add the labels at the times `wanted` (M,), s, which are the moments `at` (M,) of the states.
-
-        names: the final id of each object; signs: -1 where its headings are half a turn off those before, else 1
-        """
-        spans = [labelled.states.at(moment) for moment in at.tolist()]
-        rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(span.start, span.stop) for span in spans)])
-        ids = labelled.states.id[rows].tolist()
-        columns = replace(labelled.columns.select(rows), id=np.array([names[id_] for id_ in ids], dtype=np.int64))
-        self._parts.append(
-            {
-                "time": wanted,
-                "bounds": np.cumsum([0, *(span.stop - span.start for span in spans)]),
-                "reversed": np.array([signs[id_] < 0 for id_ in ids], dtype=np.bool_),
-                **vars(columns),
-            }
-        )
-
-    def finish(self, summaries: Mapping[int, ObjectSummary], prior: float) -> None:
-        """Take the final attributes of all objects.
-
-        prior: opportunities without a detection that every object starts with
-        """
-        ids = sorted(summaries)
-        found = [summaries[id_] for id_ in ids]
-        self._id, self._size = np.array(ids, dtype=np.int64), median_sizes(found)
-        self._score = np.array(
-            [each.probability / (max(each.opportunities, each.detections) + prior) for each in found]
-        )
-        self._turned = is_reversed(np.array([each.path for each in found]), np.array([each.votes for each in found]))
-
-    def __iter__(self) -> Iterator[tuple[Labels, ...]]:
-        for part in self._parts:
-            stored = dict(part)
-            times, bounds, backward = (stored.pop(name) for name in ("time", "bounds", "reversed"))
-            at = np.searchsorted(self._id, stored["id"])
-            turned = backward ^ self._turned[at]
-            yaw = np.where(turned, wrap_angle(stored["yaw"] + np.pi), stored["yaw"])
-            columns, size, score = LabelColumns(**{**stored, "yaw": yaw}), self._size[at], self._score[at]
-            rows = [slice(a, b) for a, b in pairwise(bounds.tolist())]
-            moments = zip(times.tolist(), rows, strict=True)
-            yield tuple(columns.select(mine).labels(time, size[mine], score[mine]) for time, mine in moments)

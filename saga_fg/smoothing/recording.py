@@ -35,14 +35,13 @@ from saga_fg.smoothing.boxes import size_weights
 from saga_fg.smoothing.labelling import (
     Identities,
     LabelledStates,
-    LabelParts,
     ObjectSummary,
-    RecordingLabels,
     dropped_boxes,
     label_states,
     source_counts,
 )
 from saga_fg.smoothing.passes import SmoothedObjects, smooth_objects, track_evidence
+from saga_fg.smoothing.recording_labels import LabelParts, RecordingLabels
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import LabelCounts
 from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings
@@ -281,6 +280,9 @@ class LabelBuilder:
             if id_ in names:
                 self._summaries[names[id_]].add_detections(total[id_], evidence.boxes.size[mine], weight[mine])
         frames = tuple(frame for frame in evidence.frames if inside[frame.moment])
+        states, log_step = chunk.labelled.states, chunk.labelled.log_step
+        for id_, mine in _by_id(states.id, np.flatnonzero(inside[states.moment] & (log_step < 0))):
+            self._summaries[names[id_]].add_steps(log_step[mine], evidence.times[states.moment[mine]])
         count = opportunities(replace(evidence, frames=frames), objects.lifespans, objects.judged)
         for id_, looked in zip(objects.lifespans.id.tolist(), count.tolist(), strict=True):
             if id_ in names:
@@ -308,6 +310,9 @@ class LabelBuilder:
                 if id_ in signs:
                     path, votes = float(headings.path[rows].sum()), float(headings.votes[rows].sum())
                     self._summaries[names[id_]].add_headings(signs[id_], float(headings.yaw[rows[-1]]), path, votes)
+            for id_, rows in _by_id(states.id, emitted):
+                self._summaries[names[id_]].boxes += len(rows)
+                self._summaries[names[id_]].rivals += int(labelled.rival[rows].sum())
             self._labels.add(wanted, at, labelled, names, signs)
         new = LabelCounts(
             **source_counts(labelled.columns.source[emitted]),

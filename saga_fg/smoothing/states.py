@@ -151,6 +151,25 @@ HIGH_DEVIATION = 0.3  # largest standard deviation of the position of a box of h
 MEDIUM_DEVIATION = 0.8  # likewise of a box of medium quality, m
 
 
+PROBABILITIES = ("p_exists", "p_class", "p_identity", "p_heading")
+"""Their names in tables."""
+
+
+@dataclass(frozen=True, eq=False)
+class Probabilities(Columns):
+    """Of N labels, or of objects, each (N,): that the object exists, that the class is right, that it is one object all
+    along, and that its heading is not turned round."""
+
+    exists: FloatArray
+    label: FloatArray
+    one: FloatArray
+    heading: FloatArray
+
+    def table_columns(self) -> dict[str, FloatArray]:
+        """The columns (N,) of a table, by name."""
+        return dict(zip(PROBABILITIES, (self.exists, self.label, self.one, self.heading), strict=True))
+
+
 @dataclass(frozen=True, eq=False)
 class Labels:
     """The boxes of one moment.
@@ -159,6 +178,7 @@ class Labels:
     yaw_variance (N,)  of the heading, rad^2; NaN where unknown
     source    (N,) observed, filled or extended
     quality   (N,) high, medium or low
+    probability  that the labels are right
 
     Raises `InputError` for columns of another length or other words.
     """
@@ -167,6 +187,7 @@ class Labels:
     yaw_variance: FloatArray
     source: StrArray
     quality: StrArray
+    probability: Probabilities
 
     def __post_init__(self) -> None:
         for name, words in (("source", get_args(Source)), ("quality", get_args(Quality))):
@@ -176,6 +197,8 @@ class Labels:
             object.__setattr__(self, name, column)
         if np.shape(self.yaw_variance) != (len(self.tracks),):
             raise InputError(f"yaw_variance: expected {len(self.tracks)} numbers")
+        if len(self.probability) != len(self.tracks):
+            raise InputError(f"probability: expected {len(self.tracks)} rows")
 
     def __len__(self) -> int:
         return len(self.tracks)

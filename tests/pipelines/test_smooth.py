@@ -40,12 +40,18 @@ def test_nuscenes_labels_are_complete(tmp_path):
     run = done(*arguments, "--detections", f"lidar={detections}", "-o", tmp_path / "labels")
     assert "observed" in run.output
     written = {path.name for path in (tmp_path / "labels").iterdir()}
-    assert written == {"labels.csv", "summary.json", "tracking.json", "v1.0-mini", "maps"}
+    assert written == {"labels.csv", "review.csv", "summary.json", "tracking.json", "v1.0-mini", "maps"}
     rows = read_tracks(tmp_path / "labels" / "labels.csv", labels=True)
     summary = json.loads((tmp_path / "labels" / "summary.json").read_text())["total"]
     assert len(rows.source) == summary["observed"] + summary["filled"] + summary["extended"] > 0
     annotations = json.loads((tmp_path / "labels" / "v1.0-mini" / "sample_annotation.json").read_text())
     assert len(annotations) == len(rows.source)
+    assert ((rows.probability >= 0) & (rows.probability <= 1)).all()
+    with (tmp_path / "labels" / "review.csv").open() as file:
+        review = list(csv.DictReader(file))
+    gains = [float(row["gain"]) for row in review]
+    assert {row["id"] for row in review} == set(rows.id.tolist())
+    assert gains == sorted(gains, reverse=True)
 
 
 def test_own_tables_become_labels_with_gaps_filled(tmp_path):

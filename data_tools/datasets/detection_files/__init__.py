@@ -67,6 +67,7 @@ from data_tools.datasets.detection_files.tracks import (
     read_predictions,
     read_tracks,
     write_label_table,
+    write_review,
     write_rows,
     write_tracks,
 )
@@ -87,6 +88,7 @@ __all__ = [
     "read_scenes_in_parts",
     "read_tracks",
     "write_label_table",
+    "write_review",
     "write_rows",
     "write_tracks",
 ]

@@ -53,7 +53,12 @@ TRACK_COLUMNS = (
     *("cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy", "coasting"),
 )
 SETTLED = "settled"  # 1 or 0, the last column of results
-LABEL_COLUMNS = (*TRACK_COLUMNS, "yaw_variance", "source", "quality")
+PROBABILITIES = ("p_exists", "p_class", "p_identity", "p_heading")
+LABEL_COLUMNS = (*TRACK_COLUMNS, "yaw_variance", "source", "quality", *PROBABILITIES)
+REVIEW_COLUMNS = (
+    *("scene", "gain", "why", "id", "label", "boxes", "timestamp", "x", "y"),
+    *(*PROBABILITIES, "boxes_far_off"),
+)
 LIMITS = {
     "timestamp": LATEST,
     **dict.fromkeys(("x", "y", "z", *POSE[:3], *ODOMETRY[:2], *GPS), MAX_POSITION),

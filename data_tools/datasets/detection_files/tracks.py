@@ -5,6 +5,7 @@ Tables of labels have the columns of tracks and
     yaw_variance   of the heading, rad^2
     source         observed, filled or extended
     quality        high, medium or low
+    p_exists, p_class, p_identity, p_heading  probabilities that the label is right
 
 Tables of true objects: a row per object and moment, with the columns of tracks and `visible`, 0 where hidden.
 
@@ -26,7 +27,7 @@ import csv
 import io
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain, islice
@@ -40,7 +41,9 @@ from data_tools.datasets.detection_files.column_names import TableImport
 from data_tools.datasets.detection_files.columns import (
     LABEL_COLUMNS,
     POSE,
+    PROBABILITIES,
     QUATERNION,
+    REVIEW_COLUMNS,
     ROTATIONS,
     SETTLED,
     TRACK_COLUMNS,
@@ -65,7 +68,7 @@ from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.track import PredictedTracks, Tracks
 
 if TYPE_CHECKING:
-    from saga_fg.smoothing import Labels
+    from saga_fg.smoothing import Labels, Review
 
 TEXTS = ("scene", "sensor", "label", "source", "quality")
 WHOLE = ("id", SETTLED)
@@ -96,10 +99,25 @@ def write_label_table(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[L
                 [value for labels in frames for value in getattr(labels, name).tolist()]
                 for name in ("yaw_variance", "source", "quality")
             ),
+            *(
+                [value for labels in frames for value in labels.probability.table_columns()[name].tolist()]
+                for name in PROBABILITIES
+            ),
         )
         for scene, frames in scenes
     )
     write_rows(path, LABEL_COLUMNS, chain.from_iterable(rows))
+
+
+def write_review(path: str | Path, reviews: Mapping[str, Review]) -> None:
+    """Write the objects of scenes by name, those first that are most worth a look; else as `write_tracks`."""
+    tables = {name: review.table_columns() for name, review in reviews.items()}
+    rows = [
+        [name, *row]
+        for name, table in tables.items()
+        for row in zip(*(c.tolist() for c in table.values()), strict=True)
+    ]
+    write_rows(path, REVIEW_COLUMNS, sorted(rows, key=lambda row: -row[1]))
 
 
 def _rows(path: str, scene: Scene, moments: Sequence[Tracks], *further: list[Any]) -> Iterator[list[Any]]:
@@ -178,7 +196,8 @@ class TrackRows(Columns):
 
     scene (N,), timestamp (N,) in s, id (N,), boxes in world coordinates, score (N,), position_covariance (N, 2, 2) in
     m^2, velocity_covariance (N, 2, 2) in (m/s)^2, coasting (N,) in s; of labels: yaw_variance (N,) in rad^2,
-    source (N,), quality (N,), "observed" and "low" where left out; named: whether the table names its scenes
+    source (N,), quality (N,), "observed" and "low" where left out, probability (N, 4)
+    by `PROBABILITIES`; named: whether the table names its scenes
     """
 
     scene: StrArray
@@ -192,6 +211,7 @@ class TrackRows(Columns):
     yaw_variance: FloatArray
     source: StrArray
     quality: StrArray
+    probability: FloatArray
     named: bool = True
 
     @classmethod
@@ -222,6 +242,7 @@ class TrackRows(Columns):
             yaw_variance=whole,
             source=np.full(n, "observed"),
             quality=np.full(n, "low"),
+            probability=np.full((n, 4), np.nan),
         )
 
 
@@ -262,6 +283,7 @@ def _track_rows(raw: RawTable) -> TrackRows:
         yaw_variance=raw.numbers("yaw_variance")[kept],
         source=raw.texts("source", "observed")[kept],
         quality=raw.texts("quality", "low")[kept],
+        probability=np.column_stack([raw.numbers(name) for name in PROBABILITIES])[kept],
         named="scene" in raw.columns,
     )
 

@@ -20,7 +20,7 @@ from data_tools.datasets.nuscenes.writer import write_nuscenes_labels
 from data_tools.datasets.source import input_files
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from saga_fg import Boxes, InputError, Scene, Tracks
-from saga_fg.smoothing import Labels
+from saga_fg.smoothing import Labels, Probabilities
 from saga_fg.types.dataset import Annotations
 
 
@@ -132,6 +132,10 @@ def test_tracks_that_cannot_be_written(tmp_path):
 # Labels as files, read back: tables of boxes, nuScenes tables, KITTI text
 
 
+def doubt(n: int) -> Probabilities:
+    return Probabilities(*np.tile([[0.9], [0.8], [0.7], [0.6]], n))
+
+
 def labels_at(time: float, ids: list[int], source: str = "observed") -> Labels:
     """Cars at x = id."""
     n = len(ids)
@@ -145,7 +149,7 @@ def labels_at(time: float, ids: list[int], source: str = "observed") -> Labels:
     )
     P = np.tile([[0.04, 0.01], [0.01, 0.09]], (n, 1, 1))
     tracks = Tracks(time, np.array(ids, dtype=np.int64), boxes, np.full(n, 0.7), P, 2 * P, np.zeros(n))
-    return Labels(tracks, np.full(n, np.nan), np.full(n, source), np.full(n, "medium"))
+    return Labels(tracks, np.full(n, np.nan), np.full(n, source), np.full(n, "medium"), doubt(n))
 
 
 def scene_of(times: list[float], tokens: tuple[str, ...] | None = None) -> Scene:
@@ -166,6 +170,7 @@ def test_a_table_of_labels_comes_back_as_it_was(tmp_path, suffix):
     assert rows.source.tolist() == ["observed", "observed", "filled", "extended", "extended"]
     assert set(rows.quality.tolist()) == {"medium"}
     assert np.isnan(rows.yaw_variance).all()
+    assert rows.probability[3].tolist() == [0.9, 0.8, 0.7, 0.6]
     assert np.array_equal(rows.position_covariance[0], LABELS[0].tracks.position_covariance[0])
 
 
@@ -184,7 +189,7 @@ def test_labels_of_another_length_or_other_words_are_refused(tmp_path):
     assert not (tmp_path / "labels.csv").exists()
     tracks = LABELS[0].tracks
     with pytest.raises(InputError, match="source: expected 2 of observed, filled, extended"):
-        Labels(tracks, np.zeros(2), np.array(["seen", "seen"]), np.array(["low", "low"]))
+        Labels(tracks, np.zeros(2), np.array(["seen", "seen"]), np.array(["low", "low"]), doubt(2))
 
 
 def test_nuscenes_tables_of_labels_are_read_as_a_dataset(tmp_path):
