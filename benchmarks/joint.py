@@ -34,7 +34,7 @@ from data_tools.simulator import SimulatorSettings, simulate_scene
 from data_tools.trajectories import Trajectory, TrajectoryErrors, trajectory_errors
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
-from pipelines.slam.joint import path_tracker
+from pipelines.slam.lidar_slam import path_tracker
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, Additions, GraphView
 from saga_fg.model.landmarks import PoleLandmark

@@ -24,11 +24,9 @@ from data_tools.plots import paths_from_above, png
 from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
 from pipelines.demo import run_demo
-from pipelines.slam.joint import path_tracker
 from pipelines.slam.laser_slam import laser_slam
-from pipelines.slam.lidar_results import write_lidar_slam
-from pipelines.slam.lidar_slam import lidar_slam
-from pipelines.slam.results import confirmed_paths, write_laser_slam
+from pipelines.slam.lidar_slam import lidar_slam, path_tracker
+from pipelines.slam.results import confirmed_paths, write_laser_slam, write_lidar_slam
 from saga_fg.slam.joint import JointSettings, estimate_jointly
 
 HERE = Path(__file__).parent

@@ -28,7 +28,7 @@ from pipelines.slam.loop_closures import Agreement
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import moved, transform, transforms, vector, vectors
-from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
+from saga_fg.slam.pose_graph.consensus import Measured, RunningPoseGraph
 
 _SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
 _SCALE = 0.05  # standard deviation of the scale of wheels

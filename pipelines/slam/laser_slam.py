@@ -33,7 +33,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import heading, moved, transform, transforms, vector, vectors
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph
-from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph, path_lengths
+from saga_fg.slam.pose_graph.consensus import Measured, RunningPoseGraph, path_lengths
 
 
 def between_keyframes(matched: FloatArray, poses: FloatArray, rows: IntArray) -> FloatArray:

@@ -24,9 +24,8 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import png, scan_map_from_above
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors
-from pipelines.slam.lidar_results import LIDAR_FILES, reference, write_paths
 from pipelines.slam.localisation import Localiser, LocaliserSettings
-from pipelines.slam.results import write_covariances
+from pipelines.slam.results import LIDAR_FILES, reference, write_covariances, write_paths
 from pipelines.slam.submaps import SlamMap, placed_clouds
 from pipelines.slam.vehicle_sensors import Vehicle
 from pipelines.tracking import Progress

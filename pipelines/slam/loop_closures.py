@@ -53,7 +53,7 @@ from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import carried_covariance, inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
-from saga_fg.slam.pose_graph.running import Measured, shortest_paths
+from saga_fg.slam.pose_graph.consensus import Measured, shortest_paths
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
 
 Loop = TypeVar("Loop", bound=LoopClosure | Measured)  # in space, or in the plane

@@ -15,11 +15,35 @@ Results of SLAM with a planar laser.
 trajectory.tum, matched.tum, odometry.tum   the path at every scan: the result, by scan matching alone, by the wheels
 poses.g2o       keyframes and all measurements between them that were kept
 map.png         occupancy, with the path; figures.json: counts, entropy of the map, time
+
+Results of LiDAR SLAM on a recording.
+
+trajectory.txt, times.txt   poses of the vehicle, KITTI's format: world_T_ego of every scan, and its time
+trajectory.tum              the same in the TUM format
+odometry.tum                by odometry alone; online.tum: as estimated when each scan came
+covariances.csv             of the sensor's pose at the keyframes
+map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
+reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
+map/                        the points of each submap (PLY or PCD) and its place (`pipelines.slam.submaps`)
+graph.g2o                   poses as estimated, the first one's prior, odometry and loops as in the solution
+observations.csv            keyframe, landmark, kind, value, covariance: all observations of landmarks of the map, value
+                            as the kind has it (a wall nx ny nz d, a pole x y z), the covariance as its upper triangle
+landmarks.json              each landmark; landmarks.csv: the same as a table, with shapes as WKT
+tracks.csv                  objects, where there are any
+above.png                   map, paths, landmarks and the objects' tracks from above
+metrics.json                errors of the trajectories against the recording's own poses, the map's sharpness, scans
+                            that left motions open, and sensors that do not fit or measured too little to tell
+
+Files of points and landmarks are left out where there are none.
+World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +52,20 @@ import numpy as np
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.laser import LaserLog, OccupancyGrid
-from data_tools.plots import occupancy_picture, paths_from_above, png
+from data_tools.lidar import scan_to_map_residual, write_cloud
+from data_tools.lidar.scan import ScanSequence
+from data_tools.plots import occupancy_picture, paths_from_above, png, scan_map_from_above
 from data_tools.pose_graphs import write_g2o
-from data_tools.trajectories import Trajectory, write_tum_poses
+from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.laser_slam import LaserPath
+from pipelines.slam.lidar_slam import START, LidarSlamResult, LidarSlamSettings
+from pipelines.slam.odometry import KeyframeClouds, OdometrySettings
+from pipelines.slam.scan_content import LINE, WALL
+from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import transforms
+from saga_fg.numerics.geometry import inverse_transform, transform_points, transforms
 from saga_fg.slam.joint import JointEstimate
-from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
+from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph, PosePriors
 from saga_fg.types.landmark import Landmark
 
 _CONFIRMED = 5  # detections
@@ -174,3 +204,238 @@ def _grid(log: LaserLog, path: LaserPath, poses: FloatArray, largest_range: floa
     laser = transforms(log.robot_T_laser[None])[0]
     scans = [log.points(row, largest_range) for row in path.keyframes.tolist()]
     return OccupancyGrid.of(scans, poses[path.keyframes] @ laser)
+
+
+# all that a run may write, also in a map of an earlier one: a folder holds the files of its last run
+LIDAR_FILES = (
+    *("trajectory.txt", "times.txt", "trajectory.tum", "odometry.tum", "online.tum", "reference.tum"),
+    *("map.ply", "map/submaps.csv", "map/origin.csv", "map/[0-9]*.ply", "map/[0-9]*.pcd"),
+    *("graph.g2o", "observations.csv", "landmarks.json", "landmarks.csv"),
+    *("covariances.csv", "tracks.csv", "above.png", "metrics.json"),
+)
+_GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
+_MOVES, _TELLING = 1.0, 10.0  # m/s; m of way that tell where ahead is
+_ONE_WAY, _SIDEWAYS = 0.9, 20.0  # length of the mean direction; deg off the axis
+_log = logging.getLogger(__name__)
+_LINED = (WALL.name, LINE.name)
+
+
+def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySettings | None = None) -> dict[str, Any]:
+    """Errors (start aligned) of the three trajectories against the recording's poses, if it has any; residuals, counts.
+
+    odometry: settings of the run
+    """
+    truth = reference(scans)
+    paths = {name: getattr(result, name) for name in ("odometry", "online", "trajectory")}
+    paths["without_objects"], kinds = result.alone, [landmark.kind.name for landmark in result.landmarks]
+    return {
+        "keyframes": len(result.keyframes),
+        "landmarks": {name: kinds.count(name) for name in sorted(set(kinds))},
+        "loops": len(result.loops),
+        "false_loops": len(result.false_loops),
+        "odometry_inflation": dict(zip(("rotation", "translation"), result.selection.inflation.tolist(), strict=True)),
+        "submaps": len(result.submaps),
+        "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
+        "misfits": {**result.misfits, **_misplaced(result.trajectory)},
+        "unjudged": dict(result.unjudged),
+        "scan_to_map_residual": _residual(result, scans, odometry or OdometrySettings()),
+        **{
+            name: asdict(trajectory_errors(path, truth, "start"))
+            for name, path in paths.items()
+            if path is not None and truth is not None
+        },
+    }
+
+
+def _misplaced(path: Trajectory) -> dict[str, str]:
+    """The LiDAR, with a warning, where the vehicle moves one way throughout that is neither ahead nor backwards."""
+    steps = (inverse_transform(path.world_T_ego[:-1]) @ path.world_T_ego[1:])[:, :3, 3]
+    way = np.linalg.norm(steps, axis=1)
+    moves = way > _MOVES * np.diff(path.timestamps)
+    if way[moves].sum() < _TELLING:
+        return {}
+    mean = (steps[moves] / way[moves, None]).mean(axis=0)
+    off = float(np.degrees(np.arccos(min(abs(mean[0]) / np.linalg.norm(mean), 1.0))))
+    if np.linalg.norm(mean) < _ONE_WAY or off < _SIDEWAYS:
+        return {}
+    text = (
+        f"lidar: the vehicle moves {off:.0f} deg off its axis ahead throughout: check where the LiDAR is mounted "
+        "(--mount, /tf), unless it is carried"
+    )
+    _log.warning(text)
+    return {"lidar": text}
+
+
+def reference(scans: ScanSequence) -> Trajectory | None:
+    """The recording's own poses; None where it has none."""
+    return None if scans.world_T_ego is None else Trajectory(scans.timestamps, scans.world_T_ego)
+
+
+def degenerate_spans(times: FloatArray, degenerate: Sequence[tuple[str, ...]]) -> list[dict[str, Any]]:
+    """Runs of scans that leave the same motions open: first and last scan, their times, s, and the motions in words."""
+    spans = list[dict[str, Any]]()
+    for row, motions in enumerate(degenerate):
+        if spans and spans[-1]["motions"] == list(motions) and spans[-1]["last"] == row - 1:
+            spans[-1] |= {"last": row, "until": float(times[row])}
+        elif motions:
+            at = float(times[row])
+            spans.append({"first": row, "last": row, "from": at, "until": at, "motions": list(motions)})
+    return spans
+
+
+def _residual(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySettings) -> float:
+    """Mean scan-to-map residual, m, of some forty keyframes at most, whose scans are read again; NaN without points."""
+    if not any(len(submap.points) for submap in result.submaps):
+        return float("nan")
+    clouds = KeyframeClouds(scans, result.drive, odometry, result.moving)
+    return scan_to_map_residual(clouds, result.world_T_lidar, every=max(5, len(clouds) // 40))
+
+
+def write_lidar_slam(
+    output: Path,
+    result: LidarSlamResult,
+    scans: ScanSequence,
+    settings: LidarSlamSettings | None = None,
+    origin: Origin | None = None,
+) -> dict[str, Any]:
+    """Write all files of a run to a folder, or none; returns the metrics.
+
+    settings: of the run, with the spacing of the map's points; origin: of the world, on Earth
+    """
+    s = settings or LidarSlamSettings()
+    clouds, objects = [submap.points for submap in result.submaps], result.objects
+    points, lines = placed_clouds(clouds, result.world_T_submap, s.map_spacing), _lines(result)
+    figures, truth = metrics(result, scans, s.odometry), reference(scans)
+    if objects is not None:
+        figures["objects"] = len(object_paths(objects))
+    with atomic_directory(output, known=LIDAR_FILES) as folder:
+        given = {name: getattr(result, name) for name in ("trajectory", "odometry", "online")}
+        write_paths(folder, **given, reference=truth)
+        if len(points):
+            (folder / "map").mkdir()
+            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin), s.map_format)
+            write_cloud(folder / "map.ply", points)
+        write_graph(folder, result)
+        times = result.trajectory.timestamps[result.keyframes].tolist()
+        write_covariances(folder / "covariances.csv", "timestamp", times, result.covariances)
+        if result.landmarks:
+            write_figures(folder / "landmarks.json", landmark_rows(result.landmarks))
+            write_landmark_table(folder / "landmarks.csv", result.landmarks, lines)
+        paths = {} if truth is None else {"reference": truth.positions}
+        paths["trajectory"] = result.trajectory.positions
+        if objects is not None:
+            write_objects(folder / "tracks.csv", objects)
+        driven = () if objects is None else tuple(confirmed_paths(objects).values())
+        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _by_kind(lines, result.landmarks), driven)
+        write_bytes(folder / "above.png", png(figure))
+        write_figures(folder / "metrics.json", figures)
+    return figures
+
+
+def write_paths(folder: Path, trajectory: Trajectory, **others: Trajectory | None) -> None:
+    """Write each path as NAME.tum, and `trajectory` in KITTI's format besides."""
+    write_kitti_poses(folder / "trajectory.txt", trajectory, folder / "times.txt")
+    for name, path in {"trajectory": trajectory, **others}.items():
+        if path is not None:
+            write_tum_poses(folder / f"{name}.tum", path)
+
+
+def _lines(result: LidarSlamResult) -> dict[int, FloatArray]:
+    """Ends (n, 2, 2), from above, of the pieces of each wall and road line that were observed."""
+    return {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind.name in _LINED}
+
+
+def _by_kind(lines: Mapping[int, FloatArray], landmarks: Sequence[Landmark]) -> dict[str, FloatArray]:
+    """Pieces (W, 2, 2) of walls and of road lines."""
+    kinds = {"walls": WALL.name, "road lines": LINE.name}
+    found = {name: [lines[mark.number] for mark in landmarks if mark.kind.name == kind] for name, kind in kinds.items()}
+    return {name: np.concatenate([np.empty((0, 2, 2)), *ends]) for name, ends in found.items()}
+
+
+def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
+    """Places (P, 2) of all but walls and lines."""
+    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (LINE, WALL)]
+    return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
+
+
+def _seen_pieces(result: LidarSlamResult, mark: Landmark) -> FloatArray:
+    """Ends (n, 2, 2) of the pieces of a wall or road line that were observed."""
+    place = mark.kind.coordinates(mark.state)
+    normal = np.array([place["nx"], place["ny"]]) / np.hypot(place["nx"], place["ny"])
+    along = np.array([-normal[1], normal[0]])
+    foot = (np.array([place["x"], place["y"]]) @ normal) * normal
+    spans = []
+    for seen in result.observations:
+        extent = seen.observation.extent
+        if seen.landmark == mark.number and extent is not None:
+            u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
+            spans.append((float(u.min()), float(u.max())))
+    pieces = [np.stack([foot + low * along, foot + high * along]) for low, high in covered_spans(spans)]
+    return np.array(pieces).reshape(-1, 2, 2)
+
+
+def covered_spans(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the union of spans, gaps up to `_GAP` filled: houses on both sides of a street may lie in one plane."""
+    covered: list[tuple[float, float]] = []
+    for low, high in sorted(spans):
+        if covered and low <= covered[-1][1] + _GAP:
+            covered[-1] = (covered[-1][0], max(high, covered[-1][1]))
+        else:
+            covered.append((low, high))
+    return covered
+
+
+def pose_graph_of(result: LidarSlamResult) -> PoseGraph:
+    """Keyframes 0 .. M - 1 with the odometry between them and the loops; M > 1."""
+    odometry = result.motions(result.drive.keyframes)
+    pairs = [*pairwise(range(len(result.keyframes))), *((loop.first, loop.second) for loop in result.loops)]
+    measured = [*(T for T, _ in odometry), *(loop.first_T_second for loop in result.loops)]
+    covariances = np.array([*(P for _, P in odometry), *(loop.covariance for loop in result.loops)])
+    information = np.linalg.inv(covariances)
+    first, second = np.array(pairs, dtype=np.int64).T
+    return PoseGraph(
+        np.arange(len(result.keyframes), dtype=np.int64),
+        result.world_T_lidar,
+        first,
+        second,
+        np.array(measured),
+        (information + information.swapaxes(1, 2)) / 2,
+        priors=PosePriors(np.zeros(1, dtype=np.int64), result.drive.poses[0][None], np.linalg.inv(START)[None]),
+    )
+
+
+def write_landmark_table(path: Path, landmarks: Iterable[Landmark], pieces: Mapping[int, FloatArray]) -> None:
+    """Write number, kind, observations, standard deviations of the state, and the geometry as WKT, in x and y, m.
+
+    pieces: (n, 2, 2) ends of what was seen of walls and lines, by the number of the landmark; others are points
+    """
+    rows = ["number,kind,observations,deviations,geometry"]
+    for mark in landmarks:
+        deviations = " ".join(f"{x:.4g}" for x in np.sqrt(np.diag(mark.covariance)))
+        if mark.number in pieces:
+            lines = ", ".join(f"({', '.join(f'{x:.3f} {y:.3f}' for x, y in ends)})" for ends in pieces[mark.number])
+            shape = f"MULTILINESTRING ({lines})" if lines else "MULTILINESTRING EMPTY"
+        else:
+            place = mark.kind.coordinates(mark.state)
+            shape = f"POINT ({place['x']:.3f} {place['y']:.3f})" if "x" in place else "POINT EMPTY"
+        rows.append(f'{mark.number},{mark.kind.name},{mark.observations},{deviations},"{shape}"')
+    write_text(path, "\n".join(rows) + "\n")
+
+
+_OBSERVED = ("keyframe", "landmark", "kind", "value", "covariance")
+
+
+def write_graph(folder: Path, result: LidarSlamResult) -> None:
+    """Write graph.g2o and observations.csv to a folder that exists; a graph of one keyframe is none."""
+    if len(result.keyframes) < 2:
+        return
+    write_g2o(folder / "graph.g2o", pose_graph_of(result))
+    marks = {mark.number for mark in result.landmarks}
+    rows = [",".join(_OBSERVED)]
+    for one in result.observations:
+        if one.landmark in marks:
+            z, P = one.observation.value, one.observation.covariance
+            fields = (z, P[np.triu_indices(len(P))])
+            value, covariance = (" ".join(f"{x:.17g}" for x in field) for field in fields)
+            rows.append(f"{one.pose},{one.landmark},{one.observation.kind.name},{value},{covariance}")
+    write_text(folder / "observations.csv", "\n".join(rows) + "\n")

@@ -120,9 +120,10 @@ class IncrementalSmoother:
 
     def forget(self, kept: Collection[int] = (), since: float | None = None) -> None:
         """Marginalise all epochs before the last until `since`, s, by default `lag` ago, but for variables `kept`."""
-        if self._lag is None:
-            return
-        since = self.time - self._lag if since is None else since
+        if since is None:
+            if self._lag is None:
+                return
+            since = self.time - self._lag
         first = sum(t <= since for t in self._times[1:])
         self.marginalise([key for key in self._graph.older_than(self._times[first]) if key not in kept])
         self._times = self._times[first:]

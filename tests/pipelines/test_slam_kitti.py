@@ -13,10 +13,10 @@ from benchmarks.scans import CURB, SimulatedScans, drive
 from data_tools.lidar import Scan, Submap, read_scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
-from pipelines.slam.lidar_results import covered_spans, metrics, write_graph, write_lidar_slam
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamResult, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.odometry import OdometrySettings, RecordedOdometry
+from pipelines.slam.results import covered_spans, metrics, write_graph, write_lidar_slam
 from pipelines.slam.scan_content import LINE, POLE
 from pipelines.slam.submaps import placed_clouds
 from saga_fg.errors import InputError

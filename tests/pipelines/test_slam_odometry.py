@@ -11,9 +11,7 @@ from benchmarks.scans import SMALL, ScannerSettings, SimulatedScans, StaticWorld
 from data_tools.lidar import Scan, Submap, constant_velocity, voxel_downsample
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import load_config
-from pipelines.slam.joint import path_tracker
-from pipelines.slam.lidar_results import metrics
-from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam, path_tracker
 from pipelines.slam.loop_closures import Agreement, PlaceLoops, deviation
 from pipelines.slam.odometry import (
     LOST_ROTATION,
@@ -23,12 +21,13 @@ from pipelines.slam.odometry import (
     OdometrySettings,
     OdometryStep,
 )
+from pipelines.slam.results import metrics
 from pipelines.slam.scan_content import MovingObjects
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform, transform_points, yaw_transform
-from saga_fg.slam.pose_graph.running import shortest_paths
+from saga_fg.slam.pose_graph.consensus import shortest_paths
 from saga_fg.slam.submaps import LoopClosure
 from tests.data_tools.featureless import tunnel
 

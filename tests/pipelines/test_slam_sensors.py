@@ -15,8 +15,8 @@ from data_tools.lidar import Scan
 from data_tools.recordings import ScanRecording
 from data_tools.sensor_logs import SensorLog, kitti_sensor_log, plausible_inertial
 from pipelines.slam.configuration import sensor_log
-from pipelines.slam.lidar_results import degenerate_spans, metrics
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
+from pipelines.slam.results import degenerate_spans, metrics
 from pipelines.slam.vehicle_sensors import Vehicle
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform

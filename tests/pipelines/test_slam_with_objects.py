@@ -16,9 +16,8 @@ from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.slam.joint import with_objects
-from pipelines.slam.lidar_results import write_lidar_slam
-from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam, with_objects
+from pipelines.slam.results import write_lidar_slam
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.sensors import SensorName, SensorSettings

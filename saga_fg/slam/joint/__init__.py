@@ -1,8 +1,7 @@
 """Joint estimation of the vehicle's path and the objects around it."""
 
-from saga_fg.slam.joint.batch import estimate_jointly
+from saga_fg.slam.joint.estimators import OnlineEstimator, estimate_jointly
 from saga_fg.slam.joint.graph import JointEstimate, ObjectStates
-from saga_fg.slam.joint.online import OnlineEstimator
 from saga_fg.slam.joint.record import JointSettings, OdometryIncrements, OdometryNoise
 
 __all__ = [

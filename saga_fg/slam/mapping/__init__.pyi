@@ -1,5 +1,4 @@
-from .association import associate, log_odds
-from .local_map import Innovation, LocalMap
+from .local_map import Innovation, LocalMap, associate, log_odds
 from .mapper import (
     AssociatedObservation,
     Given,

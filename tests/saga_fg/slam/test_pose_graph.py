@@ -23,7 +23,7 @@ from saga_fg.slam.pose_graph import (
     pose_values,
 )
 from saga_fg.slam.pose_graph.certificate import descend, lowest_eigenvalue, nearest_frames, rounded_rotations
-from saga_fg.slam.pose_graph.running import Measured, RunningPoseGraph
+from saga_fg.slam.pose_graph.consensus import Measured, RunningPoseGraph
 from tests.saga_fg.loops import loop, moved
 
 

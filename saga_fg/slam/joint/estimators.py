@@ -1,30 +1,128 @@
-"""Path and objects online: the running graph of the last seconds, with a joint prior for all before.
+"""Path of the vehicle and objects around it: from a whole recording at once, and online.
 
-Each frame adds an epoch to the window. The stationarity of objects follows from the window, the identity of detections
+From a recording. Discrete unknowns depend on the path: the association of detections, and the identity and stationarity of objects. A
+pass associates along the path so far, starting with the odometry's, takes the probabilities of stationarity from the
+detections, solves the graph of all epochs, weighs the detections by the objects found, and solves again. Passes end
+when associations repeat.
+
+Online: the running graph of the last seconds, with a joint prior for all before. Each frame adds an epoch to the window. The stationarity of objects follows from the window, the identity of detections
 from the objects after it, and iSAM2 solves the window with the new factors. Epochs older than `lag` leave: they are
 marginalised with all factors on their variables, linearised at the present estimate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
 
+from factors import SolverSettings
 from saga_fg.errors import InputError
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import Additions, FactorProvider, GraphError
+from saga_fg.graph import Additions, FactorProvider, GraphError, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform, yaw_transform
-from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities, with_identities
-from saga_fg.slam.joint.graph import JointEstimate, detections, error_key, read_estimate
-from saga_fg.slam.joint.providers import StationaryPairs, VehicleAndObjects, detections_name
-from saga_fg.slam.joint.record import MAX_ITERATIONS, EpochRecorder, JointSettings, RecordedEpoch
+from saga_fg.slam.joint.association import (
+    SlowErrors,
+    stationary_probabilities,
+    with_all_identities,
+    with_identities,
+)
+from saga_fg.slam.joint.graph import (
+    JointEstimate,
+    StationaryPairs,
+    VehicleAndObjects,
+    detections,
+    detections_name,
+    error_key,
+    read_estimate,
+    stationary_factors,
+)
+from saga_fg.slam.joint.record import (
+    MAX_ITERATIONS,
+    EpochRecorder,
+    JointSettings,
+    OdometryIncrements,
+    RecordedEpoch,
+    record_epochs,
+)
 from saga_fg.slam.mapping import Given, pose_key
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
+
+TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
+
+
+def estimate_jointly(
+    frames: Sequence[Frame],
+    odometry: OdometryIncrements,
+    new_tracker: Callable[[], Tracker],
+    settings: JointSettings | None = None,
+    start: FloatArray | None = None,
+    new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
+) -> JointEstimate:
+    """Estimate the path (n poses) and the objects of n frames, in increasing order of time.
+
+    odometry: between the frames' times; new_tracker: gives a new tracker, which associates detections; start: first
+    pose (4, 4), by default the identity; new_providers: gives new providers of other factors, asked with each frame
+    (`saga_fg.slam.mapping.LandmarkObservations` for landmarks). Detections are in ego or sensor coordinates, or in
+    those of the world with the pose they were transformed by. Raises `InputError` where frames and odometry do not fit
+    together.
+    """
+    settings = settings or JointSettings()
+    times = np.array([frame.timestamp for frame in frames])
+    if len(times) != len(odometry) or not np.allclose(times, odometry.timestamps, atol=1e-6):
+        raise InputError(f"frames: expected one at each of the {len(odometry)} times of the odometry, got {len(times)}")
+    path = odometry.path(start)
+    slow = SlowErrors.at_start(settings)
+    estimate = None
+    links: list[list[int]] = []
+    for _ in range(settings.passes):
+        tracker = new_tracker()
+        record = record_epochs(frames, path, odometry, tracker)
+        before, links = links, [now.seen.id.tolist() for now in record]
+        if links == before:
+            break
+        clutter = tracker.settings.association.clutter_area
+        start_moving = estimate is None
+        epochs = VehicleAndObjects(record, path, settings)
+        estimate = _solve(epochs, frames, slow, start_moving, clutter, new_providers())
+        path, slow = estimate.world_T_ego, estimate.slow_errors
+    assert estimate is not None
+    return estimate
+
+
+def _solve(
+    epochs: VehicleAndObjects,
+    frames: Sequence[Frame],
+    slow: SlowErrors,
+    start_moving: bool,
+    clutter_area: float,
+    providers: Sequence[FactorProvider],
+) -> JointEstimate:
+    """Solve the epochs of a record several times, each from the solution before: if `start_moving` with all objects
+    moving, which needs no good start; with those stationary that seem so along the path; with identities by the
+    solution.
+    """
+    graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=MAX_ITERATIONS, tolerance=TOLERANCE)
+    record, settings = epochs.record, epochs.settings
+    for now, frame in zip(record, frames, strict=True):
+        graph.advance(now.time)
+        ask_all([epochs, *providers], graph, frame)
+    if start_moving:
+        graph.solve(solver)
+    probabilities = stationary_probabilities(record, np.asarray(epochs.path), slow, settings)
+    name = StationaryPairs.name
+    graph.add_factors(name, stationary_factors(record, probabilities), name)
+    estimate = read_estimate(record, graph.solve(solver), probabilities)
+    places = [one.position for one in estimate.objects]
+    record = with_all_identities(record, estimate.world_T_ego, places, clutter_area)
+    graph.add_factors(epochs.name, detections(record, settings), detections_name(record[-1]))
+    return read_estimate(record, graph.solve(solver), probabilities)
+
 
 _DOUBTFUL = 0.9  # probability of an assignment below which its detection is weighed anew
 _THRESHOLD = 0.1  # standard deviations that a variable moves before its factors are linearised anew
@@ -54,8 +152,11 @@ class OnlineEstimator:
         start: FloatArray | None = None,
         providers: Sequence[FactorProvider] = (),
     ) -> None:
+        if not (math.isfinite(lag) and lag >= 0):
+            raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
         self._settings, self._lag = settings or JointSettings(), lag
-        self._smoother = IncrementalSmoother(providers, lag, RelinearisationSettings(_THRESHOLD, MAX_ITERATIONS))
+        # without a lag of its own: epochs leave here, and elimination in the order of time would cost thrice as much
+        self._smoother = IncrementalSmoother(providers, None, RelinearisationSettings(_THRESHOLD, MAX_ITERATIONS))
         self._recorder, self._clutter_area = EpochRecorder(tracker), tracker.settings.association.clutter_area
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._slow = SlowErrors.at_start(self._settings)
@@ -90,12 +191,15 @@ class OnlineEstimator:
         except GraphError:
             self._pairs = StationaryPairs()  # whose factors are unknown now
             raise
-        gone = sum(one.time <= now.time - self._lag for one in record[1:])
-        self._record, self._stationary = record[gone:], self._stationary[gone:]
+        self._record = record
         newest = self._estimate(1)
         doubtful = with_identities(now, newest.world_T_ego[-1], newest.objects[-1].position, self._clutter_area)
         if (doubtful.seen.probability < _DOUBTFUL).any():
             newest = self._weighed(doubtful)
+        since = now.time - self._lag
+        gone = sum(one.time <= since for one in record[1:])
+        self._smoother.forget(since=since)
+        self._record, self._stationary = self._record[gone:], self._stationary[gone:]
         self._slow = newest.slow_errors
         return newest
 
