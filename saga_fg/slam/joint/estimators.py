@@ -1,13 +1,14 @@
 """Path of the vehicle and objects around it: from a whole recording at once, and online.
 
-From a recording. Discrete unknowns depend on the path: the association of detections, and the identity and stationarity of objects. A
-pass associates along the path so far, starting with the odometry's, takes the probabilities of stationarity from the
-detections, solves the graph of all epochs, weighs the detections by the objects found, and solves again. Passes end
-when associations repeat.
+Discrete unknowns depend on the path: the association of detections, and the identity and stationarity of objects.
 
-Online: the running graph of the last seconds, with a joint prior for all before. Each frame adds an epoch to the window. The stationarity of objects follows from the window, the identity of detections
-from the objects after it, and iSAM2 solves the window with the new factors. Epochs older than `lag` leave: they are
-marginalised with all factors on their variables, linearised at the present estimate.
+From a recording, a pass associates along the path so far, starting with the odometry's, takes the probabilities of
+stationarity from the detections, solves the graph of all epochs, weighs the detections by the objects found, and solves
+again. Passes end when associations repeat.
+
+Online, each frame adds an epoch to the running graph of the last seconds. The stationarity of objects follows from the
+window, the identity of detections from the objects after it, and iSAM2 solves the window with the new factors. Epochs
+older than `lag` leave: they are marginalised with all factors on their variables, linearised at the present estimate.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from factors import SolverSettings
 from saga_fg.errors import InputError
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
+from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph import Additions, FactorProvider, GraphError, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform, yaw_transform
@@ -162,6 +164,7 @@ class OnlineEstimator:
         self._slow = SlowErrors.at_start(self._settings)
         self._pairs, self._stationary = StationaryPairs(), list[FloatArray]()
         self._record = list[RecordedEpoch]()  # of the window
+        self._solution: GraphSolution | None = None
 
     def step(
         self, frame: Frame, a_T_b: FloatArray | None = None, covariance: FloatArray | None = None
@@ -191,7 +194,7 @@ class OnlineEstimator:
         except GraphError:
             self._pairs = StationaryPairs()  # whose factors are unknown now
             raise
-        self._record = record
+        self._record, self._solution = record, self._smoother.solution()
         newest = self._estimate(1)
         doubtful = with_identities(now, newest.world_T_ego[-1], newest.objects[-1].position, self._clutter_area)
         if (doubtful.seen.probability < _DOUBTFUL).any():
@@ -217,11 +220,13 @@ class OnlineEstimator:
         )
         self._stationary = self._probabilities(self._record, list(map(self._pose, self._record)))
         self._smoother.extend([weighed, self._pairs.changed(self._record, self._stationary)])
+        self._solution = self._smoother.solution()
         return self._estimate(1)
 
     def _estimate(self, count: int) -> JointEstimate:
-        """The estimate of the newest epochs."""
-        return read_estimate(self._record[-count:], self._smoother.solution(), self._stationary[-count:])
+        """The estimate of the newest epochs by the last solution, which has the epochs that left after it, too."""
+        assert self._solution is not None
+        return read_estimate(self._record[-count:], self._solution, self._stationary[-count:])
 
     def _probabilities(self, record: Sequence[RecordedEpoch], path: Sequence[FloatArray]) -> list[FloatArray]:
         """For each epoch the probabilities that its objects are stationary, along a path (n, 4, 4)."""
