@@ -1,6 +1,7 @@
-"""Recordings of research as datasets of the command: `benchmarks.recordings:Ngsim` and `benchmarks.recordings:OpenAcc`;
+"""Recordings of research as datasets of the command: `benchmarks.recordings:Ngsim`, `:OpenAcc` and `:EthUcySource`;
 drives past landmarks, `read_landmark_log`."""
 
+from benchmarks.recordings.eth_ucy import EthUcySource
 from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.recordings.sensed import ABOVE, MAST, VEHICLE
 from benchmarks.recordings.sources import Ngsim, OpenAcc, TrafficScenes
@@ -10,6 +11,7 @@ __all__ = [
     "ABOVE",
     "MAST",
     "VEHICLE",
+    "EthUcySource",
     "LandmarkLog",
     "Ngsim",
     "OpenAcc",

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.recordings.eth_ucy import EthUcy
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
-from data_tools.datasets.eth_ucy import EthUcy
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 
 RATE = 2.5  # frames a second, as the recorded ones are annotated

@@ -424,7 +424,6 @@ BUILT_IN = {
     "nuscenes": "data_tools.datasets.nuscenes.source:NuScenesSource",
     "kitti": "data_tools.datasets.kitti.source:KittiSource",
     "argoverse2": "data_tools.datasets.argoverse2.source:ArgoverseSource",
-    "eth_ucy": "data_tools.datasets.eth_ucy:EthUcySource",
     "mcap": "data_tools.datasets.mcap.source:McapSource",
     "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
     "simulated": "data_tools.simulator.source:SimulatedSource",

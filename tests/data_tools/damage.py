@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.recordings.eth_ucy import EthUcy
 from benchmarks.recordings.landmarks import read_landmark_log
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
 from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.detection_files import TruthFile, read_detections, read_predictions, read_tracks
-from data_tools.datasets.eth_ucy import EthUcy
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.source import read_scored_sequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes

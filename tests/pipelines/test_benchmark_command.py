@@ -93,4 +93,4 @@ def test_a_dataset_without_official_results(tmp_path):
     assert "expected a dataset with official results" in " ".join(result.output.split())
     shown = saga_fg("benchmark", "--help").output
     assert all(name in shown for name in ("nuscenes", "kitti", "argoverse2"))
-    assert "eth_ucy" not in shown
+    assert "simulated" not in shown

@@ -168,7 +168,10 @@ def test_help_lists_what_can_be_evaluated_and_those_that_come_along_are_sources(
             ("learn", "interactions", "kitti", "--dataroot", "kitti", "-o", "out"),
             "error: kitti: expected a folder with oxts/ and calib/",
         ),
-        (("smooth", "eth_ucy", "--dataroot", ".", "-o", "out"), "error: .: expected eth/obsmat.txt"),
+        (
+            ("smooth", "benchmarks.recordings:EthUcySource", "--dataroot", ".", "-o", "out"),
+            "error: .: expected eth/obsmat.txt",
+        ),
     ],
 )
 def test_what_cannot_be_done_is_one_line(arguments, message, tmp_path, monkeypatch):

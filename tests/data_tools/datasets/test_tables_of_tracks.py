@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.recordings.eth_ucy import EthUcySource
 from data_tools.datasets.annotated import detected
 from data_tools.datasets.detection_files import (
     LABEL_COLUMNS,
@@ -14,7 +15,6 @@ from data_tools.datasets.detection_files import (
     write_label_table,
     write_tracks,
 )
-from data_tools.datasets.eth_ucy import EthUcySource
 from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
 from data_tools.datasets.nuscenes.writer import write_nuscenes_labels
 from data_tools.datasets.source import input_files

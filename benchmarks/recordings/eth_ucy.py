@@ -106,7 +106,7 @@ def _frame_rate(name: str, frame: IntArray) -> float:
 class EthUcySource(AnnotatedSource):
     """Walking pedestrians of ETH and UCY, annotated every 0.4 s."""
 
-    name = "eth_ucy"
+    name = "benchmarks.recordings:EthUcySource"
     example = "--dataroot data/eth_ucy --scenes hotel"
     dataroot: str = option("Folder that holds eth/ and hotel/ or files NAME.txt, or its URL; or one such file.")
 
