@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkdocs.structure.files import File
+from settings_tables import settings_reference
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -40,7 +41,6 @@ def configuration_tables() -> str:
     """Tables of all settings in Markdown, from their dataclasses."""
     from data_tools.simulator import SimulatorSettings
     from pipelines.config import TrackConfig
-    from pipelines.configuration import settings_reference
     from pipelines.serving import StreamSettings
     from pipelines.slam.configuration import SlamSettings
     from saga_fg import providers

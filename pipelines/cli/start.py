@@ -15,7 +15,7 @@ from data_tools.simulator.settings import scenario_settings
 from pipelines.cli.console import counted, progress_bar, show_tables, working
 from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.config import load_config
-from pipelines.configuration import load_settings, settings_reference, write_settings
+from pipelines.configuration import load_settings, write_settings
 from pipelines.demo import comparison_table, run_demo, write_simulated_tables
 from pipelines.serving import StreamSettings
 from pipelines.slam.configuration import load_slam_config
@@ -86,7 +86,6 @@ def _config(
     file: Annotated[
         Path | None, typer.Option("--config", help="Print the settings this YAML file leads to.", metavar="FILE")
     ] = None,
-    markdown: Annotated[bool, typer.Option("--markdown", help="All settings as tables in Markdown.")] = False,
     verbose: Verbose = False,
 ) -> None:
     """Print settings, their defaults and what they mean, as YAML to edit and pass to `--config`.
@@ -115,12 +114,7 @@ def _config(
         load = {"smoothing": load_smooth_config, "slam": load_slam_config, "tracking": load_config}[name]
         family = kind if kind == "heterogeneous" else dataset_source(kind).family
         settings = load(family, file)
-    if markdown:
-        text = settings_reference(type(settings))
-    elif full:
-        text = write_settings(settings)
-    else:
-        text = POINTER + write_settings(settings, selection=FIRST[name])
+    text = write_settings(settings) if full else POINTER + write_settings(settings, selection=FIRST[name])
     typer.echo(text, nl=False)
 
 

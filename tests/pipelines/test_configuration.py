@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from factors import PlanarPose, RangeBearing
 from pipelines.config import load_config
-from pipelines.configuration import load_settings, read_settings, settings_reference, write_settings
+from pipelines.configuration import load_settings, read_settings, write_settings
 from pipelines.serving.state import TreeWriter, read_tree
 from saga_fg import Detection, Detections, Frame, SceneGraph
 from saga_fg.errors import InputError
@@ -257,7 +257,10 @@ def test_unreadable_files_and_types_without_a_form_are_named(tmp_path):
         write_settings(Odd())
 
 
-def test_the_reference_names_every_key_with_default_type_and_meaning():
+def test_the_tables_of_the_site_name_every_key_with_default_type_and_meaning(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "docs")
+    from settings_tables import settings_reference  # type: ignore[import-not-found]
+
     text = settings_reference(WholeSettings)
     assert "A settings tree with one of everything." in text
     assert '| `mode` | `hungarian` | `greedy` or `"off"` or `hungarian` | how to assign |' in text
