@@ -18,9 +18,11 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from pipelines.learning.gaps import CAP, Contender, GapOutcome, JudgedRun, Run, gaps_of, tracks_without
+from benchmarks.situations import situations_of
+from data_tools.metrics import nees
+from pipelines.learning.gaps import CAP, Contender, Errors, JudgedRun, classes_of, tracks_without
 from pipelines.tracking import Progress
-from saga_fg.learning.gaps import LENGTHS, LONGEST, Gap, is_moving, made_gaps, situations_of
+from saga_fg.learning.gaps import LENGTHS, LONGEST, Gap, is_moving, made_gaps, reached
 from saga_fg.learning.labelled_scene import LabelledScene
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray
@@ -50,14 +52,31 @@ def real_gaps(labelled: LabelledScene) -> list[Gap]:
 
 
 @dataclass(frozen=True)
-class Judgement(GapOutcome):
-    """The outcome of a gap with the fate of the identity.
+class Prediction:
+    """A track without detections against the label of its object.
 
+    error   m, however large;  nees: its square by the covariance of the position, chi-squared with 2 degrees of freedom
+    nll     negative logarithm of the density of the true position, nats;  NaN, as nees, without a covariance
+    """
+
+    error: float
+    nees: float
+    nll: float
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The outcome of a gap of an object.
+
+    at          error at the end of each length that the gap reaches, m
+    predicted   where the track that had the object is then, if it is among the results
     held, kept  whether a track had the object before, and whether that track has it after
     reported    whether that track is among the results at the last moment of the gap
     error       mean over the gap, m
     """
 
+    at: Errors
+    predicted: Mapping[float, Prediction]
     held: bool
     kept: bool
     reported: bool
@@ -74,9 +93,20 @@ class Links:
 
 
 @dataclass(frozen=True)
-class LivedRun(Run):
-    """A run whose tracks are kept alive, or end as configured. links: of the run with all detections, if that was."""
+class LivedRun:
+    """A contender's outcomes in the gaps of one recording; its tracks are kept alive, or end as configured.
 
+    cluster     the first of the recordings that overlap with this one, or itself
+    situations  of the object of each gap, by the length until which; none for real gaps
+    links       of the run with all detections, if that was
+    """
+
+    recording: str
+    cluster: str
+    contender: str
+    gaps: tuple[Gap, ...]
+    label: tuple[str, ...]
+    situations: tuple[Mapping[float, frozenset[str]], ...]
     outcomes: tuple[Judgement, ...]
     life: Life
     links: Links | None
@@ -97,15 +127,29 @@ class ExtrapolatedRun(JudgedRun):
 
 def judgement(run: JudgedRun, gap: Gap) -> Judgement:
     """Judge one gap."""
-    holder, outcome = run.holder(gap), run.outcome(gap)
+    holder, at = run.holder(gap), run.outcome(gap)
     if holder is None:
-        return Judgement(outcome.at, outcome.predicted, False, False, False, CAP)
+        return Judgement(at, {}, False, False, False, CAP)
+    ends = reached(run.labelled.scene.timestamps, gap)
+    predicted = {h: found for h, k in ends.items() if (found := prediction(run, holder, gap.row, k)) is not None}
     after = run.last(run.track_of, str(run.labelled.id[gap.row]), gap.stop, back=False)
     errors = np.array([run.error(holder, gap.row, k) for k in range(gap.start + 1, gap.stop)])
     known = errors[np.isfinite(errors)]
     mean = float(known.mean()) if len(known) else float("nan")
     reported = holder in run.row_of[gap.stop - 1]
-    return Judgement(outcome.at, outcome.predicted, True, after == holder, reported, mean)
+    return Judgement(at, predicted, True, after == holder, reported, mean)
+
+
+def prediction(run: JudgedRun, track: int, row: int, moment: int) -> Prediction | None:
+    """The track at a moment, None where it is not among the results or the object is not labelled."""
+    truth, at = run.labelled.position[moment, row], run.row_of[moment].get(track)
+    if at is None or not np.isfinite(truth[0]):
+        return None
+    error = run.tracks[moment].boxes.position[at, :2] - truth
+    covariance = run.tracks[moment].position_covariance[at]
+    squared = float(nees(error[None], covariance[None])[0])
+    nll = (squared + np.linalg.slogdet(2 * np.pi * covariance)[1]) / 2 if np.isfinite(squared) else np.nan
+    return Prediction(float(np.hypot(*error)), squared, float(nll))
 
 
 def links(run: JudgedRun) -> Links:
@@ -147,7 +191,7 @@ class GapBenchSettings:
     """Passes over each recording with made gaps, the lives compared, lengths of made gaps, s.
 
     real  whether the gaps of the recordings themselves are judged too, and the links
-    of    situations, one of which objects are in at the end of made gaps (`saga_fg.learning.gaps`); none: any
+    of    situations, one of which objects are in at the end of made gaps (`benchmarks.situations`); none: any
     """
 
     passes: int = 2
@@ -208,7 +252,9 @@ def run_of(
         if number == 0:
             found = links(judged)
     name, ordered = labelled.scene.name, tuple(outcomes[k] for k in range(len(gaps)))
-    return LivedRun(name, cluster or name, contender.name, *gaps_of(labelled, gaps), ordered, life, found)
+    situations = tuple(situations_of(labelled, gap) if gap.run > 0 else {} for gap in gaps)
+    classes = classes_of(labelled, gaps)
+    return LivedRun(name, cluster or name, contender.name, tuple(gaps), classes, situations, ordered, life, found)
 
 
 def judged_run(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contender, life: Life) -> JudgedRun:

@@ -15,23 +15,25 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 import typer
 
+from benchmarks.bootstrap import difference, relative_change
+from benchmarks.gap_figures import by_cluster, compared, situation_figures
 from benchmarks.gap_picture import write_telling_picture
 from benchmarks.gap_runs import LIVES, GapBenchSettings, Judgement, LivedRun, bench_gaps
 from benchmarks.recording_sets import TRAFFIC_SETS, RecordingOptions, RecordingSet, chosen_sets
 from benchmarks.recordings.sensed import ABOVE
 from benchmarks.runner import Data, Row, Rows, chosen
+from benchmarks.situations import SITUATIONS
 from benchmarks.variants import contenders
-from data_tools.metrics.bootstrap import difference, relative_change
 from pipelines.cli.console import progress_bar, writable
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
 from pipelines.learning import learned_motions
-from pipelines.learning.gaps import Contender, by_cluster, compared, situation_figures
+from pipelines.learning.gaps import Contender
 from pipelines.learning.interactions import LEARNED, LearningSettings, learn_interactions
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import measured_trajectories
-from saga_fg.learning.gaps import LENGTHS, SITUATIONS, Gap
+from saga_fg.learning.gaps import LENGTHS, Gap
 from saga_fg.numerics.arrays import FloatArray
 
 FITS = ("noise", "edges")

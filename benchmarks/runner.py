@@ -27,10 +27,10 @@ import typer
 from rich.progress import track
 from threadpoolctl import threadpool_info
 
+from benchmarks.bootstrap import Interval
 from data_tools.datasets.source import names
 from data_tools.figures import FigureTable
 from data_tools.files.input_files import unknown_name
-from data_tools.metrics import Interval
 from pipelines.cli.console import JsonFile, MarkdownFile, error_console, new_group, report
 from pipelines.cli.options import Verbose, as_command
 from pipelines.tracking import one_thread

@@ -13,8 +13,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from benchmarks.bootstrap import paired_bootstrap
 from benchmarks.runner import Rows, Seed, each
-from data_tools.metrics import paired_bootstrap
 from data_tools.simulator import SimulatedTraffic
 from pipelines.cli.options import Config
 from pipelines.smoothing import load_smooth_config

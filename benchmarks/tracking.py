@@ -13,10 +13,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from benchmarks.bootstrap import Interval, paired_bootstrap
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, Score, chosen_sets
 from benchmarks.runner import Data, Row, Rows, clocked, each, resampled
 from benchmarks.variants import COMPONENTS, SHIPPED, contenders
-from data_tools.metrics import Interval, LabelErrors, calibration, error_summary, errors_by_class, paired_bootstrap
+from data_tools.metrics import LabelErrors, calibration, error_summary, errors_by_class
 from pipelines.cli.options import Config
 from pipelines.config import load_config
 from pipelines.learning.gaps import Contender

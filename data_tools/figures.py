@@ -6,14 +6,11 @@ import json
 import math
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
-
-if TYPE_CHECKING:
-    from data_tools.metrics import Interval
 
 
 @dataclass(frozen=True)
@@ -40,12 +37,6 @@ def cell(value: float, digits: int = 3) -> str:
 def count(value: float) -> str:
     """A count as text, "-" if it is not finite."""
     return cell(value, 0)
-
-
-def percent(change: Interval, digits: int = 1) -> str:
-    """A relative change in percent with its interval: -0.2 becomes "-20.0 % (-25.0 to -15.0)"."""
-    estimate, low, high = (f"{100 * value:+.{digits}f}" for value in (change.estimate, change.low, change.high))
-    return f"{estimate} % ({low} to {high})"
 
 
 def as_json(value: Any) -> Any:

@@ -1,11 +1,3 @@
-from .bootstrap import (
-    Interval,
-    difference,
-    paired_bootstrap,
-    ratio_of_sums,
-    relative_change,
-    root_mean_square,
-)
 from .error_sample import ErrorSample, coverage, coverages, nees
 from .hota import HotaMetrics, hota_metrics
 from .kitti_tracking import (
@@ -45,7 +37,6 @@ __all__ = [
     "ErrorSummary",
     "FrameMatch",
     "HotaMetrics",
-    "Interval",
     "KittiSimilarity",
     "KittiTrackingMetrics",
     "KittiTrackingSequence",
@@ -62,7 +53,6 @@ __all__ = [
     "calibration",
     "coverage",
     "coverages",
-    "difference",
     "error_summary",
     "errors_by_class",
     "hota_metrics",
@@ -73,10 +63,6 @@ __all__ = [
     "match_scene",
     "nees",
     "nuscenes_tracking_metrics",
-    "paired_bootstrap",
-    "ratio_of_sums",
-    "relative_change",
-    "root_mean_square",
     "scene_metrics",
     "scene_metrics_by_label",
     "track_summaries",

@@ -74,17 +74,6 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     return result
 
 
-def negative_log_density(nees_values: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Negative logarithm (N,) of Gaussian densities of errors, nats; NaN where the NEES (N,) is.
-
-    covariance (N, d, d)
-    """
-    known = np.isfinite(nees_values)
-    result = np.full(len(nees_values), np.nan)
-    result[known] = (nees_values[known] + np.linalg.slogdet(2 * np.pi * covariance[known])[1]) / 2
-    return result
-
-
 def coverage(nees_values: FloatArray, probability: float, dimension: int = 2) -> float:
     """Share of errors inside the ellipse of a `probability`; NaN without values."""
     if len(nees_values) == 0:

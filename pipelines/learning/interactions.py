@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from data_tools.datasets.annotated import detected
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable, cell
 from pipelines.config import TrackConfig
-from pipelines.learning.gaps import Contender, Run, judged_on, situation_figures, situation_tables
+from pipelines.learning.gaps import Contender, Errors, Run, judged_on
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
 from saga_fg.learning import MAX_GAPS, TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
@@ -242,10 +243,10 @@ def _ratio(runs: Sequence[Run], base: Sequence[Run], group: Sequence[str]) -> fl
     return float(np.mean(ratios)) if ratios else 1.0
 
 
-def _errors(runs: Sequence[Run], group: Sequence[str]) -> list[Mapping[float, float]]:
+def _errors(runs: Sequence[Run], group: Sequence[str]) -> list[Errors]:
     """The errors by length of all made gaps of the classes of a group."""
     return [
-        outcome.at
+        outcome
         for run in runs
         for gap, label, outcome in zip(run.gaps, run.label, run.outcomes, strict=True)
         if gap.run > 0 and label in group
@@ -291,6 +292,18 @@ def _with_tracks(scene: Scene, tracks: Sequence[Tracks]) -> Scene:
 TITLE = "recordings held out"
 
 
+def held_out_errors(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """The errors of each contender, m, at each time after the start of made gaps; that of a lost track is `CAP`."""
+    rows = []
+    for length, contender in product(LENGTHS, dict.fromkeys(run.contender for run in runs)):
+        mine = [outcome for run in runs if run.contender == contender for outcome in run.outcomes]
+        errors = np.array([outcome[length] for outcome in mine if length in outcome])
+        if len(errors):
+            figures = {"gaps": len(errors), "mean": float(errors.mean()), "median": float(np.median(errors))}
+            rows.append({"length": length, "contender": contender, **figures})
+    return rows
+
+
 def learned_tables(learned: LearnedForms) -> list[FigureTable]:
     """The forms that were tried, and the errors in the gaps of recordings held out."""
     rows = tuple(
@@ -299,8 +312,15 @@ def learned_tables(learned: LearnedForms) -> list[FigureTable]:
         for form, ratio in ratios.items()
     )
     columns = ("classes", "form", f"errors / those of the {BASE}", "")
-    forms = FigureTable(f"{TITLE}: forms of the edges", columns, rows)
-    return [table for table in (forms, *situation_tables(learned.runs, TITLE, BASE)) if table.rows]
+    errors = tuple(
+        (f"{row['length']:g} s, {row['contender']}", cell(row["gaps"]), cell(row["mean"]), cell(row["median"]))
+        for row in held_out_errors(learned.runs)
+    )
+    tables = (
+        FigureTable(f"{TITLE}: forms of the edges", columns, rows),
+        FigureTable(f"{TITLE}: errors after", ("after", "gaps", "mean, m", "median, m"), errors),
+    )
+    return [table for table in tables if table.rows]
 
 
 def learned_figures(learned: LearnedForms) -> dict[str, Any]:
@@ -310,6 +330,5 @@ def learned_figures(learned: LearnedForms) -> dict[str, Any]:
             {"classes": group, "form": learned.forms[group], "ratios": ratios}
             for group, ratios in learned.ratios.items()
         ],
-        "reference": BASE,
-        "situations": situation_figures(learned.runs, BASE),
+        "errors": held_out_errors(learned.runs),
     }

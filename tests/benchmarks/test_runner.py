@@ -10,8 +10,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from benchmarks.bootstrap import Interval
 from benchmarks.runner import Rows, application, environment, growth, in_turn, resampled, tables, text
-from data_tools.metrics import Interval
 from saga_fg.errors import SagaError
 
 

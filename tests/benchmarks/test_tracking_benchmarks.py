@@ -22,6 +22,7 @@ from benchmarks.gap_runs import (
 )
 from benchmarks.gaps import rows_of, split_runs, splits_of
 from benchmarks.recording_sets import Score, chosen_sets, simulated_set
+from benchmarks.situations import situations_of
 from benchmarks.tracking import changes, set_rows
 from benchmarks.variants import COMPONENTS, changed, contenders, variants
 from data_tools.metrics import LabelErrors
@@ -31,7 +32,7 @@ from pipelines.config import Family, load_config
 from pipelines.learning.gaps import CAP, LIFE, JudgedRun
 from pipelines.learning.interactions import LearnedForms
 from saga_fg import InputError
-from saga_fg.learning.gaps import Gap, situations_of
+from saga_fg.learning.gaps import Gap
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.stability import LearnedInteractions
 from tests.pipelines.sampled_gaps import HIDDEN, SEEN, SHORT, TIMES, labelled, straight, tracks, without

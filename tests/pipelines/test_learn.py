@@ -17,7 +17,7 @@ from pipelines.cli import app
 from pipelines.config import TrackConfig, load_config, load_interactions
 from pipelines.configuration import read_settings, write_settings
 from pipelines.learning import LearnedNoise, learn_noise, learned_fragment
-from pipelines.learning.gaps import Contender, judged_on
+from pipelines.learning.gaps import CAP, Contender, judged_on
 from pipelines.learning.interactions import (
     BASE,
     LEARNED,
@@ -192,10 +192,11 @@ def learned(detections):
 def test_edges_are_learned_from_unlabelled_detections(learned, detections):
     path, shown = learned
     assert "1 recording" in load_interactions(path).learned_from
-    for text in ("forms of the edges", "base motion", "shipped edges", "learned edges", "visible leader"):
+    for text in ("forms of the edges", "base motion", "shipped edges", "learned edges", "errors after"):
         assert text in shown
     figures = json.loads((detections.parent / "figures.json").read_text(encoding="utf-8"))
-    assert {row["contender"] for row in figures["situations"]} == {BASE, SHIPPED, LEARNED}
+    assert {row["contender"] for row in figures["errors"]} == {BASE, SHIPPED, LEARNED}
+    assert all(0 <= min(row["mean"], row["median"]) <= CAP for row in figures["errors"])
     assert all(row["form"] in (*row["ratios"], NOWHERE) for row in figures["forms"])
 
 

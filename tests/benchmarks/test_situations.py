@@ -1,0 +1,147 @@
+"""Situations of hidden objects: who leads, who halts, starts, turns, and who is at red; figures by situation."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from benchmarks.gap_figures import situation_figures
+from benchmarks.gap_runs import Judgement, LivedRun, Prediction, judgement
+from benchmarks.situations import route_of, situations_of
+from pipelines.learning.gaps import JudgedRun
+from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
+from saga_fg.learning.gaps import Gap
+from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.types.road_map import RoadMap, StopLine, TrafficLight
+
+TIMES = 0.2 * np.arange(26)
+GAP = Gap(0, 5, 16, 2.0, moving=True)  # hidden from 1 to 3.2 s
+LINE = StopLine("line", (30.0, 3.0), (30.0, -3.0), "light")  # across the x axis, for those who go in its direction
+ROAD = RoadMap((TrafficLight("light", (42.0, 0.0)),), (LINE,))
+
+
+def along(x: FloatArray, y: float = 0.0) -> FloatArray:
+    return np.column_stack([x, np.full(len(TIMES), y)])
+
+
+def labelled(
+    ways: Mapping[str, FloatArray],
+    unseen: tuple[str, ...] = (),
+    colour: str | None = None,
+    road: RoadMap | None = ROAD,
+    label: str = "car",
+) -> LabelledScene:
+    """Objects by their positions (K, 2), all detected but those unseen; the hidden one is "a"."""
+    truth, frames = [], []
+    for k, time in enumerate(TIMES.tolist()):
+        step = {name: way[min(k + 1, 25)] - way[max(k - 1, 0)] for name, way in ways.items()}
+        speed = [v / (0.2 * (min(k + 1, 25) - max(k - 1, 0))) for v in step.values()]
+        yaw = [np.arctan2(v[1], v[0]) for v in step.values()]
+        position = [(*way[k], 1.0) for way in ways.values()]
+        boxes = Boxes.of([label] * len(ways), position, None, yaw, speed)
+        truth.append(Annotations(np.array(list(ways)), boxes, np.ones(len(ways), dtype=bool)))
+        detected = boxes.select(np.array([name not in unseen for name in ways]))
+        if colour is not None:
+            light = Boxes.of([f"traffic_light_{colour}"], [[42.0, 0.0, 5.0]])
+            detected = Boxes.concatenate([detected, light])
+        found = Detections(detected, np.ones(len(detected)))
+        frames.append(Frame(time, "lidar", found, road_map=road if k == 0 else None))
+    poses = np.tile(np.eye(4), (len(TIMES), 1, 1))
+    return LabelledScene.from_scene(Scene("drawn", TIMES, poses, ("",) * len(TIMES), frames, truth), {})
+
+
+def found(ways: Mapping[str, FloatArray], gap: Gap = GAP, **how: object) -> Mapping[float, frozenset[str]]:
+    return situations_of(labelled(ways, **how), gap)  # type: ignore[arg-type]
+
+
+STEADY = along(5 * TIMES)
+
+
+def test_leaders_are_ahead_on_the_way_round_bends_and_never_inside():
+    ahead = along(5 * TIMES + 12)
+    assert found({"a": STEADY, "b": ahead}) == {h: {"all", "moving", "visible leader"} for h in (1.0, 2.0)}
+    assert found({"a": STEADY, "b": ahead}, unseen=("b",))[2.0] == {"all", "moving"}
+    for other in (along(5 * TIMES + 12, 3.5), along(5 * TIMES - 12), along(5 * TIMES + 60), along(70 - 5 * TIMES)):
+        assert found({"a": STEADY, "b": other})[2.0] == {"all", "moving", "free"}
+    assert found({"a": STEADY, "b": ahead}, label="pedestrian")[2.0] == {"all", "moving"}
+    assert "free" in found({"a": STEADY, "b": along(5 * TIMES + 0.3)})[1.0]
+    angle = 0.25 * TIMES
+    a, b = (20 * np.column_stack([np.sin(s), 1 - np.cos(s)]) for s in (angle, angle + 0.7))
+    assert found({"a": a, "b": b})[2.0] == {"all", "moving", "visible leader", "turning"}
+    assert "turning" not in found({"a": a, "b": b})[1.0], "by 14 degrees then"
+
+
+def test_halting_and_starting_are_told_at_the_end():
+    braked = along(np.where(TIMES < 2.5, 5 * TIMES, 12.5))
+    assert "halting" not in found({"a": braked})[1.0]
+    assert "halting" in found({"a": braked})[2.0]
+    started = along(np.where(TIMES < 2.5, 0.0, 5 * (TIMES - 2.5)))
+    assert "starting" in found({"a": started})[2.0]
+    parked = found({"a": along(0 * TIMES)}, Gap(0, 5, 16, 2.0, moving=False))
+    assert parked[2.0] == {"all", "stationary", "free"}
+
+
+def test_at_red_is_who_comes_to_the_line_while_it_is_closed():
+    assert "at red" in found({"a": STEADY}, colour="red")[1.0]
+    assert "at red" in found({"a": along(0 * TIMES + 10)}, colour="amber")[1.0], "stands behind the line"
+    assert "at red" not in found({"a": STEADY}, colour="green")[1.0]
+    assert "at red" not in found({"a": STEADY})[1.0], "nobody told the colour"
+    assert "at red" not in found({"a": STEADY}, colour="red", road=None)[1.0], "there is no map"
+    assert "at red" not in found({"a": STEADY}, colour="red", road=RoadMap())[1.0], "nothing is in it"
+    assert "at red" not in found({"a": along(60 - 5 * TIMES)}, colour="red")[1.0], "it comes from the other side"
+    assert "at red" not in found({"a": along(5 * TIMES + 40)}, colour="red")[1.0], "it is beyond the line"
+
+
+def test_an_object_without_direction_has_no_route():
+    scene = labelled({"a": along(0 * TIMES)})
+    scene.yaw[:] = np.nan
+    assert route_of(scene, 0, 5) is None
+    assert situations_of(scene, GAP)[1.0] == {"all", "moving"}
+
+
+def test_predictions_are_judged_by_their_own_covariance():
+    scene = labelled({"a": STEADY})
+    tracks = []
+    for k, time in enumerate(TIMES.tolist()):
+        boxes = Boxes.of(["car"], [[*(STEADY[k] + [3.0 if 5 < k < 16 else 0.0, 0.0]), 1.0]], velocity=[[5.0, 0.0]])
+        wide = np.diag([4.0, 1.0])[None]
+        seen = np.array([0.0 if not 5 < k < 16 else 1.0])
+        tracks.append(Tracks(time, np.array([7]), boxes, np.ones(1), wide, wide, seen))
+    predicted = judgement(JudgedRun(scene, tracks), GAP).predicted
+    assert set(predicted) == {1.0, 2.0}
+    assert predicted[2.0].error == pytest.approx(3.0)
+    assert predicted[2.0].nees == pytest.approx(2.25)
+    assert predicted[2.0].nll == pytest.approx(1.125 + np.log(2 * np.pi * 2.0))
+
+
+def situations_run(name: str, recording: str, cluster: str, errors: list[float]) -> LivedRun:
+    outcomes = tuple(
+        Judgement({1.0: e}, {1.0: Prediction(e, e * e, e)} if np.isfinite(e) else {}, True, True, True, e)
+        for e in errors
+    )
+    n, at = len(errors), {1.0: frozenset({"all", "free"})}
+    gaps = (Gap(0, 5, 11, 1.0, moving=True, run=1),) * n
+    return LivedRun(recording, cluster, name, gaps, ("car",) * n, (at,) * n, outcomes, "kept", None)
+
+
+def test_figures_are_paired_and_overlapping_recordings_are_one():
+    nan = float("nan")
+    ours = [
+        situations_run("saga", r, c, e)
+        for r, c, e in (("1", "1", [1.0, 1.0, nan]), ("2", "2", [1.0, 1.0]), ("3", "2", [1.0]))
+    ]
+    theirs = [
+        situations_run("kf", r, c, e)
+        for r, c, e in (("1", "1", [2.0, 2.0, 9.0]), ("2", "2", [2.0, 2.0]), ("3", "2", [2.0]))
+    ]
+    saga, kf = situation_figures([*ours, *theirs], "kf")[:2]
+    assert (saga.situation, saga.length, saga.contender, saga.gaps, saga.lost) == ("all", 1.0, "saga", 5, 1)
+    assert (kf.gaps, kf.lost, kf.error_change) == (6, 0, None)
+    assert saga.error_change is not None
+    assert saga.error_change.estimate == pytest.approx(-0.5), "over gaps that both have"
+    assert np.isnan(saga.error_change.low), "two clusters are too few for an interval"
+    assert saga.coverage == {0.5: 1.0, 0.9: 1.0}
+    assert kf.coverage == {0.5: 0.0, 0.9: pytest.approx(5 / 6)}
+    assert {f.situation for f in situation_figures([*ours, *theirs], "kf")} == {"all", "free"}
+    assert situation_figures([], "kf") == []
