@@ -17,13 +17,13 @@ covariances are right. What lies outside the gate is never matched, which lowers
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from data_tools.figures import FigureTable, cell, count
+from data_tools.figures import FEWEST, Chart, FigureTable, Series, cell, count, distribution
 from data_tools.metrics import (
     EllipseCoverage,
     ErrorSummary,
@@ -33,10 +33,9 @@ from data_tools.metrics import (
     NuScenesTrackingMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
+    RecallCurves,
     SceneBoxes,
     SceneMetrics,
-    TrackSummary,
-    WholeTracks,
     calibration,
     coverages,
     error_summary,
@@ -45,11 +44,8 @@ from data_tools.metrics import (
     label_errors,
     nuscenes_tracking_metrics,
     scene_metrics_by_label,
-    track_summaries,
-    whole_tracks,
 )
 from data_tools.metrics.hota import Similarity
-from data_tools.plots import calibration_plot, error_histograms, recall_sweep
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.types.boxes import Boxes
@@ -101,10 +97,50 @@ def error_json(errors: LabelErrors) -> dict[str, Any]:
     }
 
 
-def error_pictures(errors: LabelErrors) -> dict[str, Any]:
-    """matplotlib figures by name: error histograms and, if there are covariances, how well they fit."""
-    pictures = {"errors": error_histograms(errors)}
-    return pictures | ({"calibration": calibration_plot(errors)} if np.isfinite(errors.nees).any() else {})
+SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+
+
+def accuracy_charts(errors: LabelErrors) -> dict[str, list[Chart]]:
+    """Charts by name, if they have data: errors at labels by class, and the shares that the tracks' ellipses hold."""
+    classes = {name: of_class for name, of_class in errors_by_class(errors).items() if name != "overall"}
+    charts = [
+        distribution(
+            f"{title} at labels",
+            unit,
+            "share of labels below",
+            [(name, e.sample(field).values * scale) for name, e in classes.items()],
+        )
+        for title, unit, field, scale in (
+            ("Position error", "m", "position", 1.0),
+            ("Velocity error", "m/s", "velocity", 1.0),
+            ("Heading error", "degrees", "heading", 180 / np.pi),
+        )
+    ]
+    held = [Series("right", (0.0, 1.0), (0.0, 1.0), faint=True)]
+    for name, of_class in classes.items():
+        known = of_class.nees[np.isfinite(of_class.nees)]
+        if len(known) >= FEWEST:
+            held.append(Series(name, SHARES, list(coverages(known, SHARES).values())))
+    calibrated = Chart("Calibration of positions", "share that the ellipse should hold", "share that it holds", held)
+    named = {"errors": [chart for chart in charts if chart.series], "calibration": [calibrated] * (len(held) > 1)}
+    return {name: found for name, found in named.items() if found}
+
+
+def recall_charts(curves: Mapping[str, RecallCurves]) -> list[Chart]:
+    """Charts of what each class pays for more recall, up to the recall that it reaches.
+
+    AMOTA and AMOTP are the means of the first and the last one over the recall that is asked for; recall that is not
+    reached counts with 0 and with 2 m.
+    """
+    charts = []
+    for name, title in (("motar", "MOTAR"), ("mota", "MOTA"), ("ids", "identity switches"), ("motp", "MOTP, m")):
+        series = []
+        for label, curve in curves.items():
+            values = getattr(curve, name)
+            reached = np.isfinite(values) & np.isfinite(curve.score)
+            series.append(Series(label, curve.hypothetical_recall[reached].tolist(), values[reached].tolist()))
+        charts.append(Chart(title, "recall", title, series))
+    return charts
 
 
 def _error_cells(f: ErrorSummary) -> tuple[str, ...]:
@@ -308,23 +344,6 @@ def summary_table(sweep: NuScenesTrackingMetrics, errors: LabelErrors, hota: Seq
     return FigureTable("Tracks beside the ground truth", _SUMMARY_COLUMNS, tuple(rows))
 
 
-_QUALITY_TITLE = "Whole tracks; rank quality: average precision by mean score"
-_QUALITY_COLUMNS = ("class", "tracks", "true", "ghosts", "ghost share", "rank quality")
-
-
-def track_table(tracks: WholeTracks) -> FigureTable:
-    """Table for people."""
-    return FigureTable(
-        _QUALITY_TITLE,
-        _QUALITY_COLUMNS,
-        tuple((name, *_quality_cells(f)) for name, f in track_summaries(tracks).items()),
-    )
-
-
-def _quality_cells(f: TrackSummary) -> tuple[str, ...]:
-    return (*map(cell, (f.tracks, f.true, f.ghosts)), cell(f.ghost_share), cell(f.rank_quality))
-
-
 _MOMENT_TITLE = (
     "Tracks at every moment; MOTP and errors in m; carried error: of the track that last followed a hidden object"
 )
@@ -341,20 +360,18 @@ class Evaluation:
     tracking     table of the tracking metrics
     programs     the same figures by name, with the names of the scenes
     errors       at labels
-    tracks       as wholes, of all scenes
     hota         empty where it was not asked for
     innovations  squared distances in sigmas by class; empty where they are not known
-    draw         makes pictures of the tracking metrics by name
+    curves       of the tracking metrics over recall, by class; empty where there are none
     sweep        over scores; None where it was not asked for
     """
 
     tracking: FigureTable
     programs: Mapping[str, Any]
     errors: LabelErrors
-    tracks: WholeTracks
     hota: Sequence[HotaRow] = ()
     innovations: Mapping[str, FloatArray] = field(default_factory=dict)
-    draw: Callable[[], Mapping[str, Any]] = dict
+    curves: Mapping[str, RecallCurves] = field(default_factory=dict)
     sweep: NuScenesTrackingMetrics | None = None
 
     def summary(self) -> FigureTable | None:
@@ -368,7 +385,6 @@ class Evaluation:
             self.tracking,
             *([] if self.sweep is None else [sweep_table(TITLE, self.sweep)]),
             *error_tables(self.errors),
-            track_table(self.tracks),
             *innovations,
             *([hota_table(self.hota)] if self.hota else []),
         ]
@@ -380,14 +396,13 @@ class Evaluation:
             **self.programs,
             **swept,
             **error_json(self.errors),
-            "tracks": track_summaries(self.tracks),
             "innovations": innovation_json(self.innovations),
             "hota": hota_json(self.hota),
         }
 
-    def pictures(self) -> dict[str, Any]:
-        """matplotlib figures by name."""
-        return {**self.draw(), **error_pictures(self.errors)}
+    def charts(self) -> dict[str, list[Chart]]:
+        """Charts by name: recall, errors, calibration, those that there are."""
+        return ({"recall": recall_charts(self.curves)} if self.curves else {}) | accuracy_charts(self.errors)
 
 
 def evaluate_tracks(
@@ -404,7 +419,7 @@ def evaluate_tracks(
     Raises `InputError` for a scene without ground truth, `MissingExtraError` for HOTA without trackeval.
     """
     by_label: dict[str, list[SceneMetrics]] = {}
-    errors, tracks, pairs = [], [], []
+    errors, pairs = [], []
     for scene, found in results:
         if scene.ground_truth is None:
             raise InputError(f"scene {scene.name}: expected ground truth")
@@ -413,7 +428,6 @@ def evaluate_tracks(
         visible = SceneBoxes.of_annotations(scene.ground_truth, hidden=False)
         errors.append(label_errors(visible, found, visible.boxes.velocity))
         pairs.append((SceneBoxes.of_annotations(scene.ground_truth), found))
-        tracks.append(whole_tracks(*pairs[-1]))
     pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
     swept = score_sweep(results) if sweep else None
     thresholds = dict.fromkeys(pooled, 0.0) if swept is None else best_thresholds(swept)
@@ -427,10 +441,9 @@ def evaluate_tracks(
             "tracking": {name: _figures(metrics) for name, metrics in whole.items()},
         },
         errors=LabelErrors.pool(errors),
-        tracks=WholeTracks.concatenate(tracks),
         hota=hota(pairs, thresholds) if with_hota else (),
         innovations=innovations or {},
-        draw=dict if swept is None else lambda: {"recall": recall_sweep(swept.curves)},
+        curves={} if swept is None else swept.curves,
         sweep=swept,
     )
 

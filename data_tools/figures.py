@@ -1,9 +1,10 @@
-"""Figures for people and programs: tables of texts, and JSON with null for undefined numbers."""
+"""Figures for people and programs: tables of texts, charts as numbers, and JSON with null for undefined numbers."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
+from saga_fg.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,42 @@ def cell(value: float, digits: int = 3) -> str:
 def count(value: float) -> str:
     """A count as text, "-" if it is not finite."""
     return cell(value, 0)
+
+
+CURVE_POINTS = 100
+FEWEST = 20  # values that make a curve
+
+
+@dataclass(frozen=True)
+class Series:
+    """A curve, or the heights of bars; `faint`: the reference of the others."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    faint: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Curves over common axes; with `bars`, the one series is drawn as bars from x[k] to x[k + 1]."""
+
+    title: str
+    x_label: str
+    y_label: str
+    series: Sequence[Series]
+    bars: bool = False
+
+
+def distribution(title: str, unit: str, share_of: str, samples: Sequence[tuple[str, FloatArray]]) -> Chart:
+    """Return cumulative distributions up to the 99 % quantile, of the samples with enough values."""
+    share = np.linspace(0.0, 0.99, CURVE_POINTS)
+    series = [
+        Series(name, np.quantile(values, share).tolist(), share.tolist())
+        for name, values in samples
+        if len(values) >= FEWEST
+    ]
+    return Chart(title, unit, share_of, series)
 
 
 def as_json(value: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.datasets.source import DatasetSource
-from data_tools.evaluation import placed_detections
+from data_tools.evaluation import accuracy_charts, placed_detections
 from data_tools.figures import FigureTable, cell, write_figures
 from data_tools.files.atomic_files import write_text
 from data_tools.metrics import SceneBoxes, coverages
@@ -29,7 +30,6 @@ from data_tools.metrics.labels import (
 )
 from pipelines.config import Method
 from pipelines.report import report_page, result_report
-from pipelines.report.figures import accuracy_charts
 from pipelines.report.page import RunRecord, write_run_record
 from pipelines.smoothing import SmoothConfig
 from pipelines.tracking import Progress, track_scene
@@ -294,6 +294,6 @@ def _page(source: DatasetSource, result: Path, found: Mapping[str, SceneResult],
             facts=facts,
             notes=[*notes, *some.notes],
             tables=list(evaluation.tables()),
-            charts=accuracy_charts(evaluation.errors),
+            charts=list(chain.from_iterable(accuracy_charts(evaluation.errors).values())),
         )
     )

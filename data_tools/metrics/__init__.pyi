@@ -11,15 +11,11 @@ from .label_errors import (
     EllipseCoverage,
     ErrorSummary,
     LabelErrors,
-    TrackSummary,
-    WholeTracks,
     calibration,
     error_summary,
     errors_by_class,
     label_errors,
     label_velocities,
-    track_summaries,
-    whole_tracks,
 )
 from .nuscenes_sweep import NuScenesClassMetrics, RecallCurves
 from .nuscenes_tracking import (
@@ -48,8 +44,6 @@ __all__ = [
     "RecallCurves",
     "SceneBoxes",
     "SceneMetrics",
-    "TrackSummary",
-    "WholeTracks",
     "calibration",
     "coverage",
     "coverages",
@@ -65,6 +59,4 @@ __all__ = [
     "nuscenes_tracking_metrics",
     "scene_metrics",
     "scene_metrics_by_label",
-    "track_summaries",
-    "whole_tracks",
 ]

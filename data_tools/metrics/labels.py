@@ -176,11 +176,6 @@ class PrecisionRecall:
         k = int(np.argmax(f1))
         return float(self.precision[k]), float(self.recall[k])
 
-    @property
-    def average_precision(self) -> float:
-        """Area under the curve, a step function: precision weighted by the gain in recall."""
-        return float(np.sum(np.diff(self.recall, prepend=0.0) * self.precision))
-
     def recall_at(self, precision: float) -> float:
         """The largest recall with at least this precision; 0 if there is none."""
         return float(self.recall[self.precision >= precision].max(initial=0.0))

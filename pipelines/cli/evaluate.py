@@ -15,7 +15,7 @@ from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource, Innovations, input_files
 from data_tools.evaluation import LEGEND
 from data_tools.files.atomic_files import atomic_directory, write_text, write_zip
-from data_tools.plots import png
+from data_tools.plots import chart_picture, png
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
@@ -89,8 +89,8 @@ def _evaluate(
         write_text(shown.markdown, "\n".join(table.markdown() for table in (*([summary] if summary else ()), *tables)))
     if shown.plots is not None:
         with atomic_directory(shown.plots, known=("recall.png", "errors.png", "calibration.png")) as folder:
-            for name, picture in evaluation.pictures().items():
-                (folder / f"{name}.png").write_bytes(png(picture))
+            for name, charts in evaluation.charts().items():
+                (folder / f"{name}.png").write_bytes(png(chart_picture(charts)))
 
 
 def _tracked(source: DatasetSource, settings: TrackConfig, method: Method) -> tuple[Results, Innovations]:

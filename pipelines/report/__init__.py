@@ -3,7 +3,7 @@
 result + recordings -> `ReportScene`s, tables, charts -> `report_page` -> one file
 """
 
-from pipelines.report.figures import Chart, Series, accuracy_charts, latency_chart
+from pipelines.report.figures import latency_chart
 from pipelines.report.page import (
     Report,
     RunRecord,
@@ -16,12 +16,9 @@ from pipelines.report.page import (
 from pipelines.report.scenes import ReportScene, scene_of_run
 
 __all__ = [
-    "Chart",
     "Report",
     "ReportScene",
     "RunRecord",
-    "Series",
-    "accuracy_charts",
     "latency_chart",
     "read_run_record",
     "record_path",

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,14 @@ import numpy as np
 from data_tools.datasets.detection_files import read_predictions
 from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource
-from data_tools.figures import FigureTable, as_json
+from data_tools.evaluation import accuracy_charts
+from data_tools.figures import Chart, FigureTable, as_json
 from data_tools.files.atomic_files import write_text
 from data_tools.files.input_files import read_bytes
 from data_tools.files.readers import parsed_json
 from pipelines.config import load_config
 from pipelines.explaining import clock_table
-from pipelines.report.figures import UNSEEN, Chart, accuracy_charts, latency_chart, track_charts, track_figures
+from pipelines.report.figures import UNSEEN, latency_chart, track_charts, track_figures
 from pipelines.report.scenes import ReportScene, scene_data, start_thresholds, thumbnails
 from saga_fg.errors import InputError
 from saga_fg.tracking import SensorTime
@@ -286,6 +288,6 @@ def _on_the_ground(source: DatasetSource, scenes: Sequence[ReportScene], width: 
 def _figures(source: DatasetSource, found: Results) -> tuple[list[FigureTable], list[Chart]]:
     if source.has_truth:
         evaluation = found.evaluate()
-        return list(evaluation.tables()), accuracy_charts(evaluation.errors)
+        return list(evaluation.tables()), list(chain.from_iterable(accuracy_charts(evaluation.errors).values()))
     results = list(found.scenes.values())
     return [track_figures(results)], track_charts(results)

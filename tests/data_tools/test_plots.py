@@ -7,48 +7,34 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from data_tools.figures import FigureTable, as_json, cell, count, write_figures
-from data_tools.metrics import LabelErrors, RecallCurves
-from data_tools.plots import calibration_plot, error_histograms, plot, png, recall_sweep, running_graph_picture
+from data_tools.evaluation import recall_charts
+from data_tools.figures import Chart, FigureTable, Series, as_json, cell, count, write_figures
+from data_tools.metrics import RecallCurves
+from data_tools.plots import chart_picture, plot, png, running_graph_picture
 from saga_fg import Detection, Detections, Frame, InputError, Tracker, track
 
 
-def label_errors(nees: np.ndarray) -> LabelErrors:
-    n = len(nees)
-    column = np.linspace(0.0, 1.0, n)
-    return LabelErrors(
-        np.full(n, "car"), np.arange(n), column, np.ones(n, dtype=bool), column / 2, column, column, column, nees
+def test_a_chart_is_drawn_as_it_is():
+    chart = Chart(
+        "Errors", "m", "share", [Series("right", (0, 1), (0, 1), faint=True), Series("car", (0, 2), (0, 0.5))]
     )
+    figure = chart_picture([chart, chart])
+    for ax in figure.axes:
+        right, car = ax.lines
+        assert (ax.get_title(), right.get_color(), car.get_label()) == ("Errors", "black", "car")
+        assert car.get_xydata().tolist() == [[0, 0], [2, 0.5]]
+    assert png(figure).startswith(b"\x89PNG")
 
 
-def test_charts_follow_covariances_and_detections():
-    nees = np.random.default_rng(0).chisquare(2, 4000)
-    (ax,) = calibration_plot(label_errors(nees)).axes
-    line = next(line for line in ax.lines if str(line.get_label()).startswith("car"))
-    np.testing.assert_allclose(line.get_ydata(), line.get_xdata(), atol=0.03)
-    (ax,) = calibration_plot(label_errors(nees / 4)).axes  # covariances too large
-    assert (ax.lines[0].get_ydata() >= ax.lines[0].get_xdata()).all()
-    assert len(calibration_plot(label_errors(np.full(5, np.nan))).axes[0].lines) == 1  # the diagonal alone
-    figure = error_histograms(label_errors(np.ones(1000)))
-    position, velocity, heading = figure.axes
-    overall, detections = (line for line in position.lines if line.get_color() == "C0")
-    x, y = overall.get_data()
-    np.testing.assert_allclose(y, np.minimum(x, 1.0), atol=0.01)
-    np.testing.assert_allclose(detections.get_ydata(), np.minimum(2 * x, 1.0), atol=0.02)
-    assert len(velocity.lines) == len(heading.lines) == 2
-
-
-def test_recall_sweeps_leave_out_what_is_not_reached():
+def test_recall_charts_leave_out_what_is_not_reached():
     recall = np.linspace(1.0, 0.1, 10)
     reached = np.where(recall > 0.75, np.nan, 0.5)
-    curves = RecallCurves(recall, *([reached] * 8))
-    figure = recall_sweep({"car": curves})
-    assert len(figure.axes) == 4
-    for ax in figure.axes:
-        (line,) = ax.lines
-        assert max(line.get_xdata()) <= 0.75
-        assert set(line.get_ydata()) == {0.5}
-    assert png(figure).startswith(b"\x89PNG")
+    charts = recall_charts({"car": RecallCurves(recall, *([reached] * 8))})
+    assert len(charts) == 4
+    for chart in charts:
+        (series,) = chart.series
+        assert max(series.x) <= 0.75
+        assert set(series.y) == {0.5}
 
 
 def test_a_running_graph_is_drawn_where_it_is():

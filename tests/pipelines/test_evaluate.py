@@ -116,9 +116,6 @@ def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path):
     assert 0 < overall["position"] < 1
     assert 0 < overall["detection"] < 1
     assert 0 < figures["calibration"]["overall"]["coverage"]["0.9"] <= 1
-    assert 0 < figures["tracks"]["overall"]["true"] < figures["tracks"]["overall"]["tracks"]
-    assert 0 < figures["tracks"]["car"]["rank_quality"] <= 1
-    assert "Whole tracks" in result.stdout
     assert figures["hota"]["car"]["2D"]["hota"] >= figures["hota"]["car"]["3D"]["hota"] > 0.2
     assert "HOTA, CLEAR and Identity" in result.stdout
     assert figures["innovations"]["car"]["matches"] > 20
@@ -137,8 +134,6 @@ def test_kitti_labels_as_results_are_perfect(tmp_path):
     assert figures["per_class"]["car"]["0.7"]["mota"] == 1.0
     assert figures["errors"]["car"]["position"] == 0.0
     assert figures["errors"]["car"]["velocity"] is None
-    assert figures["tracks"]["car"]["ghost_share"] == 0.0
-    assert figures["tracks"]["car"]["rank_quality"] == 1.0
     assert figures["calibration"]["car"]["boxes"] == 0
     assert "Calibration" not in result.stdout
 
@@ -176,7 +171,6 @@ def test_simulated_scenes_are_judged_at_every_moment(tmp_path):
     assert overall["objects"] == sum(f["objects"] for name, f in figures["tracking"].items() if name != "overall")
     assert overall["objects"] == figures["errors"]["overall"]["labels"]
     assert 0 < overall["position_rmse"] < 1
-    assert 0 < figures["tracks"]["overall"]["rank_quality"] <= 1
     assert figures["calibration"]["overall"]["boxes"] > 50
     assert figures["innovations"]["car"]["matches"] > 50
     assert 0.2 < figures["innovations"]["car"]["nis"] < 5

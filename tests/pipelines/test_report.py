@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from data_tools.datasets.results import SceneResult
+from data_tools.evaluation import SHARES, accuracy_charts
 from data_tools.figures import FigureTable
 from data_tools.metrics import SceneBoxes, label_errors
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
@@ -23,13 +24,12 @@ from pipelines.report import (
     Report,
     ReportScene,
     RunRecord,
-    accuracy_charts,
     latency_chart,
     read_run_record,
     report_page,
     scene_of_run,
 )
-from pipelines.report.figures import COLUMNS, SHARES, track_charts, track_figures, unseen_for
+from pipelines.report.figures import COLUMNS, track_charts, track_figures, unseen_for
 from pipelines.report.page import record_path, write_run_record
 from pipelines.report.scenes import edges_of_frames, scene_data
 from pipelines.tracking import TrackedScene, track_scene
@@ -141,7 +141,8 @@ def test_charts_say_what_the_errors_are():
     covariance = np.tile(0.09 * np.eye(2), (n, 1, 1))
     truth = SceneBoxes(moment, np.full(n, "a"), truth_boxes, np.zeros(n))
     found = SceneBoxes(moment, np.full(n, "t"), found_boxes, np.ones(n), covariance)
-    position, velocity, heading, held = accuracy_charts(label_errors(truth, found, np.zeros((n, 2))))
+    charts = accuracy_charts(label_errors(truth, found, np.zeros((n, 2))))
+    (position, velocity, heading), (held,) = charts["errors"], charts["calibration"]
     series = position.series[0]
     assert np.interp(0.5, series.y, series.x) == pytest.approx(np.median(np.hypot(*error.T)), abs=0.01)
     assert velocity.title.startswith("Velocity")

@@ -75,12 +75,10 @@ from data_tools.metrics import (
     KittiTrackingSequence,
     LabelErrors,
     SceneBoxes,
-    WholeTracks,
     kitti_hota_metrics,
     kitti_tracking_metrics,
     label_errors,
     label_velocities,
-    whole_tracks,
 )
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -327,12 +325,6 @@ def evaluate_kitti(
         kitti_table("KITTI 3D tracking metrics, in %", tracking),
         {"sequences": tuple(scored), "per_class": tracking},
         LabelErrors.pool(kitti_label_errors(each, classes) for each in scored.values()),
-        WholeTracks.concatenate(
-            [
-                whole_tracks(_of_classes(each.truth, classes), _of_classes(each.found, classes))
-                for each in scored.values()
-            ]
-        ),
         kitti_hota(pairs, best) if with_hota else (),
         innovations or {},
     )

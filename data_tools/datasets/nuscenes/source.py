@@ -54,13 +54,10 @@ from data_tools.metrics import (
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
     SceneBoxes,
-    WholeTracks,
     label_errors,
     label_velocities,
     nuscenes_tracking_metrics,
-    whole_tracks,
 )
-from data_tools.plots import recall_sweep
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
@@ -154,10 +151,9 @@ def evaluate_nuscenes(
             nuscenes_label_errors(each.tracking, placed_detections(each.scene) if each.scene.frames else None)
             for each in scored.values()
         ),
-        WholeTracks.concatenate([whole_tracks(each.tracking.truth, each.tracking.found) for each in scored.values()]),
         nuscenes_hota([each.tracking for each in scored.values()], tracking) if with_hota else (),
         innovations or {},
-        lambda: {"recall": recall_sweep(tracking.curves)},
+        tracking.curves,
     )
 
 
