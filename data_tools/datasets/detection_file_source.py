@@ -68,7 +68,7 @@ class DetectionFileSource(DatasetSource):
     example = "detections.csv"
     detections: list[str] | None = option(
         "Table of detections: .csv, .ndjson, .jsonl, .npz, .parquet or .feather (extra [parquet]). In parallel: "
-        "several of them, patterns, URLs, or lists of such in a .txt file.",
+        "several of them, patterns, or URLs.",
         None,
         metavar="TABLE",
         required=(*TRACKING, "learn interactions"),
@@ -102,11 +102,6 @@ class DetectionFileSource(DatasetSource):
         "YAML file with the same, for --truth alone.", None, flag="--truth-import", metavar="FILE", verbs=JUDGED
     )
     scenes: str | None = option("Scene names with commas between them; all if left out.", None)
-    hosts: str | None = option(
-        "Hosts, or buckets, that URLs in lists may name and lead to, besides those of the URLs given here.",
-        None,
-        metavar="HOST,...",
-    )
     table: Literal["csv", "ndjson"] = option("Format of the tables, in parallel.", "csv", verbs=("track",))
 
     def __post_init__(self) -> None:
@@ -137,7 +132,7 @@ class DetectionFileSource(DatasetSource):
         if not self.detections:
             yield NoScenes()
             return
-        with local_copy(self._table(), self._hosts) as path:
+        with local_copy(self._table()) as path:
             dataset = read_detections(path, self.how)
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{path}: --scenes")
 
@@ -151,13 +146,13 @@ class DetectionFileSource(DatasetSource):
         if not self.detections:
             yield Parts((), (), NoScenes())
             return
-        parts = [DetectionFilePart(url, self.how, self._hosts) for url in expanded(self.detections or (), self._hosts)]
+        parts = [DetectionFilePart(url, self.how) for url in expanded(self.detections or ())]
         yield Parts([part.name for part in parts], parts)
 
     @contextmanager
     def stream(self) -> Iterator[Iterator[Scene]]:
         chosen = None if self.scenes is None else names("--scenes", self.scenes)
-        with local_copy(self._table(), self._hosts) as path:
+        with local_copy(self._table()) as path:
             yield read_scenes_in_parts(path, scenes=chosen, how=self.how)
 
     def read_results(self, result: Path, truth: bool = True) -> Results:
@@ -175,7 +170,7 @@ class DetectionFileSource(DatasetSource):
     def option_for(self, mend: Mend) -> str:
         names: Mapping[str, str] = {}
         if mend.columns and self.detections:
-            with local_copy(expanded(self.detections, self._hosts)[0], self._hosts) as path:
+            with local_copy(expanded(self.detections)[0]) as path:
                 names = column_names(path, self.how)
         return self.how.option_for(mend, names)
 
@@ -198,17 +193,13 @@ class DetectionFileSource(DatasetSource):
         """The scenes of --truth, with the frames of the detections where these are there."""
         assert self.truth is not None
         how = self.how if self.truth_import is None else self.truth_import
-        with local_copy(self.truth, self._hosts) as path:
+        with local_copy(self.truth) as path:
             truth = TruthFile(path, how)
         dataset: Dataset = truth
         if self.detections is not None:
-            with local_copy(self._table(), self._hosts) as path:
+            with local_copy(self._table()) as path:
                 dataset = DetectedTruth(truth, read_detections(path, self.how))
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{self.truth}: --scenes")
-
-    @property
-    def _hosts(self) -> tuple[str, ...]:
-        return () if self.hosts is None else tuple(names("--hosts", self.hosts))
 
     def _table(self) -> str:
         if len(self.detections or ()) != 1:
@@ -260,7 +251,6 @@ class DetectionFilePart:
 
     url: str
     how: TableImport = field(default_factory=TableImport)
-    hosts: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -270,5 +260,5 @@ class DetectionFilePart:
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
         """Open with the digest of the file."""
-        with local_copy(self.url, self.hosts) as path:
+        with local_copy(self.url) as path:
             yield OpenedPart({name_of(self.url): file_digest(path)}, lambda: read_detections(path, self.how))

@@ -7,8 +7,7 @@ A device may be endless, and a pipe without a writer blocks: both are refused be
 Files by path or by URL: s3://bucket/a.csv, gs://..., https://..., and others of `PROTOCOLS` that fsspec opens.
 
 URLs need the extra `[remote]` (https://filesystem-spec.readthedocs.io) and the package of their protocol, such as s3fs,
-which finds credentials itself. They are read in a child process, which connects to no other host than the URL's. A list
-of files names no host of its own accord.
+which finds credentials itself. They are read in a child process, which connects to no other host than the URL's.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import io
 import os
 import stat
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from glob import glob, has_magic
@@ -123,12 +122,10 @@ def name_of(location: str) -> str:
 
 
 @contextmanager
-def local_copy(location: str, hosts: Collection[str] = ()) -> Iterator[Path]:
+def local_copy(location: str) -> Iterator[Path]:
     """A local file with the content of `location`, under its name: itself, or a temporary copy.
 
     An `InputError` that is raised in the block, about the copy, names `location` instead.
-
-    hosts  that the URL may lead to, besides its own
 
     Raises `InputError` where it cannot be read, `MissingExtraError` for a URL without the packages it takes.
     """
@@ -138,7 +135,7 @@ def local_copy(location: str, hosts: Collection[str] = ()) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / (name_of(location) or "file")
         with path.open("wb") as file:
-            for _, piece in _remote(_pieces, location, None, hosts=hosts):
+            for _, piece in _remote(_pieces, location, None):
                 file.write(piece)
         with _called(path, location):
             yield path
@@ -169,65 +166,22 @@ def local_tree(location: str, patterns: Sequence[str]) -> Iterator[Path]:
             yield folder
 
 
-def expanded(locations: Sequence[str], hosts: Collection[str] = ()) -> list[str]:
+def expanded(locations: Sequence[str]) -> list[str]:
     """Paths and URLs, with patterns such as `*.csv` replaced by the sorted matching files, each file once.
 
-    A file ending in .txt is a list with one path, URL or pattern a line. Relative paths start from the working
-    directory; returned paths are absolute. URLs in lists may name the hosts (or buckets) of `locations`, and these:
-
-    hosts  further ones
-
-    Raises `InputError` for a pattern or list without files, for a list that is in itself, for another host in a list,
-    and for a path in a list that is read from a URL.
+    Returned paths are absolute. Raises `InputError` where there is no file.
     """
-    return _expanded(locations, (), {*hosts, *(_host(each) for each in locations)}, {})
-
-
-def _expanded(
-    locations: Sequence[str], lists: tuple[str, ...], hosts: set[str], known: dict[str, list[str]]
-) -> list[str]:
-    """Expand `locations`; `lists` are the lists that contain them, `known` what lists hold that were read."""
     found: list[str] = []
     for location in locations:
-        if "\0" in location:
-            raise InputError(
-                f"{lists[-1] if lists else 'files'}: expected names without a zero byte, got {location!r:.99}"
-            )
-        if lists:
-            _check_entry(location, lists[-1], hosts)
-        if name_of(location).endswith(".txt"):
-            name = location if is_url(location) else os.path.realpath(location)
-            if name in lists:
-                raise InputError(f"{location}: expected a list of files, this one is in itself")
-            if name not in known:
-                with local_copy(location, hosts) as path:
-                    lines = [line.strip() for line in read_text(path).splitlines()]
-                entries = [line for line in lines if line and not line.startswith("#")]
-                known[name] = _expanded(entries, (*lists, name), hosts, known)
-            found += known[name]
-        elif is_url(location) and "*" in location:
-            found += sorted(_remote(_matching, location, hosts=hosts))
+        if is_url(location):
+            found += sorted(_remote(_matching, location)) if "*" in location else [location]
         elif has_magic(location) and not os.path.exists(location):  # noqa: PTH110 - false for names too long
             found += sorted(str(Path(path).absolute()) for path in glob(location, recursive=True))  # noqa: PTH207
         else:
-            found.append(location if is_url(location) else str(Path(location).absolute()))
+            found.append(str(Path(location).absolute()))
     if not found:
-        raise InputError(f"{', '.join((*lists[-1:], *locations))[:500]}: expected at least one file, there is none")
+        raise InputError(f"{', '.join(locations)[:500]}: expected at least one file, there is none")
     return list(dict.fromkeys(found))
-
-
-def _check_entry(location: str, of: str, hosts: set[str]) -> None:
-    """Raise `InputError` for an entry that a list, local or `of` a URL, may not have."""
-    if is_url(of) and urlsplit(location).scheme in ("", "file") and urlsplit(of).scheme != "file":
-        raise InputError(f"{of}: {location}: expected URLs in a list that is read from a URL, this is a local file")
-    if _host(location) not in hosts and urlsplit(location).scheme not in ("", "file", "memory"):
-        host = _host(location)
-        raise InputError(f"{of}: {location}: this list names another host; if you know it: --hosts {host}")
-
-
-def _host(location: str) -> str:
-    """Host or bucket of a URL, "" for a path."""
-    return (urlsplit(location).hostname or "") if is_url(location) else ""
 
 
 @contextmanager
@@ -239,7 +193,7 @@ def _called(copy: Path, location: str) -> Iterator[None]:
         raise InputError(str(error).replace(str(copy), location)) from error
 
 
-def _remote(reader: Callable[..., Iterator[T]], url: str, *arguments: Any, hosts: Collection[str] = ()) -> Iterator[T]:
+def _remote(reader: Callable[..., Iterator[T]], url: str, *arguments: Any) -> Iterator[T]:
     """The records of a reader of a URL. Raises `InputError` for one of another protocol, and for chains of them."""
     protocol = url.partition("://")[0]
     if protocol not in PROTOCOLS or "::" in url:
@@ -252,7 +206,7 @@ def _remote(reader: Callable[..., Iterator[T]], url: str, *arguments: Any, hosts
         with one_line(_PROBLEM, url):
             yield from reader(url, *arguments)
         return
-    own = None if protocol in _STORES else [_host(url), *hosts] if protocol in _HOSTS else []
+    own = None if protocol in _STORES else [urlsplit(url).hostname or ""] if protocol in _HOSTS else []
     yield from isolated(_PROBLEM, reader, url, *arguments, hosts=own)
 
 

@@ -26,7 +26,6 @@ from data_tools.datasets.detection_files import TruthFile, read_detections, read
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.source import read_scored_sequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
-from data_tools.files.input_files import expanded
 from data_tools.laser import read_carmen
 from data_tools.lidar import Scan, read_scan
 from data_tools.pose_graphs import read_g2o
@@ -170,9 +169,6 @@ def targets(folder: Path) -> dict[str, Target]:
         "scan, PCD": one("scan.pcd", PCD, read_scan),
         "scan, PLY": one("scan.ply", PLY, read_scan),
         "scan, NumPy": Target((npy,), lambda: read_scan(npy)),
-        "list of files": one(
-            "list.txt", f"# tables\n{folder}/table.csv\n{folder}/*.npz\n", lambda path: expanded([str(path)])
-        ),
         "log of a sensor": one("gps.csv", GPS, lambda path: read_sensor_log(path, "gps")),
         "laser logs": Target(lasers, lambda: [read_carmen(path) for path in lasers]),
         "map": _map(folder / "map"),

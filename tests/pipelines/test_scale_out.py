@@ -289,11 +289,8 @@ def test_files_by_pattern_and_url(tmp_path):
     run = ["track", "file", "--workers", "1"]
     assert saga_fg(*run, tmp_path / "in" / "*.csv", "-o", tmp_path / "pattern").exit_code == 0
     assert saga_fg(*run, f"file://{tmp_path}/in/*.csv", "-o", tmp_path / "url").exit_code == 0
-    (tmp_path / "list.txt").write_text(f"# ours\n{tmp_path}/in/a00.csv\n\nfile://{tmp_path}/in/a01.csv\n")
-    assert saga_fg(*run, tmp_path / "list.txt", "-o", tmp_path / "list").exit_code == 0
     assert len(content(tmp_path / "pattern")) == 3
     assert content(tmp_path / "pattern") == content(tmp_path / "url")
-    assert list(content(tmp_path / "list")) == ["a00.csv", "a01.csv"]
     failed = saga_fg(*run, tmp_path / "in" / "a00.csv", f"file://{tmp_path}/in/none.csv", "-o", tmp_path / "pattern")
     assert failed.exit_code == 1
     assert "0 done, 1 unchanged, 1 failed" in failed.stdout

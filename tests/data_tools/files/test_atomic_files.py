@@ -248,15 +248,14 @@ def test_names():
 def test_patterns_are_sorted_and_every_file_comes_once(tmp_path):
     for name in ("b.csv", "a.csv", "c.npz"):
         (tmp_path / name).touch()
-    (tmp_path / "list.txt").write_text(f"# some\n\n{tmp_path}/c.npz\n{tmp_path}/*.csv\n")
     assert expanded([f"{tmp_path}/*.csv"]) == [f"{tmp_path}/a.csv", f"{tmp_path}/b.csv"]
-    assert [Path(path).name for path in expanded([f"{tmp_path}/b.csv", f"{tmp_path}/list.txt"])] == [
-        *("b.csv", "c.npz", "a.csv")
-    ]
+    assert [Path(path).name for path in expanded([f"{tmp_path}/b.csv", f"{tmp_path}/*"])] == ["b.csv", "a.csv", "c.npz"]
     with pytest.raises(InputError, match="expected at least one file"):
         expanded([f"{tmp_path}/*.ndjson"])
-    with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
-        expanded([f"{tmp_path}/none.txt"])
+    assert expanded(["none.csv", f"file://{tmp_path}/a.csv"]) == [
+        str(Path("none.csv").absolute()),
+        f"file://{tmp_path}/a.csv",
+    ]
 
 
 def test_what_cannot_be_read_is_named(subtests):
@@ -274,33 +273,6 @@ def test_without_fsspec_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(MissingExtraError, match=r"saga-fg\[remote\]"), local_copy("s3://bucket/a.csv"):
         pass
-
-
-def test_lists_of_files_are_read_once_and_not_in_themselves(tmp_path):
-    one, other = tmp_path / "one.txt", tmp_path / "other.txt"
-    one.write_text(f"{other}\n")
-    other.write_text(f"{one}\n")
-    with pytest.raises(InputError, match=r"one\.txt: expected a list of files, this one is in itself"):
-        expanded([str(one)])
-    other.write_text(f"{other.parent}/./other.txt\n")
-    with pytest.raises(InputError, match=r"other\.txt: expected a list of files, this one is in itself"):
-        expanded([str(one)])
-    for k in range(40):  # 2^40 paths through them
-        (tmp_path / f"{k}.txt").write_text(f"{tmp_path}/{k + 1}.txt\n{tmp_path}/./{k + 1}.txt\n")
-    (tmp_path / "40.txt").write_text(f"{tmp_path}/a.csv\n")
-    assert expanded([str(tmp_path / "0.txt")]) == [str(tmp_path / "a.csv")]
-
-
-def test_entries_that_can_be_no_files_are_refused(tmp_path, subtests):
-    path = tmp_path / "list.txt"
-    for entry, message in [
-        ("a\0b.csv", r"list\.txt: expected names without a zero byte, got 'a\\x00b\.csv'"),
-        ("[" * 5000, r"list\.txt, \[+: expected at least one file, there is none"),
-    ]:
-        with subtests.test(message):
-            path.write_text(f"{entry}\n")
-            with pytest.raises(InputError, match=message):
-                expanded([str(path)])
 
 
 def test_other_protocols_and_chains_are_refused(subtests):
@@ -328,33 +300,6 @@ def test_what_is_not_there_is_one_line(subtests):
                 pass
             assert str(caught.value).startswith(f"{url}: ")
             assert "\n" not in str(caught.value)
-
-
-def test_a_list_names_no_other_host_unless_it_is_given(tmp_path):
-    path = tmp_path / "list.txt"
-    path.write_text("https://data.example.org/a.csv\ns3://bucket/b.csv\n")
-    with pytest.raises(InputError) as caught:
-        expanded([str(path)])
-    assert str(caught.value) == (
-        f"{path}: https://data.example.org/a.csv: this list names another host; "
-        "if you know it: --hosts data.example.org"
-    )
-    with pytest.raises(InputError, match="--hosts bucket"):
-        expanded([str(path)], ["data.example.org"])
-    both = ["https://data.example.org/a.csv", "s3://bucket/b.csv"]
-    assert expanded([str(path)], ["data.example.org", "bucket"]) == both
-    assert expanded(["s3://bucket/c.csv", str(path)], ["data.example.org"]) == ["s3://bucket/c.csv", *both]
-
-
-def test_a_list_from_a_url_names_no_local_files(tmp_path):
-    memory = pytest.importorskip("fsspec").filesystem("memory")
-    for entry in ("/etc/passwd", "file:///etc/passwd", "a.csv", "*.csv"):
-        memory.pipe_file("/lists/one.txt", f"{entry}\n".encode())
-        with pytest.raises(InputError, match=r"memory://lists/one\.txt: .* expected URLs in a list"):
-            expanded(["memory://lists/one.txt"])
-    memory.pipe_file("/lists/one.txt", b"memory://lists/a.csv\n")
-    assert expanded(["memory://lists/one.txt"]) == ["memory://lists/a.csv"]
-    memory.store.clear()
 
 
 def test_pieces_of_a_large_file_are_put_together(tmp_path):

@@ -14,7 +14,7 @@ from benchmarks.recordings.landmarks import read_landmark_log
 from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.nuscenes import read_tracking_results
-from data_tools.files.input_files import expanded, open_bytes, read_text, unknown_name
+from data_tools.files.input_files import open_bytes, read_text, unknown_name
 from data_tools.files.readers import open_json, parsed_json
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o
@@ -40,7 +40,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "a.ply": read_scan,
     "a.npy": read_scan,
     "b.npz": read_scan,
-    "list.txt": lambda path: expanded([str(path)]),
 }
 
 
