@@ -157,7 +157,7 @@ def _kitti(data: Path) -> RecordingSet:
                     figures |= {f"{name} {key}": value for key, value in (own | {"IDS": float(f.ids)}).items()}
             return figures
 
-        return Score(figures_of, tuple(kitti_label_errors(each, CLASSES) for each in scored.values()))
+        return Score(figures_of, tuple(kitti_label_errors(each) for each in scored.values()))
 
     return RecordingSet("kitti", "kitti", dataset, score)
 

@@ -74,16 +74,16 @@ class ClassBoxes(Columns):
     score: FloatArray
 
 
-def true_boxes(sequences: Sequence[KittiTrackingSequence], label: str, persons: bool = False) -> ClassBoxes:
-    """The true boxes of a class (name in lower case). persons: whether `Person` is a neighbour of pedestrians."""
-    kept = [of_class(sequence.truth, label, persons) for sequence in sequences]
+def true_boxes(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
+    """The true boxes of a class (name in lower case)."""
+    kept = [of_class(sequence.truth, label) for sequence in sequences]
     exempt = [is_hidden(rows) | _neighbour(rows, label) for rows in kept]
     return _joined(kept, exempt, _frames(sequences))
 
 
-def found_boxes(sequences: Sequence[KittiTrackingSequence], label: str, persons: bool = False) -> ClassBoxes:
-    """The found boxes of a class (name in lower case). persons: whether `Person` is a neighbour of pedestrians."""
-    kept = [of_class(sequence.found, label, persons) for sequence in sequences]
+def found_boxes(sequences: Sequence[KittiTrackingSequence], label: str) -> ClassBoxes:
+    """The found boxes of a class (name in lower case)."""
+    kept = [of_class(sequence.found, label) for sequence in sequences]
     exempt = [
         is_small(rows) | _neighbour(rows, label) | in_ignored_area(rows, sequence.truth)
         for rows, sequence in zip(kept, sequences, strict=True)
@@ -98,7 +98,7 @@ def joined_ranges(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
     return n, np.arange(len(n)) - np.repeat(np.cumsum(count) - count - first, count)
 
 
-def of_class(objects: KittiObjects, label: str, persons: bool) -> KittiObjects:
+def of_class(objects: KittiObjects, label: str, persons: bool = False) -> KittiObjects:
     """The objects of a class and its neighbours. persons: whether `Person` is a neighbour of pedestrians."""
     asked = (label, *NEIGHBOURS.get(label, ()), *([PERSON] if persons and label == "pedestrian" else []))
     return objects.select(np.isin(np.char.lower(objects.type), asked) & (objects.track_id != -1))

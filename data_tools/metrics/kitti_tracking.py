@@ -170,15 +170,14 @@ class KittiTrackingMetrics:
 
 
 def kitti_tracking_metrics(
-    sequences: Sequence[KittiTrackingSequence], label: str, min_iou: float, persons: bool = False
+    sequences: Sequence[KittiTrackingSequence], label: str, min_iou: float
 ) -> KittiTrackingMetrics | None:
     """Metrics of class `label` ("car", "pedestrian", "cyclist") over all sequences; None if no true box counts.
 
-    Pairs need a 3D IoU of at least `min_iou`; the benchmark uses 0.25, 0.5 and 0.7. persons: whether `Person` lines are
-    neighbours of pedestrians (`kitti_boxes`); the reference evaluation leaves them out. Raises `InputError` for objects
-    of the class without a 3D box.
+    Pairs need a 3D IoU of at least `min_iou`; the benchmark uses 0.25, 0.5 and 0.7. Raises `InputError` for objects of
+    the class without a 3D box.
     """
-    true, found = (boxes(sequences, label.lower(), persons) for boxes in (true_boxes, found_boxes))
+    true, found = (boxes(sequences, label.lower()) for boxes in (true_boxes, found_boxes))
     gt = int((~true.exempt).sum())
     if gt == 0:
         return None

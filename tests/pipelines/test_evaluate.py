@@ -126,38 +126,16 @@ def test_kitti_labels_as_results_are_perfect(tmp_path):
     results.mkdir()
     labels = (root / "training" / "label_02" / "0007.txt").read_text().splitlines()
     (results / "0007.txt").write_text("".join(f"{line} 0.9\n" for line in labels if "DontCare" not in line))
-    result = done("evaluate", "kitti", results, "--dataroot", root, "--iou", "0.5,0.7", "--json", file)
+    result = done("evaluate", "kitti", results, "--dataroot", root, "--json", file)
     figures = json.loads(file.read_text())
     assert figures["sequences"] == ["0007"]
     assert set(figures["per_class"]) == {"car"}  # a sitting person is none that counts
-    assert set(figures["per_class"]["car"]) == {"0.5", "0.7"}
+    assert set(figures["per_class"]["car"]) == {"0.25", "0.5", "0.7"}
     assert figures["per_class"]["car"]["0.7"]["mota"] == 1.0
     assert figures["errors"]["car"]["position"] == 0.0
     assert figures["errors"]["car"]["velocity"] is None
     assert figures["calibration"]["car"]["boxes"] == 0
     assert "Calibration" not in result.stdout
-
-
-def test_who_sits_is_unknown_to_the_usual_evaluation(tmp_path):
-    for option, false_positives in [([], 1), (["--persons", "exempt"], 0)]:
-        folder = tmp_path / str(false_positives)
-        root, results, file = write_sequence(folder / "kitti"), folder / "results", folder / "figures.json"
-        results.mkdir()
-        labels = root / "training" / "label_02" / "0007.txt"
-        sitting = "2 5 Person 0 0 0 700 150 720 250 1.2 0.5 0.6 -3 1.6 8 0"
-        standing = "2 6 Pedestrian 0 0 0 800 150 820 250 1.8 0.5 0.6 3 1.6 8 0"
-        labels.write_text(f"{sitting}\n{standing}\n")
-        found = (line.replace("Person ", "Pedestrian ") for line in (sitting, standing))
-        (results / "0007.txt").write_text("".join(f"{line} 0.9\n" for line in found))
-        done("evaluate", "kitti", results, "--dataroot", root, "--iou", "0.5", "--json", file, *option)
-        assert json.loads(file.read_text())["per_class"]["pedestrian"]["0.5"]["fp"] == false_positives
-
-
-def test_options_that_are_none_are_named(tmp_path):
-    said = refused("evaluate", "kitti", tmp_path, "--dataroot", tmp_path, "--persons", "sitting")
-    assert "--persons: expected false or exempt, got 'sitting'" in said
-    for iou in ["half", "0", "1.5", ","]:
-        assert "--iou: expected" in refused("evaluate", "kitti", tmp_path, "--dataroot", tmp_path, "--iou", iou)
 
 
 def test_simulated_scenes_are_judged_at_every_moment(tmp_path):

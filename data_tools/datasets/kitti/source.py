@@ -299,24 +299,18 @@ ByIou = Mapping[float, KittiTrackingMetrics]
 
 
 def evaluate_kitti(
-    scored: Mapping[str, ScoredSequence],
-    classes: Sequence[str] = CLASSES,
-    ious: Sequence[float] = IOUS,
-    with_hota: bool = False,
-    innovations: Mapping[str, FloatArray] | None = None,
-    persons: bool = False,
+    scored: Mapping[str, ScoredSequence], with_hota: bool = False, innovations: Mapping[str, FloatArray] | None = None
 ) -> Evaluation:
     """Score the tracks of the sequences that were read; errors are those at the labels that their detections match.
 
-    persons      whether boxes at `Person` labels are exempt for pedestrians, see `kitti_tracking_metrics`
     innovations  of the journal of the run, by class, to be among the figures
 
     Raises `MissingExtraError` for HOTA without trackeval.
     """
     pairs = [KittiTrackingSequence(each.labels, each.result) for each in scored.values()]
     tracking: dict[str, ByIou] = {}
-    for label in classes:
-        found = ((iou, kitti_tracking_metrics(pairs, label, iou, persons)) for iou in ious)
+    for label in CLASSES:
+        found = ((iou, kitti_tracking_metrics(pairs, label, iou)) for iou in IOUS)
         by_iou = {iou: figures for iou, figures in found if figures is not None}
         if by_iou:
             tracking[label] = by_iou
@@ -324,21 +318,17 @@ def evaluate_kitti(
     return Evaluation(
         kitti_table("KITTI 3D tracking metrics, in %", tracking),
         {"sequences": tuple(scored), "per_class": tracking},
-        LabelErrors.pool(kitti_label_errors(each, classes) for each in scored.values()),
+        LabelErrors.pool(map(kitti_label_errors, scored.values())),
         kitti_hota(pairs, best) if with_hota else (),
         innovations or {},
     )
 
 
-def kitti_label_errors(scored: ScoredSequence, classes: Sequence[str]) -> LabelErrors:
-    """The errors at the labels of the classes in one sequence: those that a detection matches, if there are any."""
-    truth = _of_classes(scored.truth, classes)
+def kitti_label_errors(scored: ScoredSequence) -> LabelErrors:
+    """The errors at the labels of one sequence: those that a detection matches, if there are any."""
+    truth = scored.truth.select(np.isin(scored.truth.boxes.label, CLASSES))
     velocity = label_velocities(truth, scored.scene.timestamps, REACH)
     return label_errors(truth, scored.found, velocity, placed_detections(scored.scene) if scored.scene.frames else None)
-
-
-def _of_classes(table: SceneBoxes, classes: Sequence[str]) -> SceneBoxes:
-    return table.select(np.isin(table.boxes.label, classes))
 
 
 def kitti_hota(sequences: Sequence[KittiTrackingSequence], thresholds: Mapping[str, float]) -> list[HotaRow]:
@@ -414,20 +404,6 @@ class KittiSource(DatasetSource):
         "Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.", None, required=TRACKING
     )
     sequences: str | None = option("Sequences with commas between them; all if left out.", None)
-    iou: str = option("Least 3D overlaps of a pair, with commas.", "0.25,0.5,0.7", verbs=("evaluate", "benchmark"))
-    classes: str = option("Classes, with commas.", "car,pedestrian,cyclist", verbs=("evaluate", "benchmark"))
-
-    persons: str = option(
-        "Boxes at `Person` labels (who sits): false, as in the usual evaluation, or exempt, as in HOTA.",
-        "false",
-        metavar="false|exempt",
-        verbs=("evaluate", "benchmark"),
-    )
-
-    def __post_init__(self) -> None:
-        if self.persons not in ("false", "exempt"):
-            raise InputError(f"--persons: expected false or exempt, got {self.persons!r}")
-        overlaps(self.iou)
 
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[KittiTracking]:
@@ -455,16 +431,13 @@ class KittiSource(DatasetSource):
         )
 
     def read_results(self, result: Path, truth: bool = True) -> Results:
-        chosen, classes = self._chosen(), names("--classes", self.classes)
-        chosen = result_sequences(result) if chosen is None else chosen
+        chosen = self._chosen() or result_sequences(result)
         with self.restricted(chosen).open(truth) as dataset:
             if not truth:
                 scenes, table = [dataset.scene(name) for name in dataset.scenes], _table_of(result)
                 given = (given_result(result / f"{scene.name}.txt", scene, dataset, table) for scene in scenes)
                 return Results({each.scene.name: each for each in given})
-            scored = scored_sequences(result, dataset)
-        ious, exempt = overlaps(self.iou), self.persons == "exempt"
-        return Results(scored, lambda some, hota, nis: evaluate_kitti(some, classes, ious, hota, nis, exempt))
+            return Results(scored_sequences(result, dataset), evaluate_kitti)
 
     def _chosen(self) -> tuple[str, ...] | None:
         return None if self.sequences is None else names("--sequences", self.sequences)
@@ -483,14 +456,3 @@ class KittiPart:
         with self.source.open() as dataset:
             files = dataset.files(self.name)
             yield OpenedPart({f"{path.parent.name}/{path.name}": file_digest(path) for path in files}, lambda: dataset)
-
-
-def overlaps(text: str) -> tuple[float, ...]:
-    """Overlaps with commas between them. Raises `InputError` for others than those above 0 and at most 1."""
-    try:
-        values = tuple(float(value) for value in names("--iou", text))
-    except ValueError:
-        raise InputError(f"--iou: expected numbers with commas between them, got {text!r}") from None
-    if not all(0 < value <= 1 for value in values):
-        raise InputError(f"--iou: expected overlaps above 0 and at most 1, got {text!r}")
-    return values
