@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from birds_eye_picture import write_birds_eye_picture
 from concept_pictures import write_concept_pictures
 from heterogeneous_picture import write_heterogeneous_picture
 from running_graph_picture import write_running_graph_pictures
@@ -57,7 +58,7 @@ def main() -> None:
         )
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
-        shutil.copy(result.picture, HERE / "birds_eye.png")
+        write_birds_eye_picture(HERE / "birds_eye.png", result.comparison, load_config("simulated"))
         screenshot(result.page, HERE / "report.png", 1300, 920)
         frames, truth, odometry = degraded_drive(simulate_scene(street(), 0), JointSettings(), "lidar", 0)
         start, config = truth.world_T_ego[0], load_config("simulated")

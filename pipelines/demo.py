@@ -1,25 +1,22 @@
-"""The demo: simulated traffic, several trackers compared, a table, a picture and a page."""
+"""The demo: simulated traffic, several trackers compared, a table and a page."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from data_tools.figures import FigureTable, cell
 from data_tools.files.atomic_files import atomic_directory, write_text
 from data_tools.metrics import SceneMetrics, scene_metrics
-from data_tools.plots import png
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.source import write_tables
 from pipelines.config import Method, TrackConfig, load_config
 from pipelines.configuration import write_settings
-from pipelines.report import Report, ReportScene, report_page, scene_of_run
+from pipelines.report import Report, report_page, scene_of_run
 from pipelines.tracking import Progress, TrackedScene, track_scene
-from pipelines.view import SceneView, draw_scene, picture
 from saga_fg import Dataset, InputError, Scene
 from saga_fg.numerics.arrays import IntArray
 
@@ -98,10 +95,9 @@ TABLE_TITLE = (
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """The comparison, and the paths of the files."""
+    """The comparison, and the path of the page."""
 
     comparison: Comparison
-    picture: Path
     page: Path
 
 
@@ -113,21 +109,15 @@ def run_demo(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> DemoResult:
-    """Run the demonstration and write `birds_eye.png` and `index.html` into the folder `output`.
+    """Run the demonstration and write `index.html` into the folder `output`.
 
     Raises `InputError` where the folder can't be written, before any work is done.
     """
     with atomic_directory(output) as folder:
         comparison = compare(SimulatedTraffic(simulator, scenes, seed), config, METHODS, progress=progress)
         scene, moment = hardest_moment(comparison)
-        shown: tuple[Method, ...] = ("kf", "saga")
-        rules = config.tracker.edges
-        views = {
-            m: scene_of_run({m: comparison.runs[m][scene]}, rules if m == "saga" else (), config.sensors) for m in shown
-        }
-        (folder / "birds_eye.png").write_bytes(png(_picture(views, moment)))
         (folder / "index.html").write_text(report_page(_report(comparison, config, scene, moment)), encoding="utf-8")
-    return DemoResult(comparison, output / "birds_eye.png", output / "index.html")
+    return DemoResult(comparison, output / "index.html")
 
 
 def _report(comparison: Comparison, config: TrackConfig, first: int, start: int) -> Report:
@@ -164,16 +154,6 @@ def _hidden_nearby(scene: Scene, radius: float = 40.0, speed: float = 0.5) -> In
         moving = np.linalg.norm(truth.boxes.velocity, axis=1) > speed
         counts.append(int(np.sum(~truth.visible & near & moving)))
     return np.array(counts, dtype=np.int64)
-
-
-def _picture(scenes: Mapping[Method, ReportScene], moment: int) -> Any:
-    """The tracks of methods at a moment of a scene, beside the true objects."""
-    panels = {
-        TITLES[method]: [each for each in draw_scene(SceneView(scene)) if each.moment in (None, moment)]
-        for method, scene in scenes.items()
-    }
-    name = next(iter(scenes.values())).scene.name
-    return picture(panels, f"{name}/ego")
 
 
 _TABLES = tuple(f"scene-[0-9]*/{name}" for name in ("detections.csv", "truth.csv", "settings.yaml"))

@@ -127,9 +127,7 @@ that predicts hidden objects badly loses MOTA."""
 
 
 def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and the page.")] = Path(
-        "saga-fg-demo"
-    ),
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the page.")] = Path("saga-fg-demo"),
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of simulated scenes.")] = 3,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulation.")] = 0,
     scenario: Annotated[
@@ -141,7 +139,7 @@ def demo(
 ) -> None:
     """Simulate traffic, track it with three methods, and compare them.
 
-    Prints a table, and writes a bird's-eye picture and an HTML page with a player. Takes less than a minute.
+    Prints a table, and writes an HTML page with a player. Takes less than a minute.
 
     \b
     Examples:
@@ -156,7 +154,7 @@ def demo(
     title = f"{counted(scenes, 'simulated scene')}, seed {seed}"
     show_tables([comparison_table(result.comparison, title)])
     typer.echo(READING)
-    typer.echo(f"picture: {result.picture}\npage:    {result.page}")
+    typer.echo(f"page: {result.page}")
 
 
 MAPLESS: tuple[Scenario, ...] = ("traffic", "two-sensors")

@@ -1,11 +1,10 @@
 """Results in space: boxes, tracks, covariances, edges, points, landmarks.
 
 `ReportScene`s, scans, a SLAM result -> `Drawing`s -> a file for rerun (https://rerun.io) or Foxglove
-(https://foxglove.dev), rerun's viewer, which opens, or a picture from above
+(https://foxglove.dev), or rerun's viewer, which opens
 """
 
 from pipelines.view.drawing import Drawing, in_order
-from pipelines.view.picture import picture
 from pipelines.view.scenes import SceneView, SlamView, draw_scene, draw_slam, read_slam_view, result_views
 from pipelines.view.writers import check_view_file, load_rerun, show_rerun, write_view
 
@@ -18,7 +17,6 @@ __all__ = [
     "draw_slam",
     "in_order",
     "load_rerun",
-    "picture",
     "read_slam_view",
     "result_views",
     "show_rerun",

@@ -15,11 +15,7 @@ from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.demo import METHODS, Comparison, compare, comparison_table, hardest_moment, run_demo
-from pipelines.report import scene_of_run
-from pipelines.report.scenes import latest_detections
-from pipelines.view import SceneView, draw_scene, picture
 from saga_fg import InputError, Scene
-from saga_fg.numerics.geometry import inverse_transform, transform_points
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
 from tests.pipelines.command import done, refused
@@ -154,7 +150,7 @@ def test_simulated_scenes_are_judged_at_every_moment(tmp_path):
     assert 0.2 < figures["innovations"]["car"]["nis"] < 5
 
 
-# The demonstration: methods on the same scenes, a picture and a page that needs no network
+# The demonstration: methods on the same scenes, and a page that needs no network
 
 SHORT = SimulatorSettings(duration=3.0, warm_up=5.0)
 
@@ -209,37 +205,17 @@ def test_the_moment_shown_has_the_most_moving_hidden_objects(comparison):
     assert hidden(run.scene, moment) == max(hidden(scene, k) for scene in scenes for k in range(len(scene)))
 
 
-def test_the_picture_shows_a_moment_in_the_vehicles_frame(comparison):
-    run, k = comparison.runs["saga"][0], 10
-    report = scene_of_run({"saga": run}, (), {})
-    drawings = [each for each in draw_scene(SceneView(report)) if each.moment in (None, k)]
-    figure = picture({"one": drawings}, f"{run.scene.name}/ego")
-    (ax,) = figure.axes
-    assert ax.get_title(loc="left") == "one"
-    assert run.scene.ground_truth is not None
-    assert len(ax.patches) == 1 + len(run.scene.ground_truth[k]) + 2 * len(run.tracks[k])  # with the vehicle, ellipses
-    places = transform_points(inverse_transform(run.scene.world_T_ego[k]), run.tracks[k].boxes.position)[:, :2]
-    outlines = [patch.get_xy()[:4].mean(axis=0) for patch in ax.patches if len(patch.get_xy()) == 5]
-    gaps = np.linalg.norm(places[:, None] - np.array(outlines), axis=2)
-    np.testing.assert_allclose(gaps.min(axis=1), 0.0, atol=1e-6)
-    detections, _ = latest_detections(run.scene, {})
-    (crosses,) = (line for line in ax.lines if line.get_marker() == "x")
-    assert len(crosses.get_xdata()) == len(detections[k])
-    np.testing.assert_allclose(ax.patches[0].get_xy().mean(axis=0), [1.4, 0.0], atol=0.5)
-
-
-def test_the_demo_writes_a_picture_and_a_page(tmp_path):
+def test_the_demo_writes_a_page(tmp_path):
     result = run_demo(tmp_path / "out", load_config("simulated"), SHORT, scenes=1)
-    assert result.picture.read_bytes().startswith(b"\x89PNG\r\n")
     assert result.page.read_text(encoding="utf-8").startswith("<!doctype html>")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["birds_eye.png", "index.html"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["index.html"]
 
 
 def test_the_command_prints_the_table(tmp_path, monkeypatch):
     monkeypatch.setattr("pipelines.cli.start.scenario_settings", lambda scenario: SHORT)
     result = CliRunner(env={"COLUMNS": "200"}).invoke(app, ["demo", "--output", str(tmp_path / "out"), "--scenes", "1"])
     assert result.exit_code == 0, result.output
-    for text in ("occluded position RMSE, m", "ms per frame", *METHODS, "picture: ", "page: "):
+    for text in ("occluded position RMSE, m", "ms per frame", *METHODS, "page: "):
         assert text in result.stdout
 
 

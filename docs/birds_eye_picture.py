@@ -1,13 +1,18 @@
-"""Drawings of one moment as a picture from above, by matplotlib, which is imported when one is made."""
+"""The picture of README.md: tracks of two methods at a moment of the demo, beside the true objects, from above."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_tools.plots import new_figure
+from data_tools.plots import new_figure, png
+from pipelines.config import TrackConfig
+from pipelines.demo import TITLES, Comparison, hardest_moment
+from pipelines.report import scene_of_run
+from pipelines.view import SceneView, draw_scene
 from pipelines.view.drawing import Arrows, Drawing, Lines, Pose, Solids
 from pipelines.view.scenes import EDGE
 from saga_fg.numerics.arrays import FloatArray
@@ -27,6 +32,16 @@ STYLES: Mapping[str, dict[str, Any]] = {
 }
 """How solids of a layer are drawn; those of others are outlines in their own colour."""
 Extent = tuple[float, float, float, float]
+
+
+def write_birds_eye_picture(path: Path, comparison: Comparison, config: TrackConfig) -> None:
+    """Draw the tracks of kf and saga at the moment with the most hidden objects."""
+    scene, moment = hardest_moment(comparison)
+    panels, name = {}, comparison.runs["kf"][scene].scene.name
+    for method, rules in (("kf", ()), ("saga", config.tracker.edges)):
+        shown = SceneView(scene_of_run({method: comparison.runs[method][scene]}, rules, config.sensors))
+        panels[TITLES[method]] = [each for each in draw_scene(shown) if each.moment in (None, moment)]
+    path.write_bytes(png(picture(panels, f"{name}/ego")))
 
 
 def picture(panels: Mapping[str, Iterable[Drawing]], frame: str, extent: Extent = (-40.0, 70.0, -22.0, 22.0)) -> Any:
