@@ -7,12 +7,11 @@
 Keyframes (`sample`) come at most every half second. Each has a `sample_data` record of LIDAR_TOP at its own time, which
 carries the pose of the vehicle, and one of each other sensor, its frame nearest in time; all other frames are sweeps.
 There are no sensor files behind these records. A sensor's detections of a sample are those of its frame nearest in
-time, moved along their measured velocities to the sample's time; unknown velocities are NaN. Three fields are
-approximate:
+time, moved along their measured velocities to the sample's time; unknown velocities are NaN. Objects have no
+attributes, and two fields are approximate:
 
     num_lidar_pts      0 for hidden objects, else what 32 beams would leave on the object's side seen freely
     visibility_token   the lowest level for hidden objects, else the highest
-    attribute_tokens   from the class and the speed; objects whose id begins with "parked" are parked
 
 Schema: https://www.nuscenes.org/nuscenes#data-format.
 
@@ -76,7 +75,6 @@ CLASSES = ("car", "truck", "bus", "pedestrian")  # that every such version has
 KEYFRAME_INTERVAL = 0.5  # s
 ROOF = (0.94, 0.0, 1.84)  # m, of LIDAR_TOP where no sensor is a LiDAR
 RAYS_PER_STERADIAN = 12300.0  # 0.2 deg between shots, 32 beams over 42 deg
-ATTRIBUTES = ("vehicle.moving", "vehicle.stopped", "vehicle.parked", "pedestrian.moving", "pedestrian.standing")
 VISIBILITY = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
 IMAGE = (1600, 900)  # width, height, pixels
 FOCAL = IMAGE[0] / 2  # an angle of view of 90 degrees
@@ -190,7 +188,7 @@ def _shared_tables(mounts: Mounts, logs: tuple[str, ...], classes: tuple[str, ..
     image = {"category": "semantic_prior", "filename": "maps/placeholder.png"}
     return {
         "category": [{"token": token("category", c), "name": c, "description": ""} for c in categories],
-        "attribute": [{"token": token("attribute", a), "name": a, "description": ""} for a in ATTRIBUTES],
+        "attribute": [],
         "visibility": [{"token": t, "level": level, "description": ""} for t, level in VISIBILITY.items()],
         "sensor": [
             {"token": token("sensor", c.name), "channel": c.name, "modality": c.modality}
@@ -293,28 +291,17 @@ def _annotations(scene: Scene, k: int, truth: Annotations, sample: str) -> Itera
     distance = np.linalg.norm(boxes.position[:, :2] - scene.world_T_ego[k][:2, 3], axis=1)
     side = boxes.size[:, 1] * boxes.size[:, 2] / np.maximum(distance, 1.0) ** 2
     points = np.where(truth.visible, np.maximum(1, np.round(RAYS_PER_STERADIAN * side)), 0).astype(int)
-    moving = np.linalg.norm(boxes.velocity, axis=1) > 0.2
-    columns = (column.tolist() for column in (truth.id, boxes.label, truth.visible, moving, points))
-    for box, name, label, visible, moves, count in zip(box_fields(boxes, 6), *columns, strict=True):
+    columns = (column.tolist() for column in (truth.id, truth.visible, points))
+    for box, name, visible, count in zip(box_fields(boxes, 6), *columns, strict=True):
         yield {
             "token": token("sample_annotation", sample, name),
             "sample_token": sample,
             "visibility_token": "4" if visible else "1",
-            "attribute_tokens": [token("attribute", attribute) for attribute in _attributes(name, label, moves)],
+            "attribute_tokens": [],
             **box,
             "num_lidar_pts": count,
             "num_radar_pts": 0,
         }
-
-
-def _attributes(name: str, label: str, moves: bool) -> list[str]:
-    if label in ("bicycle", "traffic_cone"):
-        return []
-    if label == "pedestrian":
-        return ["pedestrian.moving" if moves else "pedestrian.standing"]
-    if name.startswith("parked"):
-        return ["vehicle.parked"]
-    return ["vehicle.moving" if moves else "vehicle.stopped"]
 
 
 LabelledObject = tuple[str, list[Record]]
