@@ -7,7 +7,19 @@ from importlib import import_module
 from benchmarks.runner import application
 
 NAMES = (
-    *("endurance", "estimators", "gaps", "geometry", "joint", "kills", "labels", "landmarks", "loops", "metrics"),
+    *(
+        "conventions",
+        "endurance",
+        "estimators",
+        "gaps",
+        "geometry",
+        "joint",
+        "kills",
+        "labels",
+        "landmarks",
+        "loops",
+        "metrics",
+    ),
     *("modes", "pose_graphs", "scaling", "service", "settling", "slam", "smoothing", "speed", "streaming", "tracking"),
 )
 

@@ -21,12 +21,11 @@ import typer
 from benchmarks.course import SimulatedCourse, revisits
 from benchmarks.joint import degraded_odometry
 from benchmarks.runner import Row, Rows, clocked, each
-from data_tools.files.input_files import error_context
 from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.slam.joint import OdometryIncrements, OdometryNoise

@@ -30,11 +30,10 @@ from threadpoolctl import threadpool_info
 from benchmarks.bootstrap import Interval
 from data_tools.datasets.source import names
 from data_tools.figures import FigureTable
-from data_tools.files.input_files import unknown_name
 from pipelines.cli.console import JsonFile, MarkdownFile, error_console, new_group, report
 from pipelines.cli.options import Verbose, as_command
 from pipelines.tracking import one_thread
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 
 PROGRAM = (sys.executable, "-c", "from pipelines.cli.main import main; main()")  # the command, for other processes

@@ -33,9 +33,8 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.files.atomic_files import write_text
-from data_tools.files.input_files import unknown_name
 from data_tools.files.readers import LARGEST, TextTable, read_lines
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics import geometry
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import adjoint, quaternion_norms, quaternion_rotation, rotation_quaternion

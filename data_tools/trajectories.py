@@ -46,9 +46,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from data_tools.files.atomic_files import write_text
-from data_tools.files.input_files import error_context
 from data_tools.files.readers import read_table
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import inverse_transform, is_rotation, quaternion_norms, quaternion_rotation
 

@@ -1,10 +1,14 @@
-"""Warnings of what is probably wrong in data and settings, each once, by the checks of `saga_fg.types.plausibility`."""
+"""What is probably wrong in data and settings, each once, by the checks of `saga_fg.tables`.
+
+Most of it is a warning. A table whose contents contradict how it is read is refused.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,19 +18,11 @@ from saga_fg import Curvilinear, Dataset, Frame, InputError, Scene, TrackerSetti
 from saga_fg.model.edge_rules import acting_classes
 from saga_fg.model.sensor import sensor_model
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.tables.conventions import Sample, findings_of
+from saga_fg.tables.plausibility import idle_lanes, idle_rules, settings_without_data
 from saga_fg.tracking.by_name import estimator_parameters
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.plausibility import (
-    Finding,
-    Mend,
-    Sample,
-    findings_of,
-    headings_in_degrees,
-    headings_of_frames,
-    idle_lanes,
-    idle_rules,
-    settings_without_data,
-)
+from saga_fg.types.finding import Finding, Mend
 from saga_fg.types.road_map import LANE, MAP_CLASSES, STOP_LINE
 
 log = logging.getLogger(__name__)
@@ -71,22 +67,37 @@ class Checks:
             yield scene
 
     def see(self, scene: Scene) -> None:
-        """Warn of what looks wrong in a scene, one of the first."""
+        """Warn of what looks wrong in a scene, one of the first.
+
+        Raises `InputError` where its contents contradict how it is read.
+        """
         sample = Sample.from_frames(scene.frames)
         self._note(sample)
         if self._judged < SCENES:
             self._judged += 1
-            self._tell(findings_of(sample, self._logits))
+            self._tell(self._found_in(scene, sample))
 
     def see_first(self, source: DatasetSource) -> None:
-        """Look at the first part of recordings that are done elsewhere; what cannot be read is said there."""
+        """See the first part of recordings that are done elsewhere; what cannot be read is said there.
+
+        Raises `InputError` as `see`.
+        """
+        found: list[Finding] = []
         with suppress(InputError), source.parts() as there:
             first = next(iter(there.parts), None)
             if first is None:  # tracks of other trackers alone
                 return
             with first.opened() as part:
                 dataset = part.read()
-                self._tell(findings_of(Sample.from_frames(dataset.scene(dataset.scenes[0]).frames), self._logits))
+                scene = dataset.scene(dataset.scenes[0])
+                found = self._found_in(scene, Sample.from_frames(scene.frames))
+        self._tell(found)
+
+    def _found_in(self, scene: Scene, sample: Sample) -> list[Finding]:
+        if scene.findings is None:
+            return findings_of(sample, self._logits)
+        logits = any(self._logits(name) for name in np.unique(sample.sensor).tolist())
+        return [finding for finding in scene.findings if finding.kind != "scores" or not logits]
 
     def add(self, classes: Iterable[str]) -> None:
         """Note classes of tracks."""
@@ -112,11 +123,9 @@ class Checks:
         self._tracked_frames += bool(len(tracks))
         if self._tracked_frames >= FRAMES or len(self._live) > 10 * FRAMES:
             self._tracked_frames = FRAMES
-            found = headings_in_degrees(np.concatenate(self._yaw)), headings_of_frames(self._live)
-            self._tell([finding for finding in found if finding is not None])
-            times = [frame.timestamp for frame in self._live]
-            ordered = [self._live[row] for row in np.argsort(times, kind="stable").tolist()]
-            self.see(Scene("live", np.empty(0), np.empty((0, 4, 4)), (), ordered))
+            sample = Sample.from_frames(self._live, np.concatenate(self._yaw))
+            self._note(sample)
+            self._tell(findings_of(sample, self._logits))
             self.finish()
             self._live, self._yaw = [], []
 
@@ -142,9 +151,12 @@ class Checks:
 
     def _tell(self, findings: Iterable[Finding]) -> None:
         for finding in findings:
+            if finding.stops:
+                raise InputError(f"{finding}; --as-given reads it as it is")
             if finding.kind not in self._told:
                 self._told.add(finding.kind)
-                log.warning("%s", finding.text("" if finding.mend is None else self._option_for(finding.mend)))
+                option = self._option_for(finding.mend) if finding.mend is not None and not finding.option else ""
+                log.warning("%s", replace(finding, option=finding.option or option))
 
 
 def _without_effect(tracker: TrackerSettings, usual: TrackerSettings) -> Iterator[Finding]:

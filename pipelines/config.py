@@ -9,9 +9,9 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Literal, get_args
 
-from data_tools.files.input_files import unknown_name
 from pipelines.configuration import load_settings, read_settings
 from saga_fg import ConstantVelocity, Curvilinear, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg.errors import unknown_name
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.stability import LearnedInteractions
 from saga_fg.settings import settings_group

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+
 
 class SagaError(Exception):
     """Base of all exceptions raised on purpose by saga-fg; its text is one line meant for people."""
@@ -31,3 +35,25 @@ class MissingExtraError(SagaError, ImportError):
 
 class KernelError(SagaError, RuntimeError):
     """A kernel cannot be compiled, as Numba is missing or does not fit; the text names the reason."""
+
+
+@contextmanager
+def error_context(where: str) -> Iterator[None]:
+    """Prefix every `InputError` of the block with `where`, unless it begins so."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(f"{where}: "):
+            raise
+        raise InputError(f"{where}: {error}") from error
+
+
+_LONGEST = 80  # characters of a name that a message shows
+
+
+def unknown_name(what: str, name: str, known: tuple[str, ...]) -> str:
+    """Message about a name that is not among the `known` ones: the nearest of them, and the list if it is short."""
+    nearest = get_close_matches(name[:_LONGEST], known, n=1, cutoff=0.6)
+    hint = f"; did you mean {nearest[0][:_LONGEST]!r}? Expected" if nearest else ", expected"
+    shown = ", ".join(each[:_LONGEST] for each in known[:12]) + (f", ... ({len(known)} in all)" * (len(known) > 12))
+    return f"unknown {what} {name[:_LONGEST]!r}{hint} one of: {shown or 'none here'}"

@@ -25,9 +25,9 @@ import numpy as np
 from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import option
-from data_tools.files.input_files import error_context, local_tree, unknown_name
+from data_tools.files.input_files import local_tree
 from data_tools.files.readers import read_table
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import IntArray
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Dataset, Scene

@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.files.input_files import error_context
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.types.road_map import Lane, Point, RoadMap, StopLine, TrafficLight

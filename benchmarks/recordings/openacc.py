@@ -23,9 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
-from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.readers import NUMBERS, WHOLE, arrow_arrays
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
 

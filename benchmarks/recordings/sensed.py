@@ -20,12 +20,11 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic
-from data_tools.files.input_files import unknown_name
 from data_tools.simulator.road_users import SimulatedTrajectories
 from data_tools.simulator.sensed_world import HEIGHT, SensedWorld
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, lidar
 from data_tools.simulator.world import scene_from_world
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import MAX_POSITION, Boxes

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.datasets.detection_files import DetectionFile, read_detections
+from data_tools.datasets.detection_files import DetectionTable, read_detections
 from data_tools.datasets.source import ChosenScenes, DatasetSource, option
 from data_tools.files.input_files import local_copy
 from saga_fg.errors import InputError
@@ -49,7 +49,7 @@ class AnnotatedSource(DatasetSource):
 class DetectedScenes:
     """The scenes of a dataset with the detections of a table, or with their annotations as detections."""
 
-    def __init__(self, dataset: Dataset, table: DetectionFile | None) -> None:
+    def __init__(self, dataset: Dataset, table: DetectionTable | None) -> None:
         self._dataset, self._table = dataset, table
         self.scenes = dataset.scenes
 

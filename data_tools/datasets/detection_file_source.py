@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport, TruthFile
-from data_tools.datasets.detection_files.column_names import pairs
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
-from data_tools.datasets.detection_files.formats import column_names
 from data_tools.datasets.results import Results, SceneResult, clear_figures, read_table_results
 from data_tools.datasets.source import (
     TRACKING,
@@ -29,12 +27,13 @@ from data_tools.datasets.source import (
 )
 from data_tools.files.input_files import expanded, local_copy, name_of
 from saga_fg.errors import InputError
+from saga_fg.tables.column_names import pairs
 from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
     from saga_fg.numerics.arrays import FloatArray
-    from saga_fg.types.plausibility import Mend
+    from saga_fg.tables.plausibility import Mend
 
 JUDGED: tuple[Verb, ...] = ("evaluate", "report", "view")
 """Verbs that compare with true objects."""
@@ -95,8 +94,9 @@ class DetectionFileSource(DatasetSource):
         None,
         metavar="KIND=UNIT,...",
     )
-    coordinates: Literal["world", "ego", "sensor"] | None = option(import_options.COORDINATES, None)
+    coordinates: Literal["world", "ego", "sensor", "camera"] | None = option(import_options.COORDINATES, None)
     sort: bool = option(import_options.SORT, False)
+    as_given: bool = option(import_options.AS_GIVEN, False)
     table_import: TableImport | None = option(import_options.IMPORT, None, flag="--import", metavar="FILE")
     truth_import: TableImport | None = option(
         "YAML file with the same, for --truth alone.", None, flag="--truth-import", metavar="FILE", verbs=JUDGED
@@ -117,6 +117,7 @@ class DetectionFileSource(DatasetSource):
             pairs("--units", self.units),
             self.coordinates or "",
             self.sort,
+            self.as_given,
         )
         return own.over(self.table_import or TableImport())
 
@@ -168,11 +169,7 @@ class DetectionFileSource(DatasetSource):
             return read_table_results(result, dataset, every_scene=truth, how=self.how, own_times=not truth)
 
     def option_for(self, mend: Mend) -> str:
-        names: Mapping[str, str] = {}
-        if mend.columns and self.detections:
-            with local_copy(expanded(self.detections)[0]) as path:
-                names = column_names(path, self.how)
-        return self.how.option_for(mend, names)
+        return TableImport(**self.how.changes(mend, {})).options().strip()
 
     def kept(self) -> Mapping[str, Any]:
         return self.how.values()

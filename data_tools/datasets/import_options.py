@@ -9,6 +9,10 @@ UNITS = (
     "ft/s), angle=deg (rad, deg; clockwise, clockwise_deg; compass, compass_rad: clockwise from north), score=percent "
     "(share, percent)."
 )
-COORDINATES = "Coordinates of rows that say none; ego and sensor need the pose of the vehicle.  [default: world]"
+COORDINATES = (
+    "Coordinates of rows that say none; all but world need the pose of the vehicle. camera: at its origin, x to the "
+    "right, y down, z ahead.  [default: world]"
+)
 SORT = "Sort the rows by time, in memory."
+AS_GIVEN = "Read the table as it is said to be, even where its contents contradict it."
 IMPORT = "YAML file with the same: columns, classes, units, coordinates, sort."

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from data_tools.datasets.detection_files import TableImport, TrackRows, read_tracks
-from data_tools.files.input_files import error_context, unknown_name
 from data_tools.metrics import SceneBoxes
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.tables.plausibility import Mend, usual_class
 from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.plausibility import Mend, usual_class
 from saga_fg.types.track import known_velocities
 
 if TYPE_CHECKING:

@@ -41,8 +41,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 
-from data_tools.files.input_files import open_bytes, unknown_name
-from saga_fg.errors import InputError
+from data_tools.files.input_files import open_bytes
+from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Dataset, Scene
 
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from data_tools.datasets.results import Results
     from data_tools.lidar.scan import ScanSequence
     from saga_fg.smoothing import Labels
-    from saga_fg.types.plausibility import Mend
+    from saga_fg.tables.plausibility import Mend
     from saga_fg.types.track import Tracks
 
 Verb = Literal[

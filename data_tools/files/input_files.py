@@ -18,7 +18,6 @@ import stat
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from glob import glob, has_magic
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
@@ -79,28 +78,6 @@ def read_text(path: str | Path) -> str:
             else "bytes that are none: another encoding, or no text"
         )
         raise InputError(f"{path}: expected text in UTF-8, got {got}") from error
-
-
-@contextmanager
-def error_context(where: str) -> Iterator[None]:
-    """Prefix every `InputError` of the block with `where`, unless it begins so."""
-    try:
-        yield
-    except InputError as error:
-        if str(error).startswith(f"{where}: "):
-            raise
-        raise InputError(f"{where}: {error}") from error
-
-
-_LONGEST = 80  # characters of a name that a message shows
-
-
-def unknown_name(what: str, name: str, known: tuple[str, ...]) -> str:
-    """Message about a name that is not among the `known` ones: the nearest of them, and the list if it is short."""
-    nearest = get_close_matches(name[:_LONGEST], known, n=1, cutoff=0.6)
-    hint = f"; did you mean {nearest[0][:_LONGEST]!r}? Expected" if nearest else ", expected"
-    shown = ", ".join(each[:_LONGEST] for each in known[:12]) + (f", ... ({len(known)} in all)" * (len(known) > 12))
-    return f"unknown {what} {name[:_LONGEST]!r}{hint} one of: {shown or 'none here'}"
 
 
 T = TypeVar("T")

@@ -16,9 +16,8 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.files.input_files import error_context
 from data_tools.lidar.scan import Scan, ScanSequence
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.numerics.geometry import checked_transform
 from saga_fg.slam.sensors import SensorName

@@ -48,11 +48,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_tools.files.atomic_files import write_bytes
-from data_tools.files.input_files import error_context, open_bytes, read_bytes
+from data_tools.files.input_files import open_bytes, read_bytes
 from data_tools.files.isolated_reading import isolated
 from data_tools.files.readers import load_archive, load_array
 from data_tools.lidar.scan import Scan
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError, MissingExtraError, error_context
 from saga_fg.numerics.arrays import BoolArray, FloatArray, checked
 
 Columns = Mapping[str, NDArray[Any]]

@@ -27,12 +27,11 @@ from data_tools.datasets.kitti.dataset import world_position
 from data_tools.datasets.mcap.dataset import TRANSFORM_TYPES, TransformRecord, TransformTree, transform_records
 from data_tools.datasets.mcap.objects import checked_time, frame_name, nanoseconds, xyz
 from data_tools.datasets.mcap.recording import SUFFIXES, LoggedMessage, Recording, Topic, decoded_messages
-from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.isolated_reading import isolated
 from data_tools.laser.carmen import LaserLog, padded
 from data_tools.lidar.recording import RecordingOptions, ScanRecording
 from data_tools.lidar.scan_files import Columns, scan_columns, scan_of_columns
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.slam.sensors import SensorName
 

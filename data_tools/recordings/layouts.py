@@ -23,7 +23,6 @@ from data_tools.datasets.kitti import KittiTracking, kitti_scans
 from data_tools.datasets.kitti.dataset import read_origin, read_transform
 from data_tools.datasets.nuscenes.dataset import nuscenes_scans
 from data_tools.datasets.nuscenes.tables import read_table, table_folder
-from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.readers import read_lines
 from data_tools.files.readers import read_table as read_rows
 from data_tools.lidar.recording import RecordingOptions, ScanRecording
@@ -32,7 +31,7 @@ from data_tools.lidar.scan_files import KITTI, SUFFIXES, read_columns, read_reco
 from data_tools.recordings.bags import is_bag, open_bag
 from data_tools.sensor_logs import kitti_sensor_log
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, quaternion_rotation
 from saga_fg.providers.odometry import mounting

@@ -10,10 +10,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from data_tools.files.input_files import unknown_name
 from pipelines.cli.console import ReportingGroup, new_command, new_group
 from saga_fg import __version__
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, unknown_name
 
 COMMANDS = {
     "inspect": ("inspect:inspect_table", "Look at a table: its columns, units, classes, times, faults."),

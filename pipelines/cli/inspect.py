@@ -13,19 +13,18 @@ import typer
 
 from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport
-from data_tools.datasets.detection_files.column_names import pairs
 from data_tools.datasets.detection_files.dataset import TableSurvey, survey_table
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_file, check_writable
-from data_tools.files.input_files import error_context
 from pipelines.cli.console import JsonFile, counted
 from pipelines.cli.options import Verbose
 from pipelines.config import load_config
 from pipelines.configuration import load_settings
 from pipelines.explaining import clock_lines, graph_picture, journal_of, read_graphs, read_track, story
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context
 from saga_fg.model.edge_rules import acting_classes
-from saga_fg.types.plausibility import FILL_IN, Finding, Mend, idle_rules, usual_classes
+from saga_fg.tables.column_names import pairs
+from saga_fg.tables.plausibility import FILL_IN, Finding, Mend, idle_rules, usual_classes
 
 MOST = 12  # scenes and classes that are listed
 EPOCH = 1e8  # s, from which times count from 1970
@@ -49,7 +48,7 @@ def inspect_table(
         typer.Option("--units", help=import_options.UNITS, metavar="KIND=UNIT,..."),
     ] = None,
     coordinates: Annotated[
-        Literal["world", "ego", "sensor"] | None,
+        Literal["world", "ego", "sensor", "camera"] | None,
         typer.Option("--coordinates", help=import_options.COORDINATES),
     ] = None,
     sort: Annotated[bool, typer.Option("--sort", help=import_options.SORT)] = False,
@@ -73,12 +72,12 @@ def inspect_table(
     survey = survey_table(table, given.over(base))
     _show_columns(survey)
     _show_times(survey)
-    findings = (*survey.findings, *_show_classes(survey))
+    findings = (*survey.findings, *survey.how.judged(_show_classes(survey), survey.raw.found.names))
     typer.echo("\nWhat looks wrong:" if survey.faults or findings or not survey.sorted else "\nNothing looks wrong.")
     for fault in survey.faults:
         typer.echo(f"  {fault}")
     for finding in findings:
-        typer.echo(f"  {finding.text(survey.how.option_for(finding.mend, survey.raw.found.names))}")
+        typer.echo(f"  {str(finding).removeprefix(f'{table}: ')}")
     if not survey.sorted:
         typer.echo("  rows are not in order of time; add --sort")
     if survey.raw.present("ego_x").any() and "coordinates" not in survey.raw.columns and not survey.how.coordinates:

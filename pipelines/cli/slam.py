@@ -11,7 +11,6 @@ import numpy as np
 import typer
 
 from data_tools.files.atomic_files import check_writable_folder
-from data_tools.files.input_files import error_context
 from data_tools.laser import read_carmen
 from data_tools.pose_graphs import read_g2o
 from data_tools.recordings import RecordingOptions, is_bag, read_bag_laser
@@ -23,6 +22,7 @@ from pipelines.slam.configuration import load_laser_settings
 from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.results import write_laser_slam, write_pose_graph
 from saga_fg import InputError
+from saga_fg.errors import error_context
 from saga_fg.numerics.arrays import IntArray
 from saga_fg.slam.pose_graph import consensus, graph_error, optimise_poses
 

@@ -1,58 +1,94 @@
-"""Tracking of a whole table of detections in one call, with warnings of what is probably wrong in it."""
+"""Tracking of a whole table of detections in one call, which refuses one whose contents contradict how it is read."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Literal
 
+import numpy as np
+
+from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import acting_classes
 from saga_fg.model.sensor import Sensor, sensor_model
+from saga_fg.tables.column_names import TableImport
+from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like
+from saga_fg.tables.plausibility import idle_rules
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker
-from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.pandas_tables import UNNAMED, Table, moments_of_table, new_table, numbers, texts
-from saga_fg.types.plausibility import Sample, findings_of, headings_in_degrees, headings_of_frames, idle_rules
+from saga_fg.types.dataset import Scene
+from saga_fg.types.finding import Mend
 from saga_fg.types.track import Tracks
 
-
-def table_findings(
-    table: Table, frames: Sequence[Frame], settings: TrackerSettings, sensors: Mapping[str, Sensor]
-) -> Iterator[str]:
-    """Yield a line for each finding of `saga_fg.types.plausibility`; `saga_fg.track` has the columns and arguments."""
-    found = (
-        headings_in_degrees(numbers(table, "yaw")),
-        headings_of_frames(frames),
-        idle_rules(acting_classes(settings.edges), set(texts(table, "label", UNNAMED).tolist()) - {UNNAMED}),
-        *findings_of(Sample.from_frames(frames), lambda name: sensor_model(sensors, name).score == "logit"),
-    )
-    return (finding.text() for finding in found if finding is not None)
+UNNAMED = "object"
+"""Class of detections without a column of classes; any name will do."""
 
 
 def track(
-    detections: Table, settings: TrackerSettings | None = None, sensors: Mapping[str, Sensor] | None = None
+    detections: Table,
+    settings: TrackerSettings | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
+    columns: Mapping[str, str] | None = None,
+    classes: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    coordinates: Literal["", "world", "ego", "sensor", "camera"] = "",
+    as_given: bool = False,
 ) -> Table:
-    """Track a `pandas.DataFrame` of detections, and return one of tracks: a row for each track and moment.
+    """Track a table of detections, of pandas, Polars or Arrow, and return one of tracks, a row for each and moment.
 
-    detections  a row for each: timestamp (s, or times of pandas), x, y (m, in a frame that does not move), and where
-                known z, label, score, sensor, length, width, height, yaw (rad), vx, vy, range_rate,
-                cov_xx, cov_xy, cov_yy (m^2); a row without x and y is a moment at which nothing was detected
-    settings    of the tracker; by default tracks are reported from their second detection on
-    sensors     models by name of the sensor
+    detections   a row for each: timestamp (s, or dates), x, y (m), and where known z, label, score, sensor, length,
+                 width, height, yaw (rad), vx, vy, range_rate, cov_xx, cov_xy, cov_yy (m^2), scene, and ego_x,
+                 ego_y, ego_yaw, the vehicle's pose; a row without x and y is a moment at which nothing was detected
+    settings     of the tracker; by default tracks are reported from their second detection on
+    sensors      models by name of the sensor
+    columns      names of columns in the table, by ours, where they are not found: {"x": "pos_e"}
+    classes      our name of a class by that in the table, an empty one to leave its objects out
+    units        {"angle": "deg", "time": "ns", "speed": "km/h", ...}, as of `saga-fg track file --units`
+    coordinates  of positions, headings and velocities: world, ego, sensor or camera
+    as_given     read the table as these arguments say even where its contents contradict them
 
-    Frames are taken in order of time, each by what came before it. Warns (`UserWarning`) of what is probably wrong, by
-    the checks of `saga-fg inspect`: units, scores, headings, sizes, times, classes on which no edge rule acts.
-    Raises `InputError` for a table that can't be used, `MissingExtraError` without pandas.
+    Frames are taken in order of time, each by what came before it. The table of tracks is of the same kind; it has a
+    column `scene` if the detections have one, and each scene has a tracker of its own. Warns (`UserWarning`) of what is
+    probably wrong, by the checks of `saga-fg inspect`. Raises `InputError` for a table that can't be used, and for one
+    whose contents contradict how it is read: units of angles, times, lengths or speeds, coordinates, exchanged columns.
     """
+    how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
     settings = TrackerSettings(min_hits=2) if settings is None else settings
-    tracker = Tracker(settings, sensors)
-    frames = list(_frames(detections))
-    if frames:
-        for finding in table_findings(detections, frames, settings, sensors or {}):
-            warnings.warn(finding, stacklevel=2)
-    found = [tracker.step(frame).table_columns() for frame in frames]
-    return new_table(found or [Tracks.empty(0.0).table_columns()])
+    raw = raw_table(detections, how)
+    scenes = scenes_of(raw)
+    tell(scenes, how, settings, sensors or {})
+    found = []
+    for scene in scenes:
+        tracker = Tracker(settings, sensors)
+        for frame in scene.frames:
+            tracks = tracker.step(frame).table_columns()
+            name = {"scene": np.full(len(tracks["id"]), scene.name)} if "scene" in raw.columns else {}
+            found.append({**name, **tracks})
+    return table_like(detections, found or [Tracks.empty(0.0).table_columns()])
 
 
-def _frames(table: Table) -> Iterator[Frame]:
-    for time, sensor, rows in moments_of_table(table):
-        yield Frame(time, sensor, Detections.from_pandas(rows))
+def tell(
+    scenes: list[Scene], how: TableImport, settings: TrackerSettings, sensors: Mapping[str, Sensor], depth: int = 3
+) -> None:
+    """Warn of what is doubtful in the scenes of a table, at the caller's caller; raise where it contradicts `how`."""
+    labels = {name for scene in scenes for frame in scene.frames for name in frame.detections.boxes.label.tolist()}
+    logits = {name for scene in scenes for name in {frame.sensor for frame in scene.frames} if _logits(sensors, name)}
+    told = {finding.kind: finding for scene in reversed(scenes) for finding in scene.findings or ()}
+    if logits:
+        told.pop("scores", None)
+    rules = idle_rules(acting_classes(settings.edges), labels - {UNNAMED})
+    for finding in (*told.values(), *([] if rules is None else [rules])):
+        option = "" if finding.mend is None else _arguments(how, finding.mend)
+        text = str(replace(finding, option=option)).removeprefix("table: ")
+        if finding.stops:
+            raise InputError(f"{text}; as_given=True reads it as it is")
+        warnings.warn(text, stacklevel=depth)
+
+
+def _logits(sensors: Mapping[str, Sensor], name: str) -> bool:
+    return sensor_model(sensors, name).score == "logit"
+
+
+def _arguments(how: TableImport, mend: Mend) -> str:
+    return ", ".join(f"{name}={value!r}" for name, value in how.changes(mend, {}).items())

@@ -18,6 +18,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, checked, checked_labels
 from saga_fg.numerics.geometry import checked_transform
 from saga_fg.types.boxes import Boxes
+from saga_fg.types.finding import Finding
 from saga_fg.types.frame import Frame
 
 
@@ -58,6 +59,7 @@ class Scene:
     tokens        K names the dataset gives to these moments ("" where it has none)
     frames        of all sensors, in order of time
     ground_truth  K annotations, or None
+    findings      what is doubtful about how it was read; None where its reader has not looked
 
     Raises `InputError` for times that repeat or run backwards, and for lengths that differ.
     """
@@ -68,6 +70,7 @@ class Scene:
     tokens: tuple[str, ...]
     frames: Sequence[Frame]
     ground_truth: Sequence[Annotations] | None = None
+    findings: tuple[Finding, ...] | None = None
 
     def __post_init__(self) -> None:
         timestamps = checked("timestamps", self.timestamps, (None,))

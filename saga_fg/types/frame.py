@@ -23,8 +23,8 @@ from saga_fg.numerics.arrays import (
 from saga_fg.numerics.geometry import checked_transform
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.landmark import Observation
-from saga_fg.types.pandas_tables import Table, boxes_of_table, html_table, text_table
 from saga_fg.types.road_map import RoadMap
+from saga_fg.types.shown import html_table, text_table
 
 _TANGENT = {3: 3, 4: 6}  # dimension of the motions of so large a transform
 
@@ -234,16 +234,6 @@ class Detections(Columns):
         score = checked("score", [d.score for d in detections], (n,))
         identity = np.array([d.identity for d in detections], dtype=np.int64)
         return cls(boxes, score, rate, covariance, identity)
-
-    @classmethod
-    def from_pandas(cls, table: Table) -> Self:
-        """Return the rows of a `pandas.DataFrame` as detections of one moment.
-
-        Columns: x, y, and where known z, length, width, height (m), yaw (rad), vx, vy (m/s), range_rate (m/s), score or
-        confidence, label or class, cov_xx, cov_xy, cov_yy (of the position, m^2). Missing values are
-        unknown. Raises `InputError` naming the column.
-        """
-        return cls(*boxes_of_table(table))
 
     @classmethod
     def empty(cls) -> Self:

@@ -43,11 +43,11 @@ import numpy as np
 
 from data_tools.datasets.annotated import DetectedScenes
 from data_tools.datasets.central_differences import central_differences
-from data_tools.datasets.detection_files import DetectionFile
+from data_tools.datasets.detection_files import DetectionTable
 from data_tools.datasets.source import AreaMap, Kind, map_points
-from data_tools.files.input_files import error_context, read_bytes, unknown_name
+from data_tools.files.input_files import read_bytes
 from data_tools.files.readers import WHOLE, arrow_arrays, parsed_json
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, checked
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
 from saga_fg.types.boxes import Boxes
@@ -213,7 +213,7 @@ _NO_LABELS: StrArray = np.empty(0, dtype=np.str_)
 class AnnotatedLogs:
     """Logs with their annotations or a table as detections; a table's classes may be categories."""
 
-    def __init__(self, logs: ArgoverseLogs, table: DetectionFile | None) -> None:
+    def __init__(self, logs: ArgoverseLogs, table: DetectionTable | None) -> None:
         self._logs, self._table = logs, table
         self.scenes = logs.scenes
 

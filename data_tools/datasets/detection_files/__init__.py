@@ -10,11 +10,13 @@ One row per detection. The same columns in every format; only the first three ar
     vx, vy                m/s over ground                            default unknown
     range_rate            m/s over ground along the horizontal line of sight from the sensor, positive when the object
                           moves away; needs ego_x, ego_y, ego_yaw    default unknown
+    cov_xx, cov_xy, cov_yy
+                          covariance of the position, m^2            default that of the sensor's model
     score                 any finite number, higher is surer         default 1
     label                 class name                                 default "object"
     sensor                name of the sensor                         default "sensor"
     scene                 name of the recording                      default the file's name
-    coordinates           "world", "ego" or "sensor"                 default "world"
+    coordinates           "world", "ego", "sensor" or "camera"       default "world"
     ego_x, ego_y, ego_yaw pose of the vehicle, m and rad             required unless coordinates is "world", or the
     ego_z                 m                                          vehicle measures itself; ego_z: default 0
     odometry_x, odometry_y, odometry_yaw, odometry_dt                default unknown
@@ -24,7 +26,7 @@ One row per detection. The same columns in every format; only the first three ar
     ego_qw, ego_qx, ego_qy, ego_qz                                   instead of ego_yaw
 
 Columns by other names (`pos_x`, `timestamp_ns`, `confidence`, ...), in other units or with other classes are understood
-too, by `data_tools.datasets.detection_files.column_names` or by what a `TableImport` says.
+too, by `saga_fg.tables.column_names` or by what a `TableImport` says.
 
 Rows with the same scene, timestamp and sensor are one frame. A row whose x and y are both left out says that the sensor
 looked and saw nothing (in NumPy arrays, which cannot leave anything out: a boolean array `empty`).
@@ -54,9 +56,7 @@ position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2), coastin
 and settled (0 where the solver found no minimum of a nonlinear graph, else 1).
 """
 
-from data_tools.datasets.detection_files.column_names import TableImport
-from data_tools.datasets.detection_files.columns import LABEL_COLUMNS, TRACK_COLUMNS
-from data_tools.datasets.detection_files.dataset import DetectionFile, read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files.dataset import DetectionTable, read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.tracks import (
     PREDICTION_COLUMNS,
     PredictionRows,
@@ -71,12 +71,14 @@ from data_tools.datasets.detection_files.tracks import (
     write_rows,
     write_tracks,
 )
+from saga_fg.tables.column_names import TableImport
+from saga_fg.tables.columns import LABEL_COLUMNS, TRACK_COLUMNS
 
 __all__ = [
     "LABEL_COLUMNS",
     "PREDICTION_COLUMNS",
     "TRACK_COLUMNS",
-    "DetectionFile",
+    "DetectionTable",
     "PredictionRows",
     "TableImport",
     "TrackRows",

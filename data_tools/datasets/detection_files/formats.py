@@ -6,7 +6,7 @@ import csv
 import logging
 import shlex
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,17 +14,17 @@ from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from data_tools.datasets.detection_files.column_names import Clock, Columns, TableImport, meaning, understood
-from data_tools.datasets.detection_files.columns import COLUMNS, POSE, REQUIRED, RawTable, Values, clock_of
 from data_tools.files.input_files import open_bytes, open_text
 from data_tools.files.readers import SUFFIXES, arrow_columns, arrow_names, load_archive, parsed_json
 from saga_fg.errors import InputError
+from saga_fg.tables.column_names import Clock, Columns, TableImport, meaning, understood
+from saga_fg.tables.columns import COLUMNS, NAMED, POSE, REQUIRED, RawTable, Values, as_names, clock_of
+from saga_fg.tables.detections import sorted_by_time
 
 log = logging.getLogger(__name__)
 
 Row = TypeVar("Row")
 ROWS = 50_000  # of a part of a table
-NAMED = ("label", "sensor", "scene", "coordinates", "id", "source", "quality")
 TRACK_MEANINGS = ("id",)  # of tracks, which need no word where detections are read
 _OPEN_QUOTE = "a quote is opened and not closed on this line"
 
@@ -55,7 +55,7 @@ class _Reading:
 
     def hint(self, names: Collection[str]) -> TableImport:
         """Hint in an error message: how to read a file with these columns."""
-        return TableImport() if self.own is not None and set(self.own) <= set(names) else self.how
+        return TableImport(as_given=True) if self.own is not None and set(self.own) <= set(names) else self.how
 
     def understood(self, names: Collection[str]) -> Columns:
         """The columns of the file by their meaning. Raises `InputError` for all that is wrong with their names."""
@@ -138,22 +138,6 @@ def _foreign_line(path: Path) -> str:
                 convert = f"iconv -f latin1 -t utf-8 {shlex.quote(str(path))}"
                 return f", line {number} is in another encoding, such as Latin-1; convert the file: {convert}"
     return ""
-
-
-def column_names(path: Path, how: TableImport | None = None) -> Mapping[str, str]:
-    """The file's name of each column of ours that a table of detections has. Raises as `read_raw_table`."""
-    return next(_tables(_Reading(path, Layout(), how or TableImport(), 1, None))).found.names
-
-
-def sorted_by_time(table: RawTable) -> RawTable:
-    """The rows of a table in order of time within each scene; scenes, and rows of one time, stay in their order."""
-    _, first, scene = np.unique(table.texts("scene", ""), return_index=True, return_inverse=True)
-    order = np.lexsort((table.numbers("timestamp"), first[scene]))
-    columns: dict[str, Values] = {
-        name: values[order] if isinstance(values, np.ndarray) else [values[row] for row in order.tolist()]
-        for name, values in table.columns.items()
-    }
-    return replace(table, columns=columns, where=lambda row: table.where(int(order[row])), _read={})
 
 
 def _tell(table: RawTable, clock: Clock) -> None:
@@ -276,14 +260,8 @@ def _read_columns(reading: _Reading) -> Iterator[RawTable]:
         if archive and np.shape(column) != (length,):
             raise InputError(f"{path}: {ours}: expected shape ({length},) as {first} has, got {np.shape(column)}")
         if ours in NAMED and not archive:
-            columns[ours] = _names(column)
+            columns[ours] = as_names(column)
     yield RawTable(path, columns, length, "row {}".format, False, found, reading.hint(names))
-
-
-def _names(values: Values) -> Values:
-    """Whole numbers as text, where names are expected."""
-    values = values.tolist() if isinstance(values, np.ndarray) else values
-    return [str(value) if type(value) is int else value for value in values]
 
 
 def _moment(how: TableImport) -> Callable[[dict[str, Any]], list[Any]]:

@@ -26,6 +26,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -37,8 +38,21 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
-from data_tools.datasets.detection_files.column_names import TableImport
-from data_tools.datasets.detection_files.columns import (
+from data_tools.datasets.detection_files.formats import Layout, read_raw_table
+from data_tools.files.atomic_files import atomic_file
+from data_tools.files.input_files import open_bytes
+from saga_fg.errors import InputError, MissingExtraError, error_context, unknown_name
+from saga_fg.numerics.arrays import (
+    BoolArray,
+    Columns,
+    FloatArray,
+    StrArray,
+    from_upper_triangle,
+    upper_triangle,
+)
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.tables.column_names import TableImport
+from saga_fg.tables.columns import (
     LABEL_COLUMNS,
     POSE,
     PROBABILITIES,
@@ -49,26 +63,16 @@ from data_tools.datasets.detection_files.columns import (
     TRACK_COLUMNS,
     RawTable,
 )
-from data_tools.datasets.detection_files.dataset import box_columns
-from data_tools.datasets.detection_files.formats import Layout, read_raw_table
-from data_tools.files.atomic_files import atomic_file
-from data_tools.files.input_files import error_context, open_bytes, unknown_name
-from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.numerics.arrays import (
-    BoolArray,
-    Columns,
-    FloatArray,
-    StrArray,
-    from_upper_triangle,
-    upper_triangle,
-)
-from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.tables.conventions import Sample, findings_of
+from saga_fg.tables.detections import box_columns
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.track import PredictedTracks, Tracks
 
 if TYPE_CHECKING:
     from saga_fg.smoothing import Labels, Review
+
+log = logging.getLogger(__name__)
 
 TEXTS = ("scene", "sensor", "label", "source", "quality")
 WHOLE = ("id", SETTLED)
@@ -266,13 +270,23 @@ def _track_rows(raw: RawTable) -> TrackRows:
     _, left_out = raw.labels()
     kept = np.flatnonzero(~left_out)
     found = box_columns(raw, left_out)
-    raw.warn_of_findings()
     timestamp = raw.numbers("timestamp")
     if np.isnan(timestamp).any():
         row = int(np.argmax(np.isnan(timestamp)))
         raise raw.fault(row, f"{raw.title('timestamp')}: expected a number, got none")
+    scene = raw.texts("scene", raw.path.stem)[kept]
+    if not raw.how.as_given and len(kept):
+        first = scene == scene[0]
+        mine = kept[first]
+        in_world = (raw.texts("coordinates", raw.how.coordinates or "world") == "world")[mine]
+        yaw = raw.numbers("yaw")[mine]
+        sample = Sample.from_rows(timestamp[mine], found.boxes.select(mine), found.score[mine], yaw, in_world)
+        for finding in raw.how.judged([*raw.findings(), *findings_of(sample)], raw.found.names):
+            if finding.stops:
+                raise InputError(f"{raw.path}: {finding}; --as-given reads it as it is")
+            log.warning("%s: %s", raw.path, finding)
     return TrackRows(
-        scene=raw.texts("scene", raw.path.stem)[kept],
+        scene=scene,
         timestamp=timestamp[kept],
         id=raw.identities("id")[kept],
         boxes=found.boxes.select(kept),

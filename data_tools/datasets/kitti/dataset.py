@@ -57,13 +57,13 @@ from data_tools.datasets.kitti.labels import (
     read_kitti_labels,
 )
 from data_tools.datasets.source import Images
-from data_tools.files.input_files import error_context, local_tree, unknown_name
+from data_tools.files.input_files import local_tree
 from data_tools.files.readers import TextTable, read_lines, read_table
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.lidar import Scan, azimuth_times
 from data_tools.lidar.recording import ScanRecording
 from data_tools.lidar.scan_files import KITTI, read_records
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, is_rotation
 from saga_fg.types.dataset import Annotations, Scene

@@ -30,10 +30,9 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.input_files import unknown_name
 from data_tools.files.readers import TextTable, read_table
 from data_tools.kitti_objects import CameraBoxes, KittiObjects, has_box
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import wrap_angle
 

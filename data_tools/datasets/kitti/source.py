@@ -67,7 +67,7 @@ from data_tools.datasets.source import (
 from data_tools.evaluation import Evaluation, HotaRow, mean_scores, placed_detections
 from data_tools.figures import FigureTable, cell
 from data_tools.files.atomic_files import atomic_directory
-from data_tools.files.input_files import error_context, is_url, unknown_name
+from data_tools.files.input_files import is_url
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
 from data_tools.metrics import (
     KittiSimilarity,
@@ -80,7 +80,7 @@ from data_tools.metrics import (
     label_errors,
     label_velocities,
 )
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.types.dataset import Dataset, Scene

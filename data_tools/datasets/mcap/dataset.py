@@ -35,9 +35,8 @@ from data_tools.datasets.mcap.objects import (
     xyz,
 )
 from data_tools.datasets.mcap.recording import LoggedMessage, Recording, Topic, decoded_messages
-from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.isolated_reading import isolated
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import checked_quaternions, inverse_transform, quaternion_rotation
 from saga_fg.types.dataset import Scene

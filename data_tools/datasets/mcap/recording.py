@@ -28,9 +28,9 @@ from io import SEEK_END
 from pathlib import Path
 from typing import Any
 
-from data_tools.files.input_files import open_bytes, unknown_name
+from data_tools.files.input_files import open_bytes
 from data_tools.files.isolated_reading import isolated, one_line
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError, MissingExtraError, unknown_name
 
 _SEPARATOR = "=" * 80
 _FIELDS = {

@@ -17,7 +17,6 @@ from typing import Any, BinaryIO, Literal, Self
 import numpy as np
 
 from data_tools.datasets.detection_files import TrackRows
-from data_tools.datasets.detection_files.column_names import pairs
 from data_tools.datasets.mcap.dataset import (
     DEFAULT_EGO,
     McapRecording,
@@ -39,8 +38,8 @@ from data_tools.datasets.source import (
     option,
 )
 from data_tools.files.atomic_files import atomic_file
-from data_tools.files.input_files import error_context
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context
+from saga_fg.tables.column_names import pairs
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.track import Tracks

@@ -39,11 +39,11 @@ from data_tools.datasets.nuscenes.tables import (
     table_folder,
 )
 from data_tools.datasets.source import AreaMap, Images, Kind, map_points
-from data_tools.files.input_files import error_context, read_bytes, unknown_name
+from data_tools.files.input_files import read_bytes
 from data_tools.files.readers import parsed_json
 from data_tools.lidar.recording import ScanRecording
 from data_tools.lidar.scan_files import NUSCENES, read_records
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame

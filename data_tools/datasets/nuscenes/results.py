@@ -38,9 +38,8 @@ import numpy as np
 
 from data_tools.datasets.nuscenes.tables import DETECTION_CLASSES, TRACKING_CLASSES
 from data_tools.files.atomic_files import atomic_file
-from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.readers import JsonStream, open_json
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import Columns, FloatArray, StrArray, from_upper_triangle, upper_triangle
 from saga_fg.numerics.geometry import quaternion_norms, quaternion_yaw, yaw_quaternion
 from saga_fg.types.boxes import Boxes

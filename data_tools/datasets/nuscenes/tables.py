@@ -35,9 +35,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
-from data_tools.files.input_files import error_context, unknown_name
 from data_tools.files.readers import JsonStream, open_json
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import (
     checked_quaternions,

@@ -56,9 +56,9 @@ from data_tools.datasets.nuscenes.tables import (
     token,
 )
 from data_tools.files.atomic_files import atomic_directory, atomic_file, write_text
-from data_tools.files.input_files import error_context, open_bytes
+from data_tools.files.input_files import open_bytes
 from data_tools.files.readers import open_json, parsed_json
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import FloatArray, IntArray, upper_triangle
 from saga_fg.numerics.geometry import yaw_of, yaw_quaternion
 from saga_fg.types.dataset import Annotations, Dataset, Scene

@@ -16,6 +16,7 @@ from data_tools.datasets.detection_files import TableImport, read_detections
 from data_tools.datasets.detection_files.dataset import survey_table
 from saga_fg import Dataset, InputError
 from saga_fg.numerics.geometry import yaw_of
+from saga_fg.tables.columns import COLUMNS
 from tests.data_tools.datasets.drive_tables import NPZ, write
 
 
@@ -65,7 +66,7 @@ def test_the_examples_of_the_documentation(tmp_path):
         assert frames[0].detections[0].position == (10.2, 3.1, 0.0)
     arrays = eval(f"dict({npz_call.removeprefix('np.savez(').split(',', 1)[1]}")
     assert [len(f) for f in read_detections(write(tmp_path, ".npz", arrays)).scene("drive").frames] == [1, 0]
-    for name in data_tools.datasets.detection_files.columns.COLUMNS:
+    for name in COLUMNS:
         assert re.search(rf"\b{name}\b", table) or name == "empty"
 
 

@@ -17,8 +17,8 @@ from data_tools.datasets.detection_files import (
     read_scenes_in_parts,
     read_tracks,
 )
-from data_tools.datasets.detection_files.column_names import ALIASES, FACTORS, Clock, canonical, meaning, pairs
 from saga_fg.errors import InputError
+from saga_fg.tables.column_names import ALIASES, FACTORS, Clock, canonical, meaning, pairs
 
 T0 = 1_700_000_000
 ROWS: list[dict[str, Any]] = [

@@ -14,12 +14,13 @@ from benchmarks.recordings.landmarks import read_landmark_log
 from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.nuscenes import read_tracking_results
-from data_tools.files.input_files import open_bytes, read_text, unknown_name
+from data_tools.files.input_files import open_bytes, read_text
 from data_tools.files.readers import open_json, parsed_json
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg import InputError
+from saga_fg.errors import unknown_name
 
 READERS: dict[str, Callable[[Path], object]] = {
     "a.csv": read_detections,

@@ -6,10 +6,10 @@ import warnings
 
 import numpy as np
 import pytest
+from saga_fg.types.pandas_tables import moments_of_table
 
 import saga_fg
 from saga_fg import Detection, Detections, Frame, InputError, MissingExtraError, Tracker, Tracks
-from saga_fg.types.pandas_tables import moments_of_table
 
 pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
 

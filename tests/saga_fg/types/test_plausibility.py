@@ -5,7 +5,7 @@ import numpy as np
 from data_tools.datasets.detection_files import TableImport
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.plausibility import (
+from saga_fg.tables.plausibility import (
     Finding,
     Sample,
     ego_taken_for_world,

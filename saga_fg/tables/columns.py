@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 import shlex
 import sys
@@ -13,7 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.detection_files.column_names import (
+from saga_fg.errors import InputError
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.tables.column_names import (
     ISO,
     Clock,
     Columns,
@@ -22,35 +24,25 @@ from data_tools.datasets.detection_files.column_names import (
     is_date,
     seconds_of_dates,
 )
-from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.tables.plausibility import days_taken_for_times, frames_taken_for_seconds
 from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED
+from saga_fg.types.finding import FILL_IN, Finding
 from saga_fg.types.frame import LATEST, EgoMeasurements, GpsFix, OdometryIncrement
-from saga_fg.types.plausibility import (
-    FILL_IN,
-    Finding,
-    days_taken_for_times,
-    frames_taken_for_seconds,
-    headings_against_motion,
-    headings_in_degrees,
-    known_velocities,
-)
-
-log = logging.getLogger(__name__)
 
 REQUIRED = ("timestamp", "x", "y")
 BOX = ("z", "length", "width", "height", "yaw", "vx", "vy", "range_rate", "score")
 POSE = ("ego_x", "ego_y", "ego_z", "ego_yaw")
 TEXT = ("label", "sensor", "scene", "coordinates")
+NAMED = (*TEXT, "id", "source", "quality")
 ODOMETRY = ("odometry_x", "odometry_y", "odometry_yaw", "odometry_dt")
 GPS = ("gps_x", "gps_y", "gps_z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ROTATIONS = {"yaw": QUATERNION, "ego_yaw": tuple(f"ego_{name}" for name in QUATERNION)}
-COLUMNS = (*REQUIRED, *BOX, *TEXT, *POSE, *ODOMETRY, *GPS, *QUATERNION, *ROTATIONS["ego_yaw"], "empty")
+COVARIANCE = ("cov_xx", "cov_xy", "cov_yy")
+COLUMNS = (*REQUIRED, *BOX, *COVARIANCE, *TEXT, *POSE, *ODOMETRY, *GPS, *QUATERNION, *ROTATIONS["ego_yaw"], "empty")
 TRACK_COLUMNS = (
     *("scene", "timestamp", "id", "label", "x", "y", "z", "length", "width", "height", "yaw", "vx", "vy", "score"),
-    *("cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy", "coasting"),
+    *(*COVARIANCE, "cov_vxvx", "cov_vxvy", "cov_vyvy", "coasting"),
 )
 SETTLED = "settled"  # 1 or 0, the last column of results
 PROBABILITIES = ("p_exists", "p_class", "p_identity", "p_heading")
@@ -154,7 +146,7 @@ class RawTable:
 
     def findings(self) -> list[Finding]:
         """Findings about columns as they are given, which cannot be seen in frames."""
-        findings = [headings_in_degrees(self.numbers("yaw")), self._headings_against_motion()]
+        findings: list[Finding | None] = []
         if self.clock.unit == ISO:
             findings.append(days_taken_for_times(self.numbers("timestamp")))
         if "timestamp" in self.columns and "time" not in self.how.units and self.clock.unit == "s":
@@ -164,17 +156,6 @@ class RawTable:
             what = "these are boxes of Argoverse 2, in the frame of the vehicle, and are taken for the world"
             findings.append(Finding("argoverse2", what, f"read them with the poses of their logs: {command}"))
         return [finding for finding in findings if finding is not None]
-
-    def _headings_against_motion(self) -> Finding | None:
-        """A finding where headings differ from velocities, given or, in the world, between frames."""
-        velocity, place = (
-            np.column_stack([self.numbers(name) for name in pair]) for pair in (("vx", "vy"), ("x", "y"))
-        )
-        label, _ = self.labels()
-        in_world = (self.how.coordinates or ("" if "coordinates" in self.columns else "world")) == "world"
-        velocity = known_velocities(velocity, self.numbers("timestamp"), label, place, in_world)
-        unit = self.how.unit("yaw", self.found.units.get("yaw")) or "rad"
-        return headings_against_motion(label, self.numbers("yaw"), velocity, unit)
 
     def argoverse_command(self) -> str:
         """The command for a file in Argoverse's format without poses, "" for another."""
@@ -186,11 +167,6 @@ class RawTable:
         if "track_id" in self.found.names.values() or "track_id" in self.found.unread:
             return f"saga-fg evaluate argoverse2 {name} --dataroot {FILL_IN}"
         return f"saga-fg track argoverse2 --dataroot {FILL_IN} --detections {name} --output tracks.feather"
-
-    def warn_of_findings(self) -> None:
-        """Warn of what is doubtful about columns as they are given."""
-        for finding in self.findings():
-            log.warning("%s: %s", self.path, finding.text(self.how.option_for(finding.mend, self.found.names)))
 
     def texts(self, name: str, default: str) -> StrArray:
         """A column (N,) of names; `default` where left out. A whole number is a name too, but in NumPy archives.
@@ -312,6 +288,12 @@ class RawTable:
         unit = checked_quaternions(" ".join(names), parts[known] / norm[:, None])
         yaw[known] = yaw_of(quaternion_rotation(unit))
         return yaw
+
+
+def as_names(values: Values) -> Values:
+    """Whole numbers as text, where names are expected."""
+    values = values.tolist() if isinstance(values, np.ndarray) else values
+    return [str(value) if type(value) is int else value for value in values]
 
 
 def _measured(name: str) -> tuple[str, int]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from difflib import get_close_matches
@@ -24,7 +24,7 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Settings, setting, settings_group
-from saga_fg.types.plausibility import FILL_IN, Mend
+from saga_fg.types.finding import FILL_IN, Finding, Mend
 
 Kind = Literal["time", "length", "speed", "angle", "score"]
 FACTORS: Mapping[Kind, Mapping[str, float]] = {
@@ -319,10 +319,13 @@ class TableImport(Settings):
         "units of time (s, ms, us, ns, iso8601, 10Hz), length (m, cm, mm, km, ft), speed, score, "
         "angle (rad, deg, clockwise, clockwise_deg, compass, compass_rad)",
     )
-    coordinates: Literal["", "world", "ego", "sensor"] = setting(
-        "", "coordinates of rows that say none: world, ego or sensor; empty: world"
+    coordinates: Literal["", "world", "ego", "sensor", "camera"] = setting(
+        "",
+        "coordinates of rows that say none: world, ego, sensor or camera (at the vehicle's origin, x to the right, y "
+        "down, z ahead, yaw about y from x); empty: world",
     )
     sort: bool = setting(False, "true: sort the rows of each scene by time; the whole table is then held in memory")
+    as_given: bool = setting(False, "true: read a table as these options say even where its contents contradict them")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -360,6 +363,7 @@ class TableImport(Settings):
             {**other.units, **self.units},
             self.coordinates or other.coordinates,
             self.sort or other.sort,
+            self.as_given or other.as_given,
         )
 
     def mended(self, mend: Mend, names: Mapping[str, str]) -> TableImport:
@@ -369,17 +373,32 @@ class TableImport(Settings):
             self,
             columns={**self.columns, **{ours: names.get(other, other) for ours, other in mend.columns.items()}},
             classes={**classes, **{name: ours for name, ours in mend.classes.items() if name not in classes}},
-            units={**self.units, **mend.units},
+            units={**self.units, **self._in_degrees(mend.units, names)},
             coordinates=mend.coordinates or self.coordinates,
         )
 
-    def option_for(self, mend: Mend | None, names: Mapping[str, str]) -> str:
-        """The options that mend a suspicion, in place of those of the same name; "" for none."""
-        if mend is None:
-            return ""
+    def _in_degrees(self, units: Mapping[str, str], names: Mapping[str, str]) -> Mapping[str, str]:
+        """Units that mend, where angles are read as degrees already."""
+        by_name = (meaning(names["yaw"]) or ("", None))[1] if "yaw" in names else None
+        if "angle" not in units or self.unit("yaw", by_name) != "deg":
+            return units
+        return {**units, "angle": {"clockwise": "clockwise_deg", "compass_rad": "compass"}.get(units["angle"], "rad")}
+
+    def changes(self, mend: Mend, names: Mapping[str, str]) -> dict[str, Any]:
+        """The entries that mend a suspicion, in place of those of the same name; `names` as of `mended`."""
         mended = self.mended(mend, names)
-        changed = {field.name: getattr(mended, field.name) for field in fields(Mend) if getattr(mend, field.name)}
-        return TableImport(**changed).options().strip()
+        return {field.name: getattr(mended, field.name) for field in fields(Mend) if getattr(mend, field.name)}
+
+    def judged(self, findings: Iterable[Finding], names: Mapping[str, str]) -> tuple[Finding, ...]:
+        """The findings, each with the options that mend it, and whether the table cannot be used as it is read."""
+        return tuple(self._judged(finding, finding.mend, names) for finding in findings)
+
+    def _judged(self, finding: Finding, mend: Mend | None, names: Mapping[str, str]) -> Finding:
+        if mend is None:
+            return finding
+        changes = self.changes(mend, names)
+        stops = not self.as_given and not changes.keys() <= {"classes"}
+        return replace(finding, option=TableImport(**changes).options().strip(), stops=stops)
 
     def options(self) -> str:
         """The options of the command that say the same, with a space before each; empty if there are none."""
@@ -387,7 +406,8 @@ class TableImport(Settings):
         for name in ("columns", "classes", "units"):
             pairs = ",".join(f"{ours}={theirs}" for ours, theirs in getattr(self, name).items())
             text += f" --{name} {shlex.quote(pairs)}" if pairs else ""
-        return text + (f" --coordinates {self.coordinates}" if self.coordinates else "") + " --sort" * self.sort
+        text += f" --coordinates {self.coordinates}" if self.coordinates else ""
+        return text + " --sort" * self.sort + " --as-given" * self.as_given
 
     def values(self) -> dict[str, Any]:
         """The values that differ from the default, for a record."""

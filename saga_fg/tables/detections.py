@@ -1,0 +1,239 @@
+"""A table of detections as recordings: rows with the same scene, time and sensor become frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from saga_fg.errors import InputError, error_context, unknown_name
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, from_upper_triangle
+from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.tables.columns import BOX, COVARIANCE, GPS, ODOMETRY, POSE, EgoColumns, RawTable, Values
+from saga_fg.tables.conventions import Sample, findings_of
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.dataset import Scene
+from saga_fg.types.finding import Finding
+from saga_fg.types.frame import Coordinates, Detections, Frame
+
+_COORDINATES = ("world", "ego", "sensor", "camera")
+JUDGED = 3  # scenes of a table
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The checked table: N rows, of which those that are not `empty` hold a detection."""
+
+    raw: RawTable
+    scene: StrArray
+    timestamp: FloatArray
+    sensor: StrArray
+    coordinates: StrArray
+    empty: BoolArray
+    detections: Detections
+    pose: FloatArray | None  # (N, 4): x, y, z, yaw
+    ego: EgoColumns | None
+
+
+class DetectionTable:
+    """The scenes of one table of detections. See the package for its columns.
+
+    A scene's moments are all times at which some sensor spoke; without pose columns its poses are the identity.
+    """
+
+    def __init__(self, table: RawTable, judged: bool = True) -> None:
+        """Check everything. Raises `InputError` naming file, row and column.
+
+        judged: whether its first scenes are to have their `findings`
+        """
+        self._rows, self._judged = _checked(table), judged
+        names, first = np.unique(self._rows.scene, return_index=True)
+        self._scenes = tuple(names[np.argsort(first)].tolist())
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The names of the scenes, in the order of the file."""
+        return self._scenes
+
+    def scene(self, name: str) -> Scene:
+        """One of the scenes; raises `InputError` for an unknown name."""
+        path = self._rows.raw.path
+        if name not in self._scenes:
+            raise InputError(f"{path}: {unknown_name('scene', name, self._scenes)}")
+        rows = np.flatnonzero(self._rows.scene == name)
+        times, moment = np.unique(self._rows.timestamp[rows], return_inverse=True)
+        with error_context(f"{path}: scene {name}"):
+            poses = self._poses(rows, moment, len(times))
+            world_T_ego = np.tile(np.eye(4), (len(times), 1, 1)) if poses is None else poses
+            frames, kept = self._frames(rows, moment, poses)
+            findings = self._findings(frames, kept) if self._judged and name in self._scenes[:JUDGED] else ()
+            return Scene(name, times, world_T_ego, ("",) * len(times), frames, findings=findings)
+
+    def _findings(self, frames: list[Frame], rows: IntArray) -> tuple[Finding, ...]:
+        """What is doubtful about the table and a scene of it, whose frames hold these rows."""
+        raw = self._rows.raw
+        found = [*raw.findings(), *findings_of(Sample.from_frames(frames, raw.numbers("yaw")[rows]))]
+        judged = raw.how.judged(found, raw.found.names)
+        return tuple(replace(finding, what=f"{raw.path}: {finding.what}") for finding in judged)
+
+    @property
+    def with_poses(self) -> bool:
+        """True if the table has poses of the vehicle."""
+        return self._rows.pose is not None
+
+    def _poses(self, rows: IntArray, moment: IntArray, count: int) -> FloatArray | None:
+        """world_T_ego (K, 4, 4) of the moments of a scene, None without pose columns."""
+        if self._rows.pose is None:
+            return None
+        pose = self._rows.pose[rows]
+        _, first = np.unique(moment, return_index=True)
+        other = (pose != pose[first][moment]).any(axis=1)
+        if other.any():
+            row = int(rows[np.argmax(other)])
+            raise self._rows.raw.fault(row, "ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time, got another")
+        return np.array([yaw_transform(*pose[k]) for k in first.tolist()]).reshape(count, 4, 4)
+
+    def _frames(self, rows: IntArray, moment: IntArray, poses: FloatArray | None) -> tuple[list[Frame], IntArray]:
+        """The frames of a scene, and the rows (N,) of their detections in this order."""
+        table, kept = self._rows, []
+        sensors, sensor = np.unique(table.sensor[rows], return_inverse=True)
+        key = moment * len(sensors) + sensor
+        order = np.argsort(key, kind="stable")
+        starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+        frames = []
+        for group in np.split(order, starts[1:]):
+            k = int(moment[group[0]])
+            members = rows[group]
+            kind = table.coordinates[members]
+            if (kind != kind[0]).any():
+                row = int(members[np.argmax(kind != kind[0])])
+                raise table.raw.fault(row, "coordinates: expected the same in all rows of a frame")
+            kept.append(members[~table.empty[members]])
+            frames.append(
+                Frame(
+                    timestamp=float(table.timestamp[members[0]]),
+                    sensor=str(table.sensor[members[0]]),
+                    detections=table.detections.select(kept[-1]),
+                    world_T_ego=None if poses is None else poses[k],
+                    coordinates=cast(Coordinates, str(kind[0])),
+                    ego=None if table.ego is None else table.ego.measured(members),
+                )
+            )
+        return frames, np.concatenate(kept)
+
+
+def _checked(raw: RawTable) -> _Rows:
+    if raw.length == 0:
+        raise InputError(f"{raw.path}: expected at least one row, the table is empty")
+    raw.check_numbers(("timestamp", "x", "y", *BOX, *COVARIANCE, *POSE, *ODOMETRY, *GPS))
+    timestamp = raw.numbers("timestamp")
+    _require(raw, np.isfinite(timestamp), "timestamp", timestamp, "a finite number of seconds")
+    scene = raw.texts("scene", raw.path.stem)
+    _check_order(raw, scene, timestamp)
+    empty = raw.flags("empty") | (~raw.present("x") & ~raw.present("y")) | raw.labels()[1]
+    coordinates = raw.texts("coordinates", raw.how.coordinates or "world")
+    strange = ~np.isin(coordinates, _COORDINATES)
+    if strange.any():
+        row = int(np.argmax(strange))
+        raise raw.fault(row, f"coordinates: expected world, ego, sensor or camera, got {str(coordinates[row])!r}")
+    ego = EgoColumns.from_table(raw)
+    pose = _pose(raw, coordinates, ego is not None)
+    detections = replace(box_columns(raw, empty), position_covariance=_covariances(raw, empty))
+    of_camera = coordinates == "camera"
+    if of_camera.any():
+        detections = replace(detections, boxes=_from_camera(detections.boxes, of_camera))
+    coordinates = np.where(of_camera, "ego", coordinates)
+    return _Rows(
+        raw=raw,
+        scene=scene,
+        timestamp=timestamp,
+        sensor=raw.texts("sensor", "sensor"),
+        coordinates=coordinates,
+        empty=empty,
+        detections=detections,
+        pose=pose,
+        ego=ego,
+    )
+
+
+def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
+    order = np.argsort(scene, kind="stable")
+    late = (np.diff(timestamp[order]) < 0) & (scene[order][1:] == scene[order][:-1])
+    if late.any():
+        row = int(order[1:][np.argmax(late)])
+        title = raw.title("timestamp")
+        text = f"{title}: expected rows in order of time, time runs backwards at {timestamp[row]} s; --sort sorts them"
+        raise raw.fault(row, text)
+
+
+def box_columns(raw: RawTable, empty: BoolArray) -> Detections:
+    """Boxes and scores of all rows; those of empty rows hold zeros and are never looked at."""
+    position = np.stack([raw.numbers("x"), raw.numbers("y"), raw.numbers("z", 0.0)], axis=-1)
+    position[empty] = 0.0
+    for axis, name in enumerate("xyz"):
+        column = position[:, axis]
+        _require(raw, np.isfinite(column), name, column, "a finite number of metres")
+    size = np.stack([raw.numbers(name) for name in ("length", "width", "height")], axis=-1)
+    size[empty] = np.nan
+    for axis, name in enumerate(("length", "width", "height")):
+        column = size[:, axis]
+        _require(raw, ~(column <= 0), name, column, "a positive number of metres")
+    score = np.where(empty, 0.0, raw.numbers("score", 1.0))
+    _require(raw, np.isfinite(score), "score", score, "a finite number")
+    velocity = np.stack([raw.numbers("vx"), raw.numbers("vy")], axis=-1)
+    boxes = Boxes(raw.labels()[0], position, size, raw.numbers("yaw"), velocity)
+    return Detections(boxes, score, np.where(empty, np.nan, raw.numbers("range_rate")))
+
+
+def _covariances(raw: RawTable, empty: BoolArray) -> FloatArray:
+    """(N, 2, 2) covariance of the position, NaN where none was reported."""
+    xx, xy, yy = (raw.numbers(name) for name in COVARIANCE)
+    given = ~empty & ~(np.isnan(xx) & np.isnan(xy) & np.isnan(yy))
+    bad = given & ~((xx > 0) & (yy > 0) & (xx * yy > xy**2))
+    if bad.any():
+        row = int(np.argmax(bad))
+        got = f"got {xx[row]:g}, {xy[row]:g}, {yy[row]:g}"
+        raise raw.fault(row, f"{', '.join(COVARIANCE)}: expected a positive definite matrix, {got}")
+    return from_upper_triangle(np.where(given, [xx, xy, yy], np.nan).T)
+
+
+def _from_camera(boxes: Boxes, rows: BoolArray) -> Boxes:
+    """Boxes, of which those at `rows` are of a camera (x to the right, y down, z ahead, yaw about y from x), ahead."""
+    right, down, ahead = boxes.position.T
+    position = np.where(rows[:, None], np.column_stack([ahead, -right, -down]), boxes.position)
+    yaw = np.where(rows, -boxes.yaw - np.pi / 2, boxes.yaw)
+    velocity = np.where(rows[:, None], np.nan, boxes.velocity)  # of which nobody knows the part ahead
+    return Boxes(boxes.label, position, boxes.size, yaw, velocity)
+
+
+def _pose(raw: RawTable, coordinates: StrArray, estimated: bool) -> FloatArray | None:
+    """(N, 4); None where there are none, as there may where the vehicle's own measurements stand in for them."""
+    given = [name for name in POSE if raw.present(name).any()]
+    if not given:
+        if (coordinates != "world").any() and not estimated:
+            row = int(np.argmax(coordinates != "world"))
+            raise raw.fault(row, f"coordinates: {coordinates[row]} needs the columns ego_x, ego_y and ego_yaw")
+        return None
+    columns = {name: raw.numbers(name, 0.0 if name == "ego_z" else np.nan) for name in POSE}
+    for name, column in columns.items():
+        _require(raw, np.isfinite(column), name, column, f"a finite number, since {given[0]} is given")
+    return np.stack(list(columns.values()), axis=-1)
+
+
+def _require(raw: RawTable, good: BoolArray, name: str, column: FloatArray, expected: str) -> None:
+    if not good.all():
+        row = int(np.argmin(good))
+        got = f"got {column[row]:g}" if raw.present(name)[row] else "it is left out"
+        raise raw.fault(row, f"{raw.title(name)}: expected {expected}, {got}")
+
+
+def sorted_by_time(table: RawTable) -> RawTable:
+    """The rows of a table in order of time within each scene; scenes, and rows of one time, stay in their order."""
+    _, first, scene = np.unique(table.texts("scene", ""), return_index=True, return_inverse=True)
+    order = np.lexsort((table.numbers("timestamp"), first[scene]))
+    columns: dict[str, Values] = {
+        name: values[order] if isinstance(values, np.ndarray) else [values[row] for row in order.tolist()]
+        for name, values in table.columns.items()
+    }
+    return replace(table, columns=columns, where=lambda row: table.where(int(order[row])), _read={})

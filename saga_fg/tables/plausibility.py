@@ -1,0 +1,201 @@
+"""Suspicions about data and settings: units, coordinates, classes, times, and what mends them.
+
+Checks of detections, one function for each suspicion, over the arrays of a sample.
+
+Each returns a `Finding` or None. Shares and numbers are such that recordings which come with tests raise none.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable
+from difflib import get_close_matches
+
+import numpy as np
+
+from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.types.finding import FILL_IN, Finding, Mend
+
+_WORDS = {
+    "pedestrian": "pedestrian pedestrians person people human walker adult child",
+    "bicycle": "bicycle bicyclist bike cyclist cycle",
+    "motorcycle": "motorcycle motorcyclist motorbike scooter moped",
+    "trailer": "trailer semitrailer",
+    "bus": "bus buses coach",
+    "truck": "truck lorry hgv tractor",
+    "car": "car cars vehicle sedan suv van taxi pickup auto automobile passenger",
+    "barrier": "barrier fence wall guardrail",
+}
+_WORD_OF = {word: ours for ours, words in _WORDS.items() for word in words.split()}
+_ORDER = tuple(_WORDS)  # a "vehicle.truck" is a truck, and a "vehicular_trailer" a trailer
+_LARGE = re.compile(r"large|heavy")
+
+
+def usual_class(name: str) -> str | None:
+    """Our class that a name means, such as "car" for REGULAR_VEHICLE; None for a name that means none of them."""
+    parted = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+    found: set[str] = set()
+    for text in (name, parted):
+        found = found or {_WORD_OF[word] for word in re.findall(r"[a-z]+", text.lower()) if word in _WORD_OF}
+    if "car" in found and _LARGE.search(name.lower()):
+        found.add("truck")
+    return next((ours for ours in _ORDER if ours in found), None)
+
+
+def usual_classes(names: Iterable[str], known: Collection[str]) -> dict[str, str]:
+    """For those of the names that are none of the `known` classes: the known one that they mean."""
+    found = {name: usual_class(name) for name in names if name not in known}
+    return {name: ours for name, ours in found.items() if ours is not None and ours in known}
+
+
+def idle_rules(acting: Collection[str], classes: Collection[str]) -> Finding | None:
+    """Edge rules that act on classes (`acting`), none of which the objects have."""
+    if not acting or not classes or set(acting) & set(classes):
+        return None
+    meant = usual_classes(sorted(classes), acting) or dict.fromkeys(sorted(classes), FILL_IN)
+    what = (
+        f"no edges: tracker.edges act on {', '.join(sorted(acting))}, and the tracks are of "
+        f"{', '.join(sorted(classes))}; objects are tracked one by one"
+    )
+    expected = "name the classes as the rules do, or the rules' `classes` as the data"
+    return Finding("edges", what, expected, Mend(classes=meant))
+
+
+def idle_lanes() -> Finding:
+    """Lanes of `tracker.road_map` where neither a class nor an edge rule reads lanes."""
+    what = "tracker.road_map.lanes: no class follows them (motion.course_time), and no rule of tracker.edges reads them"
+    return Finding("lanes", what, "set course_time of a curvilinear motion, or add a rule such as in_lane")
+
+
+def settings_without_data(where: str, set_up: Collection[str], there: Collection[str]) -> Finding | None:
+    """Settings at `where` for classes or sensors (`set_up`) that the data lack, while they have others without any."""
+    idle, plain = sorted(set(set_up) - set(there)), sorted(set(there) - set(set_up))
+    if not idle or not plain:
+        return None
+    nearest = get_close_matches(idle[0].lower(), [name.lower() for name in plain], n=1, cutoff=0.6)
+    hint = next((name for name in plain if name.lower() == nearest[0]), plain[0]) if nearest else plain[0]
+    what = f"{where}.{idle[0]} has settings and the data have none of it; {', '.join(plain[:6])} have the default ones"
+    return Finding(where, what, f"is {where}.{hint} meant?")
+
+
+FEWEST = 20  # values that allow a judgement
+_FASTEST = {"pedestrian": 12.0, "bicycle": 25.0}  # m/s
+_FASTEST_VEHICLE, _FASTEST_OTHER = 75.0, 110.0  # m/s
+_COUNTS = {"frame", "frames", "step", "timestep", "tick", "index", "idx", "sweep"}
+
+
+def scores_beyond_one(score: FloatArray) -> Finding | None:
+    """Scores (n,), which should be shares, beyond 0 to 1: percent where none is negative, else logits."""
+    beyond = share((score < -1e-6) | (score > 1 + 1e-6))
+    if len(score) < FEWEST or beyond < 0.01:
+        return None
+    low, high = float(score.min()), float(score.max())
+    what = f"scores are not from 0 to 1: {beyond:.0%} of them are outside, from {low:.3g} to {high:.3g}; "
+    if low >= 0 and 5 < high <= 100.5:
+        return Finding("scores", what + "they look like percent", "expected 0 to 1", Mend(units={"score": "percent"}))
+    declared = 'put `sensors: {default: {score: logit}}` into a file for --config, or take Sensor(score="logit")'
+    return Finding("scores", what + "they look like logits", declared)
+
+
+def length_below_width(label: StrArray, size: FloatArray) -> Finding | None:
+    """Boxes of vehicles, sizes (n, 3), that are mostly wider than long; barriers are, and pedestrians."""
+    usual = {name: usual_class(name) for name in np.unique(label).tolist()}
+    least = {None: 2.5, "barrier": np.inf, "pedestrian": np.inf, "bicycle": 1.2, "motorcycle": 1.2}
+    longest = np.array([least.get(usual[name], 2.5) for name in label.tolist()])
+    large = np.isfinite(size[:, :2]).all(axis=1) & (size[:, :2].max(axis=1, initial=-np.inf) >= longest)
+    wide = size[large, 0] < 0.8 * size[large, 1]
+    if large.sum() < FEWEST or share(wide) < 0.7:
+        return None
+    what = f"{share(wide):.0%} of the vehicles' boxes are wider than long: length and width look exchanged"
+    exchanged = Mend(columns={"length": "width", "width": "length"})
+    return Finding("sides", what, "expected the length along the heading", exchanged)
+
+
+def unlikely_sizes(label: StrArray, size: FloatArray) -> Finding | None:
+    """Lengths (of sizes (n, 3)) that no object has: other units than metres."""
+    length, width = size[:, 0], size[:, 1]
+    known = np.isfinite(length)
+    cars = known & np.isin(label, [name for name in np.unique(label).tolist() if usual_class(name) == "car"])
+    if known.sum() < FEWEST:
+        return None
+    middle = float(np.median(length[known]))
+    unit = "mm" if middle > 1000 else "cm" if middle > 80 else "km" if middle < 0.02 else ""
+    if not unit and cars.sum() >= FEWEST and np.isfinite(width[cars]).any():
+        feet = 11 < np.median(length[cars]) < 25 and 4 < np.nanmedian(width[cars]) < 10
+        middle, unit = (float(np.median(length[cars])), "ft") if feet else (middle, "")
+    if not unit:
+        return None
+    what = f"objects have a usual length of {middle:.3g}: this looks like {unit}"
+    return Finding("lengths", what, "expected metres", Mend(units={"length": unit}))
+
+
+def within_a_metre(frame: IntArray, position: FloatArray) -> Finding | None:
+    """Positions (n, 3) of frames (n,) with several objects, all of them within a metre."""
+    several = np.flatnonzero(np.bincount(frame, minlength=1) >= 3)
+    mine = position[np.isin(frame, several), :2]
+    if len(mine) < FEWEST:
+        return None
+    spread = float(np.ptp(mine, axis=0).max())
+    if spread >= 1.0:
+        return None
+    what = f"all objects of all frames are within {spread:.2g} m: positions look like "
+    middle = np.abs(np.median(mine, axis=0))
+    if middle.max() > 5 and middle.min() <= 90 and middle.max() <= 180:
+        return Finding("places", what + "degrees of latitude and longitude", "expected metres in a plane, such as UTM")
+    return Finding("places", what + "km", "expected metres", Mend(units={"length": "km"}))
+
+
+def far_too_fast(label: StrArray, velocity: FloatArray) -> Finding | None:
+    """Measured velocities (n, 2), of which many are beyond what the class can do."""
+    names, of_row = np.unique(label, return_inverse=True)
+    usual = [usual_class(name) for name in names.tolist()]
+    limits = [_FASTEST.get(name or "", _FASTEST_VEHICLE if name else _FASTEST_OTHER) for name in usual]
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    for k, name in enumerate(names.tolist()):
+        mine = speed[(of_row == k) & np.isfinite(speed)]
+        beyond = share(mine > limits[k])
+        if len(mine) >= FEWEST and beyond > 0.05:
+            what = f"{beyond:.0%} of the velocities of {name} are above {limits[k]:g} m/s, up to {mine.max():.3g}"
+            return Finding("speeds", f"{what}: they look like km/h", "expected m/s", Mend(units={"speed": "km/h"}))
+    return None
+
+
+def strange_time_steps(time: FloatArray, sensor: StrArray) -> Finding | None:
+    """Times (f,) of the frames of sensors (f,), s, which are mostly a thousand times too far apart, or too near."""
+    steps = [np.diff(np.unique(time[sensor == name])) for name in np.unique(sensor).tolist()]
+    step = np.concatenate([np.empty(0), *steps])
+    if len(step) < 3:
+        return None
+    middle = float(np.median(step))
+    if middle >= 20:
+        unit = "ms" if middle < 2e4 else "us" if middle < 2e7 else "ns"
+        what = f"frames are usually {middle:.4g} s apart: their times look like {unit}"
+        return Finding("times", what, "expected seconds", Mend(units={"time": unit}))
+    if middle <= 1e-4:
+        what = f"frames are usually {middle:.1g} s apart: their times look like a coarser unit than seconds"
+        return Finding("times", what, "expected seconds", Mend(units={"time": "s"}))
+    return None
+
+
+def frames_taken_for_seconds(column: str, time: FloatArray) -> Finding | None:
+    """Times (n,) read as s from a column whose name is that of a count, and which are whole numbers."""
+    words = set(re.findall(r"[a-z]+", column.lower()))
+    known = np.unique(time[np.isfinite(time)])
+    if not words & _COUNTS or len(known) < 3 or (known % 1).any():
+        return None
+    what = f"times are whole numbers of the column {column[:40]!r}: they look like frames, such as 10 a second"
+    return Finding("frames", what, "expected seconds", Mend(units={"time": "10Hz"}))
+
+
+def days_taken_for_times(time: FloatArray) -> Finding | None:
+    """Times (n,), s, of dates, all of which are of midnight."""
+    known = time[np.isfinite(time)]
+    if len(known) < 2 or (known % 86_400).any():
+        return None
+    what = "dates have no time of day: all rows of a day are one frame"
+    return Finding("days", what, "expected a date and time for each frame")
+
+
+def share(mask: BoolArray) -> float:
+    """Share of a mask that is set, 0 of an empty one."""
+    return float(np.mean(mask)) if len(mask) else 0.0

@@ -1,0 +1,51 @@
+"""Suspicions about data and settings, and what mends them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+FILL_IN = "..."
+"""Stands for a name that only the owner of the data knows."""
+
+
+@dataclass(frozen=True)
+class Mend:
+    """Entries of a `TableImport` that mend a suspicion.
+
+    columns      by our name: the column, by our name for it as it is read now, that it should be read from
+    classes      by the name as it is read now; `FILL_IN` where it is not known
+    units        by kind
+    coordinates  of rows that say none, "" to leave them
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    classes: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    coordinates: Literal["", "ego", "camera"] = ""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One suspicion.
+
+    kind      names it; each is told once
+    what      what is seen, and what it looks like
+    expected  what should be given instead
+    mend      what mends it where a table is read; None for none
+    option    that of the command, or argument in a program, which mends it, "" for none
+    stops     whether the data contradict how they are read, so that nothing good can come of them
+    """
+
+    kind: str
+    what: str
+    expected: str
+    mend: Mend | None = None
+    option: str = ""
+    stops: bool = False
+
+    def __str__(self) -> str:
+        if not self.option:
+            return f"{self.what}; {self.expected}"
+        return f"{self.what}; {'fill in and add' if FILL_IN in self.option else 'add'} {self.option}"
