@@ -48,7 +48,8 @@ class Traffic:
 
 def _along(start: FloatArray, heading: FloatArray, distance: FloatArray) -> FloatArray:
     """Straight paths (N, T, 2) from places (N, 2) and headings (N,), rad, by distances (N, T), m."""
-    return start[:, None] + distance[:, :, None] * np.column_stack([np.cos(heading), np.sin(heading)])[:, None]
+    ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+    return np.asarray(start[:, None] + distance[:, :, None] * ahead[:, None])
 
 
 def _queue(time: FloatArray, rng: np.random.Generator) -> Traffic:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.figures import Chart
-from saga_fg import Boxes, Detections, InputError, Tracks
+from saga_fg import Boxes, Detections, Tracks
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
 
 __all__ = [
@@ -93,13 +93,12 @@ def _rows(tracks: Any) -> tuple[StrArray, Boxes]:
     """Return the ids (N,) and boxes of all rows in order of time."""
     if isinstance(tracks, Tracks):
         tracks = [tracks]
-    if hasattr(tracks, "iloc") and {"id", "x", "y"} <= set(tracks.columns):
-        table = tracks.sort_values("timestamp") if "timestamp" in tracks.columns else tracks
-        return table["id"].to_numpy().astype(np.str_), Detections.from_pandas(table).boxes
     if isinstance(tracks, Sequence) and all(isinstance(each, Tracks) for each in tracks):
         names = np.concatenate([np.empty(0, dtype=np.int64), *(each.id for each in tracks)]).astype(np.str_)
         return names, Boxes.concatenate([each.boxes for each in tracks])
-    raise InputError(f"tracks: expected Tracks, a list of them, or a table of tracks, got {type(tracks).__name__}")
+    with error_context("tracks: expected Tracks, a list of them, or a table of tracks"):
+        table = raw_table(tracks, columns=TRACK_COLUMNS, required=("id", "x", "y"))
+    return table.identities("id"), box_columns(table, np.zeros(table.length, dtype=np.bool_)).boxes
 
 
 def _footprint(box: Boxes) -> FloatArray:

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.datasets.detection_files import DetectionTable, read_detections
+from data_tools.datasets.detection_files import read_detections
 from data_tools.datasets.source import ChosenScenes, DatasetSource, option
 from data_tools.files.input_files import local_copy
 from saga_fg.errors import InputError
+from saga_fg.tables.detections import DetectionTable
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Detections, Frame
 

@@ -33,7 +33,7 @@ from saga_fg.types.dataset import Dataset, Scene
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
     from saga_fg.numerics.arrays import FloatArray
-    from saga_fg.tables.plausibility import Mend
+    from saga_fg.types.finding import Mend
 
 JUDGED: tuple[Verb, ...] = ("evaluate", "report", "view")
 """Verbs that compare with true objects."""

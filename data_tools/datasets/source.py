@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from data_tools.datasets.results import Results
     from data_tools.lidar.scan import ScanSequence
     from saga_fg.smoothing import Labels
-    from saga_fg.tables.plausibility import Mend
+    from saga_fg.types.finding import Mend
     from saga_fg.types.track import Tracks
 
 Verb = Literal[

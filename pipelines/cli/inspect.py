@@ -24,7 +24,8 @@ from pipelines.explaining import clock_lines, graph_picture, journal_of, read_gr
 from saga_fg.errors import InputError, error_context
 from saga_fg.model.edge_rules import acting_classes
 from saga_fg.tables.column_names import pairs
-from saga_fg.tables.plausibility import FILL_IN, Finding, Mend, idle_rules, usual_classes
+from saga_fg.tables.plausibility import idle_rules, usual_classes
+from saga_fg.types.finding import FILL_IN, Finding, Mend
 
 MOST = 12  # scenes and classes that are listed
 EPOCH = 1e8  # s, from which times count from 1970

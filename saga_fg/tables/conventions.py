@@ -250,9 +250,9 @@ def ego_taken_for_world(sample: Sample) -> Finding | None:
     if len(rows) < FEWEST:
         return None
     given, placed, ego = sample.boxes.position[:, :2], sample.placed(), sample.ego[0]
-    away = rows[np.hypot(*ego[rows].T) > _AWAY]
-    about = np.median(np.hypot(*given[away].T)) < 0.5 * np.median(np.hypot(*(given - ego)[away].T)) if len(away) else 0
-    if len(away) >= FEWEST and about:
+    far = _AWAY if np.ptp(ego[rows], axis=0).max() > _TRAVELLED else 3 * _AWAY  # of a sensor that stands
+    away = rows[np.hypot(*ego[rows].T) > far]
+    if len(away) >= FEWEST and np.median(np.hypot(*given[away].T)) < 0.5 * np.median(np.hypot(*(given - ego)[away].T)):
         return _EGO
     hit = [
         share(np.bincount(sample.frame[rows], _within(p[rows], ego[rows]) & ~sample.walks[rows]) > 0)
@@ -296,7 +296,7 @@ def _heading_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatA
     """Rad between headings and motion between frames, of objects that move."""
     least = np.where(sample.walks, _WALKS, _MOVES)
     moves = rows[(np.hypot(*motion.T) > least)[rows] & np.isfinite(sample.yaw)[rows] & ~sample.stands[rows]]
-    return np.abs(wrap_angle(sample.yaw[moves] - np.arctan2(motion[moves, 1], motion[moves, 0])))
+    return np.asarray(np.abs(wrap_angle(sample.yaw[moves] - np.arctan2(motion[moves, 1], motion[moves, 0]))))
 
 
 def _stay_nearer(sample: Sample, rows: IntArray, given: FloatArray, placed: FloatArray) -> bool:
@@ -304,7 +304,8 @@ def _stay_nearer(sample: Sample, rows: IntArray, given: FloatArray, placed: Floa
     from scipy.spatial import cKDTree
 
     ego, frame = sample.world_T_ego[:, :2, 3], sample.frame
-    as_given, as_placed = [], []
+    as_given: list[FloatArray] = []
+    as_placed: list[FloatArray] = []
     known = np.unique(frame[rows])
     for name in np.unique(sample.sensor[known]).tolist():
         mine = known[sample.sensor[known] == name]
@@ -313,7 +314,7 @@ def _stay_nearer(sample: Sample, rows: IntArray, given: FloatArray, placed: Floa
             if len(later):
                 for position, apart in ((given, as_given), (placed, as_placed)):
                     apart.append(cKDTree(position[frame == later[0]]).query(position[frame == k])[0])
-    if sum(map(len, as_given)) < FEWEST:
+    if sum(len(each) for each in as_given) < FEWEST:
         return False
     stays, moves = float(np.median(np.concatenate(as_placed))), float(np.median(np.concatenate(as_given)))
     return moves > 1.0 and stays < 0.5 * moves
@@ -343,8 +344,8 @@ def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: F
     degrees = headings_in_degrees(sample.yaw)
     if not any(scale) and found[-1] is None:
         measured = np.isfinite(boxes.velocity).any(axis=1)
-        motion = np.where(measured[:, None], boxes.velocity, sample.world_motion)
-        motion[sample.stands] = np.nan
+        known = measured & ~sample.stands
+        motion = np.where(known[:, None], boxes.velocity, np.where(sample.stands[:, None], np.nan, sample.world_motion))
         headings = headings_against_motion(sample.yaw, motion, sample.walks)
         speeds = speeds_against_motion(boxes.velocity, sample.world_motion) or far_too_fast(label, boxes.velocity)
         found += [headings or degrees, speeds]

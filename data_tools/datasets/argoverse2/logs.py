@@ -43,13 +43,13 @@ import numpy as np
 
 from data_tools.datasets.annotated import DetectedScenes
 from data_tools.datasets.central_differences import central_differences
-from data_tools.datasets.detection_files import DetectionTable
 from data_tools.datasets.source import AreaMap, Kind, map_points
 from data_tools.files.input_files import read_bytes
 from data_tools.files.readers import WHOLE, arrow_arrays, parsed_json
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, checked
 from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.tables.detections import DetectionTable
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
 from saga_fg.types.frame import Detections, Frame
@@ -135,7 +135,8 @@ class ArgoverseLogs:
             of_moment = [np.flatnonzero(moment == k) for k in range(len(stamps))]
             truth = [Annotations(ids[at], boxes.select(at), seen[at]) for at in of_moment]
         categories = [category[at] for at in of_moment]
-        return ArgoverseScene(name, time, poses, tuple(map(str, stamps.tolist())), [], truth, categories)
+        tokens = tuple(map(str, stamps.tolist()))
+        return ArgoverseScene(name, time, poses, tokens, [], truth, categories=categories)
 
     def poses(self, name: str, stamps: IntArray) -> FloatArray:
         """city_T_ego (K, 4, 4) at some times, ns. Raises `InputError` for one without a pose."""

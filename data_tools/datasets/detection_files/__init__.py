@@ -56,7 +56,7 @@ position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2), coastin
 and settled (0 where the solver found no minimum of a nonlinear graph, else 1).
 """
 
-from data_tools.datasets.detection_files.dataset import DetectionTable, read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
 from data_tools.datasets.detection_files.tracks import (
     PREDICTION_COLUMNS,
     PredictionRows,
@@ -78,7 +78,6 @@ __all__ = [
     "LABEL_COLUMNS",
     "PREDICTION_COLUMNS",
     "TRACK_COLUMNS",
-    "DetectionTable",
     "PredictionRows",
     "TableImport",
     "TrackRows",

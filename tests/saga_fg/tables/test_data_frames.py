@@ -1,15 +1,16 @@
-"""Tables of pandas in and out, and the one-line tracker."""
+"""Tables of pandas, Polars and Arrow in and out, and the one-line tracker."""
 
+import re
 import subprocess
 import sys
 import warnings
 
 import numpy as np
 import pytest
-from saga_fg.types.pandas_tables import moments_of_table
 
 import saga_fg
 from saga_fg import Detection, Detections, Frame, InputError, MissingExtraError, Tracker, Tracks
+from saga_fg.tables.data_frames import frames
 
 pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
 
@@ -28,7 +29,7 @@ def test_all_columns_become_detections():
             "confidence": [0.7, 0.8], "class": ["car", "truck"], "colour": ["red", "blue"],
         }
     )  # fmt: skip
-    found = Detections.from_pandas(rows)
+    found = frames(rows.assign(timestamp=1.0, ego_x=0.0, ego_y=0.0, ego_yaw=0.0))[0].detections
     assert found[0] == Detection(
         "car", (1.0, 3.0, 0.5), (4.0, 2.0, 1.5), found.boxes.yaw[0], (5.0, 0.0), 0.7, 1.0, (0.4, 0.1, 0.3)
     )
@@ -36,29 +37,75 @@ def test_all_columns_become_detections():
     assert found.boxes.position[1].tolist() == [2.0, 4.0, 0.0]
     assert np.isnan(found.boxes.velocity[1]).all()
     assert found.score.tolist() == [0.7, 0.8]
-    assert len(Detections.from_pandas(rows[:0])) == 0
+    assert frames(rows.assign(timestamp=1.0)[:0]) == []
 
 
 def test_frames_come_in_order_of_time_and_by_sensor():
     rows = table(sensor=["lidar", "camera"] * 12).sample(frac=1, random_state=1)
-    moments = list(moments_of_table(rows))
-    assert len(moments) == 24
-    assert [time for time, _, _ in moments] == sorted(time for time, _, _ in moments)
-    assert {sensor for _, sensor, _ in moments} == {"lidar", "camera"}
-    assert all(len(found) == 1 for _, _, found in moments)
+    found = frames(rows)
+    assert len(found) == 24
+    assert [frame.timestamp for frame in found] == sorted(frame.timestamp for frame in found)
+    assert {frame.sensor for frame in found} == {"lidar", "camera"}
+    assert all(len(frame) == 1 for frame in found)
 
 
-def test_times_of_pandas_are_seconds_and_rows_without_a_place_moments():
+def test_dates_are_seconds_and_rows_without_a_place_moments():
     start = pd.Timestamp("2024-05-01 12:00:00")
     for unit in ("s", "ns"):
         times = table().assign(timestamp=lambda t: (start + pd.to_timedelta(t.timestamp, unit="s")).dt.round("100ms"))
         if unit == "ns":
             times["timestamp"] = times.timestamp.astype("datetime64[ns]")
-        first, *_ = next(moments_of_table(times))
-        assert first == pytest.approx(start.timestamp())
+        assert frames(times)[0].timestamp == pytest.approx(start.timestamp())
+    elapsed = table().assign(timestamp=lambda t: pd.to_timedelta(t.timestamp, unit="s"))
+    assert [f.timestamp for f in frames(elapsed)] == pytest.approx([f.timestamp for f in frames(table())])
     rows = pd.concat([table(), pd.DataFrame({"timestamp": [5.0], "x": [None], "y": [None]})])
-    *_, (time, _, found) = moments_of_table(rows)
-    assert (time, len(found)) == (5.0, 0)
+    last = frames(rows)[-1]
+    assert (last.timestamp, len(last)) == (5.0, 0)
+
+
+def test_tables_of_polars_and_arrow_give_the_same_tracks_as_tables_of_their_kind():
+    rows = table(label="car", yaw=[0.1, None] * 12)
+    expected = saga_fg.track(rows)
+    for kind, made in (
+        ("pyarrow", lambda rows: pytest.importorskip("pyarrow").Table.from_pandas(rows)),
+        ("polars", lambda rows: pytest.importorskip("polars").DataFrame(rows.to_dict("list"))),
+    ):
+        tracks = saga_fg.track(made(rows))
+        assert type(tracks).__module__.startswith(kind)
+        pd.testing.assert_frame_equal(tracks.to_pandas(), expected, check_dtype=False)
+
+
+def test_each_scene_has_a_tracker_of_its_own():
+    rows = pd.concat([table(label="car", scene=name) for name in ("first", "second")])
+    tracks = saga_fg.track(rows)
+    for _, of_scene in tracks.groupby("scene"):
+        alone = of_scene.drop(columns="scene").reset_index(drop=True)
+        pd.testing.assert_frame_equal(alone, saga_fg.track(table(label="car")))
+
+
+def test_tables_are_read_as_the_arguments_say():
+    rows = table(label="car", yaw=0.1, vx=10.0, vy=0.0)
+    expected = saga_fg.track(rows)
+    foreign = pd.DataFrame(
+        {
+            "ts": (1e3 * rows.timestamp).round(), "east": 100 * rows.x, "north": 100 * rows.y, "label": "PKW",
+            "yaw": np.degrees(0.1), "vx": 36.0, "vy": 0.0,
+        }
+    )  # fmt: skip
+    tracks = saga_fg.track(
+        foreign,
+        columns={"x": "east", "y": "north"},
+        classes={"PKW": "car"},
+        units={"time": "ms", "length": "cm", "angle": "deg", "speed": "km/h"},
+    )
+    pd.testing.assert_frame_equal(tracks, expected, rtol=1e-6, atol=1e-9)
+    drive = 8.0 * rows.timestamp
+    of_vehicle = rows.assign(ego_x=drive, ego_y=0.0, ego_yaw=0.0, x=rows.x - drive)
+    pd.testing.assert_frame_equal(saga_fg.track(of_vehicle, coordinates="ego"), expected, rtol=1e-6, atol=1e-9)
+    of_camera = of_vehicle.assign(x=-of_vehicle.y, y=1.5, z=of_vehicle.x, yaw=-0.1 - np.pi / 2)
+    found = saga_fg.track(of_camera.drop(columns=["vx", "vy"]), coordinates="camera")
+    plain = saga_fg.track(rows.drop(columns=["vx", "vy"]))
+    pd.testing.assert_frame_equal(found[["x", "y", "yaw"]], plain[["x", "y", "yaw"]], rtol=1e-6, atol=1e-9)
 
 
 def test_a_table_is_tracked_in_one_line():
@@ -70,17 +117,17 @@ def test_a_table_is_tracked_in_one_line():
     assert (last.cov_xx > 0).all()
     assert list(saga_fg.track(table()[:0]).columns) == list(tracks.columns)
     tracker = Tracker()
-    for time, sensor, rows in moments_of_table(table(label="car")):
-        now = tracker.step(Frame(time, sensor, Detections.from_pandas(rows)))
+    for frame in frames(table(label="car")):
+        now = tracker.step(frame)
     pd.testing.assert_frame_equal(now.to_pandas(), tracks[-2:].reset_index(drop=True))
 
 
 def test_tables_that_cannot_be_used_are_refused(subtests):
     for rows, message in [
-        ([1, 2], r"expected a pandas.DataFrame, got list"),
-        (pd.DataFrame({"t": [1.0], "x": [1.0]}), r"expected the columns timestamp, y as well, there are t, x"),
-        (pd.DataFrame({"timestamp": [1.0], "x": ["far"], "y": [1.0]}), r"x: expected numbers"),
-        (pd.DataFrame({"timestamp": [1e15], "x": [1.0], "y": [1.0]}), r"timestamp"),
+        ([1, 2], r"expected a table of pandas, Polars or Arrow, got list"),
+        (pd.DataFrame({"t": [1.0], "x": [1.0]}), r"expected a column 'y', the columns there are t, x"),
+        (pd.DataFrame({"timestamp": [1.0], "x": ["far"], "y": [1.0]}), r"row 0: x: expected a number, got 'far'"),
+        (pd.DataFrame({"timestamp": [1e30], "x": [1.0], "y": [1.0]}), r"timestamp"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             saga_fg.track(rows)
@@ -88,15 +135,11 @@ def test_tables_that_cannot_be_used_are_refused(subtests):
 
 def test_a_value_is_named_by_its_column_and_row(subtests):
     for column, value, message in [
-        ("x", np.inf, r"^x: row 500: expected a finite number of at most 1e\+09, got inf"),
-        ("y", 1e12, r"^y: row 500: expected a finite number of at most 1e\+09, got 1e\+12|1000000000000"),
-        (
-            "width",
-            -2.0,
-            r"^width: row 500: expected a size above 0 m of at most 100000, or nothing for unknown, got -2",
-        ),
-        ("confidence", np.inf, r"^confidence: row 500: expected a finite number, or nothing for unknown, got inf"),
-        ("cov_xy", 3.0, r"^cov_xx, cov_xy, cov_yy: row 500: expected a positive definite matrix, got 1.0, 3.0, 1.0"),
+        ("x", np.inf, r"^table: row 500: x: expected a finite number, got inf"),
+        ("y", 1e12, r"^table: row 500: y: expected a finite number within 1e\+09, got 1e\+12"),
+        ("width", -2.0, r"^table: row 500: width: expected a positive number of metres, got -2"),
+        ("confidence", np.inf, r"^table: row 500: score \(column 'confidence'\): expected a finite number, got inf"),
+        ("cov_xy", 3.0, r"^table: row 500: cov_xx, cov_xy, cov_yy: expected a positive definite matrix, got 1, 3, 1"),
     ]:
         with subtests.test(message):
             rows = table(label="car", width=1.8, confidence=0.5, cov_xx=1.0, cov_xy=0.0, cov_yy=1.0)
@@ -108,26 +151,45 @@ def test_a_value_is_named_by_its_column_and_row(subtests):
 
 def test_what_is_probably_wrong_is_warned_of(subtests):
     for columns, message in [
-        ({"label": "car", "score": 87.0}, r"scores are not from 0 to 1: 100% .* look like percent; expected 0 to 1"),
         ({"label": "car", "score": -2.5}, r'Sensor\(score="logit"\)'),
-        ({"label": "car", "yaw": 90.0}, r"headings look like degrees: 100% .* the largest is 90; expected rad"),
-        ({"label": "car", "timestamp": 1e8 * np.arange(24)}, r"frames are usually 1e\+08 s apart: .* look like ns"),
-        ({"label": "car", "length": 180.0, "width": 71.0}, r"objects have a usual length of 180: this looks like cm"),
         (
             {"label": "REGULAR_VEHICLE"},
-            r"no edges: tracker.edges act on .*car.*, and the tracks are of REGULAR_VEHICLE",
+            r"no edges: tracker.edges act on .*car.*, and the tracks are of REGULAR_VEHICLE; .*; "
+            r"add classes=\{'REGULAR_VEHICLE': 'car'\}",
         ),
     ]:
         with subtests.test(message), pytest.warns(UserWarning, match=message):
             saga_fg.track(table(**columns))
 
 
-def test_headings_of_a_compass_are_warned_of_with_and_without_velocities():
+def test_a_table_that_contradicts_how_it_is_read_is_refused_with_what_mends_it(subtests):
+    for columns, mend in [
+        ({"score": 87.0}, {"units": {"score": "percent"}}),
+        ({"yaw": 90.0, "vx": 0.0, "vy": 3.0}, {"units": {"angle": "deg"}}),
+        ({"timestamp": 1e8 * np.arange(24)}, {"units": {"time": "ns"}}),
+        ({"length": 180.0, "width": 71.0}, {"units": {"length": "cm"}}),
+        ({"length": 1.8, "width": 4.5}, {"columns": {"length": "width", "width": "length"}}),
+    ]:
+        rows = table(label="car", **columns)
+        wanted = ", ".join(f"{name}={value!r}" for name, value in mend.items())
+        with subtests.test(wanted):
+            with pytest.raises(InputError, match=re.escape(f"; add {wanted}; as_given=True reads it as it is")):
+                saga_fg.track(rows)
+            with pytest.warns(UserWarning, match=re.escape(wanted)):
+                saga_fg.track(rows, as_given=True)
+            if "length" not in str(mend):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error")
+                    saga_fg.track(rows, **mend)
+
+
+def test_headings_of_a_compass_are_refused_with_and_without_velocities():
     angle = np.linspace(0, 6, 60)
     x, y = 20 * np.sin(angle), -20 * np.cos(angle)
     turning = pd.DataFrame({"timestamp": angle / 0.5, "label": "car", "x": x, "y": y, "yaw": np.pi / 2 - angle})
     for rows in (turning, turning.assign(vx=10 * np.cos(angle), vy=10 * np.sin(angle))):
-        with pytest.warns(UserWarning, match="headings look clockwise from north: .* expected counter-clockwise"):
+        message = r"headings look clockwise from north: .* add units=\{'angle': 'compass_rad'\}"
+        with pytest.raises(InputError, match=message):
             saga_fg.track(rows)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -163,7 +225,7 @@ def test_notebooks_show_tables():
 
 
 def test_tracks_and_detections_are_printed_as_tables_of_one_width():
-    detections = Detections.from_pandas(table(label=["car", "pedestrian"] * 12))
+    detections = Detections.concatenate([frame.detections for frame in frames(table(label=["car", "pedestrian"] * 12))])
     tracks = saga_fg.Tracker().step(saga_fg.Frame(0.0, "lidar", detections))
     for shown in (detections, tracks):
         title, *rows = str(shown).splitlines()

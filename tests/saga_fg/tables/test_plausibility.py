@@ -5,14 +5,18 @@ import numpy as np
 from data_tools.datasets.detection_files import TableImport
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.tables.plausibility import (
-    Finding,
+from saga_fg.tables.conventions import (
     Sample,
+    camera_axes,
     ego_taken_for_world,
-    far_too_fast,
     findings_of,
     headings_against_motion,
     headings_in_degrees,
+    speeds_against_motion,
+    velocities_between_frames,
+)
+from saga_fg.tables.plausibility import (
+    far_too_fast,
     idle_rules,
     length_below_width,
     scores_beyond_one,
@@ -21,16 +25,19 @@ from saga_fg.tables.plausibility import (
     unlikely_sizes,
     usual_class,
     usual_classes,
-    velocities_between_frames,
     within_a_metre,
 )
+from saga_fg.types.finding import Finding
 
 RNG = np.random.default_rng(5)
 CARS = np.full(60, "car")
 
 
 def option(finding: Finding | None) -> str | None:
-    return None if finding is None else TableImport().option_for(finding.mend, {"length": "len", "width": "wid"})
+    if finding is None:
+        return None
+    (judged,) = TableImport().judged([finding], {"length": "len", "width": "wid"})
+    return judged.option
 
 
 def test_headings_in_degrees(subtests):
@@ -56,23 +63,56 @@ def test_headings_against_motion(subtests):
     turned = np.where(RNG.random(100) < 0.1, moving + np.pi, moving)
     along_x = np.where(np.arange(100) % 2, 0.0, np.pi) + RNG.normal(0, 0.05, 100)
     on_x = 5.0 * np.column_stack([np.cos(along_x), np.sin(along_x)])
-    for name, label, yaw, v, unit, found in [
-        ("right", "car", moving, velocity, "rad", None),
-        ("some turned round", "car", turned, velocity, "rad", None),
-        ("mirrored", "car", -moving, velocity, "rad", "--units angle=clockwise"),
-        ("mirrored degrees", "car", -moving, velocity, "deg", "--units angle=clockwise_deg"),
-        ("compass", "truck", np.pi / 2 - moving, velocity, "deg", "--units angle=compass"),
-        ("compass in rad", "car", np.pi / 2 - moving, velocity, "rad", "--units angle=compass_rad"),
-        ("compass on a straight road", "car", np.pi / 2 - along_x, on_x, "deg", "--units angle=compass"),
-        ("mirrored, which makes no difference", "car", -along_x, on_x, "rad", None),
-        ("no convention", "car", RNG.uniform(-3, 3, 100), velocity, "rad", None),
-        ("people look around", "pedestrian", -moving, velocity, "rad", None),
-        ("nothing moves", "car", -moving, 0.1 * velocity, "rad", None),
-        ("no velocities", "car", -moving, np.full((100, 2), np.nan), "rad", None),
-        ("too few", "car", -moving[:30], velocity[:30], "rad", None),
+    walks = np.zeros(100, dtype=np.bool_)
+    for name, yaw, v, found in [
+        ("right", moving, velocity, None),
+        ("some turned round", turned, velocity, None),
+        ("mirrored", -moving, velocity, "--units angle=clockwise"),
+        ("degrees", np.degrees(moving), velocity, "--units angle=deg"),
+        ("mirrored degrees", -np.degrees(moving), velocity, "--units angle=clockwise_deg"),
+        ("compass", 90 - np.degrees(moving), velocity, "--units angle=compass"),
+        ("compass in rad", np.pi / 2 - moving, velocity, "--units angle=compass_rad"),
+        ("compass on a straight road", 90 - np.degrees(along_x), on_x, "--units angle=compass"),
+        ("mirrored, which makes no difference", -along_x, on_x, None),
+        ("no convention", RNG.uniform(-3, 3, 100), velocity, None),
+        ("nothing moves", -moving, 0.1 * velocity, None),
+        ("no velocities", -moving, np.full((100, 2), np.nan), None),
+        ("too few", -moving[:30], velocity[:30], None),
     ]:
         with subtests.test(name):
-            assert option(headings_against_motion(np.full(len(yaw), label), yaw, v, unit)) == found
+            assert option(headings_against_motion(yaw, v, walks[: len(yaw)])) == found
+    walking = 0.2 * velocity
+    assert headings_against_motion(-moving, walking, walks) is None
+    assert option(headings_against_motion(-moving, walking, ~walks)) == "--units angle=clockwise"
+    in_degrees = TableImport(units={"angle": "deg"}).judged([headings_against_motion(-moving, velocity, walks)], {})
+    assert in_degrees[0].option == "--units angle=clockwise_deg"
+
+
+def test_speeds_against_motion(subtests):
+    motion = RNG.normal(0, 6, (80, 2))
+    for factor, found in [(1.0, None), (3.6, "km/h"), (2.237, "mph"), (3.281, "ft/s"), (0.5, None), (-3.6, None)]:
+        with subtests.test(factor=factor):
+            measured = factor * motion + RNG.normal(0, 0.3, motion.shape)
+            finding = speeds_against_motion(measured, motion + RNG.normal(0, 0.5, motion.shape))
+            assert option(finding) == (None if found is None else f"--units speed={found}")
+    assert speeds_against_motion(3.6 * motion[:20], motion[:20]) is None
+    assert speeds_against_motion(3.6 * motion, np.full(motion.shape, np.nan)) is None
+
+
+def test_camera_axes(subtests):
+    right, ahead = RNG.uniform(-12, 12, 80), RNG.uniform(4, 50, 80)
+    down = RNG.normal(1.2, 0.3, 80)
+    for name, position, found in [
+        ("camera", (right, down, ahead), True),
+        ("vehicle", (ahead, right, -down), False),
+        ("world on a hill", (right, 3 * right, ahead), False),
+        ("a straight road in a tall town", (right, down, ahead + 200), False),
+        ("on a plane", (ahead, 0 * down, down), False),
+    ]:
+        with subtests.test(name):
+            finding = camera_axes(np.column_stack(position))
+            assert option(finding) == ("--coordinates camera" if found else None)
+    assert camera_axes(np.column_stack((right, down, ahead))[:10]) is None
 
 
 def test_velocities_between_frames_are_those_of_objects_that_cannot_be_mistaken():
@@ -81,8 +121,8 @@ def test_velocities_between_frames_are_those_of_objects_that_cannot_be_mistaken(
     time, label = np.repeat(np.arange(5) * 0.2, 3), np.tile(["car", "car", "truck"], 5)
     place = np.concatenate([start + t * v for t in np.arange(5) * 0.2])
     found = velocities_between_frames(time, label, place)
-    np.testing.assert_allclose(found[:12], np.tile(v, (4, 1)), atol=1e-9)
-    assert np.isnan(found[12:]).all()
+    np.testing.assert_allclose(found[:6], np.tile(v, (2, 1)), atol=1e-9)
+    assert np.isnan(found[6:]).all()  # followed for less than half a second
     crowd = np.concatenate([0.3 * np.arange(3)[:, None] * [1.0, 0.0] + t for t in np.arange(5) * 0.2])
     assert np.isnan(velocities_between_frames(time, np.full(15, "car"), crowd)).all()
     at_once = velocities_between_frames(np.array([0.0, 0.0, 1e-308, 1e-308]), np.full(4, "car"), place[[0, 1, 3, 4]])
@@ -215,7 +255,7 @@ def test_ego_taken_for_world(subtests):
     ]:
         with subtests.test(frames=frames, found=found):
             s = Sample.from_frames(frames)
-            finding = ego_taken_for_world(s.frame, s.boxes.position, s.world_T_ego, s.in_world, s.sensor)
+            finding = ego_taken_for_world(s)
             assert option(finding) == ("--coordinates ego" if found else None)
 
 
@@ -256,7 +296,9 @@ def test_rules_that_meet_no_class():
     numbered = idle_rules({"car", "pedestrian"}, {"0", "1"})  # 1 may be the pedestrians
     assert option(numbered) == "--classes 0=...,1=..."
     assert numbered is not None
-    assert numbered.text("--classes 0=...,1=...").endswith("; fill in and add --classes 0=...,1=...")
+    (judged,) = TableImport().judged([numbered], {})
+    assert str(judged).endswith("; fill in and add --classes 0=...,1=...")
+    assert not judged.stops  # objects can be tracked one by one
     assert idle_rules({"car"}, {"car", "dog"}) is None
     assert idle_rules(set(), {"dog"}) is None
     assert idle_rules({"car"}, set()) is None
@@ -266,7 +308,7 @@ def test_rules_that_meet_no_class():
 def test_settings_without_data():
     finding = settings_without_data("tracker.classes", {"Pedestrian", "car"}, {"pedestrian", "car"})
     assert finding is not None
-    assert finding.text() == (
+    assert str(finding) == (
         "tracker.classes.Pedestrian has settings and the data have none of it; pedestrian have the default ones; "
         "is tracker.classes.pedestrian meant?"
     )
