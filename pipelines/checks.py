@@ -22,7 +22,7 @@ from saga_fg.tables.conventions import Sample, findings_of
 from saga_fg.tables.plausibility import idle_lanes, idle_rules, settings_without_data
 from saga_fg.tracking.by_name import estimator_parameters
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.finding import Finding, Mend
+from saga_fg.types.finding import Finding, Mend, refuse_contradictions
 from saga_fg.types.road_map import LANE, MAP_CLASSES, STOP_LINE
 
 log = logging.getLogger(__name__)
@@ -150,9 +150,9 @@ class Checks:
         return sensor_model(self._settings.sensors, sensor).score == "logit"
 
     def _tell(self, findings: Iterable[Finding]) -> None:
+        findings = list(findings)
+        refuse_contradictions(findings)
         for finding in findings:
-            if finding.stops:
-                raise InputError(f"{finding}; --as-given reads it as it is")
             if finding.kind not in self._told:
                 self._told.add(finding.kind)
                 option = self._option_for(finding.mend) if finding.mend is not None and not finding.option else ""

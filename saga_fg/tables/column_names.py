@@ -14,8 +14,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, reduce
 from math import pi
+from operator import or_
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -35,6 +36,7 @@ FACTORS: Mapping[Kind, Mapping[str, float]] = {
     | {"compass": -pi / 180, "compass_rad": -1.0},
     "score": {"share": 1.0, "percent": 0.01},
 }
+_DEGREES = {"clockwise": "clockwise_deg", "compass_rad": "compass"}
 OFFSETS = {"compass": pi / 2, "compass_rad": pi / 2}
 """Offset of angles in these units, rad: a compass counts clockwise from the y axis, which is north."""
 ISO = "iso8601"
@@ -382,7 +384,7 @@ class TableImport(Settings):
         by_name = (meaning(names["yaw"]) or ("", None))[1] if "yaw" in names else None
         if "angle" not in units or self.unit("yaw", by_name) != "deg":
             return units
-        return {**units, "angle": {"clockwise": "clockwise_deg", "compass_rad": "compass"}.get(units["angle"], "rad")}
+        return {**units, "angle": _DEGREES.get(units["angle"], units["angle"])}
 
     def changes(self, mend: Mend, names: Mapping[str, str]) -> dict[str, Any]:
         """The entries that mend a suspicion, in place of those of the same name; `names` as of `mended`."""
@@ -390,15 +392,14 @@ class TableImport(Settings):
         return {field.name: getattr(mended, field.name) for field in fields(Mend) if getattr(mend, field.name)}
 
     def judged(self, findings: Iterable[Finding], names: Mapping[str, str]) -> tuple[Finding, ...]:
-        """The findings, each with the options that mend it, and whether the table cannot be used as it is read."""
-        return tuple(self._judged(finding, finding.mend, names) for finding in findings)
-
-    def _judged(self, finding: Finding, mend: Mend | None, names: Mapping[str, str]) -> Finding:
-        if mend is None:
-            return finding
-        changes = self.changes(mend, names)
-        stops = not self.as_given and not changes.keys() <= {"classes"}
-        return replace(finding, option=TableImport(**changes).options().strip(), stops=stops)
+        """The findings, each with the options that mend it, and whether the table contradicts how it is read."""
+        judged = [replace(one, stops=not self.as_given and one.contradicts) for one in findings]
+        together = reduce(or_, (one.mend for one in judged if one.stops and one.mend is not None), Mend())
+        mends = [together if one.stops else one.mend for one in judged]
+        options = ["" if m is None else TableImport(**self.changes(m, names)).options().strip() for m in mends]
+        return tuple(
+            replace(one, mend=mend, option=option) for one, mend, option in zip(judged, mends, options, strict=True)
+        )
 
     def options(self) -> str:
         """The options of the command that say the same, with a space before each; empty if there are none."""

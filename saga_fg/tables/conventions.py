@@ -194,16 +194,18 @@ def headings_against_motion(yaw: FloatArray, velocity: FloatArray, walks: BoolAr
         return None
     direction, given = np.arctan2(velocity[moves, 1], velocity[moves, 0]), yaw[moves]
     apart = {unit: np.abs(wrap_angle(meant(given) - direction)) for unit, (_, meant) in _CONVENTIONS.items()}
-    astray = {unit: share(each > _ASTRAY) for unit, each in apart.items()}
-    best, as_read = (
-        min(astray, key=lambda unit: (astray[unit], np.median(apart[unit]))),
-        np.abs(wrap_angle(given - direction)),
+    as_read = np.abs(wrap_angle(given - direction))
+    fits = {unit: (share(each > _ASTRAY), float(np.median(each))) for unit, each in apart.items()}
+    least = [min(column) for column in zip(*fits.values(), strict=True)]
+    best = next(  # the plainest of those that fit alike, as several do on a road along an axis
+        (unit for unit, fit in fits.items() if fit[0] <= least[0] + 0.02 and fit[1] <= least[1] + 0.05), "deg"
     )
-    now, usual = share(as_read > _ASTRAY), np.median(as_read)
-    if not (now >= 0.15 and astray[best] <= now / 3) and not (usual > _OFF and np.median(apart[best]) < usual / 3):
+    now, usual = share(as_read > _ASTRAY), float(np.median(as_read))
+    astray, off = fits[best]
+    if not (now >= 0.15 and astray <= now / 3) and not (usual > _OFF and off < usual / 3):
         return None
     what = f"headings look {_CONVENTIONS[best][0]}: {now:.0%} of those of moving objects differ from their motion"
-    expected = f"expected counter-clockwise from x, rad; read so, {astray[best]:.0%} differ"
+    expected = f"expected counter-clockwise from x, rad; read so, {astray:.0%} differ"
     return Finding("headings", what, expected, Mend(units={"angle": best}))
 
 
@@ -289,7 +291,7 @@ def _within(position: FloatArray, ego: FloatArray) -> BoolArray:
 def _velocity_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatArray:
     """m/s between measured velocities and those between frames."""
     apart = np.hypot(*(sample.boxes.velocity - motion)[rows].T)
-    return apart[np.isfinite(apart)]
+    return np.asarray(apart[np.isfinite(apart)])
 
 
 def _heading_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatArray:

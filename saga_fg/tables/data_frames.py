@@ -77,7 +77,7 @@ def scenes_of(raw: RawTable) -> list[Scene]:
     return [table.scene(name) for name in table.scenes]
 
 
-def frames(table: Table, how: TableImport | None = None) -> list[Frame]:
+def frames_of(table: Table, how: TableImport | None = None) -> list[Frame]:
     """The frames of a table of detections of one recording, in order of time; `saga_fg.track` has the columns.
 
     Rows with the same time and sensor are a frame. Raises `InputError` naming row and column.

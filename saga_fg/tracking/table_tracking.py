@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 
-from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import acting_classes
 from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.tables.column_names import TableImport
@@ -18,7 +17,7 @@ from saga_fg.tables.plausibility import idle_rules
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker
 from saga_fg.types.dataset import Scene
-from saga_fg.types.finding import Mend
+from saga_fg.types.finding import Mend, refuse_contradictions
 from saga_fg.types.track import Tracks
 
 UNNAMED = "object"
@@ -78,12 +77,13 @@ def tell(
     if logits:
         told.pop("scores", None)
     rules = idle_rules(acting_classes(settings.edges), labels - {UNNAMED})
-    for finding in (*told.values(), *([] if rules is None else [rules])):
+    found = [*told.values(), *([] if rules is None else [rules])]
+    for row, finding in enumerate(found):
         option = "" if finding.mend is None else _arguments(how, finding.mend)
-        text = str(replace(finding, option=option)).removeprefix("table: ")
-        if finding.stops:
-            raise InputError(f"{text}; as_given=True reads it as it is")
-        warnings.warn(text, stacklevel=depth)
+        found[row] = replace(finding, what=finding.what.removeprefix("table: "), option=option)
+    refuse_contradictions(found, "as_given=True")
+    for finding in found:
+        warnings.warn(str(finding), stacklevel=depth)
 
 
 def _logits(sensors: Mapping[str, Sensor], name: str) -> bool:

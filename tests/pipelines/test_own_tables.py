@@ -1,6 +1,7 @@
 """Tables of one's own, and what looks wrong in them. From a stranger's table to a judged result."""
 
 import json
+import math
 import re
 import shlex
 from importlib.util import find_spec
@@ -173,17 +174,24 @@ def test_the_same_in_a_file_and_in_options(tmp_path):
 # What `inspect` and `track` say of tables with oddities, and what mends them
 
 
-def test_what_looks_wrong_is_told_once_with_what_mends_it(tmp_path, caplog):
+def test_what_contradicts_how_it_is_read_is_refused_with_what_mends_it(tmp_path, caplog):
     table = write(tmp_path / "d.csv", rows()[0])
-    assert saga_fg("smooth", "file", table, "--sort", "--output", tmp_path / "labels").exit_code == 0
+    mend = "--units score=percent,angle=deg"
+    refused = saga_fg("smooth", "file", table, "--sort", "--output", tmp_path / "labels")
+    assert refused.exit_code == 2
+    assert refused.stderr.rstrip().endswith(f"; add {mend}; --as-given reads it as it is"), refused.stderr
+    assert "headings look" in refused.stderr
+    assert "scores are not from 0 to 1" in refused.stderr
+    assert not (tmp_path / "labels").exists()
+    given = saga_fg("smooth", "file", table, "--sort", "--as-given", "--output", tmp_path / "labels")
+    assert given.exit_code == 0, given.output
     told = [record.getMessage() for record in caplog.records]
-    for mend in ("--units angle=deg", "--units score=percent"):
-        assert len([line for line in told if line.endswith(f"add {mend}")]) == 1, told
+    assert len([line for line in told if "add --units" in line]) == 2, told
 
 
 def added(text: str) -> list[str]:
     """The options that a warning or a look says to add."""
-    (mend,) = re.findall(r"; (?:fill in and )?add (--\S+ \S+)$", text, re.MULTILINE)
+    (mend,) = re.findall(r"; (?:fill in and )?add (--\S+ \S+?)(?:; --as-given .*)?$", text, re.MULTILINE)
     return shlex.split(str(mend))
 
 
@@ -204,9 +212,12 @@ def test_what_is_told_mends_it_when_pasted(tmp_path, caplog):
         caplog.clear()
         before, after = (["inspect"], []) if command == "inspect" else (["track", "file"], ["-o", tmp_path / "t.csv"])
         result = saga_fg(*before, tmp_path / "d.csv", *options, *after)
-        assert result.exit_code == 0, result.output
         lines = [*(record.getMessage() for record in caplog.records), *result.stdout.splitlines()]
-        return [line for line in lines if "; add --" in line]
+        lines += [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+        found = [line for line in lines if "; add --" in line]
+        refused = any("--as-given" in line for line in found)
+        assert result.exit_code == (2 if refused else 0), result.output
+        return [line.removesuffix("; --as-given reads it as it is") for line in found]
 
     for command, renamed, given, option in PASTED:
         found = [{renamed.get(name, name): value for name, value in row.items()} for row in rows()[0]]
@@ -294,8 +305,9 @@ def test_numbers_of_frames_taken_for_seconds(tmp_path, caplog):
     found = [{"frame": k // 2, "x": k // 2 + 20 * (k % 2), "y": 2, "label": "car"} for k in range(40)]
     table = write(tmp_path / "d.csv", found)
     track = ["track", "file", table, "--columns", "time=frame", "-o", tmp_path / "t.csv"]
-    assert saga_fg(*track).exit_code == 0
-    assert "they look like frames, such as 10 a second; add --units time=10Hz" in caplog.text
+    refused = saga_fg(*track)
+    assert refused.exit_code == 2
+    assert "they look like frames, such as 10 a second; add --units time=10Hz" in refused.output
     assert "add --units time=10Hz" in saga_fg("inspect", table, "--columns", "time=frame").stdout
     caplog.clear()
     assert saga_fg(*track, "--units", "time=10Hz").exit_code == 0
@@ -336,9 +348,11 @@ def test_a_look_at_a_table_without_doubts(tmp_path):
 def test_the_examples_of_the_help_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found, true = rows()
+    found, in_rad = ([{**row, "hdg": math.radians(row["hdg"])} for row in each] for each in (found, true))
+    found = [{**row, "conf": row["conf"] / 100} for row in found]
     write(tmp_path / "detections.csv", sorted(found, key=lambda row: row["ts_ns"]))
-    write(tmp_path / "truth.csv", true)
-    write(tmp_path / "tracks.csv", true)
+    write(tmp_path / "truth.csv", in_rad)
+    write(tmp_path / "tracks.csv", in_rad)
     text = saga_fg("evaluate", "file", "--help").stdout
     lines = [line.strip() for line in text.replace(" \\\n", " ").splitlines() if "saga-fg evaluate file" in line]
     assert len(lines) == 3

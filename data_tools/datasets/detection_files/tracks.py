@@ -67,6 +67,7 @@ from saga_fg.tables.conventions import Sample, findings_of
 from saga_fg.tables.detections import box_columns
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types.finding import refuse_contradictions
 from saga_fg.types.track import PredictedTracks, Tracks
 
 if TYPE_CHECKING:
@@ -281,9 +282,10 @@ def _track_rows(raw: RawTable) -> TrackRows:
         in_world = (raw.texts("coordinates", raw.how.coordinates or "world") == "world")[mine]
         yaw = raw.numbers("yaw")[mine]
         sample = Sample.from_rows(timestamp[mine], found.boxes.select(mine), found.score[mine], yaw, in_world)
-        for finding in raw.how.judged([*raw.findings(), *findings_of(sample)], raw.found.names):
-            if finding.stops:
-                raise InputError(f"{raw.path}: {finding}; --as-given reads it as it is")
+        findings = raw.how.judged([*raw.findings(), *findings_of(sample)], raw.found.names)
+        with error_context(str(raw.path)):
+            refuse_contradictions(findings)
+        for finding in findings:
             log.warning("%s: %s", raw.path, finding)
     return TrackRows(
         scene=scene,

@@ -195,7 +195,7 @@ BROKEN_CSV = [
     (HEAD + "1,1,1,1,1,nan,car\n", "line 3: score: expected a finite number, got nan"),
     (HEAD + ",1,1,1,1,1,car\n", "line 3: timestamp: expected a finite number of seconds, it is left out"),
     (HEAD + "-1,1,1,1,1,1,car\n", "line 3: timestamp: expected rows in order of time, time runs backwards at -1.0 s"),
-    ("timestamp,x,y,coordinates\n0,1,1,map\n", "line 2: coordinates: expected world, ego or sensor, got 'map'"),
+    ("timestamp,x,y,coordinates\n0,1,1,map\n", "line 2: coordinates: expected world, ego, sensor or camera, got 'map'"),
     ("timestamp,x,y,coordinates\n0,1,1,ego\n", "line 2: coordinates: ego needs the columns ego_x, ego_y and ego_yaw"),
     ("timestamp,x,y,ego_x\n0,1,1,3\n", "line 2: ego_y: expected a finite number, since ego_x is given, it is left out"),
     (HEAD + "1,1,1,1,1,1," + "c" * 200_000, "line 3: expected comma-separated values: field larger"),

@@ -10,7 +10,7 @@ import pytest
 
 import saga_fg
 from saga_fg import Detection, Detections, Frame, InputError, MissingExtraError, Tracker, Tracks
-from saga_fg.tables.data_frames import frames
+from saga_fg.tables.data_frames import frames_of
 
 pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
 
@@ -29,7 +29,7 @@ def test_all_columns_become_detections():
             "confidence": [0.7, 0.8], "class": ["car", "truck"], "colour": ["red", "blue"],
         }
     )  # fmt: skip
-    found = frames(rows.assign(timestamp=1.0, ego_x=0.0, ego_y=0.0, ego_yaw=0.0))[0].detections
+    found = frames_of(rows.assign(timestamp=1.0, ego_x=0.0, ego_y=0.0, ego_yaw=0.0))[0].detections
     assert found[0] == Detection(
         "car", (1.0, 3.0, 0.5), (4.0, 2.0, 1.5), found.boxes.yaw[0], (5.0, 0.0), 0.7, 1.0, (0.4, 0.1, 0.3)
     )
@@ -37,12 +37,12 @@ def test_all_columns_become_detections():
     assert found.boxes.position[1].tolist() == [2.0, 4.0, 0.0]
     assert np.isnan(found.boxes.velocity[1]).all()
     assert found.score.tolist() == [0.7, 0.8]
-    assert frames(rows.assign(timestamp=1.0)[:0]) == []
+    assert frames_of(rows.assign(timestamp=1.0)[:0]) == []
 
 
 def test_frames_come_in_order_of_time_and_by_sensor():
     rows = table(sensor=["lidar", "camera"] * 12).sample(frac=1, random_state=1)
-    found = frames(rows)
+    found = frames_of(rows)
     assert len(found) == 24
     assert [frame.timestamp for frame in found] == sorted(frame.timestamp for frame in found)
     assert {frame.sensor for frame in found} == {"lidar", "camera"}
@@ -55,11 +55,11 @@ def test_dates_are_seconds_and_rows_without_a_place_moments():
         times = table().assign(timestamp=lambda t: (start + pd.to_timedelta(t.timestamp, unit="s")).dt.round("100ms"))
         if unit == "ns":
             times["timestamp"] = times.timestamp.astype("datetime64[ns]")
-        assert frames(times)[0].timestamp == pytest.approx(start.timestamp())
+        assert frames_of(times)[0].timestamp == pytest.approx(start.timestamp())
     elapsed = table().assign(timestamp=lambda t: pd.to_timedelta(t.timestamp, unit="s"))
-    assert [f.timestamp for f in frames(elapsed)] == pytest.approx([f.timestamp for f in frames(table())])
+    assert [f.timestamp for f in frames_of(elapsed)] == pytest.approx([f.timestamp for f in frames_of(table())])
     rows = pd.concat([table(), pd.DataFrame({"timestamp": [5.0], "x": [None], "y": [None]})])
-    last = frames(rows)[-1]
+    last = frames_of(rows)[-1]
     assert (last.timestamp, len(last)) == (5.0, 0)
 
 
@@ -117,7 +117,7 @@ def test_a_table_is_tracked_in_one_line():
     assert (last.cov_xx > 0).all()
     assert list(saga_fg.track(table()[:0]).columns) == list(tracks.columns)
     tracker = Tracker()
-    for frame in frames(table(label="car")):
+    for frame in frames_of(table(label="car")):
         now = tracker.step(frame)
     pd.testing.assert_frame_equal(now.to_pandas(), tracks[-2:].reset_index(drop=True))
 
@@ -225,7 +225,9 @@ def test_notebooks_show_tables():
 
 
 def test_tracks_and_detections_are_printed_as_tables_of_one_width():
-    detections = Detections.concatenate([frame.detections for frame in frames(table(label=["car", "pedestrian"] * 12))])
+    detections = Detections.concatenate(
+        [frame.detections for frame in frames_of(table(label=["car", "pedestrian"] * 12))]
+    )
     tracks = saga_fg.Tracker().step(saga_fg.Frame(0.0, "lidar", detections))
     for shown in (detections, tracks):
         title, *rows = str(shown).splitlines()
