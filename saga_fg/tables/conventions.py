@@ -252,10 +252,12 @@ def ego_taken_for_world(sample: Sample) -> Finding | None:
     if len(rows) < FEWEST:
         return None
     given, placed, ego = sample.boxes.position[:, :2], sample.placed(), sample.ego[0]
-    far = _AWAY if np.ptp(ego[rows], axis=0).max() > _TRAVELLED else 3 * _AWAY  # of a sensor that stands
-    away = rows[np.hypot(*ego[rows].T) > far]
-    if len(away) >= FEWEST and np.median(np.hypot(*given[away].T)) < 0.5 * np.median(np.hypot(*(given - ego)[away].T)):
-        return _EGO
+    away = rows[np.hypot(*ego[rows].T) > _AWAY]
+    if len(away) >= FEWEST:
+        about, from_ego = (float(np.median(np.hypot(*each[away].T))) for each in (given, given - ego))
+        drives = np.ptp(ego[rows], axis=0).max() > _TRAVELLED
+        if about < 0.5 * from_ego if drives else about < 1.5 * _AWAY and from_ego > 3 * _AWAY:
+            return _EGO
     hit = [
         share(np.bincount(sample.frame[rows], _within(p[rows], ego[rows]) & ~sample.walks[rows]) > 0)
         for p in (given, placed)
@@ -263,13 +265,13 @@ def ego_taken_for_world(sample: Sample) -> Finding | None:
     if 5 * hit[1] < hit[0] and 0.05 < hit[0] < 0.5:  # more often, it is the vehicle that is detected
         return _EGO
     as_given, as_placed = sample.motion(given), _turned(sample.motion(placed), -sample.ego[1])
-    for reading in (_velocity_apart, _heading_apart):
+    for reading, least in ((_velocity_apart, 0.3), (_heading_apart, 0.12)):
         apart = [reading(sample, motion, rows) for motion in (as_given, as_placed)]
         if min(map(len, apart)) >= 2 * FEWEST:
             one, other = (float(np.median(each)) for each in apart)
-            if one > 0.3 and other < 0.4 * one:
+            if one > least and other < 0.4 * one:
                 return _EGO
-            if other > 0.3 and one < 0.4 * other:
+            if other > least and one < 0.4 * other:
                 return None
     return _EGO if _stay_nearer(sample, rows, given, placed) else None
 
