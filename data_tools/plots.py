@@ -11,7 +11,11 @@ import numpy as np
 
 from data_tools.figures import Chart
 from saga_fg import Boxes, Detections, Tracks
+from saga_fg.errors import error_context
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.tables.columns import TRACK_COLUMNS
+from saga_fg.tables.data_frames import raw_table
+from saga_fg.tables.detections import box_columns
 
 __all__ = [
     "chart_picture",

@@ -29,7 +29,7 @@ from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, St
 from saga_fg.numerics.gating import near_pairs
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.states import Lifespans, Probabilities, StateTable
-from saga_fg.types.pandas_tables import Table, new_table, text_table
+from saga_fg.types.shown import data_frame, text_table
 
 HANDED_OUT = 0.5  # P(exists)
 FAR_OFF = 0.5  # of a position, m
@@ -160,9 +160,9 @@ class Review(Columns):
         place = {"timestamp": self.time, "x": self.position[:, 0], "y": self.position[:, 1]}
         return {**shown, **place, **self.probability.table_columns(), "boxes_far_off": self.far_off}
 
-    def to_pandas(self) -> Table:
+    def to_pandas(self) -> Any:
         """Return a `pandas.DataFrame` of `table_columns`. Needs the extra `pandas`."""
-        return new_table([self.table_columns()])
+        return data_frame(self.table_columns())
 
     def __str__(self) -> str:
         rows = list(zip(*(column.tolist() for column in self.table_columns().values()), strict=True))

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from saga_fg.errors import MissingExtraError
 
 LONGEST = 20
 """Rows that are shown."""
@@ -34,3 +37,12 @@ def _text(value: str | float | int) -> str:
 
 def _cell(value: str | float | int) -> str:
     return html.escape(_text(value))
+
+
+def data_frame(columns: Mapping[str, Any]) -> Any:
+    """Return columns as a `pandas.DataFrame`. Raises `MissingExtraError` without pandas."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise MissingExtraError("tables need pandas: pip install 'saga-fg[pandas]'") from error
+    return pandas.DataFrame(columns)

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import (
     BoolArray,
     Columns,
@@ -21,7 +21,7 @@ from saga_fg.numerics.arrays import (
     upper_triangle,
 )
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.shown import html_table, text_table
+from saga_fg.types.shown import data_frame, html_table, text_table
 
 KNOWN_SPEED_DEVIATION = 2.0  # m/s; a velocity of a larger standard deviation counts as unknown
 
@@ -136,11 +136,7 @@ class Tracks(Columns):
 
         Raises `MissingExtraError` without pandas.
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise MissingExtraError("tables need pandas: pip install 'saga-fg[pandas]'") from error
-        return pandas.DataFrame(self.table_columns())
+        return data_frame(self.table_columns())
 
     def table_columns(self) -> dict[str, Any]:
         """Return the columns (N,) of a table, named as in the files of `saga-fg track file`.
