@@ -1,14 +1,13 @@
 """Path of the vehicle and objects around it: from a whole recording at once, and online.
 
-Discrete unknowns depend on the path: the association of detections, and the identity and stationarity of objects.
+Discrete unknowns depend on the path: the association of detections, and the stationarity of objects.
 
 From a recording, a pass associates along the path so far, starting with the odometry's, takes the probabilities of
-stationarity from the detections, solves the graph of all epochs, weighs the detections by the objects found, and solves
-again. Passes end when associations repeat.
+stationarity from the detections, and solves the graph of all epochs. Passes end when associations repeat.
 
 Online, each frame adds an epoch to the running graph of the last seconds. The stationarity of objects follows from the
-window, the identity of detections from the objects after it, and iSAM2 solves the window with the new factors. Epochs
-older than `lag` leave: they are marginalised with all factors on their variables, linearised at the present estimate.
+window, and iSAM2 solves that with the new factors. Epochs older than `lag` leave: they are marginalised with all
+factors on their variables, linearised at the present estimate.
 """
 
 from __future__ import annotations
@@ -24,21 +23,17 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
 from saga_fg.estimators.solution import GraphSolution
-from saga_fg.graph import Additions, FactorProvider, GraphError, SceneFactorGraph, ask_all
+from saga_fg.graph import FactorProvider, GraphError, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform, yaw_transform
 from saga_fg.slam.joint.association import (
     SlowErrors,
     stationary_probabilities,
-    with_all_identities,
-    with_identities,
 )
 from saga_fg.slam.joint.graph import (
     JointEstimate,
     StationaryPairs,
     VehicleAndObjects,
-    detections,
-    detections_name,
     error_key,
     read_estimate,
     stationary_factors,
@@ -51,7 +46,7 @@ from saga_fg.slam.joint.record import (
     RecordedEpoch,
     record_epochs,
 )
-from saga_fg.slam.mapping import Given, pose_key
+from saga_fg.slam.mapping import pose_key
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 
@@ -88,10 +83,9 @@ def estimate_jointly(
         before, links = links, [now.seen.id.tolist() for now in record]
         if links == before:
             break
-        clutter = tracker.settings.association.clutter_area
         start_moving = estimate is None
         epochs = VehicleAndObjects(record, path, settings)
-        estimate = _solve(epochs, frames, slow, start_moving, clutter, new_providers())
+        estimate = _solve(epochs, frames, slow, start_moving, new_providers())
         path, slow = estimate.world_T_ego, estimate.slow_errors
     assert estimate is not None
     return estimate
@@ -102,12 +96,10 @@ def _solve(
     frames: Sequence[Frame],
     slow: SlowErrors,
     start_moving: bool,
-    clutter_area: float,
     providers: Sequence[FactorProvider],
 ) -> JointEstimate:
     """Solve the epochs of a record several times, each from the solution before: if `start_moving` with all objects
-    moving, which needs no good start; with those stationary that seem so along the path; with identities by the
-    solution.
+    moving, which needs no good start; then with those stationary that seem so along the path.
     """
     graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=MAX_ITERATIONS, tolerance=TOLERANCE)
     record, settings = epochs.record, epochs.settings
@@ -119,14 +111,9 @@ def _solve(
     probabilities = stationary_probabilities(record, np.asarray(epochs.path), slow, settings)
     name = StationaryPairs.name
     graph.add_factors(name, stationary_factors(record, probabilities), name)
-    estimate = read_estimate(record, graph.solve(solver), probabilities)
-    places = [one.position for one in estimate.objects]
-    record = with_all_identities(record, estimate.world_T_ego, places, clutter_area)
-    graph.add_factors(epochs.name, detections(record, settings), detections_name(record[-1]))
     return read_estimate(record, graph.solve(solver), probabilities)
 
 
-_DOUBTFUL = 0.9  # probability of an assignment below which its detection is weighed anew
 _THRESHOLD = 0.1  # standard deviations that a variable moves before its factors are linearised anew
 
 
@@ -159,7 +146,7 @@ class OnlineEstimator:
         self._settings, self._lag = settings or JointSettings(), lag
         # without a lag of its own: epochs leave here, and elimination in the order of time would cost thrice as much
         self._smoother = IncrementalSmoother(providers, None, RelinearisationSettings(_THRESHOLD, MAX_ITERATIONS))
-        self._recorder, self._clutter_area = EpochRecorder(tracker), tracker.settings.association.clutter_area
+        self._recorder = EpochRecorder(tracker)
         self._start = np.eye(4) if start is None else checked_transform("start", start)
         self._slow = SlowErrors.at_start(self._settings)
         self._pairs, self._stationary = StationaryPairs(), list[FloatArray]()
@@ -196,9 +183,6 @@ class OnlineEstimator:
             raise
         self._record, self._solution = record, self._smoother.solution()
         newest = self._estimate(1)
-        doubtful = with_identities(now, newest.world_T_ego[-1], newest.objects[-1].position, self._clutter_area)
-        if (doubtful.seen.probability < _DOUBTFUL).any():
-            newest = self._weighed(doubtful)
         since = now.time - self._lag
         gone = sum(one.time <= since for one in record[1:])
         self._smoother.forget(since=since)
@@ -211,17 +195,6 @@ class OnlineEstimator:
         if not self._record:
             raise InputError("expected a frame before the estimate is asked for")
         return self._estimate(len(self._record))
-
-    def _weighed(self, now: RecordedEpoch) -> JointEstimate:
-        """The newest epoch with other probabilities of its detections, solved again."""
-        self._record[-1] = now
-        weighed = Given(
-            Additions(named={detections_name(now): detections([now], self._settings)}), VehicleAndObjects.name
-        )
-        self._stationary = self._probabilities(self._record, list(map(self._pose, self._record)))
-        self._smoother.extend([weighed, self._pairs.changed(self._record, self._stationary)])
-        self._solution = self._smoother.solution()
-        return self._estimate(1)
 
     def _estimate(self, count: int) -> JointEstimate:
         """The estimate of the newest epochs by the last solution, which has the epochs that left after it, too."""

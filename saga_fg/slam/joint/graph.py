@@ -8,24 +8,11 @@ Factors of a record: poses of the vehicle, errors of its odometry, and states of
     detection    a pose and an object's state              (`factors.relative`), robust
     stationary   p' - p ~ N(0, stationary_drift^2 dt),  v' ~ N(0, stationary_speed^2)     with probability P
 
-The last two are the hybrid part of the model. With the probability P (`saga_fg.slam.joint.association`) an object is
-stationary and a landmark, else it moves as its class does and the factor is silent: a mixture (`factors.Mixture`). With
-the probability p (`saga_fg.slam.joint.association`) a detection is of the object that it is assigned to: it counts for
-a share p of its information. A variable is a `gtsam.Pose3` for the vehicle and a vector for everything else.
+The last one is the hybrid part of the model. With the probability P (`saga_fg.slam.joint.association`) an object is
+stationary and a landmark, else it moves as its class does and the factor is silent: a mixture (`factors.Mixture`). A
+variable is a `gtsam.Pose3` for the vehicle and a vector for everything else.
 
-Motion of objects over an interval, with noise that traffic has in common.
-
-A tracker's motion model says how one object moves, x' = F x + b + q, q ~ N(0, Q), and takes the noise of different
-objects for independent. Beside a vehicle whose path is unknown that is wrong: traffic brakes, and follows a bend, as
-one. Twenty cars that do so by chance are less likely than an error of the vehicle's odometry, and would bend its path.
-So vehicles that head the same way, a stream, share a part of their noise,
-
-    x_i' = sum_j F_ij x_j + b_i + sqrt(rho) Q_i^(1/2) c + q_i,     c ~ N(0, I),   q_i ~ N(0, (1 - rho) Q_i)
-
-with one variable c a stream and interval, and the symmetric root, so that c has the same directions for all. Each
-object alone moves exactly as in the tracker; only what all do at once is no news of the path.
-
-Factor providers of the joint estimation, for a whole recording or a window of epochs.
+Providers add them, for a whole recording or a window of epochs.
 """
 
 from __future__ import annotations
@@ -53,7 +40,7 @@ from factors import (
 )
 from saga_fg.errors import InputError
 from saga_fg.estimators.solution import GraphSolution
-from saga_fg.graph import EGO_ERROR, EGO_POSE, OBJECT, Additions, GraphView, NewVariable, VariableKind, key_of
+from saga_fg.graph import EGO_ERROR, EGO_POSE, OBJECT, Additions, GraphView, NewVariable, key_of
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Factors
 from saga_fg.model.interactions import POSITION, VELOCITY
@@ -135,8 +122,7 @@ def detections(record: Record, settings: JointSettings) -> list[ResidualFactors]
     collected: dict[NodeType, list[tuple[int, int, FloatArray, FloatArray]]] = {}
     for now in record:
         types = dict(zip(now.objects.id.tolist(), now.objects.types, strict=True))
-        R_weighed = now.seen.R / now.seen.probability[:, None, None]
-        for name, z, R in zip(now.seen.id.tolist(), now.seen.z, R_weighed, strict=True):
+        for name, z, R in zip(now.seen.id.tolist(), now.seen.z, now.seen.R, strict=True):
             collected.setdefault(types[name], []).append((pose_key(now.epoch), object_key(now.epoch, name), z, R))
     factors: list[ResidualFactors] = []
     for node_type, rows in collected.items():
@@ -203,23 +189,8 @@ def by_type(types: Sequence[NodeType]) -> list[tuple[NodeType, np.ndarray[tuple[
     return [(node_type, np.array(mine, dtype=np.int64)) for node_type, mine in rows.items()]
 
 
-STREAM = VariableKind("traffic stream", "s")
-_SHARE = 0.9  # rho
-_SECTORS = 4  # of headings beside the vehicle's: the same way, to the left, towards it, to the right
-
-
-def new_streams(now: RecordedEpoch) -> list[NewVariable]:
-    """The variables c of the interval that ends at an epoch."""
-    return [NewVariable(STREAM, number, np.zeros(number // _SECTORS), label="stream") for number in _streams(now)]
-
-
-def stream_keys(now: RecordedEpoch) -> list[int]:
-    """Their keys."""
-    return [key_of(STREAM, number, now.epoch) for number in _streams(now)]
-
-
 def motion_factors(now: RecordedEpoch) -> list[gtsam.JacobianFactor]:
-    """Motion and interactions from the epoch before, and the priors of c.
+    """Motion and interactions from the epoch before.
 
     Raises `InputError` for motions and interactions that are not linear.
     """
@@ -228,42 +199,17 @@ def motion_factors(now: RecordedEpoch) -> list[gtsam.JacobianFactor]:
         return []
     if transition.graph.nonlinear or any(node_type.flow is not None for node_type in transition.graph.types):
         raise InputError("motion: expected linear motion and interactions of objects beside a vehicle's path")
-    streams = _streams(now)
-    dims = [number // _SECTORS for number in streams]
-    factors = [prior_factor(key, np.zeros(d), np.eye(d)) for key, d in zip(stream_keys(now), dims, strict=True)]
-    members = {name: number for number, names in streams.items() for name in names}
-    names = transition.nodes.tolist()
+    factors, names = list[gtsam.JacobianFactor](), transition.nodes.tolist()
     sources: list[list[tuple[int, FloatArray]]] = [[] for _ in names]
     for blocks in transition.F:
         for i, j, F in zip(blocks.target.tolist(), blocks.source.tolist(), blocks.values, strict=True):
             sources[i].append((object_key(k - 1, names[j]), F))
     for blocks in transition.Q:
-        roots = _roots(blocks.values)
-        for i, Q, root in zip(blocks.target.tolist(), blocks.values, roots, strict=True):
-            keys, F, number = [key for key, _ in sources[i]], [one for _, one in sources[i]], members.get(names[i])
-            if number is not None:
-                keys, F, Q = [*keys, key_of(STREAM, number, k)], [*F, np.sqrt(_SHARE) * root], (1 - _SHARE) * Q
+        for i, Q in zip(blocks.target.tolist(), blocks.values, strict=True):
+            keys, F = [key for key, _ in sources[i]], [one for _, one in sources[i]]
             b = transition.b[transition.offsets[i] : transition.offsets[i + 1]]
             factors.append(interaction_factor(object_key(k, names[i]), keys, F, b, Q))
     return factors
-
-
-def _streams(now: RecordedEpoch) -> dict[int, list[int]]:
-    """Objects of each stream of two and more, by its number: size of a state times the sectors, plus the sector."""
-    found: dict[int, list[int]] = {}
-    if now.transition is not None:
-        for name, d in zip(now.transition.nodes.tolist(), now.transition.graph.dims.tolist(), strict=True):
-            heading = now.headings.get(name)
-            if heading is not None:
-                sector = round(heading / (2 * np.pi / _SECTORS)) % _SECTORS
-                found.setdefault(d * _SECTORS + sector, []).append(name)
-    return {number: names for number, names in found.items() if len(names) > 1}
-
-
-def _roots(Q: FloatArray) -> FloatArray:
-    """Symmetric square roots of covariances (n, d, d)."""
-    values, vectors = np.linalg.eigh(Q)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ vectors.swapaxes(1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,21 +331,14 @@ class VehicleAndObjects:
                 state[kind.index(POSITION)] = seen[name]
             new.append(NewVariable(OBJECT, name, state, label=label))
         factors: list[Factor] = [*new_object_factors(now, before)]
-        named: dict[Hashable, Factors] = {}
         if before:
-            new += new_streams(now)
             factors += motion_factors(now)
         if k == 0:
             factors += start_factors(k, pose, self.settings)
         if row + 1 == len(self.record):
             factors += odometry(self.record[max(self.known - 1, 0) :], self.settings)
-            named[detections_name(now)] = detections(self.record[self.known :], self.settings)
-        return Additions(new, factors, named=named)
-
-
-def detections_name(now: RecordedEpoch) -> Hashable:
-    """Name of the detections up to an epoch among the factors of `VehicleAndObjects`."""
-    return ("detections", now.epoch)
+            factors += detections(self.record[self.known :], self.settings)
+        return Additions(new, factors)
 
 
 class StationaryPairs:

@@ -20,7 +20,7 @@ N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks (see `fac
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -29,10 +29,9 @@ from numpy.typing import ArrayLike
 from factors import ERROR_DIM
 from saga_fg.errors import InputError
 from saga_fg.model.discretisation import Transition, discretise
-from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.model.motion import NodeType
 from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances, of_classes
+from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances
 from saga_fg.numerics.geometry import checked_transform, inverse_transform
 from saga_fg.settings import (
     Positive,
@@ -47,7 +46,6 @@ from saga_fg.tracking.map_nodes import motion_of
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.track import Tracks
 
 
 @dataclass(frozen=True)
@@ -166,14 +164,12 @@ class JointSettings(Settings):
 class RecordedDetections:
     """Detections assigned to objects: id (m,); z (m, 3), m, in the vehicle's frame; R (m, 2, 2), m^2, in its axes.
 
-    probability  (m,) that the detection is of this object
     row          (m,) of the detection in the frame
     """
 
     id: IntArray
     z: FloatArray
     R: FloatArray
-    probability: FloatArray
     row: IntArray
 
 
@@ -203,7 +199,6 @@ class RecordedEpoch:
     seen        detections of them
     transition  of the objects that the epoch before has as well; None if there are none
     covariance  (6, 6) of a_T_b, as in `OdometryIncrements`, where the device states one
-    headings    of vehicles at the epoch before by id, rad from the vehicle's heading
     """
 
     epoch: int
@@ -213,7 +208,6 @@ class RecordedEpoch:
     seen: RecordedDetections
     transition: Transition | None
     covariance: FloatArray | None = None
-    headings: Mapping[int, float] = field(default_factory=dict)
 
 
 class EpochRecorder:
@@ -223,7 +217,6 @@ class EpochRecorder:
         self._tracker = tracker
         self._types: dict[str, NodeType] = {}
         self._last: RecordedEpoch | None = None
-        self._headings: Mapping[int, float] = {}
 
     def add(
         self, epoch: int, frame: Frame, world_T_ego: FloatArray, a_T_b: FloatArray, covariance: FloatArray | None = None
@@ -237,7 +230,7 @@ class EpochRecorder:
             raise InputError(f"frame at {frame.timestamp:.6f} s: expected one after {last.time:.6f} s")
         detections = in_ego(frame, tracker.sensor(frame.sensor))
         before = tracker.graph
-        tracks = tracker.step(Frame(frame.timestamp, frame.sensor, detections, world_T_ego, "ego"))
+        tracker.step(Frame(frame.timestamp, frame.sensor, detections, world_T_ego, "ego"))
         seen, label = self._seen(frame, detections)
         objects, transition = self._objects(seen, label), None
         if last is not None and tracker.graph is not None and tracker.graph is not before:
@@ -246,8 +239,7 @@ class EpochRecorder:
             objects = _joined(last.objects.select(np.flatnonzero(stay)), objects)
             if len(graph):
                 transition = discretise(graph, frame.timestamp - last.time)
-        headings, self._headings = self._headings, _headings(tracks, world_T_ego)
-        self._last = RecordedEpoch(epoch, frame.timestamp, a_T_b, objects, seen, transition, covariance, headings)
+        self._last = RecordedEpoch(epoch, frame.timestamp, a_T_b, objects, seen, transition, covariance)
         return self._last
 
     def _seen(self, frame: Frame, detections: Detections) -> tuple[RecordedDetections, list[str]]:
@@ -260,7 +252,7 @@ class EpochRecorder:
         order = np.argsort(ids)
         rows = rows[order]
         z, R = measurements.boxes.position[rows], measurements.R[rows, :2, :2]
-        seen = RecordedDetections(ids[order], z, R, np.ones(len(rows)), measurements.row[rows])
+        seen = RecordedDetections(ids[order], z, R, measurements.row[rows])
         return seen, tracker.classes_of(seen.id).tolist()
 
     def _objects(self, seen: RecordedDetections, label: list[str]) -> RecordedObjects:
@@ -325,13 +317,6 @@ def in_ego(frame: Frame, sensor: Sensor) -> Detections:
             f"frame at {frame.timestamp:.6f} s: expected a pose, or detections in ego or sensor coordinates"
         )
     return frame.detections.transformed(inverse_transform(frame.world_T_ego))
-
-
-def _headings(tracks: Tracks, world_T_ego: FloatArray) -> dict[int, float]:
-    """Headings of vehicles from that of the vehicle, rad."""
-    yaw = tracks.boxes.yaw - np.arctan2(world_T_ego[1, 0], world_T_ego[0, 0])
-    known = of_classes(tracks.boxes.label, VEHICLES) & np.isfinite(yaw)
-    return dict(zip(tracks.id[known].tolist(), yaw[known].tolist(), strict=True))
 
 
 def _joined(before: RecordedObjects, seen: RecordedObjects) -> RecordedObjects:
