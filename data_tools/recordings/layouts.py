@@ -35,6 +35,7 @@ from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, quaternion_rotation
 from saga_fg.providers.odometry import mounting
+from saga_fg.tables.column_names import seconds_of_dates
 from saga_fg.tracking.by_name import named
 
 GROUP = "saga_fg.scans"
@@ -146,9 +147,9 @@ def _stem(path: Path) -> str:
 
 
 def _seconds(text: str) -> float:
-    """A time, s, of a number in s, ms, us or ns, or of a date. Raises `ValueError` for none."""
+    """A time, s, of a number in s, ms, us or ns, or of a date, UTC unless it says another zone; else `ValueError`."""
     if ":" in text:
-        return float(np.datetime64(text.strip().replace(" ", "T"), "ns").astype(np.int64)) * 1e-9
+        return float(seconds_of_dates([text])[0])
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(text)

@@ -353,7 +353,7 @@ def read_annotations(
             if (len(translation), len(size), len(rotation)) != (3, 3, 4):
                 raise TypeError("lengths")
             rows[name].numbers.extend((*translation, *size, *rotation))
-            rows[name].names.append((k, instance, label, int(lidar + radar)))
+            rows[name].names.append((k, instance, label, int(lidar + radar) > 0))
         except (TypeError, ValueError, OverflowError) as error:
             where = f"{path}: sample {sample}, instance {instance}"
             raise InputError(f"{where}: expected 3, 3 and 4 numbers as translation, size, rotation") from error
@@ -376,15 +376,15 @@ def _instance_classes(folder: Path, class_of: Mapping[str, str]) -> dict[str, st
 
 
 class _Rows(NamedTuple):
-    """Annotations of one scene: index of the sample, instance, class, number of points; and ten numbers of each."""
+    """Annotations of one scene: index of the sample, instance, class, whether it has points; ten numbers of each."""
 
-    names: list[tuple[int, str, str, int]]
+    names: list[tuple[int, str, str, bool]]
     numbers: array[float]
 
     def annotations(self, scene: SceneRecord) -> list[Annotations]:
-        index, instances, labels, points = zip(*self.names, strict=True) if self.names else ((), (), (), ())
+        index, instances, labels, seen = zip(*self.names, strict=True) if self.names else ((), (), (), ())
         sample, instance = np.array(index, dtype=np.int64), np.array(instances, dtype=np.str_)
-        visible = np.array(points, dtype=np.int64) > 0
+        visible = np.array(seen, dtype=np.bool_)
         numbers = np.array(self.numbers).reshape(-1, 10)
         boxes = Boxes(
             label=np.array(labels, dtype=np.str_),

@@ -355,7 +355,9 @@ def content_with_rack() -> dict[str, list[dict[str, Any]]]:
 
 
 def test_truth_tracks_and_racks_of_each_sample(tmp_path):
-    root = write_tables(tmp_path, content_with_rack())
+    content = content_with_rack()
+    content["sample_annotation"][1]["num_lidar_pts"] = 10**40  # it is asked only whether there are any
+    root = write_tables(tmp_path, content)
     results = {"a0": [tracked("a0"), tracked("a0", "u")], "a1": [], "a2": [tracked("a2")], "b0": []}
     (scored,) = read_scored_scenes(write(tmp_path / "r.json", results), root, VERSION, ["scene-0103"]).values()
     scene = scored.tracking

@@ -81,6 +81,7 @@ def test_times_in_names(tmp_path: Path, scans: list[Scan], names: list[str], tim
         "000002 0.25\n000001 0.1\n000000 0.0\n",
         "1700000000000000000\n1700000000100000000\n1700000000250000000\n",
         "2011-09-26 13:02:25.000000000\n2011-09-26 13:02:25.100000000\n2011-09-26 13:02:25.250000000\n",
+        "time\n2011-09-26T13:02:25Z\n2011-09-26T13:02:25.1Z\n2011-09-26T14:02:25.25+01:00\n",
     ],
 )
 def test_times_of_a_table(tmp_path: Path, scans: list[Scan], table: str) -> None:
