@@ -7,11 +7,15 @@ Labels are handed out where P(exists) >= `KEPT`. Their errors, track by track:
     join     a change from one true object to another, between boxes that match
     off      a box of a true track that is off by `FAR_OFF` or `TURNED_OFF`, from the true one that it matches
     missed   a visible true box, detected within `GATE`, that no label matches
+
+The annotator looks at tracks and says which exist and of which class they are. Then the scene is solved again, joins
+are cut, and the box in the middle of the longest run of boxes that are off is given; twice again where some are left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -23,7 +27,8 @@ from data_tools.metrics import SceneBoxes
 from data_tools.metrics.scene_boxes import nearest_pairs
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.smoothing import Labels, Probabilities
+from saga_fg.smoothing import LabelBuilder, Labels, Probabilities, RecordingLabels
+from saga_fg.smoothing.corrections import checked_corrections
 from saga_fg.types.dataset import Scene
 
 KEPT = 0.5
@@ -154,3 +159,154 @@ class Answers:
                     yield {"question": question, "from": low, "to": high, "objects": int(mine.sum())} | dict(
                         zip(("said", "is"), figures, strict=True)
                     )
+
+
+RUN = 3  # boxes in a row that are off, from which one is given
+LOOKS = 3  # boxes that the annotator gives a track, one after the other, where they are still off
+
+
+class Annotator:
+    """Looks at tracks, knows the truth, and says what is wrong with them."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+
+    def looks_at(self, now: JudgedLabels, ids: Iterable[str], whole: bool) -> list[dict[str, Any]]:
+        """Corrections of tracks as a whole, else of joins and boxes."""
+        tracks = now.tracks()
+        rows = [tracks[id_] for id_ in ids if id_ in tracks]
+        say = self._whole if whole else self._parts
+        return [correction for mine in rows for correction in say(now, mine)]
+
+    def _place(self, now: JudgedLabels, row: int) -> dict[str, Any]:
+        (x, y), at = now.found.boxes.position[row, :2].tolist(), float(self._scene.timestamps[now.found.frame[row]])
+        return {"time": at, "x": x, "y": y, "label": str(now.found.boxes.label[row])}
+
+    def _whole(self, now: JudgedLabels, rows: IntArray) -> Iterator[dict[str, Any]]:
+        """What is wrong with a whole track."""
+        matched = rows[now.any[rows] >= 0]
+        if now.is_false(rows):
+            yield {"what": "exists", "at": self._place(now, int(rows[len(rows) // 2])), "value": False}
+            return
+        at = self._place(now, int(matched[len(matched) // 2]))
+        if not now.kept[rows[0]]:
+            yield {"what": "exists", "at": at, "value": True}
+        if now.is_other_class(rows):
+            names, counts = np.unique(now.truth.boxes.label[now.any[matched]], return_counts=True)
+            yield {"what": "class", "at": at, "label": str(names[np.argmax(counts)])}
+
+    def _parts(self, now: JudgedLabels, rows: IntArray) -> Iterator[dict[str, Any]]:
+        """What is wrong with some of the boxes."""
+        if now.is_false(rows):
+            return
+        for a, b in now.joins(rows):
+            yield {"what": "same", "at": self._place(now, a), "and": self._place(now, b), "value": False}
+        off = rows[now.off[rows]]
+        if len(off):
+            run = max(np.split(off, np.flatnonzero(np.diff(now.found.frame[off]) > 1) + 1), key=len)
+            if len(run) < RUN:
+                return
+            row = int(run[len(run) // 2])
+            true = now.truth.boxes.select([now.own[row]])
+            (x, y, z), (length, width, height) = true.position[0].tolist(), true.size[0].tolist()
+            box = {
+                "x": x,
+                "y": y,
+                "z": z,
+                "yaw": float(true.yaw[0]),
+                "length": length,
+                "width": width,
+                "height": height,
+            }
+            yield {"what": "box", "at": self._place(now, row), "box": box}
+
+
+@dataclass
+class Account:
+    """What the annotator did in some scenes: errors before and after; boxes that are off or missing once it is said
+    what exists, and after; the corrections that gave a box or a join, and all."""
+
+    before: int = 0
+    after: int = 0
+    boxes_before: int = 0
+    boxes_after: int = 0
+    given: int = 0
+    corrections: int = 0
+    looks: int = 0
+    unfit: int = 0
+
+    def figures(self) -> dict[str, float]:
+        """The figures of all scenes."""
+        mended = (self.boxes_before - self.boxes_after) / max(self.given, 1)
+        return {
+            "looks": self.looks,
+            "corrections": self.corrections,
+            "unfit": self.unfit,
+            "errors": self.before,
+            "gone": 1 - self.after / max(self.before, 1),
+            "boxes each": mended,
+        }
+
+
+class Corrected:
+    """Labels of scenes as an annotator leaves them, who looks at a tenth of the tracks: of the whole list, or as many
+    as a tenth of those handed out; by the list, or at random."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self.accounts: dict[str, Account] = {}
+        self.seconds: list[tuple[float, float]] = []  # of a single correction, of everything
+
+    def add(self, scene: Scene, builder: LabelBuilder, labels: RecordingLabels, whole: float) -> None:
+        """Correct the labels of a scene, which took `whole` seconds."""
+        before, review = judged(scene, moments_of(labels)), labels.review()
+        ids = review.id.astype(np.str_)
+        handed = int((review.probability.exists >= KEPT).sum())
+        out = ids[review.probability.exists >= KEPT]
+        tenth = max(1, round(handed / 10))
+        ways = {
+            "a tenth of the list, first": ids[: round(len(ids) / 10)],
+            "a tenth of the list, random": self._rng.choice(ids, round(len(ids) / 10), replace=False),
+            "a tenth of those handed out, first": ids[:tenth],
+            "a tenth of those handed out, random": self._rng.choice(out, tenth, replace=False),
+        }
+        for way, chosen in ways.items():
+            self._annotate(way, scene, builder, before, chosen.tolist())
+        annotator = Annotator(scene)
+        for id_ in ids[:3].tolist():
+            one = checked_corrections(
+                [one for whole in (False, True) for one in annotator.looks_at(before, [id_], whole)][:1]
+            )
+            start = time.perf_counter()
+            builder.corrected(one)
+            self.seconds.append((time.perf_counter() - start, whole))
+
+    def _annotate(self, way: str, scene: Scene, builder: LabelBuilder, before: JudgedLabels, ids: list[str]) -> None:
+        annotator, account, now = Annotator(scene), self.accounts.setdefault(way, Account()), before
+        records: list[dict[str, Any]] = []
+        errors = [before.errors()]
+        for look in range(1 + LOOKS):
+            records += annotator.looks_at(now, ids, whole=look == 0)
+            if records:
+                labels, _ = builder.corrected(checked_corrections(records))
+                now = judged(scene, moments_of(labels))
+            errors.append(now.errors())
+        account.before += sum(errors[0].values())
+        account.after += sum(errors[-1].values())
+        account.boxes_before += errors[1]["off"] + errors[1]["missed"]
+        account.boxes_after += errors[-1]["off"] + errors[-1]["missed"]
+        account.given += sum(record["what"] in ("box", "same") for record in records)
+        account.corrections += len(records)
+        account.looks += len(ids)
+        account.unfit += sum(why != "" for _, why in builder.outcomes) if records else 0
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """A row for each way to choose the tracks, and the time from a correction to new labels."""
+        seconds, whole = np.median(np.array(self.seconds), axis=0).tolist()
+        for way, account in self.accounts.items():
+            yield {"looked at": way, **account.figures(), "seconds": seconds, "of whole": seconds / whole}
+
+
+def moments_of(labels: RecordingLabels) -> list[Labels]:
+    """The labels of all moments."""
+    return [moment for part in labels for moment in part]

@@ -6,24 +6,27 @@ refined     `saga-fg smooth --tracks`; shuffled: after the identities of every f
 together    both methods' tracks refined to one result
 detections  labels from the detections that all of them had, by `saga-fg smooth`; tracked: by `saga-fg track`
 doubt       of these labels: how often what they say with a probability is so
+corrected   by an annotator who knows the truth and looks at a tenth of their tracks (`benchmarks.annotator`)
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.annotator import Answers, judged
+from benchmarks.annotator import Answers, Corrected, judged, moments_of
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, chosen_sets
 from benchmarks.runner import Data, Row, Rows, Seed, each
 from data_tools.datasets.given_tracks import sensor_names, with_tracks
 from data_tools.datasets.results import SceneResult
 from data_tools.metrics import LabelErrors, SceneBoxes, error_summary
 from pipelines.config import Method, load_config
-from pipelines.smoothing import for_given_tracks, load_smooth_config, smooth_scene
+from pipelines.smoothing import for_given_tracks, label_model, load_smooth_config, smooth_scene
 from pipelines.tracking import TrackedScene, track_scene
+from saga_fg.smoothing import LabelBuilder
 from saga_fg.types.dataset import Scene
 from saga_fg.types.track import Tracks
 
@@ -48,6 +51,7 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
     runs: dict[str, dict[str, TrackedScene]] = {}
     online, offline = load_config(recordings.family), load_smooth_config(recordings.family)
     rng, answers = np.random.default_rng(seed), Answers()
+    corrected = Corrected(np.random.default_rng(seed))
     for name in each(recordings.dataset.scenes, recordings.name):
         scene = recordings.scene(name)
         given: dict[str, SceneResult] = {}
@@ -57,9 +61,14 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
             coasting = np.concatenate([each.coasting for each in run.tracks])
             given[method] = SceneResult(scene, SceneBoxes.of_tracks(run.tracks), coasting=coasting)
         del given[GRAPH]
-        made = smooth_scene(scene, offline)
-        answers.add(judged(scene, made.labels), made.labels)
-        runs.setdefault("detections, labels", {})[name] = as_run(scene, made.tracks)
+        start = time.perf_counter()
+        builder = LabelBuilder(offline.tracking.new_tracker(GRAPH), label_model(offline, GRAPH))
+        builder.add(scene.frames, scene.timestamps)
+        made, _ = builder.finish()
+        corrected.add(scene, builder, made, time.perf_counter() - start)
+        moments = moments_of(made)
+        answers.add(judged(scene, moments), moments)
+        runs.setdefault("detections, labels", {})[name] = as_run(scene, [moment.tracks for moment in moments])
         wanted = {f"{method}, refined": [result] for method, result in given.items()}
         wanted |= {f"{method}, shuffled": [shuffled(result, rng)] for method, result in given.items()}
         for variant, results in (wanted | {"together, refined": list(given.values())}).items():
@@ -71,6 +80,8 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
         yield f"{recordings.name}: {len(found)} scenes", {"labels": variant, **figures(recordings, found)}
     for row in answers.rows():
         yield f"{recordings.name}: doubt", row
+    for row in corrected.rows():
+        yield f"{recordings.name}: corrected", row
 
 
 def as_run(scene: Scene, tracks: Sequence[Tracks]) -> TrackedScene:

@@ -20,7 +20,17 @@ from pipelines.cli.options import Config
 from pipelines.smoothing import load_smooth_config
 from pipelines.tracking import one_thread
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.smoothing import Evidence, StateTable, assign_detections, gather_evidence, smooth_known_objects
+from saga_fg.smoothing import (
+    Evidence,
+    SmoothingSettings,
+    StateTable,
+    StationaryStates,
+    assign_detections,
+    gather_evidence,
+    smooth_states,
+)
+from saga_fg.smoothing.passes import Passes
+from saga_fg.tracking import TrackerSettings
 from saga_fg.types.dataset import Scene
 
 NEAR = 2.0  # largest distance between a detection and its true object, m
@@ -90,3 +100,14 @@ def _hidden_errors(scene: Scene, evidence: Evidence, states: StateTable, names: 
         offset = states.mean[at, :2] + evidence.origin - truth.boxes.position[hidden, :2]
         errors.append(np.hypot(*offset[at >= 0].T))
     return np.concatenate(errors)
+
+
+def smooth_known_objects(
+    evidence: Evidence, object_of: IntArray, settings: SmoothingSettings, tracker: TrackerSettings
+) -> StateTable:
+    """States by the last pass alone, without stationary states; object_of (N,): true object of each detection, -1 for
+    none."""
+    passes = Passes(evidence, settings, tracker, ())
+    lifespans = evidence.lifespans(object_of)
+    states = smooth_states(evidence, object_of, lifespans, passes.motion(lifespans))
+    return passes.final(lifespans, object_of, states, StationaryStates(settings.position_drift))

@@ -2,6 +2,7 @@ from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
 from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType, RandomWalk
 from .model.scene_graph import Edges, SceneGraph
 from .model.sensor import Sensor
+from .smoothing import smooth
 from .tables.data_frames import frames_of
 from .tracking import GreedyTracker, Tracker, TrackerSettings, track
 from .types.boxes import Boxes
@@ -38,5 +39,6 @@ __all__ = [
     "Tracks",
     "UnknownNodeError",
     "frames_of",
+    "smooth",
     "track",
 ]

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from data_tools.datasets.corrections import read_corrections, read_outcomes
 from data_tools.datasets.given_tracks import GivenTracks, TrackedRecordings, read_given_tracks, tracked_parts
 from data_tools.datasets.source import DatasetSource, input_files
 from pipelines import smoothing
@@ -24,6 +25,7 @@ from pipelines.scale_out import RunSummary, SceneTask, SmoothTask, TrackTask, fi
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg import InputError
 from saga_fg.smoothing import LabelCounts
+from saga_fg.smoothing.corrections import Correction, unfit
 from saga_fg.tracking import SensorTime
 
 FAILED_SCENES = 1  # exit code
@@ -223,6 +225,10 @@ class LabelOptions:
             metavar="FILE",
         ),
     ] = None
+    corrections: Annotated[
+        Path | None,
+        typer.Option("--corrections", help="A person's corrections, JSON lines, as factors.", metavar="FILE"),
+    ] = None
     table: Annotated[
         Literal["csv", "ndjson", "parquet"],
         typer.Option("--table", help="Format of the table of boxes; parquet needs the extra [parquet]."),
@@ -247,15 +253,17 @@ def _smooth(
     settings = smoothing.load_smooth_config(source.family, config)
     tracking = options.with_interactions(settings.tracking, method, labels.interactions)
     settings = replace(settings, tracking=tracking.with_association(labels.association))
-    options.apart(output, *(labels.tracks or ()))
+    options.apart(output, *(labels.tracks or ()), *([labels.corrections] if labels.corrections else ()))
+    corrections = read_corrections(labels.corrections) if labels.corrections else ()
     given = read_given_tracks(source, labels.tracks or ())
     settings = smoothing.for_given_tracks(settings, given)
     usual = smoothing.load_smooth_config(source.family).tracking
     checks = Checks(settings.tracking.of_method(method), usual, source.option_for)
     if scale.wanted:
         checks.see_first(source)
-        task = SmoothTask(settings, method, source, f".{labels.table}")
+        task = SmoothTask(settings, method, source, f".{labels.table}", corrections)
         report = run_at_scale(source, task, output, scale, labels=True, given=given)
+        _show_unfit(corrections, read_outcomes(output / "corrections"))
         exit_on_failures(report)
         return
     stream, table = None if given else source.stream(), f".{labels.table}"
@@ -263,7 +271,9 @@ def _smooth(
         with stream as parts, progress_bar() as progress:
             done = smoothing.write_labels(
                 output,
-                lambda folder: smoothing.smooth_stream(checks.over(parts), settings, folder, method, progress=progress),
+                lambda folder: smoothing.smooth_stream(
+                    checks.over(parts), settings, folder, method, progress=progress, corrections=corrections
+                ),
                 table,
             )
     else:
@@ -272,17 +282,27 @@ def _smooth(
             checked = CheckedDataset(recordings, checks)
             done = smoothing.write_labels(
                 output,
-                lambda _: smoothing.smooth_dataset(checked, settings, method, progress=progress),
+                lambda _: smoothing.smooth_dataset(
+                    checked, settings, method, progress=progress, corrections=corrections
+                ),
                 table,
                 lambda folder, found: source.written.write_labels(folder, dataset, found),
             )
+    _show_unfit(corrections, [(one.origin, why) for run in done for _, one, why in run.outcomes])
     _show(output, done)
+
+
+def _show_unfit(corrections: Sequence[Correction], outcomes: Iterable[tuple[str, str]]) -> None:
+    """A line for each correction that does not hold."""
+    for line in unfit(corrections, outcomes):
+        typer.echo(f"not applied: {line}", err=True)
 
 
 _SMOOTH_EXAMPLES = (
     "smooth {recordings} --output labels",
     "smooth {recordings} --output labels --workers 0   # all cores",
     "smooth {recordings} --tracks theirs --output labels   # refines the tracks of another tracker",
+    "smooth {recordings} --corrections mine.jsonl --output labels",
 )
 smooth_app = dataset_commands(
     "smooth",
@@ -297,7 +317,8 @@ def _show(output: Path, runs: Sequence[smoothing.SmoothedScene]) -> None:
     total = LabelCounts.sum(run.counts for run in runs)
     typer.echo(
         f"{output}: {counted(len(runs), 'scene')}, {counted(total.objects, 'object')}, {counted(total.boxes, 'box')}: "
-        f"{total.observed} observed, {total.filled} filled, {total.extended} extended; "
+        f"{total.observed} observed, {total.filled} filled, {total.extended} extended"
+        f"{f', {total.corrected} corrected, {total.near} near these' * (total.corrected > 0)}; "
         f"{total.dropped} dropped with {counted(total.dropped_objects, 'object')}; "
         f"{counted(total.joined, 'tracklet')} joined to others"
     )

@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
 
+from data_tools.datasets.corrections import write_outcomes
 from data_tools.datasets.detection_files import write_label_table, write_review
 from data_tools.datasets.given_tracks import TrackedRecordings
 from data_tools.datasets.source import DatasetSource, Part, part_suffix
@@ -27,6 +28,7 @@ from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg import Dataset, InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.smoothing import LabelCounts
+from saga_fg.smoothing.corrections import Correction
 
 log = logging.getLogger(__name__)
 
@@ -169,22 +171,27 @@ class SmoothTask:
     method: Method
     source: DatasetSource
     suffix: str = ".csv"
+    corrections: Sequence[Correction] = ()
 
     @property
     def configuration(self) -> str:
         """The method, the form of the results, and the settings."""
         head = f"# smooth, method {self.method}, results of {self.source.name}, table as {self.suffix}\n"
+        head += "".join(f"# corrected: {one!r}\n" for one in self.corrections)
         head += _reading(self.source)
         return head + write_settings(self.settings, comments=False)
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         """Write the labels; counts objects, and boxes by where they come from."""
-        runs = tuple(smooth_dataset(dataset, self.settings, self.method))
+        runs = tuple(smooth_dataset(dataset, self.settings, self.method, corrections=self.corrections))
         labels = [part for run in runs for part in run.parts]
         (folder / "labels").mkdir()
         write_label_table(folder / "labels" / f"{file_name(name)}{self.suffix}", labels)
         (folder / "review").mkdir()
         write_review(folder / "review" / f"{file_name(name)}.csv", {run.name: run.review for run in runs})
+        if outcomes := [outcome for run in runs for outcome in run.outcomes]:
+            (folder / "corrections").mkdir()
+            write_outcomes(folder / "corrections" / f"{file_name(name)}.csv", outcomes)
         recordings = dataset.recordings if isinstance(dataset, TrackedRecordings) else dataset
         self.source.written.write_labels(folder, recordings, labels, file_name(name))
         return asdict(LabelCounts.sum(run.counts for run in runs))

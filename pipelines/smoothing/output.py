@@ -2,6 +2,7 @@
 
 labels.csv       a row per box (or .ndjson, .parquet)
 review.csv       a row per object, those first that are most worth a look
+corrections.csv  what became of corrections, where there are some
 summary.json     how many boxes of each scene were observed, filled, extended and dropped
 tracking.json    nuScenes: the official tracking result
 VERSION/         nuScenes: tables whose annotations are the labels
@@ -17,6 +18,7 @@ from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from data_tools.datasets.corrections import write_outcomes
 from data_tools.datasets.detection_files import write_label_table, write_review
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory
@@ -24,7 +26,7 @@ from pipelines.smoothing.streaming import SmoothedScene
 from saga_fg.smoothing import LabelCounts, Labels
 from saga_fg.types.dataset import Scene
 
-_TABLES = ("labels.csv", "labels.ndjson", "labels.parquet", "review.csv", "summary.json")
+_TABLES = ("labels.csv", "labels.ndjson", "labels.parquet", "review.csv", "corrections.csv", "summary.json")
 
 
 def write_labels(
@@ -42,6 +44,8 @@ def write_labels(
         done = tuple(smooth(Path(spools)))
         write_label_table(folder / f"labels{suffix}", chain.from_iterable(run.parts for run in done))
         write_review(folder / "review.csv", {run.name: run.review for run in done})
+        if outcomes := [outcome for run in done for outcome in run.outcomes]:
+            write_outcomes(folder / "corrections.csv", outcomes)
         total = LabelCounts.sum(run.counts for run in done)
         scenes = {run.name: {**asdict(run.counts), "seconds": round(run.seconds, 3)} for run in done}
         write_figures(folder / "summary.json", {"total": asdict(total), "scenes": scenes})

@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.corrections import Outcomes
 from pipelines.config import Method
 from pipelines.smoothing.configuration import SmoothConfig
 from pipelines.tracking import Progress, one_thread, scene_with_frames
 from saga_fg.graph import FactorProvider
 from saga_fg.smoothing import ChunkSettings, LabelBuilder, LabelCounts, LabelModel, Labels, RecordingLabels, Review
+from saga_fg.smoothing.corrections import Correction
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.track import Tracks
 
@@ -36,6 +38,7 @@ class SmoothedScene:
     counts   where its boxes come from
     frames   frames taken in
     seconds  time spent
+    outcomes what became of the corrections that may be about it
     """
 
     name: str
@@ -44,6 +47,7 @@ class SmoothedScene:
     counts: LabelCounts
     frames: int
     seconds: float
+    outcomes: Outcomes = ()
 
     @property
     def labels(self) -> tuple[Labels, ...]:
@@ -62,12 +66,16 @@ def smooth_scene(
     method: Method = "saga",
     progress: Progress | None = None,
     providers: Sequence[FactorProvider] = (),
+    corrections: Sequence[Correction] = (),
 ) -> SmoothedScene:
     """Smooth one recording at once, with the edges of the tracker's settings unless `method` is another than `saga`.
 
-    providers: of factors of your own, in place of those that the configuration names
+    providers: of factors of your own, in place of those that the configuration names; corrections: those of other
+    scenes are left out
     """
-    run = _labelled(scene.name, [scene], _builder(config, method, providers), progress)
+    model = label_model(config, method, of_scene(corrections, scene.name), providers)
+    builder = LabelBuilder(config.tracking.new_tracker(method), model)
+    run = _labelled(scene.name, [scene], builder, progress)
     return replace(run, parts=((scene, run.labels),))
 
 
@@ -77,10 +85,11 @@ def smooth_dataset(
     method: Method = "saga",
     scenes: Iterable[str] | None = None,
     progress: Progress | None = None,
+    corrections: Sequence[Correction] = (),
 ) -> Iterator[SmoothedScene]:
     """Smooth some recordings (default: all), one at a time as they are asked for."""
     for name in dataset.scenes if scenes is None else scenes:
-        yield smooth_scene(scene_with_frames(dataset, name), config, method, progress)
+        yield smooth_scene(scene_with_frames(dataset, name), config, method, progress, corrections=corrections)
 
 
 def smooth_stream(
@@ -90,6 +99,7 @@ def smooth_stream(
     method: Method = "saga",
     chunks: ChunkSettings | None = None,
     progress: Progress | None = None,
+    corrections: Sequence[Correction] = (),
 ) -> Iterator[SmoothedScene]:
     """Smooth recordings that come in parts: successive scenes of the same name, each beginning after the one before.
 
@@ -97,7 +107,8 @@ def smooth_stream(
     `InputError` for what the parts are refused for.
     """
     for number, (name, scene) in enumerate(groupby(parts, key=lambda part: part.name)):
-        builder = _builder(config, method, (), chunks or ChunkSettings(), StoredParts(folder / f"{number:06d}"))
+        model, waiting = label_model(config, method, of_scene(corrections, name)), StoredParts(folder / f"{number:06d}")
+        builder = LabelBuilder(config.tracking.new_tracker(method), model, chunks or ChunkSettings(), waiting)
         yield _labelled(name, scene, builder, progress)
 
 
@@ -119,16 +130,20 @@ class StoredParts:
                 yield dict(file)
 
 
-def _builder(
+def label_model(
     config: SmoothConfig,
     method: Method,
-    providers: Sequence[FactorProvider],
-    chunks: ChunkSettings | None = None,
-    parts: StoredParts | None = None,
-) -> LabelBuilder:
-    tracking = config.tracking.of_method(method)
-    model = LabelModel(tracking.tracker, config.sensors, config.smoothing, providers)
-    return LabelBuilder(tracking.new_tracker(method), model, chunks, parts)
+    corrections: Sequence[Correction] = (),
+    providers: Sequence[FactorProvider] = (),
+) -> LabelModel:
+    """What the labels of a recording follow from."""
+    tracker = config.tracking.of_method(method).tracker
+    return LabelModel(tracker, config.sensors, config.smoothing, providers, corrections)
+
+
+def of_scene(corrections: Sequence[Correction], name: str) -> tuple[Correction, ...]:
+    """Those that name a scene, or none."""
+    return tuple(one for one in corrections if one.scene in ("", name))
 
 
 def _labelled(name: str, parts: Iterable[Scene], builder: LabelBuilder, progress: Progress | None) -> SmoothedScene:
@@ -149,7 +164,8 @@ def _labelled(name: str, parts: Iterable[Scene], builder: LabelBuilder, progress
     with one_thread():
         labels, counts = builder.finish(advance)
     seconds += time.perf_counter() - begin
-    return SmoothedScene(name, _Spooled(name, labels), labels.review(), counts, frames, seconds)
+    outcomes = tuple((name, one, why) for one, why in builder.outcomes)
+    return SmoothedScene(name, _Spooled(name, labels), labels.review(), counts, frames, seconds, outcomes)
 
 
 @dataclass(frozen=True, eq=False)

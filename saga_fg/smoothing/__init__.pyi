@@ -22,7 +22,6 @@ from .boxes import (
     weighted_medians,
 )
 from .doubt import Review
-from .passes import smooth_known_objects
 from .recording import ChunkSettings, LabelBuilder, LabelModel
 from .recording_labels import RecordingLabels
 from .settings import (
@@ -30,7 +29,6 @@ from .settings import (
     SmoothingSettings,
 )
 from .states import (
-    PROBABILITIES,
     LabelCounts,
     Labels,
     Lifespans,
@@ -42,9 +40,9 @@ from .states import (
     lifespans_of,
     quality_of,
 )
+from .table_smoothing import smooth
 
 __all__ = [
-    "PROBABILITIES",
     "ChunkSettings",
     "Evidence",
     "EvidenceFrame",
@@ -80,8 +78,8 @@ __all__ = [
     "robust_weights",
     "scalar_readings",
     "size_weights",
+    "smooth",
     "smooth_headings",
-    "smooth_known_objects",
     "smooth_states",
     "smooth_walks",
     "stationary_states",

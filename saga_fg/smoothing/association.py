@@ -80,7 +80,7 @@ class Evidence:
     z_noise, yaw_noise (N,)   standard deviations, m and rad
     distance     (N,)         from the vehicle, m; NaN where its place is unknown
     confused     classes that the sensors confuse; class_likelihood (N, C) of each detection in them
-    corrected    (N,)         boxes that a person gave
+    corrected    (N,)         of boxes that a person gave: weight of their sizes, in detections; else 0
     """
 
     times: FloatArray
@@ -96,7 +96,7 @@ class Evidence:
     distance: FloatArray
     confused: ConfusedClasses
     class_likelihood: FloatArray
-    corrected: BoolArray
+    corrected: FloatArray
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -168,7 +168,7 @@ def gather_evidence(
         distance=np.hypot(*(boxes.position[:, :2] - np.reshape(places, (-1, 2))[number]).T),
         confused=confused,
         class_likelihood=column("class_likelihood", len(confused)),
-        corrected=np.zeros(len(boxes), dtype=np.bool_),
+        corrected=np.zeros(len(boxes)),
     )
 
 

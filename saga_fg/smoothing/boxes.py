@@ -115,26 +115,24 @@ def _update(mean: FloatArray, variance: FloatArray, reading: ScalarReadings, per
 FAR = 20.0  # distance at which a detection's size counts half, m
 TELLING_PATH = 10.0  # m
 CLEAR = 3.0  # standard deviations by which a motion is no estimation error
+CERTAIN = 1e6  # m, of a heading that a person gave
 COURSE_NOISE = 0.1  # standard deviation between heading and direction of motion, rad
 
 
-def constant_sizes(
-    owner: IntArray, count: int, size: FloatArray, probability: FloatArray, distance: FloatArray
-) -> FloatArray:
-    """(count, 3) length, width, height of each object, NaN where none was measured.
+def constant_sizes(owner: IntArray, count: int, size: FloatArray, weight: FloatArray) -> FloatArray:
+    """(count, 3) length, width, height of each object, m, NaN where none was measured.
 
-    owner (m,): row of the object of each detection; size (m, 3), NaN for unmeasured; probability (m,); distance (m,)
-    from the sensor, m, NaN for unknown
+    owner (m,): row of the object of each detection; size (m, 3), NaN for unmeasured; weight (m,): of the size
     """
-    weight = size_weights(probability, distance)
     known = np.isfinite(size).all(axis=1)
     columns = [weighted_medians(owner[known], count, column[known], weight[known]) for column in size.T]
     return np.stack(columns, axis=-1)
 
 
-def size_weights(probability: FloatArray, distance: FloatArray) -> FloatArray:
-    """(m,) the weight of detections' sizes; distance (m,) from the sensor, m, NaN for unknown."""
-    return np.asarray(probability / (1 + (np.nan_to_num(distance) / FAR) ** 2))
+def size_weights(evidence: Evidence) -> FloatArray:
+    """(N,) the weight of detections' sizes."""
+    detected = evidence.probability / (1 + (np.nan_to_num(evidence.distance) / FAR) ** 2)
+    return np.where(evidence.corrected > 0, evidence.corrected, detected)
 
 
 def weighted_medians(owner: IntArray, count: int, value: FloatArray, weight: FloatArray) -> FloatArray:
@@ -201,6 +199,8 @@ def smooth_headings(
     path[telling] = (speed * states.elapsed(evidence.times) * np.cos(course - np.nan_to_num(axis)))[telling]
     seen = evidence.probability[detection] * np.cos(np.where(known, yaw - axis[row], np.pi / 2))
     votes = np.bincount(row, np.nan_to_num(seen), minlength=len(states))
+    told = np.flatnonzero(known & (evidence.corrected[detection] > 0))
+    np.add.at(path, row[told], CERTAIN * np.cos(yaw[told] - axis[row[told]]))
     reversed_ = is_reversed(*(np.bincount(owner, w, len(lifespans)).astype(np.float64) for w in (path, votes)))
     sign = np.where(reversed_, -1.0, 1.0)[owner]
     return Headings(wrap_angle(axis + np.pi * (sign < 0)), variance, sign * path, sign * votes)

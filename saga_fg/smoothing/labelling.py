@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import get_args
 
 import numpy as np
 
@@ -22,18 +23,21 @@ from saga_fg.smoothing.boxes import (
     Headings,
     constant_sizes,
     scalar_readings,
+    size_weights,
     smooth_headings,
     smooth_walks,
     weighted_medians,
 )
+from saga_fg.smoothing.corrections import WholeObject
 from saga_fg.smoothing.doubt import step_doubt
 from saga_fg.smoothing.passes import SmoothedObjects
 from saga_fg.smoothing.settings import OfflineClass, SmoothingSettings
-from saga_fg.smoothing.states import Labels, Probabilities, StateTable, quality_of
+from saga_fg.smoothing.states import Labels, Probabilities, Source, StateTable, quality_of
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import class_values
 from saga_fg.types.track import Tracks
 
+NEAR_CORRECTION = 1.0  # time to a corrected box up to which a label is near one, s
 HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, m
 YAW_DRIFT = (
     0.2  # standard deviation of the change of heading in one second, rad: detections of both sides in time tell more
@@ -109,15 +113,15 @@ def label_states(
         coasting=gap,
         source=_sources(evidence, objects, wanted),
     )
-    mine, boxes = lifespans.rows_of(objects.object_of[rows]), evidence.boxes
-    size = constant_sizes(mine, len(lifespans), boxes.size[rows], evidence.probability[rows], evidence.distance[rows])
+    mine, weight = lifespans.rows_of(objects.object_of[rows]), size_weights(evidence)[rows]
+    size = constant_sizes(mine, len(lifespans), evidence.boxes.size[rows], weight)
     doubt = step_doubt(evidence, objects.object_of, lifespans, states, size[:, 0])
     return LabelledStates(states, headings, columns, *doubt)
 
 
 def source_counts(source: StrArray) -> dict[str, int]:
-    """Numbers of boxes that were observed, filled and extended."""
-    return {kind: int((source == kind).sum()) for kind in ("observed", "filled", "extended")}
+    """Numbers of boxes by what they rest on."""
+    return {kind: int((source == kind).sum()) for kind in get_args(Source)}
 
 
 def dropped_boxes(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -> int:
@@ -145,7 +149,8 @@ def _time_to_detection(states: StateTable, times: FloatArray, object_of: IntArra
 
 def _sources(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -> StrArray:
     """(R,) extended before and after the detections of the online tracks; else observed at the wanted moment that is
-    nearest to a detection, filled elsewhere."""
+    nearest to a detection, filled elsewhere; corrected where a person's box is or the object was said to stand, near up
+    to `NEAR_CORRECTION` from there."""
     states, times = objects.states, evidence.times
     rows = np.flatnonzero(objects.object_of >= 0)
     at = np.searchsorted(times, wanted)
@@ -157,7 +162,14 @@ def _sources(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -
     online = evidence.lifespans(np.where(objects.track_of >= 0, objects.object_of, -1))
     row = online.rows_of(states.id)
     beyond = (states.moment < online.first[row]) | (states.moment > online.last[row])
-    return np.where(beyond, "extended", np.where(observed, "observed", "filled"))
+    source = np.where(beyond, "extended", np.where(observed, "observed", "filled"))
+    boxes = rows[evidence.corrected[rows] > 0]
+    moment = np.concatenate([evidence.moment[boxes], objects.held.moment])
+    owner = np.concatenate([objects.object_of[boxes], objects.held.id])
+    if len(owner):
+        gap = _time_to_detection(states, times, owner, times[moment])
+        source = np.where(gap == 0, "corrected", np.where(gap <= NEAR_CORRECTION, "near", source))
+    return source
 
 
 RESOLUTION = 5e-4  # m, of the sizes that are kept
@@ -170,6 +182,7 @@ class ObjectSummary:
 
     yaw, sign  latest heading written, rad, and -1 where the latest headings are half a turn off those at its start
     log_one    log P that it is one object all along; weakest: of its least certain step, and when that is, s
+    said       by a person
     boxes, rivals  number of its labels, and of those at the place of a better object of another class
     sizes      lengths, widths and heights: of each, measured values, m, and their weights (2, m)
     """
@@ -185,6 +198,7 @@ class ObjectSummary:
     weakest: tuple[float, float] = (0.0, np.nan)
     boxes: int = 0
     rivals: int = 0
+    said: WholeObject = field(default_factory=WholeObject)
     sizes: list[FloatArray] = field(default_factory=lambda: [np.empty((2, 0))] * 3)
 
     def heading_sign(self, yaw: float) -> float:

@@ -15,7 +15,7 @@ are weak. Its low score puts it at the end of the ranking.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from saga_fg.smoothing.batch_states import (
     smooth_states,
     stationary_states,
 )
-from saga_fg.smoothing.boxes import constant_sizes
+from saga_fg.smoothing.boxes import constant_sizes, size_weights
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import MEDIUM_SCORE, Lifespans, SmoothedEdges, StateTable
 from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings
@@ -49,7 +49,7 @@ from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
 
 _REWEIGHTINGS = 1  # repetitions of loss weights and edges at the final states
-_ASSOCIATION_GATE = 0.95  # gate probability of detections without a track; higher: more are added, right and wrong
+ASSOCIATION_GATE = 0.95  # gate probability of detections without a track; higher: more are added, right and wrong
 WEAK_SCORE = 0.05  # of a tracklet, below which it is not stitched and takes no detections from others
 MAX_FREE_DISTANCE = 3.0  # between a state and a free detection assigned to it, m
 UPDATED_GATE = 1 - 1e-12  # wide: the tracker has matched them already, perhaps by other models of the noise
@@ -100,6 +100,7 @@ class SmoothedObjects:
     judged     the states, within the lifespans, that scores and stationary states follow from
     stationary the states in which an object is stationary
     dropped    the lifespans of the objects dropped
+    held       states in which a person says that an object stands
     """
 
     lifespans: Lifespans
@@ -109,6 +110,7 @@ class SmoothedObjects:
     judged: StateTable
     stationary: StationaryStates
     dropped: Lifespans
+    held: StationaryStates = field(default_factory=lambda: StationaryStates(np.nan))
 
 
 def smooth_objects(
@@ -121,7 +123,7 @@ def smooth_objects(
     """All passes. track_of (N,): the online track of each detection, -1 for none; providers: in place of those of the
     settings, asked from the first moment on every time the final states are solved for.
     """
-    passes = _Passes(evidence, settings, tracker, providers)
+    passes = Passes(evidence, settings, tracker, providers)
     everything = evidence.lifespans(track_of)
     ahead = max(EXTENSION, settings.max_gap)
     alone = passes.alone(everything, track_of, ahead)
@@ -137,7 +139,7 @@ def smooth_objects(
     joined = evidence.lifespans(object_of)
     states = passes.alone(joined, object_of, EXTENSION)
     states = passes.coupled(joined, object_of, EXTENSION, states)
-    object_of = assign_free_detections(evidence, object_of, joined, states, _ASSOCIATION_GATE, MAX_FREE_DISTANCE)
+    object_of = assign_free_detections(evidence, object_of, joined, states, ASSOCIATION_GATE, MAX_FREE_DISTANCE)
     track_of = np.where(strong | (object_of < 0), track_of, -1)
     object_of = np.where(object_of < 0, track_of, object_of)
     states = states.merged(alone.select(~is_strong))
@@ -160,20 +162,9 @@ def smooth_objects(
     )
 
 
-def smooth_known_objects(
-    evidence: Evidence, object_of: IntArray, settings: SmoothingSettings, tracker: TrackerSettings
-) -> StateTable:
-    """States by the last pass alone, without stationary states; object_of (N,): true object of each detection, -1 for
-    none."""
-    passes = _Passes(evidence, settings, tracker, ())
-    lifespans = evidence.lifespans(object_of)
-    states = smooth_states(evidence, object_of, lifespans, passes.motion(lifespans))
-    return passes.final(lifespans, object_of, states, StationaryStates(settings.position_drift))
-
-
 @dataclass(frozen=True, eq=False)
-class _Passes:
-    """Inputs of all passes."""
+class Passes:
+    """Inputs of all passes, each of which gives states."""
 
     evidence: Evidence
     settings: SmoothingSettings
@@ -227,8 +218,8 @@ class _Passes:
     def _edges(self, lifespans: Lifespans, object_of: IntArray, states: StateTable) -> SmoothedEdges:
         rows = np.flatnonzero(object_of >= 0)
         rows = rows[np.isin(object_of[rows], lifespans.id)]
-        owner, boxes, p = lifespans.rows_of(object_of[rows]), self.evidence.boxes, self.evidence.probability[rows]
-        size = constant_sizes(owner, len(lifespans), boxes.size[rows], p, self.evidence.distance[rows])
+        owner, boxes = lifespans.rows_of(object_of[rows]), self.evidence.boxes
+        size = constant_sizes(owner, len(lifespans), boxes.size[rows], size_weights(self.evidence)[rows])
         yaw = np.full(len(lifespans), np.nan)
         known = np.isfinite(boxes.yaw[rows])
         yaw[owner[known]] = boxes.yaw[rows[known]]

@@ -32,13 +32,14 @@ from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.smoothing.association import Evidence, gather_evidence, measured_in_order, opportunities
 from saga_fg.smoothing.boxes import size_weights
+from saga_fg.smoothing.correcting import LATE, PERSON, correct_objects
+from saga_fg.smoothing.corrections import Correction, WholeObject
 from saga_fg.smoothing.labelling import (
     Identities,
     LabelledStates,
     ObjectSummary,
     dropped_boxes,
     label_states,
-    source_counts,
 )
 from saga_fg.smoothing.passes import SmoothedObjects, smooth_objects, track_evidence
 from saga_fg.smoothing.recording_labels import LabelParts, RecordingLabels
@@ -139,13 +140,14 @@ class Backlog:
 
 @dataclass(frozen=True, eq=False)
 class LabelModel:
-    """What labels follow from: settings of the tracker, of the sensors offline and of smoothing, and providers of
-    factors in place of those that the settings name."""
+    """What labels follow from: settings of the tracker, of the sensors offline and of smoothing, providers of factors
+    in place of those that the settings name, and corrections."""
 
     tracker: TrackerSettings
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
     providers: Sequence[FactorProvider] = ()
+    corrections: Sequence[Correction] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,11 +198,16 @@ class LabelBuilder:
         parts: LabelParts | None = None,
     ) -> None:
         self._tracker, self._model, self._chunks = tracker, model, chunks or WHOLE
-        self._labels = RecordingLabels([] if parts is None else parts)
         offsets = [0.0, *(sensor.time_offset for sensor in model.sensors.values())]
         self._early = min(offsets)  # a frame's measurement may be this much before its timestamp
         self._coming: list[Frame] = []
         self._backlog = Backlog(self._chunks)
+        self._whole: tuple[Evidence, SmoothedObjects, FloatArray] | None = None  # before corrections, of one chunk
+        self._reset([] if parts is None else parts)
+
+    def _reset(self, parts: LabelParts) -> None:
+        self._labels = RecordingLabels(parts)
+        self._outcome: dict[int, str] = {}  # by number of the correction: why it does not hold, or ""
         self._identities = Identities()
         self._summaries: defaultdict[int, ObjectSummary] = defaultdict(ObjectSummary)
         self._present: set[int] = set()  # in the latest chunk
@@ -218,9 +225,28 @@ class LabelBuilder:
         """The labels, and where they come from, when all parts are there."""
         self._track(np.inf, progress)
         self._smooth(np.inf)
+        return self._finished()
+
+    def _finished(self) -> tuple[RecordingLabels, LabelCounts]:
         self._labels.finish(self._summaries, PRIOR_OPPORTUNITY_TIME * self._sums.rate)
-        counts = replace(self._sums.counts, objects=len(self._summaries), joined=self._identities.joined)
-        return self._labels, counts
+        objects = sum(each.said.exists is not False for each in self._summaries.values())
+        counts = replace(self._sums.counts, objects=objects, joined=self._identities.joined)
+        return self._labels, LabelCounts.sum([counts, self._labels.counts()])
+
+    def corrected(self, corrections: Sequence[Correction]) -> tuple[RecordingLabels, LabelCounts]:
+        """The labels of a recording that is finished and was one chunk, with these corrections in place of others: the
+        objects concerned alone are solved again."""
+        assert self._whole is not None
+        self._model = replace(self._model, corrections=corrections)
+        self._reset([])
+        self._label(-np.inf, np.inf, *self._whole)
+        return self._finished()
+
+    @property
+    def outcomes(self) -> tuple[tuple[Correction, str], ...]:
+        """The corrections, and why they do not hold; "" where they do."""
+        given = enumerate(self._model.corrections)
+        return tuple((one, self._outcome.get(k, "outside the recording")) for k, one in given)
 
     def _track(self, until: float, progress: Callable[[int], None] | None) -> None:
         """The online pass over what was measured before a time."""
@@ -252,16 +278,37 @@ class LabelBuilder:
             if len(evidence.times):
                 track_of = np.concatenate([np.empty(0, dtype=np.int64), *(each.track_of for each in tracked)])
                 objects = smooth_objects(evidence, track_of, model.smoothing, model.tracker, model.providers)
-                labelled = label_states(evidence, objects, wanted, model.smoothing)
-                mine = wanted[(wanted >= begin) & (wanted < end)]
-                self._add(_Chunk(begin, end, evidence, objects, labelled), mine)
+                if self._chunks is WHOLE:
+                    self._whole = evidence, objects, wanted
+                self._label(begin, end, evidence, objects, wanted)
 
-    def _add(self, chunk: _Chunk, wanted: FloatArray) -> None:
-        """Add a chunk to the summaries of its objects, and write its labels at the times `wanted`, s."""
+    def _label(
+        self, begin: float, end: float, evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray
+    ) -> None:
+        """The labels of a chunk, as corrected."""
+        model, whole = self._model, {}
+        near = evidence.times[[0, -1]] + [-LATE, LATE]
+        given = [(k, one) for k, one in enumerate(model.corrections) if near[0] <= one.at.time <= near[1]]
+        if given:
+            found = correct_objects(evidence, objects, given, model.smoothing, model.tracker, model.providers)
+            evidence, objects, whole = found.evidence, found.objects, found.whole
+            for number, one in given:
+                if begin <= one.at.time < end or number not in self._outcome:
+                    self._outcome[number] = found.outcome[number]
+        labelled = label_states(evidence, objects, wanted, model.smoothing)
+        mine = wanted[(wanted >= begin) & (wanted < end)]
+        self._add(_Chunk(begin, end, evidence, objects, labelled), mine, whole)
+
+    def _add(self, chunk: _Chunk, wanted: FloatArray, whole: Mapping[int, WholeObject]) -> None:
+        """Add a chunk to the summaries of its objects, and write its labels at the times `wanted`, s; whole: what was
+        said of objects."""
         evidence, objects, states = chunk.evidence, chunk.objects, chunk.labelled.states
         here = np.unique(states.id[chunk.inside[states.moment]])
         times, span = evidence.times[evidence.moment], (chunk.begin, chunk.end)
         names = self._identities.name(here, objects.object_of, objects.track_of, times, span)
+        for id_, said in whole.items():
+            if id_ in names:
+                self._summaries[names[id_]].said = self._summaries[names[id_]].said.updated(said)
         self._gather(chunk, names)
         self._write(chunk, names, wanted)
         present = set(names.values())
@@ -274,12 +321,13 @@ class LabelBuilder:
         """Add the chunk's evidence on whole objects."""
         evidence, objects, inside = chunk.evidence, chunk.objects, chunk.inside
         rows = np.flatnonzero((objects.object_of >= 0) & inside[evidence.moment])
-        weight = size_weights(evidence.probability, evidence.distance)
-        total = np.bincount(objects.object_of[rows], evidence.probability[rows]).tolist()
-        for id_, mine in _by_id(objects.object_of, rows):
+        weight = size_weights(evidence)
+        _, number = np.unique(objects.object_of[rows], return_inverse=True)
+        totals = np.bincount(number, evidence.probability[rows]).tolist()
+        for (id_, mine), total in zip(_by_id(objects.object_of, rows), totals, strict=True):
             if id_ in names:
-                self._summaries[names[id_]].add_detections(total[id_], evidence.boxes.size[mine], weight[mine])
-        frames = tuple(frame for frame in evidence.frames if inside[frame.moment])
+                self._summaries[names[id_]].add_detections(total, evidence.boxes.size[mine], weight[mine])
+        frames = tuple(frame for frame in evidence.frames if inside[frame.moment] and frame.sensor is not PERSON)
         states, log_step = chunk.labelled.states, chunk.labelled.log_step
         for id_, mine in _by_id(states.id, np.flatnonzero(inside[states.moment] & (log_step < 0))):
             self._summaries[names[id_]].add_steps(log_step[mine], evidence.times[states.moment[mine]])
@@ -315,7 +363,6 @@ class LabelBuilder:
                 self._summaries[names[id_]].rivals += int(labelled.rival[rows].sum())
             self._labels.add(wanted, at, labelled, names, signs)
         new = LabelCounts(
-            **source_counts(labelled.columns.source[emitted]),
             dropped=dropped_boxes(evidence, objects, wanted),
             dropped_objects=int(chunk.inside[objects.dropped.first].sum()),
         )

@@ -13,8 +13,8 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.smoothing.boxes import is_reversed
 from saga_fg.smoothing.doubt import REASONS, Review, far_off, gain_parts, object_probabilities
-from saga_fg.smoothing.labelling import LabelColumns, LabelledStates, ObjectSummary, median_sizes
-from saga_fg.smoothing.states import Labels, Probabilities
+from saga_fg.smoothing.labelling import LabelColumns, LabelledStates, ObjectSummary, median_sizes, source_counts
+from saga_fg.smoothing.states import LabelCounts, Labels, Probabilities
 
 
 class LabelParts(Protocol):
@@ -35,6 +35,7 @@ class RecordingLabels:
         self._parts = parts
         self._id = np.empty(0, dtype=np.int64)  # of all objects, ascending; then their attributes
         self._size, self._score, self._turned = np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.bool_)
+        self._gone, self._label = np.empty(0, dtype=np.bool_), np.empty(0, dtype="U64")
         self._boxes, self._weakest = np.empty(0, dtype=np.int64), np.empty((0, 2))
         self._probability = Probabilities(*(np.empty(0),) * 4)
 
@@ -80,7 +81,22 @@ class RecordingLabels:
         self._boxes, rivals = column("boxes").astype(np.int64), column("rivals") / np.maximum(column("boxes"), 1)
         self._weakest = np.array([each.weakest for each in found]).reshape(len(found), 2)
         one, path = np.exp(column("log_one")), column("path")
-        self._probability = object_probabilities(self._score, detections, weight, rivals, path, votes, one)
+        p = object_probabilities(self._score, detections, weight, rivals, path, votes, one)
+        said = [each.said for each in found]
+        real = np.array([each.exists is True for each in said], dtype=np.bool_)
+        self._gone = np.array([each.exists is False for each in said], dtype=np.bool_)
+        self._label = np.array([each.label for each in said], dtype="U64")
+        self._score = np.where(real, 1.0, self._score)
+        size = np.array([each.size for each in said]).reshape(-1, 3)
+        self._size = np.where(np.isnan(size), self._size, size)
+        self._probability = Probabilities(
+            np.where(real, 1.0, p.exists), np.where(self._label != "", 1.0, p.label), p.one, p.heading
+        )
+
+    def counts(self) -> LabelCounts:
+        """Where the boxes come from."""
+        sources = [source_counts(columns.source) for _, _, _, columns in self._chunks()]
+        return LabelCounts.sum(LabelCounts(**counts) for counts in sources)
 
     def __iter__(self) -> Iterator[tuple[Labels, ...]]:
         for times, rows, at, columns in self._chunks():
@@ -116,7 +132,7 @@ class RecordingLabels:
         gain = parts.sum(axis=1)
         found = Review(self._id, label, self._boxes, gain, REASONS[why], shown[:, 0], shown[:, 1:], p, off)
         order = np.lexsort((self._id, -gain))
-        return found.select(order[self._boxes[order] > 0])
+        return found.select(order[(self._boxes[order] > 0) & ~self._gone[order]])
 
     def _chunks(self) -> Iterator[tuple[FloatArray, list[slice], IntArray, LabelColumns]]:
         """Of each chunk: the times of its moments, s, their rows, the objects of all rows, and their columns."""
@@ -126,7 +142,11 @@ class RecordingLabels:
             at = np.searchsorted(self._id, stored["id"])
             turned = backward ^ self._turned[at]
             yaw = np.where(turned, wrap_angle(stored["yaw"] + np.pi), stored["yaw"])
-            yield times, [slice(a, b) for a, b in pairwise(bounds.tolist())], at, LabelColumns(**{**stored, "yaw": yaw})
+            label = np.where(self._label[at] != "", self._label[at], stored["label"])
+            kept = ~self._gone[at]
+            columns = LabelColumns(**{**stored, "yaw": yaw, "label": label}).select(kept)
+            bounds = np.concatenate([[0], np.cumsum(kept)])[bounds]
+            yield times, [slice(a, b) for a, b in pairwise(bounds.tolist())], at[kept], columns
 
 
 def _keep_largest(best: FloatArray, at: IntArray, value: FloatArray, where: FloatArray) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from saga_fg.model.interactions import NodeTable
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
+from saga_fg.tables.columns import PROBABILITIES
 from saga_fg.types.track import Tracks
 
 
@@ -141,18 +142,15 @@ class StateTable(Columns):
         return self.moment * self._span + self.id
 
 
-Source = Literal["observed", "filled", "extended"]
-"""Observed: the object was detected; filled: between detections; extended: before its online track or after it."""
+Source = Literal["observed", "filled", "extended", "corrected", "near"]
+"""Observed: the object was detected; filled: between detections; extended: before its online track or after it;
+corrected: a person said so; near: within a second of such a box."""
 
 Quality = Literal["high", "medium", "low"]
 MEDIUM_SCORE = 0.2  # least score of a box of medium quality
 HIGH_SCORE = 0.5  # least score of a box of high quality
 HIGH_DEVIATION = 0.3  # largest standard deviation of the position of a box of high quality, m
 MEDIUM_DEVIATION = 0.8  # likewise of a box of medium quality, m
-
-
-PROBABILITIES = ("p_exists", "p_class", "p_identity", "p_heading")
-"""Their names in tables."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +174,7 @@ class Labels:
 
     tracks    boxes (world), ids, scores and covariances; `coasting` is the time to the nearest detection, s
     yaw_variance (N,)  of the heading, rad^2; NaN where unknown
-    source    (N,) observed, filled or extended
+    source    (N,) observed, filled, extended, corrected or near
     quality   (N,) high, medium or low
     probability  that the labels are right
 
@@ -200,18 +198,31 @@ class Labels:
         if len(self.probability) != len(self.tracks):
             raise InputError(f"probability: expected {len(self.tracks)} rows")
 
+    @classmethod
+    def empty(cls) -> Self:
+        """No labels."""
+        none, words = np.empty(0), np.empty(0, dtype=np.str_)
+        return cls(Tracks.empty(0.0), none, words, words, Probabilities(none, none, none, none))
+
     def __len__(self) -> int:
         return len(self.tracks)
+
+    def table_columns(self) -> dict[str, Any]:
+        """The columns (N,) of a table, by name."""
+        own = {"yaw_variance": self.yaw_variance, "source": self.source, "quality": self.quality}
+        return {**self.tracks.table_columns(), **own, **self.probability.table_columns()}
 
 
 @dataclass(frozen=True)
 class LabelCounts:
-    """Numbers of boxes of a recording that were observed, filled and extended, and dropped with their objects; of
-    objects kept and dropped, and of tracklets stitched to another."""
+    """Numbers of boxes of a recording by `Source`, and dropped with their objects; of objects kept and dropped, and of
+    tracklets stitched to another."""
 
     observed: int = 0
     filled: int = 0
     extended: int = 0
+    corrected: int = 0
+    near: int = 0
     dropped: int = 0
     objects: int = 0
     dropped_objects: int = 0
@@ -220,7 +231,7 @@ class LabelCounts:
     @property
     def boxes(self) -> int:
         """Boxes written."""
-        return self.observed + self.filled + self.extended
+        return self.observed + self.filled + self.extended + self.corrected + self.near
 
     @classmethod
     def sum(cls, counts: Iterable[LabelCounts]) -> Self:

@@ -18,12 +18,12 @@ from benchmarks.flocks import Kind, flock
 from benchmarks.modes import FRAMES, draw, enumerated, matched
 from benchmarks.sampled_traffic import providers
 from benchmarks.settling import APART, EVADING, MIXED, NEAR, SILENT, STRAIGHT, largest_difference, sample_scene
-from benchmarks.smoothing import true_objects
+from benchmarks.smoothing import smooth_known_objects, true_objects
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.smoothing import load_smooth_config
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import OBJECT
-from saga_fg.smoothing import gather_evidence, smooth_known_objects
+from saga_fg.smoothing import gather_evidence
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from benchmarks.recordings.landmarks import read_landmark_log
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
 from data_tools.datasets.argoverse2 import ArgoverseLogs
+from data_tools.datasets.corrections import read_corrections
 from data_tools.datasets.detection_files import TruthFile, read_detections, read_predictions, read_tracks
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.source import read_scored_sequences
@@ -56,6 +57,10 @@ NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 CSV = "timestamp,sensor,label,x,y,length,ego_x,ego_y,ego_yaw\n0,a,car,1,2,3,0,0,0\n1,a,,,,,1,1,1\n"
 NDJSON = '{"timestamp": 0, "x": 1, "y": 2, "label": "car", "yaw": 0.5}\n{"timestamp": 1, "sensor": "b"}\n'
+CORRECTIONS = """{"what": "exists", "at": {"time": 1, "x": 2.5, "y": -3}, "value": false, "who": "a", "when": "2026"}
+{"what": "same", "at": {"time": 1, "x": 2, "y": 3, "label": "car"}, "and": {"time": 2, "x": 2, "y": 3}, "scene": "s"}
+{"what": "box", "at": {"time": 1, "x": 2, "y": 3}, "box": {"x": 1, "y": 2, "length": 4.5}, "deviation": {"yaw": 0.1}}
+"""
 TRACKS = (
     "scene,timestamp,id,label,x,y,vx,cov_xx,cov_xy,cov_yy\na,0,1,car,1,2,3,0.5,0.1,0.5\na,1,1,car,2,2,3,0.5,0,0.5\n"
 )
@@ -182,6 +187,7 @@ def targets(folder: Path) -> dict[str, Target]:
         **_scan_folders(folder),
         **_traffic(folder),
         **_recordings(folder),
+        "corrections": one("c.jsonl", CORRECTIONS, read_corrections),
         "predictions": one("a.predictions.csv", PREDICTIONS, lambda path: read_predictions(folder / "a")),
         "state": _state(folder / "state.saga", config),
         "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),

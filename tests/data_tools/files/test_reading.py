@@ -209,6 +209,7 @@ SIZES = {
     "list of files": 3,
     "log of a sensor": 2,
     "laser logs": 3,
+    "corrections": 3,
     "predictions": 1,
     "tracks": 2,
     "labels": 2,

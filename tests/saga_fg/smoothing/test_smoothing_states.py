@@ -200,7 +200,7 @@ def test_with_equal_weights_the_weighted_median_is_the_median(values):
 def test_sizes_follow_the_weight_and_objects_do_not_mix():
     size = np.array([[4.0, 2.0, 1.5], [4.2, 2.0, 1.5], [9.0, 3.0, 2.0], [np.nan] * 3])
     owner, probability = np.array([0, 0, 0, 2]), np.array([0.9, 0.9, 0.1, 0.9])
-    found = constant_sizes(owner, 3, size, probability, np.full(4, 10.0))
+    found = constant_sizes(owner, 3, size, probability)
     assert 4.0 <= found[0, 0] <= 4.2
     assert np.isnan(found[1:]).all()
     states = chain(2, objects=2)

@@ -1,0 +1,62 @@
+"""Files of corrections, JSON lines of which each is one, and what became of them.
+
+    {"what": "exists", "at": PLACE, "value": false}            the object at a place does not exist, or does (true)
+    {"what": "class", "at": PLACE, "label": "bus"}
+    {"what": "same", "at": PLACE, "and": PLACE, "value": true} two places are of one object, or of two (false)
+    {"what": "box", "at": PLACE, "box": {"x": 3.1, "y": 4.0, "z": 1.0, "yaw": 0.1, "length": 4.2, "width": 1.8,
+     "height": 1.5, "time": 11.0}, "deviation": {"position": 0.1, "height": 0.1, "yaw": 0.05, "size": 0.05},
+     "label": "car"}
+    {"what": "standing", "at": PLACE, "until": 12.5}           from the time of the place to another
+    {"what": "size", "at": PLACE, "box": {"length": 4.2, "width": 1.8, "height": 1.5}}
+
+PLACE is {"time": 10.2, "x": 3.5, "y": 4.1, "label": "car"}: s, m in the world, and the class if known. Of a box x and
+y alone are required; its time is that of the place unless it has one. Every line may have who, when and scene.
+`saga_fg.smoothing.corrections` says what they do.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+from data_tools.datasets.detection_files import write_rows
+from data_tools.files.readers import parsed_json, read_lines
+from saga_fg.errors import InputError
+from saga_fg.smoothing.corrections import Correction, correction_from
+
+COLUMNS = ("scene", "correction", "what", "timestamp", "x", "y", "who", "when", "problem")
+
+
+def read_corrections(path: Path) -> tuple[Correction, ...]:
+    """Read a file. Raises `InputError` naming line and field of one that can't be used."""
+    found = []
+    for number, line in enumerate(read_lines(path), 1):
+        if line.strip():
+            origin = f"{path}: line {number}"
+            found.append(correction_from(parsed_json(line, origin), origin))
+    if not found:
+        raise InputError(f"{path}: expected corrections, a line each, there are none")
+    return tuple(found)
+
+
+Outcomes = Sequence[tuple[str, Correction, str]]
+"""Scene, a correction that may be about it, and why it does not hold there; "" where it does."""
+
+
+def write_outcomes(path: Path, outcomes: Outcomes) -> None:
+    """Write what became of corrections, as a table."""
+    rows = (
+        [scene, one.origin, one.what, one.at.time, one.at.x, one.at.y, one.who, one.when, why]
+        for scene, one, why in outcomes
+    )
+    write_rows(path, COLUMNS, rows)
+
+
+def read_outcomes(folder: Path) -> list[tuple[str, str]]:
+    """Name and problem of the corrections in the tables of a folder."""
+    found = []
+    for path in sorted(folder.glob("*.csv")):
+        with path.open(newline="", encoding="utf-8") as file:
+            found += [(row["correction"], row["problem"]) for row in csv.DictReader(file)]
+    return found

@@ -1,0 +1,88 @@
+"""Labels of a whole table of detections in one call, beside `saga_fg.track`."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from saga_fg.model.sensor import Sensor
+from saga_fg.smoothing.corrections import Correction, checked_corrections, unfit
+from saga_fg.smoothing.recording import LabelBuilder, LabelModel
+from saga_fg.smoothing.recording_labels import RecordingLabels
+from saga_fg.smoothing.settings import SmoothingSettings
+from saga_fg.smoothing.states import Labels
+from saga_fg.tables.column_names import TableImport
+from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like
+from saga_fg.tracking import Tracker, TrackerSettings
+from saga_fg.tracking.table_tracking import tell
+
+
+@dataclass(frozen=True, eq=False)
+class TableLabels:
+    """The labels of the scenes of a table of detections, by name.
+
+    detections: whose kind of table `boxes` and `review` give; named: they have a column `scene`
+    """
+
+    scenes: Mapping[str, RecordingLabels]
+    detections: Table
+    named: bool
+
+    def boxes(self) -> Table:
+        """A row for each box, with the columns of `labels.csv`."""
+        found = [(name, moment) for name, one in self.scenes.items() for part in one for moment in part]
+        return self._table([(name, moment.table_columns()) for name, moment in found], Labels.empty().table_columns())
+
+    def review(self) -> Table:
+        """A row for each object, with the columns of `review.csv`: in each scene those first that are most worth a
+        look."""
+        found = [(name, one.review().table_columns()) for name, one in self.scenes.items()]
+        return self._table(found, RecordingLabels([]).review().table_columns())
+
+    def _table(self, parts: Sequence[tuple[str, Mapping[str, Any]]], none: Mapping[str, Any]) -> Table:
+        found = []
+        for name, columns in parts or [("", none)]:
+            scene = {"scene": np.full(len(columns["id"]), name)} if self.named else {}
+            found.append({**scene, **columns})
+        return table_like(self.detections, found)
+
+
+def smooth(
+    detections: Table,
+    settings: TrackerSettings | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
+    smoothing: SmoothingSettings | None = None,
+    corrections: Iterable[Correction | Mapping[str, Any]] = (),
+    how: TableImport | None = None,
+) -> TableLabels:
+    """Label a table of detections, of pandas, Polars or Arrow, with past and future of every object.
+
+    detections, settings, sensors  as `saga_fg.track` takes them
+    smoothing    settings of the passes over the whole table
+    corrections  by a person, as `Correction` or as a mapping like a line of a file of corrections
+    how          what it takes to understand the table: columns, classes, units, coordinates
+
+    Warns (`UserWarning`) as `saga_fg.track` does, and of each correction that does not hold. Raises `InputError` for a
+    table or a correction that can't be used.
+    """
+    how = how or TableImport()
+    settings = TrackerSettings(min_hits=2) if settings is None else settings
+    given, known = checked_corrections(corrections), sensors or {}
+    raw = raw_table(detections, how)
+    scenes = scenes_of(raw)
+    tell(scenes, how, settings, known)
+    labels, outcomes = {}, []
+    for scene in scenes:
+        mine = tuple(one for one in given if one.scene in ("", scene.name))
+        model = LabelModel(settings, known, smoothing or SmoothingSettings(), (), mine)
+        builder = LabelBuilder(Tracker(settings, sensors), model)
+        builder.add(scene.frames, scene.timestamps)
+        labels[scene.name], _ = builder.finish()
+        outcomes += [(one.origin, why) for one, why in builder.outcomes]
+    for problem in unfit(given, outcomes):
+        warnings.warn(problem, stacklevel=2)
+    return TableLabels(labels, detections, "scene" in raw.columns)
