@@ -21,10 +21,11 @@ import numpy as np
 from data_tools.simulator.road import Lanes
 from data_tools.simulator.road_users import SimulatedTrajectories
 from data_tools.simulator.scene_layout import ClosingLine
-from data_tools.simulator.sensors import in_view, position_errors, sensor_position, visible_share
+from data_tools.simulator.sensors import in_view, position_errors, sensor_position
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import wrap_angle, yaw_of
+from saga_fg.tracking.visibility import visible_share
 from saga_fg.types import road_map
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations

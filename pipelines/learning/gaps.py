@@ -100,7 +100,6 @@ class Contender:
             own,
             report_coasting=inf,
             max_coasting=LIFE,
-            max_out_of_view=inf,
             classes={label: replace(each, max_deviation=inf) for label, each in own.classes.items()},
             existence=replace(own.existence, delete_below=0.0, report_above=0.0),
         )

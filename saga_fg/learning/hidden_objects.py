@@ -151,7 +151,7 @@ def recorded_tracks(
         owner[row] = column
         mean[:, :2] = position
         table.stationarity.position = table.stationarity.position + state.origin
-        for name in ("initiated", "last_detected", "last_in_view"):
+        for name in ("initiated", "last_detected"):
             setattr(table, name, getattr(table, name) - state.time)
         table.sensors = SensorEvidence.empty(len(table))
         parts.append(RecordedTracks(table, mean, P))
@@ -317,7 +317,7 @@ def _placed(tracks: RecordedTracks, ids: IntArray, shift: FloatArray, time: floa
     table = tracks.table
     table.id = ids
     table.stationarity.position = table.stationarity.position + shift
-    for name in ("initiated", "last_detected", "last_in_view"):
+    for name in ("initiated", "last_detected"):
         setattr(table, name, getattr(table, name) + time)
     mean = tracks.mean.copy()
     mean[:, :2] += shift

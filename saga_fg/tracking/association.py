@@ -1,15 +1,16 @@
 r"""Associate: match the measurements of a frame to the tracks, within the classes.
 
     cost_ij      = d_ij^2 + log det S_ij
-    unmatched_ij = a 2 log( p_D r_i / (1 - p_D r_i) ) + b 2 log( p_j / (1 - p_j) ) - 2 log( 2 pi lambda )
+    unmatched_ij = a 2 log( p_i / (1 - p_i) ) + b 2 log( p_j / (1 - p_j) ) - 2 log( 2 pi lambda )
     lambda       = sum over j of (1 - p_j) / clutter_area
 
 A pair is matched for less than what it costs to leave both alone: with a = b = 1 the difference of the two is
 -2 log of the ratio of likelihoods that the detection is the track's, or that the track was missed and the detection is
-false. r_i is the track's existence, p_D the sensor's detection probability, p_j the detection's probability; a and b
-below 1 reduce their influence. lambda is the number of false detections of the class per m^2 that the frame's own
-scores suggest, so that it fits any detector. A track of low existence can't take a strong detection from afar, least of
-all among many weak ones, and of two detections the more probable one is preferred.
+false. p_i = r_i v_i p_D: the track's existence, its visibility (`saga_fg.tracking.visibility`) and the sensor's
+detection probability. p_j is the detection's probability; a and b below 1 reduce their influence. lambda is the number
+of false detections of the class per m^2 that the frame's own scores suggest, so that it fits any detector. A track of
+low existence, or one that nobody can see, can't take a strong detection from afar, least of all among many weak ones,
+and of two detections the more probable one is preferred.
 
 Candidates are the pairs of one class, or of classes that a sensor confuses, with a cost of their own
 (`saga_fg.tracking.class_belief`), inside its gate. Identities that a sensor gives add theirs
@@ -100,7 +101,7 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> tuple[Mat
         P = relative_covariances(state.joint, table.id, table.label)
     last = state.identities.tracks(measurements.name, measurements.identity)
     predicted = state.boxes(position, np.full_like(position, np.nan))
-    expected = table.existence * sensor.detection_chance(table.label)
+    expected = table.existence * sensor.detection_chance(table.label) * table.sensors.seen_by(measurements.name)
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
     deferred = over_confirmed(state, predicted)
     real = np.where(table.confirmed, table.existence, 0.0)
@@ -115,7 +116,7 @@ class ExpectedTracks(NamedTuple):
 
     boxes     predicted, world
     P         (n, 2, 2) covariance of their positions
-    chance    (n,) that the track is detected: its existence times the sensor's detection probability
+    chance    (n,) that the track is detected: its existence times its visibility and the detection probability
     real      (n,) existence of confirmed tracks, 0 of others
     cross     covariances between the positions of tracks, for the method `graph`
     deferred  (n,) tracks that are matched to what the others leave; None: none

@@ -48,7 +48,6 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         position_bias=measurements.position_bias[rows],
         initiated=np.full(k, time),
         last_detected=np.full(k, time),
-        last_in_view=np.full(k, state.time),
         confirmed=(p >= state.settings.existence.confirm_above) & (unresolved == 0),
         has_moved=np.zeros(k, dtype=bool),
         required_hits=np.full(k, required_hits(state, measurements.sensor)),

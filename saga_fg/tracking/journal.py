@@ -104,7 +104,6 @@ class TrackerView:
         """View a state and the results of a frame so far."""
         table, now = state.table.copied(), state.kinematics()
         table.last_detected += state.start
-        table.last_in_view += state.start
         return cls(
             timestamp=state.start + state.time,
             sensor=sensor,

@@ -266,7 +266,7 @@ def _join(state: TrackerState, old: IntArray, new: IntArray, stationary: FloatAr
     report = state.confused.report(table.class_belief[new])
     table.class_belief[old] = state.confused.updated(table.class_belief[old], report)
     table.sensors.join(old, new)
-    for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected, table.last_in_view):
+    for column in (table.score, table.covariance_scale, table.position_bias, table.last_detected):
         column[old] = column[new]
     table.best_score[old] = np.maximum(table.best_score[old], table.best_score[new])
     table.confirmed[old] |= table.confirmed[new]

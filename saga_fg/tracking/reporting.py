@@ -1,16 +1,18 @@
 """Report and delete: which tracks are told to the user, and which end.
 
-Report: the tracks of sufficient existence that are detected, or whose place is known well enough.
+Report: the tracks of sufficient existence that are detected, or that are in a field of view at a place that is known
+well enough.
 
 Each has a score and a calibrated covariance:
 
-    score       max(p, g m) ( hits / (opportunities + prior_opportunities) )^w     while coasting times r
+    score       max(p, g m) ( hits / (opportunities + prior_opportunities) )^w     while coasting times r v
     P_reported  = ( c (1 + h (1 - p)) )^2 P + ( b (1 + k (1 - p)) )^2 u u^T
 
 The score rests on all evidence of the track so far: p is the probability of its latest detection, m that of its best
-one, g the share of it that lasts, r the existence. It is monotone in the evidence: a higher probability of any
-detection lowers no score of the track, then or later, and neither does one more hit. A weak detection leaves the share
-g, and a gap multiplies the scores of the boxes in it by r, which misses of a well-seen track hardly lower.
+one, g the share of it that lasts, r the existence, v the visibility (`saga_fg.tracking.visibility`). It is monotone in
+the evidence: a higher probability of any detection lowers no score of the track, then or later, and neither does one
+more hit. A weak detection leaves the share g, and a gap multiplies the scores of the boxes in it by r v: misses lower r
+where the object should have been seen, and v where it may be hidden.
 
 A filter's noise is wider than its errors where it also has to let the right detections through the gate, which are not
 as Gaussian as it assumes: the factor c, of sensor and class, corrects this, and h its dependence on the probability p
@@ -29,7 +31,6 @@ marginalised, so that their information on their neighbours stays.
 from __future__ import annotations
 
 import logging
-import math
 from typing import Any
 
 import numpy as np
@@ -80,9 +81,8 @@ def reported_rows(state: TrackerState) -> IntArray:
     chosen = table.confirmed | (table.existence >= settings.existence.report_above)
     if settings.tentative_score_factor == 0:
         chosen &= ~table.tentative
-    chosen &= (coasting == 0) | ((coasting <= settings.report_coasting) & known_places(state))
-    if settings.max_out_of_view < math.inf:
-        chosen &= table.out_of_view(state.relative(state.clock.newest)) <= settings.max_out_of_view
+    in_view = table.sensors.seen_by_any() > 0
+    chosen &= (coasting == 0) | ((coasting <= settings.report_coasting) & in_view & known_places(state))
     return chosen.nonzero()[0]
 
 
@@ -97,7 +97,8 @@ def reported_score(table: TrackTable, rows: IntArray, coasting: BoolArray, setti
     hits, opportunities = table.sensors.best_hits()
     hit_ratio = (hits[rows] / (opportunities[rows] + settings.prior_opportunities)) ** settings.hit_ratio_weight
     evidence = np.maximum(table.score[rows], LASTING_SHARE * table.best_score[rows])
-    return np.asarray(evidence * hit_ratio * np.where(coasting, table.existence[rows], 1.0))
+    unseen = (table.existence * table.sensors.seen_by_any())[rows]
+    return np.asarray(evidence * hit_ratio * np.where(coasting, unseen, 1.0))
 
 
 log = logging.getLogger(__name__)

@@ -260,11 +260,6 @@ class TrackerSettings(Settings):
         "report no track for longer than this after its last detection, s; .inf: for as long as `max_deviation` lets "
         "it; higher: fewer gaps, more false positives",
     )
-    max_out_of_view: PositiveOrInf = setting(
-        0.5,
-        "report a track for this long after it left every sensor's field of view, s; usual 0.2 to 2; higher: reported "
-        "for longer",
-    )
 
     def nonlinear(self, rules: Sequence[EdgeRule]) -> bool:
         """Return True if a class moves nonlinearly or an edge rule is nonlinear."""

@@ -31,6 +31,7 @@ from saga_fg.types.boxes import Boxes
 
 PRIOR_LOGIT = math.log(0.3 / 0.7)  # of a detection whose score says nothing
 MANY_SENSORS = 32  # from here on, sensors without a part in any track are forgotten: names come from outside
+MEMORY = 3.0  # s, over which an object that was hidden or in view goes on to be; usual 1 to 3
 LARGEST_LOGIT = 7.0  # a sum of many sensors is no certainty, since they do not err quite independently
 
 
@@ -43,7 +44,8 @@ class SensorEvidence(Columns):
     time           (n, S) of it, s, -inf if there was none
     hits           (n, S) frames in which the sensor detected the track
     opportunities  (n, S) frames in which the sensor could have detected it
-    in_view        (n, S) whether it was in the field of view in the sensor's latest frame
+    visibility     (n, S) probability that the sensor's latest frame had it in view, see `saga_fg.tracking.visibility`
+    looked         (n, S) time of that frame, s
     sensors        names (S,), of the whole table
     """
 
@@ -52,7 +54,8 @@ class SensorEvidence(Columns):
     time: FloatArray
     hits: IntArray
     opportunities: IntArray
-    in_view: BoolArray
+    visibility: FloatArray
+    looked: FloatArray
     sensors: tuple[str, ...]
 
     @classmethod
@@ -62,26 +65,29 @@ class SensorEvidence(Columns):
         counts = np.zeros(shape, dtype=np.int64)
         unseen = np.full(shape, -np.inf)
         no = np.zeros(shape, dtype=bool)
-        return cls(np.zeros(shape), no, unseen, counts, counts.copy(), no.copy(), tuple(sensors))
+        return cls(np.zeros(shape), no, unseen, counts, counts.copy(), np.zeros(shape), unseen.copy(), tuple(sensors))
 
     def initiated(self, sensor: str, probability: FloatArray, now: float) -> Self:
         """Return the evidence of new tracks, each from a detection by the sensor with this probability (k,)."""
         at = self._column(sensor)
         new = self.empty(len(probability), self.sensors)
-        new.logit[:, at], new.time[:, at] = _logit(probability) - PRIOR_LOGIT, now
-        new.detected[:, at], new.hits[:, at], new.opportunities[:, at], new.in_view[:, at] = True, 1, 1, True
+        new.logit[:, at], new.time[:, at], new.looked[:, at] = _logit(probability) - PRIOR_LOGIT, now, now
+        new.detected[:, at], new.hits[:, at], new.opportunities[:, at], new.visibility[:, at] = True, 1, 1, 1.0
         return new
 
     def update(
         self, sensor: str, now: float, seen: IntArray, probability: FloatArray, missed: BoolArray, chance: FloatArray
     ) -> None:
         """Take in a frame: `seen` tracks (k,), their probabilities (k,); `missed` ones (n,), by the chance (n,) to
-        detect them."""
+        detect them where they are in view."""
         at = self._column(sensor)
-        self.opportunities[missed, at] += 1
+        v = self.visibility[:, at].copy()
+        self.opportunities[missed & (v >= 0.5), at] += 1
         self.opportunities[seen, at] += 1
-        missed = missed & (self.hits[:, at] == 0)
-        self.logit[missed, at] = np.log(1 - np.minimum(chance[missed], 0.99))
+        self.visibility[missed, at] = (v * (1 - chance) / np.maximum(1 - v * chance, 1e-9))[missed]
+        self.visibility[seen, at] = 1.0
+        missed = missed & (v > 0) & (self.hits[:, at] == 0)
+        self.logit[missed, at] = np.log(1 - np.minimum(v * chance, 0.99)[missed])
         self.logit[seen, at] = _logit(probability) - PRIOR_LOGIT
         self.detected[missed, at], self.detected[seen, at] = False, True
         self.time[missed, at] = self.time[seen, at] = now
@@ -90,19 +96,28 @@ class SensorEvidence(Columns):
     def join(self, rows: IntArray, others: IntArray) -> None:
         """Add what is known of tracks `others` (k,) to tracks `rows` (k,), which missed all detections of theirs."""
         newer = self.time[others] > self.time[rows]
-        for column in (self.logit, self.detected, self.time):
+        for column in (self.logit, self.detected, self.time, self.visibility, self.looked):
             column[rows] = np.where(newer, column[others], column[rows])
         self.hits[rows] += self.hits[others]
         self.opportunities[rows] = np.maximum(self.opportunities[rows], self.hits[rows])
 
-    def look(self, sensor: str, visible: BoolArray) -> BoolArray:
-        """Note which tracks (n,) a frame of the sensor has in view; return those in view of some sensor's latest frame.
+    def look(self, sensor: str, view: FloatArray, now: float) -> None:
+        """Note the tracks that a frame of the sensor has in view, by how probable (n,) that is of what covers them."""
+        at = self._column(sensor)
+        before, kept = self.visibility[:, at], np.exp(np.minimum(self.looked[:, at] - now, 0.0) / MEMORY)
+        self.visibility[:, at] = np.where((before > 0) & (view > 0), view + (before - view) * kept, view)
+        self.looked[:, at] = now
+
+    def seen_by(self, sensor: str) -> FloatArray:
+        """(n,) probability that the sensor has a track in view."""
+        return self.visibility[:, self._column(sensor)].copy()
+
+    def seen_by_any(self) -> FloatArray:
+        """(n,) probability that the sensor which sees a track best has it in view, by the latest frame of each.
 
         A sensor that falls silent keeps its field of view, so that an outage of one sensor ends no track.
         """
-        at = self._column(sensor)
-        self.in_view[:, at] = visible
-        return np.asarray(self.in_view.any(axis=1))
+        return np.asarray(self.visibility.max(axis=1, initial=0.0))
 
     def probability(self, now: float, memory: float) -> FloatArray:
         """P (n,) by the evidence of the last `memory` s, NaN for tracks that no sensor has detected since."""
@@ -143,7 +158,7 @@ class SensorEvidence(Columns):
             if len(kept) >= MANY_SENSORS:  # forget those that have detected none of the present tracks
                 kept = np.flatnonzero(self.hits.any(axis=0))
             new = self.empty(len(self.logit), [sensor])
-            for name in ("logit", "detected", "time", "hits", "opportunities", "in_view"):
+            for name in ("logit", "detected", "time", "hits", "opportunities", "visibility", "looked"):
                 setattr(self, name, np.concatenate([getattr(self, name)[:, kept], getattr(new, name)], axis=1))
             self.sensors = (*(self.sensors[k] for k in kept.tolist()), sensor)
         return self.sensors.index(sensor)
@@ -167,7 +182,6 @@ class TrackTable(Columns):
     position_bias     (n,) standard deviation of the position error that all its detections share, m
     initiated         (n,) time of its first detection
     last_detected     (n,) time of its latest detection
-    last_in_view      (n,) time when it was last inside a sensor's field of view
     confirmed         (n,) whether misses no longer delete it
     has_moved         (n,) whether it was ever clearly in motion
     required_hits     (n,) detections after which it is no longer tentative, if they are of one sensor
@@ -189,7 +203,6 @@ class TrackTable(Columns):
     position_bias: FloatArray
     initiated: FloatArray
     last_detected: FloatArray
-    last_in_view: FloatArray
     confirmed: BoolArray
     has_moved: BoolArray
     required_hits: FloatArray
@@ -215,7 +228,6 @@ class TrackTable(Columns):
             position_bias=none,
             initiated=none,
             last_detected=none,
-            last_in_view=none,
             confirmed=no,
             has_moved=no,
             required_hits=none,
@@ -239,10 +251,6 @@ class TrackTable(Columns):
     def coasting(self, now: float) -> FloatArray:
         """(n,) time since the latest detection, s, rounded to the microsecond."""
         return np.maximum(_rounded(now - self.last_detected), 0.0)
-
-    def out_of_view(self, now: float) -> FloatArray:
-        """(n,) time since it was last in a sensor's field of view, s, rounded to the microsecond."""
-        return _rounded(now - self.last_in_view)
 
     def boxes(self, position: FloatArray, velocity: FloatArray) -> Boxes:
         """The boxes of all tracks at positions (n, 2), world, with velocities (n, 2), which are not checked."""

@@ -1,6 +1,6 @@
 """The graph-aware tracker: one frame of one sensor at a time, from any sensor at any time.
 
-    predict (prediction, courses) -> measure (measurements, map_nodes) -> associate (association, relinking)
+    predict (prediction, courses) -> measure (measurements, map_nodes, visibility) -> associate (association, relinking)
     -> follow encounters (update, encounters) -> update, existence (update, unresolved) -> hand over (relinking)
     -> initiate (initiation) -> exchange identities (update) -> delete, report (reporting)
 
@@ -49,6 +49,7 @@ from saga_fg.tracking.update import (
     update_existence,
     update_tracks,
 )
+from saga_fg.tracking.visibility import look
 from saga_fg.types.frame import LATEST, Frame, finite_seconds
 from saga_fg.types.track import PredictedTracks, Tracks, checked_horizons
 
@@ -179,6 +180,7 @@ class Tracker:
         stamp = frame.timestamp + sensor.time_offset
         state.clock, state.shared = compared(state.clock, state.shared, stamp, measurements)
         state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
+        look(state, measurements)
         self._notify("measure", state, frame.sensor, measurements)
 
         matching, rivals = associate(state, measurements)

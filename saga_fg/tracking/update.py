@@ -14,12 +14,14 @@ Where they are, and how fast, is remembered for the paths and speeds of others (
 
 The probability r that a track is a real object is updated by Bayes' rule, and so is the score of its box.
 
-    miss    r <- r (1 - p_D) / (1 - r p_D) exp(-dt / lifetime)
+    miss    r <- r (1 - p_D v) / (1 - r p_D v) exp(-dt / lifetime)
     match   r / (1 - r) <- r / (1 - r)  p / (1 - p)  (1 - c) / c
 
-p_D is the chance of a detection at the track (0 outside the field of view), p the detection's probability, and c the
-probability at which a detection is no evidence. Source: Musicki, Evans, Stankovic, Integrated Probabilistic Data
-Association, IEEE Transactions on Automatic Control 39(6), 1994.
+p_D is the sensor's chance to detect what it has in view, v the probability that it has the track in view
+(`saga_fg.tracking.visibility`), p the detection's probability, and c that at which a detection is no evidence.
+
+Source: Musicki, Evans, Stankovic, Integrated Probabilistic Data Association, IEEE Transactions on Automatic Control
+39(6), 1994.
 """
 
 from __future__ import annotations
@@ -195,13 +197,11 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     time, t, d = state.time - measurements.delay, matching.track, matching.detection
     missed = np.ones(len(table), dtype=bool)
     missed[t] = False
-    now, sensor = state.kinematics(), measurements.sensor
-    visible = sensor.sees(now.position + state.origin, measurements.world_T_ego)
-    table.last_in_view[table.sensors.look(measurements.name, visible)] = state.time
-    p_detect = np.where(visible, sensor.detection_chance(table.label), 0.0)
+    p_detect = measurements.sensor.detection_chance(table.label)
+    p_seen = p_detect * table.sensors.seen_by(measurements.name)
     # a track that another sensor has just detected exists, whether this one misses it or not
     excused = table.sensors.detected_by_others(measurements.name, time, SCORE_MEMORY)
-    p, p_miss, resolved = measurements.probability[d], np.where(excused, 0.0, p_detect), table.unresolved[t] == 0
+    p, p_miss, resolved = measurements.probability[d], np.where(excused, 0.0, p_seen), table.unresolved[t] == 0
     # a detection of an unresolved track may be of the track that it overlaps
     survival = math.exp(-elapsed / LIFETIME)
     table.existence = existences(
@@ -209,10 +209,9 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     )
     table.last_existence[t] = table.existence[t]
     table.confirmed |= table.existence >= settings.confirm_above
-    table.sensors.update(measurements.name, time, t, p, missed & visible, p_detect)
+    table.sensors.update(measurements.name, time, t, p, missed, p_detect)
     fused = table.sensors.probability(state.time, max(SCORE_MEMORY, measurements.delay))
     table.score = np.where(np.isfinite(fused), fused, table.score)
     table.best_score = np.maximum(table.best_score, table.score)
     table.covariance_scale[t], table.position_bias[t] = measurements.covariance_scale[d], measurements.position_bias[d]
     table.last_detected[t] = np.maximum(table.last_detected[t], time)
-    table.last_in_view[t] = state.time

@@ -85,7 +85,7 @@ def test_numbers_out_of_range_are_refused(subtests):
         (ExistenceSettings, {"report_above": 1.1}, "report_above: expected a number from 0 to 1, got 1.1"),
         (TrackerSettings, {"explained_noise": -0.1}, "explained_noise: expected a finite number >= 0"),
         (TrackerSettings, {"tolerance": 1.0}, "tolerance: expected a number from 0 to below 1, got 1.0"),
-        (TrackerSettings, {"max_out_of_view": 0.0}, "max_out_of_view: expected a number > 0"),
+        (TrackerSettings, {"max_coasting": 0.0}, "max_coasting: expected a number > 0"),
         (TrackerSettings, {"max_delay": -0.1}, "max_delay: expected a finite number >= 0"),
         (GreedySettings, {"max_coasting": math.nan}, "max_coasting: expected a number > 0"),
     ]:

@@ -17,7 +17,6 @@ from data_tools.simulator.sensors import (
     points_on,
     range_drifts,
     sensor_position,
-    visible_share,
 )
 from data_tools.simulator.settings import SensorSettings, camera, far_camera, lidar, radar, sparse_lidar
 from saga_fg.numerics.arrays import FloatArray
@@ -172,75 +171,6 @@ def test_no_frame_comes_in_an_outage():
     gaps = np.diff(left)
     assert ((gaps < 0.11) | ((gaps > 0.95) & (gaps < 3.2))).mean() > 0.998  # two outages may follow at once
     assert outside_outages(lidar(), time, np.random.default_rng(0)) is time
-
-
-# Visible shares on cases one can work out by hand
-
-EYE = np.array([0.0, 0.0, 2.0])
-
-
-def box(x: float, y: float, length: float = 4.0, width: float = 2.0, height: float = 1.5, yaw: float = 0.0) -> Boxes:
-    return Boxes.of(["car"], [[x, y, height / 2]], [[length, width, height]], [yaw], [[0.0, 0.0]])
-
-
-def share(*boxes: Boxes, rays: int = 400) -> float:
-    """Visible share of the first box, seen past the others."""
-    return float(visible_share(EYE, Boxes.concatenate(boxes), np.array([0]), rays)[0])
-
-
-def test_what_is_seen_is_what_nothing_before_it_hides_half_or_whole():
-    assert share(box(20, 3)) == 1.0
-    assert visible_share(EYE, box(20, 3), np.empty(0, dtype=np.int64)).shape == (0,)
-    assert share(box(20, 0), box(30, 0, height=4.0), box(20, 3, height=4.0), box(-10, 0, height=4.0)) == 1.0
-    assert share(box(20, 0), box(10, 0, length=0.5, width=4.0, height=3.0)) == 0.0
-    thin = box(20, 0, length=0.01, width=2.0)  # fills the azimuths of -1 m to 1 m at 20 m
-    wall = box(10, 5.0, length=0.01, width=10.0, height=3.0)  # from 0 m to the left
-    assert share(thin, wall) == pytest.approx(0.5, abs=0.01)
-    quarter = box(10, 5.25, length=0.01, width=10.0, height=3.0)  # from 0.25 m, which at 20 m is 0.5 m
-    assert share(thin, quarter) == share(thin, quarter, quarter) == pytest.approx(0.75, abs=0.01)
-    right = box(10, -5.25, length=0.01, width=10.0, height=3.0)
-    assert share(thin, quarter, right) == pytest.approx(0.5, abs=0.01)
-
-
-def test_occluders_throw_shadows_by_their_height_and_place():
-    """An eye 2 m up sees the ground at 20 m past an edge 1 m high at 10 m: half of 1 m is hidden at 15 m."""
-    low = box(10, 0, length=0.01, width=6.0, height=1.0)
-    assert share(box(15, 0, length=0.01, height=1.0), low) == pytest.approx(0.5, abs=0.01)
-    assert share(box(19.9, 0, length=0.01, height=1.0), low) == pytest.approx(0.99, abs=0.01)
-    assert share(box(10.1, 0, length=0.01, height=1.0), low) == pytest.approx(0.01, abs=0.01)
-    assert share(box(40, 0, length=0.01, height=1.0), low) == 1.0
-    high = box(10, 0, length=0.01, width=20.0, height=2.01)
-    assert share(box(60, 0, height=1.5), high) == 0.0
-    assert share(box(60, 0, height=4.0), high) == pytest.approx((4.0 - (2 + 0.01 * 58 / 10)) / 4.0, abs=0.01)
-    truck = box(0, 2.0, length=12.0, width=2.5, height=3.5)
-    assert share(box(0, 8), truck) == 0.0
-    assert share(box(15, 6), truck) == 0.0
-    assert share(box(0, -8), truck) == 1.0
-    assert share(truck, box(0, 8)) == 1.0
-
-
-@settings(max_examples=50, deadline=None)
-@given(turn=st.floats(-np.pi, np.pi), seed=st.integers(0, 1000))
-def test_turning_the_whole_world_changes_nothing_and_more_boxes_hide_more(turn, seed):
-    rng = np.random.default_rng(seed)
-    n = 10
-    places = rng.uniform(-40, 40, (n, 2))
-    places += 4.0 * np.sign(places)
-    boxes = Boxes.of(
-        ["car"] * n,
-        np.column_stack([places, np.full(n, 0.75)]),
-        np.column_stack([rng.uniform(2, 10, n), rng.uniform(1, 3, n), rng.uniform(1, 4, n)]),
-        rng.uniform(-3, 3, n),
-        np.zeros((n, 2)),
-    )
-    c, s = np.cos(turn), np.sin(turn)
-    turned = boxes.transformed(np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
-    rows = np.arange(n)
-    shares = visible_share(EYE, boxes, rows, 100)
-    assert ((shares >= 0) & (shares <= 1)).all()
-    assert visible_share(EYE, turned, rows, 100) == pytest.approx(shares, abs=0.03)
-    fewer = visible_share(EYE, boxes.select(rows[:-2]), rows[:-2], 100)
-    assert (fewer >= shares[:-2] - 1e-9).all()
 
 
 # Roads and lanes: arc length, headings and metric agree with finite differences of positions

@@ -278,9 +278,7 @@ def hidden_follower(seed: int) -> list[tuple[Frame, float, bool]]:
 def astray(ego: EgoNodeSettings | None, estimator: str, providers: tuple[Any, ...] = ()) -> float:
     """RMS error of the follower's place while it is hidden, m."""
     classes = {"default": ClassSettings(motion=ConstantVelocity(acceleration_noise=1.0), max_deviation=20.0)}
-    settings = TrackerSettings(
-        classes=classes, edges=(Following(rate=2.0),), estimator=estimator, ego=ego, max_out_of_view=5.0
-    )
+    settings = TrackerSettings(classes=classes, edges=(Following(rate=2.0),), estimator=estimator, ego=ego)
     squares = []
     for seed in range(3):
         tracker, before = Tracker(settings, providers=providers), None

@@ -103,10 +103,6 @@ def test_sensors_that_saw_before_or_fall_silent_are_heard_rightly():
     updated(evidence, "camera", 1.0, [1], [0.6], n=2)
     assert evidence.detected_by_others("lidar", 1.0, 0.2).tolist() == [False, True]
     assert evidence.detected_by_others("camera", 1.0, 0.2).tolist() == [False, False]
-    evidence = initiated([0.6, 0.6])
-    assert evidence.look("camera", np.array([True, False])).tolist() == [True, True]
-    assert evidence.look("camera", np.array([False, False])).tolist() == [True, True]  # of the LiDAR
-    assert evidence.look("lidar", np.array([True, False])).tolist() == [True, False]
 
 
 def test_words_count_for_a_while_only_and_none_without_a_detection():
@@ -157,7 +153,7 @@ def test_the_steadiest_sensor_speaks_for_a_track():
 def test_a_car_behind_outlives_an_outage_of_the_lidar_while_the_camera_looks_ahead():
     ahead = Sensor(field_of_view=FieldOfView(min_azimuth=-0.5, max_azimuth=0.5))
     classes = {"default": ClassSettings(max_deviation=20.0)}
-    tracker = Tracker(TrackerSettings(classes, max_out_of_view=0.5), {"camera": ahead})
+    tracker = Tracker(TrackerSettings(classes), {"camera": ahead})
     pose = {"world_T_ego": np.eye(4)}
     for k in range(5):
         tracker.step(frame(k / 10, [(-20.0, 0.0)], **pose))

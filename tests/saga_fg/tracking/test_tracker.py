@@ -36,9 +36,7 @@ TENTHS = np.arange(0, 5, 0.1)
 def settings(edges=(), **values):
     """Independent objects of one kind of class settings."""
     existence = {k: values.pop(k) for k in ("report_above", "confirm_above", "delete_below") if k in values}
-    overall = {
-        k: values.pop(k) for k in ("max_delay", "max_coasting", "report_coasting", "max_out_of_view") if k in values
-    }
+    overall = {k: values.pop(k) for k in ("max_delay", "max_coasting", "report_coasting") if k in values}
     association = AssociationSettings(relink_above=values.pop("relink_above", 0.9))
     classes = {"default": ClassSettings(**values)}
     return TrackerSettings(

@@ -25,7 +25,6 @@ from tests.saga_fg.traffic_frames import assert_estimators_agree, assert_same, c
 PATIENT = {
     "classes": {"default": ClassSettings(motion=ConstantVelocity(1.0), max_deviation=np.inf)},
     "max_coasting": 10.0,
-    "max_out_of_view": 10.0,
 }
 
 

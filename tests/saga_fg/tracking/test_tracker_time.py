@@ -342,9 +342,7 @@ def test_how_far_the_clock_may_jump_can_be_set():
 
 
 def test_tracks_that_outlive_a_jump_are_predicted():
-    settings = TrackerSettings(
-        {"default": ClassSettings(max_deviation=np.inf)}, max_coasting=np.inf, max_out_of_view=np.inf
-    )
+    settings = TrackerSettings({"default": ClassSettings(max_deviation=np.inf)}, max_coasting=np.inf)
     tracker = Tracker(settings)
     run(tracker, at(0.0, np.arange(10) / 10))
     assert verdicts(tracker, [frame(20.0, []), frame(20.1, [])]) == ["unconfirmed", "set_ahead"]
