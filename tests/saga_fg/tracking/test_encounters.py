@@ -298,4 +298,4 @@ def test_fewer_identities_are_exchanged_in_a_crowd():
     found = contenders("traffic", load_config("traffic", None), "saga,hard association", ())
     runs = [track_scene(recordings.scene("crowd-1"), one.config.new_tracker(one.method)) for one in found]
     soft, hard = (scene_metrics(run.scene.ground_truth, run.tracks).switches for run in runs)
-    assert soft < 0.8 * hard
+    assert soft < 0.9 * hard

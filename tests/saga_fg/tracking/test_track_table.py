@@ -73,6 +73,7 @@ def logit(p):
 
 def updated(evidence, sensor, now, seen=(), p=(), missed=None, chance=0.8, n=1):
     missed = np.zeros(n, dtype=bool) if missed is None else np.array(missed)
+    evidence.look(sensor, np.ones(n), now)
     evidence.update(sensor, now, np.array(seen, dtype=np.int64), np.array(p, dtype=float), missed, np.full(n, chance))
 
 
@@ -171,7 +172,7 @@ def score(probability, hits, opportunities, coasting=False, existence=0.9, setti
     probability = np.atleast_1d(np.asarray(probability, dtype=float))
     n = len(probability)
     sensors = SensorEvidence.empty(n, ["lidar"])
-    sensors.hits[:], sensors.opportunities[:] = hits, opportunities
+    sensors.hits[:], sensors.opportunities[:], sensors.visibility[:] = hits, opportunities, 1.0
     best = np.maximum(probability, best)
     table = replace(
         TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, sensors=sensors
