@@ -74,7 +74,8 @@ def visible_share(
     """The share (K,), from 0 hidden to 1, of boxes[targets] (K,) visible from `viewpoint` (x, y, z), m.
 
     All boxes stand on the ground z = 0 of the frame they share with the viewpoint. Those of unknown size or heading
-    are visible and hide nothing; solid: mask (N,) of the boxes that can hide others, None: all.
+    are visible and hide nothing. solid: mask (N,) of the boxes that can hide others, of estimated ones, which hide
+    nothing that they overlap; None: all, of true ones.
     """
     if len(targets) == 0:
         return np.empty(0)
@@ -106,7 +107,7 @@ def visible_share(
     r = own[target]
     rise = boxes.size[other, 2] - viewpoint[2]
     rim = np.where(rise[:, None] < 0, leaves, enters)
-    hides = (leaves <= r) & np.isfinite(enters)  # what a box stands inside does not hide it
+    hides = ((enters < r) if solid is None else (leaves <= r)) & np.isfinite(enters)
     with np.errstate(invalid="ignore"):
         shadow = np.where(hides, viewpoint[2] + rise[:, None] * r / np.maximum(rim, 0.1), 0.0)
     highest = np.zeros((len(targets), rays))

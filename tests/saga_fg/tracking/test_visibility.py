@@ -57,7 +57,8 @@ def test_occluders_throw_shadows_by_their_height_and_place():
     assert share(box(0, -8), truck) == 1.0
     assert share(truck, box(0, 8)) == 1.0
     again = box(0, 1.8, length=12.0, width=2.5, height=5.0)
-    assert share(truck, again) == pytest.approx(1.0, abs=0.01)  # a second box of one object does not hide the first
+    twice, rows = Boxes.concatenate([truck, again]), np.array([0])  # a second box of one object does not hide the first
+    assert visible_share(EYE, twice, rows, solid=np.ones(2, dtype=bool)) == pytest.approx([1.0], abs=0.01)
 
 
 @settings(max_examples=50, deadline=None)
