@@ -107,7 +107,7 @@ READINGS = " ".join(f"{1 + k / 10:.2f}" for k in range(11))
 FLASER = "".join(f"FLASER 11 {READINGS} {k}.2 2.0 0 {k} 2.0 0 {k}.5 nohost 0.1\n" for k in (1, 2))
 ROBOT = f"ROBOTLASER1 0 -1.57 3.14 0.314 5 0.01 0 11 {READINGS} 0 1.2 2 0.5 1 2 0.5 0 0 0 0 0 17.5 nohost 0.1\n"
 GPS = "time [s],latitude [deg],longitude [deg],altitude [m]\n0,49.0,8.4,110\n1,49.00001,8.4,110.5\n"
-SLAM = "slam:\n  lidar:\n    loops: {drift: 0.05}\n  joint: {}\nsensors:\n  default: {}\n"
+SLAM = "slam:\n  lidar:\n    loops: {drift: 0.05}\n  landmarks: []\nsensors:\n  default: {}\n"
 INTERACTIONS = (
     "format: saga-fg interactions\nedges:\n- {kind: following, classes: [car], rate: 0.5}\nexplained_noise: 0.5\n"
 )

@@ -206,7 +206,6 @@ SIZES = {
     "scan, archive": 4,
     "scan, records": 200,
     "scans in a folder": 2,
-    "list of files": 3,
     "log of a sensor": 2,
     "laser logs": 3,
     "corrections": 3,
