@@ -22,7 +22,7 @@ have correlated errors.
 Beside it stand the probabilities p_ij of the pairs over all joint events, each of which weighs as the likelihood that
 goes with these costs, and of a detection the share that is its track's, among the tracks that claim it:
 
-    share_ij = p_ij / ( p_ij + sum of q_k p_kj over other tracks k )     q_k: existence of a confirmed track, else 0
+    share_ij = p_ij / ( p_ij + sum of q_k p_kj over other tracks k )     q_k: r_k v_k of a confirmed track, else 0
 
 It is 1 almost everywhere, and is taken as 1 from `association.clear_above` on. Below that the update is weighted by it
 (`saga_fg.tracking.update`), and the two tracks may have exchanged their objects (`saga_fg.tracking.encounters`).
@@ -101,10 +101,11 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> tuple[Mat
         P = relative_covariances(state.joint, table.id, table.label)
     last = state.identities.tracks(measurements.name, measurements.identity)
     predicted = state.boxes(position, np.full_like(position, np.nan))
-    expected = table.existence * sensor.detection_chance(table.label) * table.sensors.seen_by(measurements.name)
+    seen = table.existence * table.sensors.seen_by(measurements.name)
+    expected = seen * sensor.detection_chance(table.label)
     area = association.clutter_area if sensor.clutter_area is None else sensor.clutter_area
     deferred = over_confirmed(state, predicted)
-    real = np.where(table.confirmed, table.existence, 0.0)
+    real = np.where(table.confirmed, seen, 0.0)
     belief = state.class_belief()
     tracks = ExpectedTracks(predicted, P, expected, real, cross, deferred, state.confused, belief, table.id)
     found, rivals = match(tracks, measurements, state.settings, area, last)
@@ -117,7 +118,7 @@ class ExpectedTracks(NamedTuple):
     boxes     predicted, world
     P         (n, 2, 2) covariance of their positions
     chance    (n,) that the track is detected: its existence times its visibility and the detection probability
-    real      (n,) existence of confirmed tracks, 0 of others
+    real      (n,) of confirmed tracks, existence times visibility; 0 of others
     cross     covariances between the positions of tracks, for the method `graph`
     deferred  (n,) tracks that are matched to what the others leave; None: none
     confused  classes that sensors confuse, and the log-beliefs (n, C) in them

@@ -430,7 +430,7 @@ class Journal:
         settings, coasting = self._settings, float(last.timestamp - last.table.last_detected[row])
         if coasting > settings.max_coasting:
             return f"not detected for longer than {settings.max_coasting:g} s"
-        if not last.table.confirmed[row] and last.table.existence[row] < settings.existence.delete_below:
+        if not last.table.confirmed[row] and last.table.seen_existence[row] < settings.existence.delete_below:
             return f"existence below {settings.existence.delete_below:g} before it was confirmed"
         if coasting > 0:
             return "its place is no longer known well enough to report it or to find it again"

@@ -78,7 +78,7 @@ def reported_rows(state: TrackerState) -> IntArray:
     """Rows of the tracks to be reported."""
     table, settings = state.table, state.settings
     coasting = table.coasting(state.time)
-    chosen = table.confirmed | (table.existence >= settings.existence.report_above)
+    chosen = table.confirmed | (table.seen_existence >= settings.existence.report_above)
     if settings.tentative_score_factor == 0:
         chosen &= ~table.tentative
     in_view = table.sensors.seen_by_any() > 0
@@ -97,8 +97,7 @@ def reported_score(table: TrackTable, rows: IntArray, coasting: BoolArray, setti
     hits, opportunities = table.sensors.best_hits()
     hit_ratio = (hits[rows] / (opportunities[rows] + settings.prior_opportunities)) ** settings.hit_ratio_weight
     evidence = np.maximum(table.score[rows], LASTING_SHARE * table.best_score[rows])
-    unseen = (table.existence * table.sensors.seen_by_any())[rows]
-    return np.asarray(evidence * hit_ratio * np.where(coasting, unseen, 1.0))
+    return np.asarray(evidence * hit_ratio * np.where(coasting, table.seen_existence[rows], 1.0))
 
 
 log = logging.getLogger(__name__)
@@ -111,7 +110,7 @@ def delete_tracks(state: TrackerState) -> None:
     detected[table.rows(state.assignment.id)] = True  # perhaps by a late frame
     deleted = ~(detected | known_places(state) | relinkable(state))
     deleted |= table.coasting(state.time) > settings.max_coasting
-    deleted |= ~table.confirmed & (table.existence < settings.existence.delete_below)
+    deleted |= ~table.confirmed & (table.seen_existence < settings.existence.delete_below)
     deleted |= untrackable(state)
     state.remove(deleted)
 

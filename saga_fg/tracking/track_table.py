@@ -248,6 +248,11 @@ class TrackTable(Columns):
         """(n,) tracks that may be no object of their own: of too few detections, or unresolved."""
         return np.asarray((self.unresolved > 0) | ~self.sensors.confirmed(self.required_hits))
 
+    @property
+    def seen_existence(self) -> FloatArray:
+        """(n,) probability that the track is a real object that some sensor has in view."""
+        return np.asarray(self.existence * self.sensors.seen_by_any())
+
     def coasting(self, now: float) -> FloatArray:
         """(n,) time since the latest detection, s, rounded to the microsecond."""
         return np.maximum(_rounded(now - self.last_detected), 0.0)

@@ -16,7 +16,8 @@ detection probability. It decides
     existence     r falls by misses only as far as the object should have been seen
     hit ratio     of a hidden object (v below 1/2), a miss is no opportunity
     score         of a box without a detection: times the v of the sensor that sees it best
-    report        no box without a detection outside every field of view
+    report        no box without a detection outside every field of view; an unconfirmed track is reported and deleted
+                  by r v, so that false ones do not outlive their misses behind others
 
 Source: Musicki and Evans, Joint Integrated Probabilistic Data Association, IEEE Transactions on Aerospace and
 Electronic Systems 40(3), 2004: existence of targets that are observable or not, as a Markov chain.
