@@ -18,7 +18,7 @@ from saga_fg.smoothing.states import Labels
 from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like
 from saga_fg.tracking import Tracker, TrackerSettings
-from saga_fg.tracking.table_tracking import tell
+from saga_fg.tracking.table_tracking import check_scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def smooth(
     given, known = checked_corrections(corrections), sensors or {}
     raw = raw_table(detections, how)
     scenes = scenes_of(raw)
-    tell(scenes, how, settings, known)
+    check_scenes(raw, scenes, settings, known)
     labels, outcomes = {}, []
     for scene in scenes:
         mine = tuple(one for one in given if one.scene in ("", scene.name))

@@ -73,6 +73,9 @@ def in_our_unit(name: str, numbers: FloatArray, unit: str, power: int = 1) -> Fl
     return numbers * FACTORS[kind_of[name]][unit] ** power + OFFSETS.get(unit, 0.0)
 
 
+KINDS = ("time", "length", "speed", "angle", "score")
+
+
 def unit_of_speed(length: str) -> str:
     """Unit of speeds where only that of lengths is given: the same per second."""
     return _PER_SECOND.get(length, "m/s") if length != "km" else "m/s"
@@ -118,6 +121,10 @@ def frame_rate(unit: str) -> float | None:
     """Frames per second of a unit such as 10Hz, None for another unit."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*[hH][zZ]", unit)
     return float(found[1]) if found and float(found[1]) > 0 else None
+
+
+def _kind(name: str) -> str:
+    return name if name in KINDS else kind_of.get(name, name)
 
 
 def checked_unit(kind: str, unit: str) -> str:
@@ -186,6 +193,7 @@ _ALIASES = {
     "id": "track_id object_id obj_id tracking_id track_uuid instance_id instance_token uuid vehicle_id agent_id "
     "target_id track_token instance",
     "visible": "is_visible visibility",
+    "coordinates": "coordinate_system",
 }
 ALIASES = MappingProxyType({ours: tuple(aliases.split()) for ours, aliases in _ALIASES.items()})
 _SHORTEST_GUESS = 4  # letters of a name that may be a misspelt one
@@ -300,9 +308,6 @@ def _plain(name: str) -> str:
     return re.sub(r"[^0-9a-z]+", "_", name.strip().lower()).strip("_")
 
 
-KINDS = ("time", "length", "speed", "angle", "score")
-
-
 @dataclass(frozen=True)
 class TableImport(Settings):
     """Options for reading a table. Those left out follow from the names of the columns; units are s, m, m/s and rad.
@@ -319,7 +324,7 @@ class TableImport(Settings):
     units: Mapping[str, str] = settings_group(
         dict,
         "units of time (s, ms, us, ns, iso8601, 10Hz), length (m, cm, mm, km, ft), speed, score, "
-        "angle (rad, deg, clockwise, clockwise_deg, compass, compass_rad)",
+        "angle (rad, deg, clockwise, clockwise_deg, compass, compass_rad), or of a column such as yaw",
     )
     coordinates: Literal["", "world", "ego", "sensor", "camera"] = setting(
         "",
@@ -342,17 +347,17 @@ class TableImport(Settings):
                 )
                 raise InputError(f"columns.{name[:40]}: unknown column, {hint}")
             columns[ours] = column
-        for kind in self.units:
-            if kind not in KINDS:
-                raise InputError(f"units.{kind[:40]}: expected one of {', '.join(KINDS)}")
-        units = {kind: checked_unit(kind, unit) for kind, unit in self.units.items()}
+        for name in self.units:
+            if name not in KINDS and name not in kind_of:
+                raise InputError(f"units.{name[:40]}: expected one of {', '.join(KINDS)}, or a column such as yaw")
+        units = {name: checked_unit(_kind(name), unit) for name, unit in self.units.items()}
         vars(self).update(columns=columns, units=units)
 
     def unit(self, name: str, by_name: str | None) -> str | None:
         """The unit of a column of ours, where its name in the file says `by_name`; None: ours."""
         kind = kind_of.get(name, "")
-        if kind in self.units:
-            return self.units[kind]
+        if name in self.units or kind in self.units:
+            return self.units.get(name) or self.units[kind]
         if by_name is not None:
             return by_name
         return unit_of_speed(self.units["length"]) if kind == "speed" and "length" in self.units else None
@@ -381,19 +386,27 @@ class TableImport(Settings):
 
     def _in_degrees(self, units: Mapping[str, str], names: Mapping[str, str]) -> Mapping[str, str]:
         """Units that mend, where angles are read as degrees already."""
-        by_name = (meaning(names["yaw"]) or ("", None))[1] if "yaw" in names else None
-        if "angle" not in units or self.unit("yaw", by_name) != "deg":
-            return units
-        return {**units, "angle": _DEGREES.get(units["angle"], units["angle"])}
+
+        def mended(name: str, unit: str) -> str:
+            column = "yaw" if name == "angle" else name
+            by_name = (meaning(names[column]) or ("", None))[1] if column in names else None
+            return _DEGREES.get(unit, unit) if self.unit(column, by_name) == "deg" else unit
+
+        return {name: mended(name, unit) if _kind(name) == "angle" else unit for name, unit in units.items()}
 
     def changes(self, mend: Mend, names: Mapping[str, str]) -> dict[str, Any]:
         """The entries that mend a suspicion, in place of those of the same name; `names` as of `mended`."""
         mended = self.mended(mend, names)
         return {field.name: getattr(mended, field.name) for field in fields(Mend) if getattr(mend, field.name)}
 
+    def _mends(self, mend: Mend) -> bool:
+        """False where a suspicion stays although these options say all that mends it."""
+        return any(getattr(self.mended(mend, {}), field.name) != getattr(self, field.name) for field in fields(Mend))
+
     def judged(self, findings: Iterable[Finding], names: Mapping[str, str]) -> tuple[Finding, ...]:
         """The findings, each with the options that mend it, and whether the table contradicts how it is read."""
-        judged = [replace(one, stops=not self.as_given and one.contradicts) for one in findings]
+        judged = [one if one.mend is None or self._mends(one.mend) else replace(one, mend=None) for one in findings]
+        judged = [replace(one, stops=not self.as_given and one.contradicts) for one in judged]
         together = reduce(or_, (one.mend for one in judged if one.stops and one.mend is not None), Mend())
         mends = [together if one.stops else one.mend for one in judged]
         options = ["" if m is None else TableImport(**self.changes(m, names)).options().strip() for m in mends]

@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics.geometry import wrap_angle, yaw_of
 from saga_fg.tables.plausibility import (
     FEWEST,
     far_too_fast,
@@ -38,30 +38,32 @@ SPAN = 0.5  # s of motion, so that the noise of places hardly matters
 _MOVES, _WALKS = 2.0, 0.8  # m/s, from which the direction of motion tells the heading, of vehicles and of people
 _ASTRAY, _OFF = 0.5, 0.2  # rad between them: of one object, and of half of them
 _AWAY = 100.0  # m from the origin, from which what surrounds the vehicle does not surround the origin
-_HIT = 1.0  # m between centres that two vehicles cannot have
-_DEEP, _FLAT, _NEAR = 8.0, 3.0, 15.0  # m: spread of depths, spread of heights, and the nearest depth before a camera
+_DEEP, _FLAT, _NEAR = 8.0, 3.0, 40.0  # m: spread of depths, spread of heights, and the nearest depth before a camera
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
     """N detections of F frames of one recording.
 
-    time (F,) s, sensor (F,), world_T_ego (F, 4, 4) NaN where unknown, in_world (F,): whether coordinates are "world";
-    frame (N,), boxes, score (N,), yaw (N,): headings as they are read, before they are wrapped, rad
+    time (F,) s, sensor (F,), coordinates (F,), world_T_ego (F, 4, 4) NaN where unknown; frame (N,), boxes, score (N,),
+    yaw (N,), ego_yaw (F,): headings of objects and vehicle as they are read, before they are wrapped, rad
     """
 
     time: FloatArray
     sensor: StrArray
     world_T_ego: FloatArray
-    in_world: BoolArray
+    coordinates: StrArray
     frame: IntArray
     boxes: Boxes
     score: FloatArray
     yaw: FloatArray
+    ego_yaw: FloatArray
 
     @classmethod
-    def from_frames(cls, frames: Sequence[Frame], yaw: FloatArray | None = None) -> Self:
-        """The first frames of a recording; yaw: of all their detections, before they were wrapped, where known."""
+    def from_frames(
+        cls, frames: Sequence[Frame], yaw: FloatArray | None = None, ego_yaw: FloatArray | None = None
+    ) -> Self:
+        """The first frames; yaw, ego_yaw: of all detections and frames, before they were wrapped, where known."""
         first = frames[:MAX_FRAMES]
         unknown = np.full((4, 4), np.nan)
         poses = [unknown if frame.world_T_ego is None else frame.world_T_ego for frame in first]
@@ -70,11 +72,12 @@ class Sample:
             time=np.array([frame.timestamp for frame in first]),
             sensor=np.array([frame.sensor for frame in first], dtype=np.str_),
             world_T_ego=np.array(poses).reshape(-1, 4, 4),
-            in_world=np.array([frame.coordinates == "world" for frame in first], dtype=np.bool_),
+            coordinates=np.array([frame.coordinates for frame in first], dtype=np.str_),
             frame=np.repeat(np.arange(len(first)), [len(frame) for frame in first]),
             boxes=boxes,
             score=np.concatenate([np.empty(0), *(frame.detections.score for frame in first)]),
             yaw=boxes.yaw if yaw is None else yaw[: len(boxes)],
+            ego_yaw=yaw_of(np.array(poses).reshape(-1, 4, 4)) if ego_yaw is None else ego_yaw[:MAX_FRAMES],
         )
 
     @classmethod
@@ -87,11 +90,12 @@ class Sample:
             time=moments,
             sensor=np.full(len(moments), ""),
             world_T_ego=np.full((len(moments), 4, 4), np.nan),
-            in_world=np.bincount(frame, ~in_world)[: len(moments)] == 0,
+            coordinates=np.where(np.bincount(frame, ~in_world)[: len(moments)] == 0, "world", "sensor"),
             frame=frame[rows],
             boxes=boxes.select(rows),
             score=score[rows],
             yaw=yaw[rows],
+            ego_yaw=np.full(len(moments), np.nan),
         )
 
     @cached_property
@@ -124,11 +128,24 @@ class Sample:
         return velocities_between_frames(self.time[self.frame], self.boxes.label, position)
 
     @cached_property
-    def world_motion(self) -> FloatArray:
-        """(N, 2) velocities between frames, as far as positions are in the world."""
-        motion = self.motion(self.boxes.position[:, :2])
-        motion[~self.in_world[self.frame]] = np.nan
+    def own_motion(self) -> FloatArray:
+        """(N, 2) velocities over ground between frames, along the axes in which boxes are given, NaN where unknown."""
+        given = self.coordinates[self.frame]
+        of_ego = (given == "ego")[:, None]
+        motion = self.motion(np.where(of_ego, self.placed(), self.boxes.position[:, :2]))
+        motion = np.where(of_ego, _turned(motion, -self.ego[1]), motion)
+        motion[given == "sensor"] = np.nan
         return motion
+
+    @cached_property
+    def ego_motion(self) -> FloatArray:
+        """(F, 2) velocity of the vehicle, over half a second and more, NaN where unknown."""
+        later = np.searchsorted(self.time, self.time + SPAN - MIN_STEP)
+        found = np.full((len(self.time), 2), np.nan)
+        rows = np.flatnonzero(later < len(self.time))
+        place, took = self.world_T_ego[:, :2, 3], self.time[later[rows]] - self.time[rows]
+        found[rows] = (place[later[rows]] - place[rows]) / took[:, None]
+        return found
 
 
 def velocities_between_frames(time: FloatArray, label: StrArray, position: FloatArray) -> FloatArray:
@@ -184,37 +201,68 @@ _CONVENTIONS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
 """By unit of angles: what they look like, and the heading that is meant by what was read as rad."""
 
 
-def headings_against_motion(yaw: FloatArray, velocity: FloatArray, walks: BoolArray) -> Finding | None:
-    """Headings (n,), read as rad, of objects that move otherwise, velocities (n, 2), as in another convention.
+def fitting_convention(yaw: FloatArray, velocity: FloatArray, walks: BoolArray) -> tuple[str, str] | None:
+    """The unit of headings (n,), read as rad, of objects that move with `velocity` (n, 2), and how far they are off.
 
-    walks: whether each is a pedestrian
+    The unit is "rad" where they fit as they are read, and "" where no convention fits; None where too few move.
     """
     moves = (np.hypot(*velocity.T) > np.where(walks, _WALKS, _MOVES)) & np.isfinite(yaw)
     if moves.sum() < 2 * FEWEST:
         return None
     direction, given = np.arctan2(velocity[moves, 1], velocity[moves, 0]), yaw[moves]
-    apart = {unit: np.abs(wrap_angle(meant(given) - direction)) for unit, (_, meant) in _CONVENTIONS.items()}
-    as_read = np.abs(wrap_angle(given - direction))
+    meant = {"rad": given, **{unit: convert(given) for unit, (_, convert) in _CONVENTIONS.items()}}
+    apart = {unit: np.abs(wrap_angle(each - direction)) for unit, each in meant.items()}
     fits = {unit: (share(each > _ASTRAY), float(np.median(each))) for unit, each in apart.items()}
     least = [min(column) for column in zip(*fits.values(), strict=True)]
     best = next(  # the plainest of those that fit alike, as several do on a road along an axis
-        (unit for unit, fit in fits.items() if fit[0] <= least[0] + 0.02 and fit[1] <= least[1] + 0.05), "deg"
+        (unit for unit, fit in fits.items() if fit[0] <= least[0] + 0.02 and fit[1] <= least[1] + 0.05), "rad"
     )
-    now, usual = share(as_read > _ASTRAY), float(np.median(as_read))
+    now, usual = fits["rad"]
+    said = f"{now:.0%} of those of moving objects differ from their motion, half of them by {usual:.2g} rad and more"
     astray, off = fits[best]
-    if not (now >= 0.15 and astray <= now / 3) and not (usual > _OFF and off < usual / 3):
-        return None
-    what = f"headings look {_CONVENTIONS[best][0]}: {now:.0%} of those of moving objects differ from their motion"
-    expected = f"expected counter-clockwise from x, rad; read so, {astray:.0%} differ"
-    return Finding("headings", what, expected, Mend(units={"angle": best}))
+    better = (now >= 0.15 and astray <= now / 3) or (usual > _OFF and off < usual / 3)
+    if better and astray < 0.2 and off < _OFF:
+        return best, said
+    constant = np.ptp(given) < 1e-6
+    return ("" if now > 0.5 and (constant or not walks[moves].any()) else "rad"), said
+
+
+def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | None:
+    """Headings of objects that move otherwise, `motion` (N, 2), as in another convention or none."""
+    of_objects = fitting_convention(sample.yaw, motion, sample.walks)
+    none = np.zeros(len(sample.time), dtype=np.bool_)
+    of_ego = fitting_convention(sample.ego_yaw, sample.ego_motion, none)
+    units = {name: found[0] for name, found in (("yaw", of_objects), ("ego_yaw", of_ego)) if found is not None}
+    wrong = {name: unit for name, unit in units.items() if unit not in ("rad", "")}
+    if "ego_yaw" in wrong and (sample.coordinates == "ego").any():
+        wrong.pop("yaw", None)  # how objects move is not known before
+    alike = len(wrong) == 2 and len(set(wrong.values())) == 1
+    if alike or (wrong and np.isnan(sample.ego_yaw).all()):
+        wrong = {"angle": wrong["yaw"]}
+    said = next(iter(found[1] for found in (of_objects, of_ego) if found is not None and found[0] != "rad"), "")
+    if wrong:
+        looks = " and ".join(dict.fromkeys(_CONVENTIONS[unit][0] for unit in wrong.values()))
+        whose = "headings of the vehicle look" if wrong.keys() == {"ego_yaw"} else "headings look"
+        return Finding(
+            "headings", f"{whose} {looks}: {said}", "expected counter-clockwise from x, rad", Mend(units=wrong)
+        )
+    if units.get("yaw") == "":
+        what, mend = f"headings fit no convention: {said}", Mend(columns={"yaw": ""})
+        return Finding("headings", what, "expected the direction of travel, or no headings", mend)
+    return None
 
 
 _SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237}
 
 
 def speeds_against_motion(velocity: FloatArray, motion: FloatArray) -> Finding | None:
-    """Measured velocities (n, 2) which are those between frames (n, 2) in another unit than m/s."""
-    moves = (np.hypot(*velocity.T) > 2 * _WALKS) & np.isfinite(motion).all(axis=1)
+    """Measured velocities (n, 2) which are those between frames (n, 2) in another unit than m/s, or are none."""
+    known = np.isfinite(motion).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    moves = known & (np.hypot(*motion.T) > _MOVES)
+    if moves.sum() >= 2 * FEWEST and np.median(np.hypot(*velocity[moves].T)) < 0.1 * _MOVES:
+        what, mend = "measured velocities are zero of objects that move", Mend(columns={"vx": "", "vy": ""})
+        return Finding("speeds", what, "expected those over ground, or none", mend)
+    moves = known & (np.hypot(*velocity.T) > 2 * _WALKS)
     if moves.sum() < 2 * FEWEST:
         return None
     measured, moved = velocity[moves], motion[moves]
@@ -242,52 +290,49 @@ def camera_axes(position: FloatArray) -> Finding | None:
     return Finding("frame", what, "expected x and y in the plane, and z up", Mend(coordinates="camera"))
 
 
-def ego_taken_for_world(sample: Sample) -> Finding | None:
-    """Positions that are said to be in the world, and move with the vehicle.
+def frame_taken_for_another(sample: Sample) -> Finding | None:
+    """Positions that are said to be in the world, and are in the vehicle's frame, or the other way round.
 
-    Either they lie about the origin while the vehicle is far from it, or it drives through them. Or, once they are
-    placed by the poses of the vehicle, headings or measured velocities fit how they move, or they stay where they were.
+    Either they lie about the origin while the vehicle is far from it. Or headings or measured velocities fit how
+    objects move in the other frame alone, or objects stay there where they were.
     """
-    rows = np.flatnonzero(sample.in_world[sample.frame] & np.isfinite(sample.ego[1]))
-    if len(rows) < FEWEST:
-        return None
+    known = np.isfinite(sample.ego[1])
     given, placed, ego = sample.boxes.position[:, :2], sample.placed(), sample.ego[0]
-    away = rows[np.hypot(*ego[rows].T) > _AWAY]
-    if len(away) >= FEWEST:
-        about, from_ego = (float(np.median(np.hypot(*each[away].T))) for each in (given, given - ego))
-        drives = np.ptp(ego[rows], axis=0).max() > _TRAVELLED
-        if about < 0.5 * from_ego if drives else about < 1.5 * _AWAY and from_ego > 3 * _AWAY:
-            return _EGO
-    hit = [
-        share(np.bincount(sample.frame[rows], _within(p[rows], ego[rows]) & ~sample.walks[rows]) > 0)
-        for p in (given, placed)
-    ]
-    if 5 * hit[1] < hit[0] and 0.05 < hit[0] < 0.5:  # more often, it is the vehicle that is detected
-        return _EGO
-    as_given, as_placed = sample.motion(given), _turned(sample.motion(placed), -sample.ego[1])
-    for reading, least in ((_velocity_apart, 0.3), (_heading_apart, 0.12)):
-        apart = [reading(sample, motion, rows) for motion in (as_given, as_placed)]
-        if min(map(len, apart)) >= 2 * FEWEST:
-            one, other = (float(np.median(each)) for each in apart)
-            if one > least and other < 0.4 * one:
+    world, own = (np.flatnonzero(known & (sample.coordinates[sample.frame] == name)) for name in ("world", "ego"))
+    if len(world) >= FEWEST:
+        away = world[np.hypot(*ego[world].T) > _AWAY]
+        if len(away) >= FEWEST:
+            about, from_ego = (float(np.median(np.hypot(*each[away].T))) for each in (given, given - ego))
+            drives = np.ptp(ego[world], axis=0).max() > _TRAVELLED
+            if about < 0.5 * from_ego if drives else about < 1.5 * _AWAY and from_ego > 3 * _AWAY:
                 return _EGO
-            if other > least and one < 0.4 * other:
-                return None
-    return _EGO if _stay_nearer(sample, rows, given, placed) else None
+        return _EGO if _fits_better(sample, world, given, placed) else None
+    return _WORLD if len(own) >= FEWEST and _fits_better(sample, own, placed, given) else None
 
 
-_EGO = Finding(
-    "frame",
-    "positions look like coordinates of the vehicle, but are taken for the world: they move with it",
-    "expected world coordinates, or coordinates: ego",
-    Mend(coordinates="ego"),
-)
+def _fits_better(sample: Sample, rows: IntArray, read: FloatArray, other: FloatArray) -> bool:
+    """True if objects at `other` positions (N, 2) in the world, and not as `read`, move as one would expect."""
+    turn = -sample.ego[1] if (sample.coordinates[sample.frame[rows[0]]] == "ego") else None
+    motions = [sample.motion(read), sample.motion(other)]
+    own = int(turn is None)  # the one of them that is of the vehicle's frame
+    motions[own] = _turned(motions[own], -sample.ego[1])
+    for apart_of, least in ((_velocity_apart, 0.3), (_heading_apart, 0.12)):
+        apart = [apart_of(sample, motion, rows) for motion in motions]
+        if min(map(len, apart)) >= 2 * FEWEST:
+            one, another = (float(np.median(each)) for each in apart)
+            if one > least and another < 0.4 * one:
+                return True
+        if len(apart[0]) >= 2 * FEWEST and np.median(apart[0]) < least:
+            return False
+    return own == 1 and _stay_nearer(sample, rows, read, other)  # traffic that goes along stays in the vehicle's frame
+
+
+_MOVE_WITH = "positions look like coordinates of the vehicle, but are taken for the world: they move with it"
+_EGO = Finding("frame", _MOVE_WITH, "expected world coordinates, or coordinates: ego", Mend(coordinates="ego"))
+_STAY = "positions look like coordinates of the world, but are taken for the vehicle's: they do not move with it"
+_WORLD = Finding("frame", _STAY, "expected the vehicle's frame, or coordinates: world", Mend(coordinates="world"))
 _TRAVELLED = 3.0  # m of the vehicle, from which it shows what moves with it
 _PAIRS = 20  # pairs of frames that are compared
-
-
-def _within(position: FloatArray, ego: FloatArray) -> BoolArray:
-    return np.asarray(np.hypot(*(position - ego).T) < _HIT)
 
 
 def _velocity_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatArray:
@@ -342,17 +387,21 @@ def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: F
         unlikely_sizes(label, boxes.size),
         within_a_metre(sample.frame, boxes.position),
     )
-    found = [scores_beyond_one(sample.score[shares]), length_below_width(label, boxes.size), *scale]
-    if not any(scale):
-        found.append(camera_axes(boxes.position[~np.isnan(boxes.position).any(axis=1)]) or ego_taken_for_world(sample))
-    degrees = headings_in_degrees(sample.yaw)
-    if not any(scale) and found[-1] is None:
-        measured = np.isfinite(boxes.velocity).any(axis=1)
-        known = measured & ~sample.stands
-        motion = np.where(known[:, None], boxes.velocity, np.where(sample.stands[:, None], np.nan, sample.world_motion))
-        headings = headings_against_motion(sample.yaw, motion, sample.walks)
-        speeds = speeds_against_motion(boxes.velocity, sample.world_motion) or far_too_fast(label, boxes.velocity)
-        found += [headings or degrees, speeds]
+    with_yaw = np.isfinite(sample.yaw)
+    sides = length_below_width(label[with_yaw], boxes.size[with_yaw])
+    found = [scores_beyond_one(sample.score[shares]), sides, *scale]
+    if any(scale):
+        return [finding for finding in (*found, headings_in_degrees(sample.yaw)) if finding is not None]
+    frame = camera_axes(boxes.position) or frame_taken_for_another(sample)
+    if frame is None:
+        known = np.isfinite(boxes.velocity).any(axis=1) & (np.hypot(*boxes.velocity.T) > _WALKS)
+        motion = np.where(known[:, None], boxes.velocity, sample.own_motion)
+        motion[sample.stands] = np.nan
+        headings = headings_against_motion(sample, motion)
+        if headings is None and fitting_convention(sample.yaw, motion, sample.walks) is None:
+            headings = headings_in_degrees(sample.yaw)
+        speeds = speeds_against_motion(boxes.velocity, sample.own_motion) or far_too_fast(label, boxes.velocity)
+        found += [headings, speeds]
     else:
-        found += [degrees, far_too_fast(label, boxes.velocity)]
+        found += [frame, headings_in_degrees(sample.yaw), far_too_fast(label, boxes.velocity)]
     return [finding for finding in found if finding is not None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from saga_fg.tables.column_names import Clock, TableImport, understood
 from saga_fg.tables.columns import COLUMNS, NAMED, REQUIRED, RawTable, Values, as_names, clock_of
 from saga_fg.tables.detections import DetectionTable, sorted_by_time
 from saga_fg.types.dataset import Scene
+from saga_fg.types.finding import Finding, refuse_contradictions
 from saga_fg.types.frame import Frame
 
 Table = Any
@@ -38,11 +40,15 @@ def raw_table(
 
     try:
         frame = nw.from_native(table, eager_only=True)
+        names = [name for name in frame.columns if isinstance(name, str)]
+        frame = frame.select(names)
     except TypeError as error:
         expected = "expected a table of pandas, Polars or Arrow"
         raise InputError(f"{expected}, got {type(table).__name__}") from error
+    except nw.exceptions.NarwhalsError as error:
+        raise InputError(f"{NAME}: expected every column once: {str(error).splitlines()[0]}") from error
     how = how or TableImport()
-    found = understood(frame.columns, columns, required, how.columns)
+    found = understood(names, columns, required, how.columns)
     if found.faults:
         raise InputError(f"{NAME}: {'; '.join(found.faults)}")
     index, clock = nw.maybe_get_index(frame), None
@@ -80,9 +86,34 @@ def scenes_of(raw: RawTable) -> list[Scene]:
 def frames_of(table: Table, how: TableImport | None = None) -> list[Frame]:
     """The frames of a table of detections of one recording, in order of time; `saga_fg.track` has the columns.
 
-    Rows with the same time and sensor are a frame. Raises `InputError` naming row and column.
+    Rows with the same time and sensor are a frame. Warns and raises as `saga_fg.track`, and for several recordings.
     """
-    return [frame for scene in scenes_of(raw_table(table, how)) for frame in scene.frames]
+    raw = raw_table(table, how)
+    scenes = scenes_of(raw)
+    if len(scenes) > 1:
+        raise InputError(f"{NAME}: scene: expected one recording, got {', '.join(each.name for each in scenes[:6])}")
+    tell([finding for scene in scenes for finding in scene.findings or ()], raw, 3)
+    return [frame for scene in scenes for frame in scene.frames]
+
+
+def tell(findings: Sequence[Finding], raw: RawTable, depth: int) -> None:
+    """Warn of what is doubtful in a table, `depth` callers up, each kind once.
+
+    Raises `InputError` for all that contradicts how it is read, with the arguments that mend it.
+    """
+    how, names = raw.how, raw.found.names
+    known = {finding.kind: finding for finding in reversed(findings)}
+    found = []
+    for each in known.values():
+        changes = {} if each.mend is None else how.changes(each.mend, names)
+        option = ", ".join(f"{name}={value!r}" for name, value in changes.items())
+        found.append(replace(each, what=each.what.removeprefix(f"{NAME}: "), option=option))
+    refuse_contradictions(found, "as_given=True")
+    for each in found:
+        warnings.warn(str(each), stacklevel=depth)
+    if raw.clock.guessed:
+        unit = raw.clock.unit
+        warnings.warn(f"times are read as {unit}, by their size; units={{'time': {unit!r}}} says so", stacklevel=depth)
 
 
 def table_like(table: Table, parts: Sequence[Mapping[str, Any]]) -> Table:
@@ -91,8 +122,5 @@ def table_like(table: Table, parts: Sequence[Mapping[str, Any]]) -> Table:
 
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     backend = nw.from_native(table, eager_only=True).implementation
-    return nw.from_dict({name: _listed(each) for name, each in columns.items()}, backend=backend).to_native()
-
-
-def _listed(column: Any) -> Any:
-    return column.tolist() if column.dtype.kind == "U" else column
+    listed = {name: each.tolist() if each.dtype.kind == "U" else each for name, each in columns.items()}
+    return nw.from_dict(listed, backend=backend).to_native()

@@ -14,7 +14,7 @@ from saga_fg.tables.columns import BOX, COVARIANCE, GPS, ODOMETRY, POSE, EgoColu
 from saga_fg.tables.conventions import Sample, findings_of
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
-from saga_fg.types.finding import Finding
+from saga_fg.types.finding import Finding, Mend
 from saga_fg.types.frame import Coordinates, Detections, Frame
 
 _COORDINATES = ("world", "ego", "sensor", "camera")
@@ -66,14 +66,18 @@ class DetectionTable:
         with error_context(f"{path}: scene {name}"):
             poses = self._poses(rows, moment, len(times))
             world_T_ego = np.tile(np.eye(4), (len(times), 1, 1)) if poses is None else poses
-            frames, kept = self._frames(rows, moment, poses)
-            findings = self._findings(frames, kept) if self._judged and name in self._scenes[:JUDGED] else ()
+            frames, kept, firsts = self._frames(rows, moment, poses)
+            findings = self._findings(frames, kept, firsts) if self._judged and name in self._scenes[:JUDGED] else ()
             return Scene(name, times, world_T_ego, ("",) * len(times), frames, findings=findings)
 
-    def _findings(self, frames: list[Frame], rows: IntArray) -> tuple[Finding, ...]:
-        """What is doubtful about the table and a scene of it, whose frames hold these rows."""
+    def _findings(self, frames: list[Frame], rows: IntArray, firsts: IntArray) -> tuple[Finding, ...]:
+        """What is doubtful about the table and a scene, whose frames hold these rows, and begin at `firsts`."""
         raw = self._rows.raw
-        found = [*raw.findings(), *findings_of(Sample.from_frames(frames, raw.numbers("yaw")[rows]))]
+        ego_yaw = raw.numbers("ego_yaw")[firsts]
+        found = [*raw.findings(), *findings_of(Sample.from_frames(frames, raw.numbers("yaw")[rows], ego_yaw))]
+        if "coordinates" in raw.columns:  # which no option replaces
+            left_out = Mend(columns={"coordinates": ""})
+            found = [replace(f, mend=f.mend | left_out) if f.mend and f.mend.coordinates else f for f in found]
         judged = raw.how.judged(found, raw.found.names)
         return tuple(replace(finding, what=f"{raw.path}: {finding.what}") for finding in judged)
 
@@ -94,8 +98,10 @@ class DetectionTable:
             raise self._rows.raw.fault(row, "ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time, got another")
         return np.array([yaw_transform(*pose[k]) for k in first.tolist()]).reshape(count, 4, 4)
 
-    def _frames(self, rows: IntArray, moment: IntArray, poses: FloatArray | None) -> tuple[list[Frame], IntArray]:
-        """The frames of a scene, and the rows (N,) of their detections in this order."""
+    def _frames(
+        self, rows: IntArray, moment: IntArray, poses: FloatArray | None
+    ) -> tuple[list[Frame], IntArray, IntArray]:
+        """The frames of a scene, the rows (N,) of their detections in this order, and the first row (F,) of each."""
         table, kept = self._rows, []
         sensors, sensor = np.unique(table.sensor[rows], return_inverse=True)
         key = moment * len(sensors) + sensor
@@ -120,7 +126,7 @@ class DetectionTable:
                     ego=None if table.ego is None else table.ego.measured(members),
                 )
             )
-        return frames, np.concatenate(kept)
+        return frames, np.concatenate(kept), rows[[group[0] for group in np.split(order, starts[1:])]]
 
 
 def _checked(raw: RawTable) -> _Rows:

@@ -100,7 +100,7 @@ def scores_beyond_one(score: FloatArray) -> Finding | None:
 def length_below_width(label: StrArray, size: FloatArray) -> Finding | None:
     """Boxes of vehicles, sizes (n, 3), that are mostly wider than long; barriers are, and pedestrians."""
     usual = {name: usual_class(name) for name in np.unique(label).tolist()}
-    least = {None: 2.5, "barrier": np.inf, "pedestrian": np.inf, "bicycle": 1.2, "motorcycle": 1.2}
+    least = {None: 3.5, "barrier": np.inf, "pedestrian": np.inf, "bicycle": 1.2, "motorcycle": 1.2}
     longest = np.array([least.get(usual[name], 2.5) for name in label.tolist()])
     large = np.isfinite(size[:, :2]).all(axis=1) & (size[:, :2].max(axis=1, initial=-np.inf) >= longest)
     wide = size[large, 0] < 0.8 * size[large, 1]
@@ -111,21 +111,25 @@ def length_below_width(label: StrArray, size: FloatArray) -> Finding | None:
     return Finding("sides", what, "expected the length along the heading", exchanged)
 
 
+_USUAL_LENGTH = {"pedestrian": 0.7, "bicycle": 1.8, "motorcycle": 2.2, "car": 4.5, "bus": 11.0, "truck": 8.0}  # m
+
+
 def unlikely_sizes(label: StrArray, size: FloatArray) -> Finding | None:
-    """Lengths (of sizes (n, 3)) that no object has: other units than metres."""
+    """Lengths (of sizes (n, 3)) that no object of its class has: other units than metres."""
+    names, of_row = np.unique(label, return_inverse=True)
+    usual = np.array([_USUAL_LENGTH.get(usual_class(name) or "", np.nan) for name in names.tolist()])
     length, width = size[:, 0], size[:, 1]
-    known = np.isfinite(length)
-    cars = known & np.isin(label, [name for name in np.unique(label).tolist() if usual_class(name) == "car"])
-    if known.sum() < FEWEST:
+    ratio = (length / usual[of_row])[np.isfinite(length) & np.isfinite(usual[of_row])]
+    if len(ratio) < FEWEST:
         return None
-    middle = float(np.median(length[known]))
-    unit = "mm" if middle > 1000 else "cm" if middle > 80 else "km" if middle < 0.02 else ""
-    if not unit and cars.sum() >= FEWEST and np.isfinite(width[cars]).any():
-        feet = 11 < np.median(length[cars]) < 25 and 4 < np.nanmedian(width[cars]) < 10
-        middle, unit = (float(np.median(length[cars])), "ft") if feet else (middle, "")
+    middle = float(np.median(ratio))
+    unit = "mm" if middle > 250 else "cm" if middle > 25 else "km" if middle < 0.01 else ""
+    cars = np.isfinite(size[:, :2]).all(axis=1) & (usual[of_row] == _USUAL_LENGTH["car"])
+    if not unit and cars.sum() >= FEWEST:
+        unit = "ft" if 11 < np.median(length[cars]) < 25 and 4 < np.median(width[cars]) < 10 else ""
     if not unit:
         return None
-    what = f"objects have a usual length of {middle:.3g}: this looks like {unit}"
+    what = f"objects are usually {middle:.3g} times as long as others of their class: this looks like {unit}"
     return Finding("lengths", what, "expected metres", Mend(units={"length": unit}))
 
 

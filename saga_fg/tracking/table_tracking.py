@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -12,12 +10,12 @@ import numpy as np
 from saga_fg.model.edge_rules import acting_classes
 from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like
+from saga_fg.tables.columns import RawTable
+from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like, tell
 from saga_fg.tables.plausibility import idle_rules
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker
 from saga_fg.types.dataset import Scene
-from saga_fg.types.finding import Mend, refuse_contradictions
 from saga_fg.types.track import Tracks
 
 UNNAMED = "object"
@@ -56,7 +54,7 @@ def track(
     settings = TrackerSettings(min_hits=2) if settings is None else settings
     raw = raw_table(detections, how)
     scenes = scenes_of(raw)
-    tell(scenes, how, settings, sensors or {})
+    check_scenes(raw, scenes, settings, sensors or {})
     found = []
     for scene in scenes:
         tracker = Tracker(settings, sensors)
@@ -67,28 +65,13 @@ def track(
     return table_like(detections, found or [Tracks.empty(0.0).table_columns()])
 
 
-def tell(
-    scenes: list[Scene], how: TableImport, settings: TrackerSettings, sensors: Mapping[str, Sensor], depth: int = 3
+def check_scenes(
+    raw: RawTable, scenes: list[Scene], settings: TrackerSettings, sensors: Mapping[str, Sensor], depth: int = 4
 ) -> None:
-    """Warn of what is doubtful in the scenes of a table, at the caller's caller; raise where it contradicts `how`."""
-    labels = {name for scene in scenes for frame in scene.frames for name in frame.detections.boxes.label.tolist()}
-    logits = {name for scene in scenes for name in {frame.sensor for frame in scene.frames} if _logits(sensors, name)}
-    told = {finding.kind: finding for scene in reversed(scenes) for finding in scene.findings or ()}
-    if logits:
-        told.pop("scores", None)
+    """Warn of what is doubtful in the scenes of a table, at the caller's caller; raise as `tell`."""
+    frames = [frame for scene in scenes for frame in scene.frames]
+    labels = {name for frame in frames for name in frame.detections.boxes.label.tolist()}
+    logits = any(sensor_model(sensors, name).score == "logit" for name in {frame.sensor for frame in frames})
+    found = [one for scene in scenes for one in scene.findings or () if one.kind != "scores" or not logits]
     rules = idle_rules(acting_classes(settings.edges), labels - {UNNAMED})
-    found = [*told.values(), *([] if rules is None else [rules])]
-    for row, finding in enumerate(found):
-        option = "" if finding.mend is None else _arguments(how, finding.mend)
-        found[row] = replace(finding, what=finding.what.removeprefix("table: "), option=option)
-    refuse_contradictions(found, "as_given=True")
-    for finding in found:
-        warnings.warn(str(finding), stacklevel=depth)
-
-
-def _logits(sensors: Mapping[str, Sensor], name: str) -> bool:
-    return sensor_model(sensors, name).score == "logit"
-
-
-def _arguments(how: TableImport, mend: Mend) -> str:
-    return ", ".join(f"{name}={value!r}" for name, value in how.changes(mend, {}).items())
+    tell([*found, *([] if rules is None else [rules])], raw, depth)

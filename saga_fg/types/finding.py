@@ -25,7 +25,7 @@ class Mend:
     columns: Mapping[str, str] = field(default_factory=dict)
     classes: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
-    coordinates: Literal["", "ego", "camera"] = ""
+    coordinates: Literal["", "world", "ego", "camera"] = ""
 
     def __or__(self, other: Mend) -> Mend:
         """Both."""

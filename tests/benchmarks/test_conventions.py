@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.conventions import KINDS, SPEEDS, TRAPS, table
 from saga_fg import InputError
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.data_frames import raw_table, scenes_of
 from saga_fg.types.finding import refuse_contradictions
@@ -14,33 +15,85 @@ from saga_fg.types.finding import refuse_contradictions
 MENDS = {
     "vehicle's frame as world": "--coordinates ego",
     "camera axes": "--coordinates camera",
-    "compass": "--units angle=compass",
-    "mirrored headings": "--units angle=clockwise",
-    "headings in degrees": "--units angle=deg",
+    "compass": "--units yaw=compass",
+    "mirrored headings": "--units yaw=clockwise",
+    "headings in degrees": "--units yaw=deg",
     "elapsed ns": "--units time=ns",
     "km/h": "--units speed=km/h",
     "sizes exchanged": "--columns length=width,width=length",
 }
 
 
-def check(made, how=None):
+def read(made, how=None):
     (scene,) = scenes_of(raw_table(made, how))
-    refuse_contradictions(scene.findings or ())
+    return scene
 
 
-def test_traps_are_named_with_what_mends_them(subtests):
+def placed(scene):
+    """Positions, headings and velocities in the world."""
+    boxes = [
+        frame.detections.boxes
+        if frame.coordinates == "world"
+        else frame.detections.boxes.transformed(frame.world_T_ego)
+        for frame in scene.frames
+    ]
+    return [np.concatenate(each) for each in zip(*((b.position[:, :2], b.yaw, b.velocity) for b in boxes), strict=True)]
+
+
+def assert_same(found, wanted):
+    np.testing.assert_allclose(found[0], wanted[0], atol=1e-6)
+    np.testing.assert_allclose(wrap_angle(found[1] - wanted[1]), 0.0, atol=1e-6)
+    if np.isfinite(found[2]).any():
+        np.testing.assert_allclose(found[2], wanted[2], atol=1e-6)
+
+
+def test_traps_are_named_and_what_mends_them_gives_the_right_table(subtests):
     kinds = cycle(KINDS)
     for number, (trap, change) in enumerate(TRAPS.items()):
         for kind in (next(kinds), next(kinds)):
-            made = change(table(kind, np.random.default_rng(number), trap == SPEEDS))
+            right = table(kind, np.random.default_rng(number), trap == SPEEDS)
+            made = change(right)
             with subtests.test(trap=trap, kind=kind):
-                with pytest.raises(InputError, match=f"add {MENDS[trap]}; --as-given reads"):
-                    check(made)
-                check(made, TableImport(as_given=True))
+                scene = read(made)
+                with pytest.raises(InputError, match=f"add {MENDS[trap]}.*; --as-given reads"):
+                    refuse_contradictions(scene.findings)
+                refuse_contradictions(read(made, TableImport(as_given=True)).findings)
+                mend = next(finding.mend for finding in scene.findings if finding.stops)
+                mended = read(made, TableImport(**TableImport().changes(mend, {})))
+                assert mended.findings == ()
+                assert_same(placed(mended), placed(read(right.loc[made.index])))
+
+
+@pytest.mark.parametrize(
+    ("trap", "kinds"), [("compass", KINDS), ("mirrored headings", ("crossing", "crowd")), (SPEEDS, KINDS)]
+)
+def test_traps_in_the_vehicles_frame(trap, kinds, subtests):
+    for number, kind in enumerate(kinds):
+        right = table(kind, np.random.default_rng(40 + number), trap == SPEEDS)
+        with subtests.test(kind):
+            how = TableImport(coordinates="ego")
+            of_ego = TRAPS["vehicle's frame as world"](right)
+            assert read(of_ego, how).findings == ()
+            made = TRAPS[trap](of_ego)
+            (finding,) = read(made, how).findings
+            assert finding.mend.units.keys() <= {"yaw", "speed"}  # the vehicle's heading is right
+            mended = read(made, how.mended(finding.mend, {}))
+            assert mended.findings == ()
+            assert_same(placed(mended), placed(read(right)))
+
+
+def test_the_world_is_not_taken_for_the_vehicles_frame(subtests):
+    for number, kind in enumerate(KINDS):
+        made = table(kind, np.random.default_rng(60 + number), True)
+        with subtests.test(kind):
+            (finding,) = read(made, TableImport(coordinates="ego")).findings
+            assert finding.option == "--coordinates world"
+            (finding,) = read(TRAPS["vehicle's frame as world"](made).assign(coordinates="world")).findings
+            assert finding.option == "--columns coordinates= --coordinates ego"
 
 
 def test_right_tables_pass(subtests):
     for number, kind in enumerate(KINDS):
         for speeds in (False, True):
             with subtests.test(kind=kind, speeds=speeds):
-                check(table(kind, np.random.default_rng(100 + number), speeds))
+                assert read(table(kind, np.random.default_rng(100 + number), speeds)).findings == ()

@@ -168,7 +168,7 @@ def test_a_table_that_contradicts_how_it_is_read_is_refused_with_what_mends_it(s
         ({"yaw": 90.0, "vx": 0.0, "vy": 3.0}, {"units": {"angle": "deg"}}),
         ({"timestamp": 1e8 * np.arange(24)}, {"units": {"time": "ns"}}),
         ({"length": 180.0, "width": 71.0}, {"units": {"length": "cm"}}),
-        ({"length": 1.8, "width": 4.5}, {"columns": {"length": "width", "width": "length"}}),
+        ({"length": 1.8, "width": 4.5, "yaw": 0.0}, {"columns": {"length": "width", "width": "length"}}),
     ]:
         rows = table(label="car", **columns)
         wanted = ", ".join(f"{name}={value!r}" for name, value in mend.items())

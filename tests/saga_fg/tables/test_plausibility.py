@@ -8,9 +8,9 @@ from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tables.conventions import (
     Sample,
     camera_axes,
-    ego_taken_for_world,
     findings_of,
-    headings_against_motion,
+    fitting_convention,
+    frame_taken_for_another,
     headings_in_degrees,
     speeds_against_motion,
     velocities_between_frames,
@@ -27,7 +27,7 @@ from saga_fg.tables.plausibility import (
     usual_classes,
     within_a_metre,
 )
-from saga_fg.types.finding import Finding
+from saga_fg.types.finding import Finding, Mend
 
 RNG = np.random.default_rng(5)
 CARS = np.full(60, "car")
@@ -65,27 +65,48 @@ def test_headings_against_motion(subtests):
     on_x = 5.0 * np.column_stack([np.cos(along_x), np.sin(along_x)])
     walks = np.zeros(100, dtype=np.bool_)
     for name, yaw, v, found in [
-        ("right", moving, velocity, None),
-        ("some turned round", turned, velocity, None),
-        ("mirrored", -moving, velocity, "--units angle=clockwise"),
-        ("degrees", np.degrees(moving), velocity, "--units angle=deg"),
-        ("mirrored degrees", -np.degrees(moving), velocity, "--units angle=clockwise_deg"),
-        ("compass", 90 - np.degrees(moving), velocity, "--units angle=compass"),
-        ("compass in rad", np.pi / 2 - moving, velocity, "--units angle=compass_rad"),
-        ("compass on a straight road", 90 - np.degrees(along_x), on_x, "--units angle=compass"),
-        ("mirrored, which makes no difference", -along_x, on_x, None),
-        ("no convention", RNG.uniform(-3, 3, 100), velocity, None),
+        ("right", moving, velocity, "rad"),
+        ("some turned round", turned, velocity, "rad"),
+        ("mirrored", -moving, velocity, "clockwise"),
+        ("degrees", np.degrees(moving), velocity, "deg"),
+        ("mirrored degrees", -np.degrees(moving), velocity, "clockwise_deg"),
+        ("compass", 90 - np.degrees(moving), velocity, "compass"),
+        ("compass in rad", np.pi / 2 - moving, velocity, "compass_rad"),
+        ("compass on a straight road", 90 - np.degrees(along_x), on_x, "compass"),
+        ("mirrored, which makes no difference", -along_x, on_x, "rad"),
+        ("no convention", RNG.uniform(-3, 3, 100), velocity, ""),
+        ("constant", np.zeros(100), velocity, ""),
+        ("all turned round", moving + np.pi, velocity, ""),
         ("nothing moves", -moving, 0.1 * velocity, None),
         ("no velocities", -moving, np.full((100, 2), np.nan), None),
         ("too few", -moving[:30], velocity[:30], None),
     ]:
         with subtests.test(name):
-            assert option(headings_against_motion(yaw, v, walks[: len(yaw)])) == found
+            fit = fitting_convention(yaw, v, walks[: len(yaw)])
+            assert (None if fit is None else fit[0]) == found
     walking = 0.2 * velocity
-    assert headings_against_motion(-moving, walking, walks) is None
-    assert option(headings_against_motion(-moving, walking, ~walks)) == "--units angle=clockwise"
-    in_degrees = TableImport(units={"angle": "deg"}).judged([headings_against_motion(-moving, velocity, walks)], {})
-    assert in_degrees[0].option == "--units angle=clockwise_deg"
+    assert fitting_convention(-moving, walking, walks) is None
+    for yaw, unit in ((-moving, "clockwise"), (RNG.uniform(-3, 3, 100), "rad"), (np.zeros(100), "")):
+        fit = fitting_convention(yaw, walking, ~walks)  # people look around
+        assert fit is not None
+        assert fit[0] == unit
+
+
+def test_units_that_mend_are_those_of_how_a_table_is_read():
+    finding = Finding("headings", "", "", Mend(units={"angle": "clockwise"}))
+    for how, names, option in [
+        (TableImport(), {}, "--units angle=clockwise"),
+        (TableImport(units={"angle": "deg"}), {}, "--units angle=clockwise_deg"),
+        (TableImport(), {"yaw": "heading_deg"}, "--units angle=clockwise_deg"),
+    ]:
+        (judged,) = how.judged([finding], names)
+        assert judged.option == option
+        assert judged.stops
+    (again,) = TableImport(units={"angle": "clockwise"}).judged([finding], {})
+    assert not again.stops  # the option that mends it is there
+    of_column = TableImport(units={"yaw": "deg"})
+    assert of_column.unit("yaw", None) == "deg"
+    assert of_column.unit("ego_yaw", None) is None
 
 
 def test_speeds_against_motion(subtests):
@@ -95,6 +116,7 @@ def test_speeds_against_motion(subtests):
             measured = factor * motion + RNG.normal(0, 0.3, motion.shape)
             finding = speeds_against_motion(measured, motion + RNG.normal(0, 0.5, motion.shape))
             assert option(finding) == (None if found is None else f"--units speed={found}")
+    assert option(speeds_against_motion(0 * motion, motion)) == "--columns vx=,vy="
     assert speeds_against_motion(3.6 * motion[:20], motion[:20]) is None
     assert speeds_against_motion(3.6 * motion, np.full(motion.shape, np.nan)) is None
 
@@ -106,7 +128,7 @@ def test_camera_axes(subtests):
         ("camera", (right, down, ahead), True),
         ("vehicle", (ahead, right, -down), False),
         ("world on a hill", (right, 3 * right, ahead), False),
-        ("a straight road in a tall town", (right, down, ahead + 200), False),
+        ("a straight road in the mountains", (right, down, ahead + 200), False),
         ("on a plane", (ahead, 0 * down, down), False),
     ]:
         with subtests.test(name):
@@ -167,6 +189,8 @@ def test_unlikely_sizes(subtests):
         ("truck", (16.0, 2.6, 3.5), None),
         ("pedestrian", (0.5, 0.5, 1.7), None),
         ("tram", (40.0, 2.6, 3.5), None),
+        ("ship", (120.0, 20.0, 30.0), None),
+        ("pedestrian", (50.0, 50.0, 170.0), "cm"),
     ]:
         with subtests.test(label=label, size=size, unit=unit):
             found = option(unlikely_sizes(np.full(60, label), np.tile(size, (60, 1))))
@@ -255,7 +279,7 @@ def test_ego_taken_for_world(subtests):
     ]:
         with subtests.test(frames=frames, found=found):
             s = Sample.from_frames(frames)
-            finding = ego_taken_for_world(s)
+            finding = frame_taken_for_another(s)
             assert option(finding) == ("--coordinates ego" if found else None)
 
 
