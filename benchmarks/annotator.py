@@ -259,7 +259,7 @@ class Corrected:
 
     def add(self, scene: Scene, builder: LabelBuilder, labels: RecordingLabels, whole: float) -> None:
         """Correct the labels of a scene, which took `whole` seconds."""
-        before, review = judged(scene, moments_of(labels)), labels.review()
+        before, review = judged(scene, moments_of(labels)), labels.review(0.0)
         ids = review.id.astype(np.str_)
         handed = int((review.probability.exists >= KEPT).sum())
         out = ids[review.probability.exists >= KEPT]

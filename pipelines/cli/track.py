@@ -313,7 +313,7 @@ smooth_app = dataset_commands(
 
 
 def _show(output: Path, runs: Sequence[smoothing.SmoothedScene]) -> None:
-    """The line that says what was done."""
+    """The lines that say what was done."""
     total = LabelCounts.sum(run.counts for run in runs)
     typer.echo(
         f"{output}: {counted(len(runs), 'scene')}, {counted(total.objects, 'object')}, {counted(total.boxes, 'box')}: "
@@ -322,3 +322,5 @@ def _show(output: Path, runs: Sequence[smoothing.SmoothedScene]) -> None:
         f"{total.dropped} dropped with {counted(total.dropped_objects, 'object')}; "
         f"{counted(total.joined, 'tracklet')} joined to others"
     )
+    worth = sum(len(run.review) for run in runs)
+    typer.echo(f"{output / 'review.csv'}: {counted(worth, 'object')} worth a look, the most worth first")

@@ -1,7 +1,7 @@
 """A folder of labels, the output of a run of smoothing.
 
 labels.csv       a row per box (or .ndjson, .parquet)
-review.csv       a row per object, those first that are most worth a look
+review.csv       a row per object worth a look, those first that are most worth it
 corrections.csv  what became of corrections, where there are some
 summary.json     how many boxes of each scene were observed, filled, extended and dropped
 tracking.json    nuScenes: the official tracking result

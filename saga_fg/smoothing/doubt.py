@@ -7,7 +7,8 @@ object all along, and that its heading is not turned round. A fifth one, that th
     P = 1 / (1 + exp(-(b_0 + b . features)))
 
 fitted to recordings with ground truth (four scenes of nuScenes, five of KITTI; `python -m benchmarks labels` has their
-reliability on others), but that of one object all along, the product over its steps from a detection to the next.
+reliability on others), but that of one object all along, the product over its steps from a detection to the next. What
+is bad with those detectors need not be so with others: what an object's own detections settle is not far off.
 
 A look mends everything that is wrong with an object. Of n boxes handed out, where P(exists) is `HANDED_OUT` at least,
 and of an object that is held back, the number of errors to go is expected to be
@@ -16,6 +17,7 @@ and of an object that is held back, the number of errors to go is expected to be
     gain = n P(exists) P(class)
 
 A false object is one error, and so are a wrong class and a wrong join; every box that is missing or off is one.
+Boxes without a heading are not turned round.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from saga_fg.smoothing.states import Lifespans, Probabilities, StateTable
 from saga_fg.types.shown import data_frame, text_table
 
 HANDED_OUT = 0.5  # P(exists)
+LEAST_GAIN = 0.05  # of an object that is worth a look
 FAR_OFF = 0.5  # of a position, m
 TURNED_OFF = np.pi / 9  # of a heading up to half a turn, rad
 RIVAL = 1.0  # distance within which a box of another class is at the same place, m; or a third of the length
@@ -59,8 +62,8 @@ def _logit(score: FloatArray) -> FloatArray:
 def step_doubt(
     evidence: Evidence, object_of: IntArray, lifespans: Lifespans, states: StateTable, length: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Of each of R states: log P that the detections before it and at it are of one object, 0 where there are none; and
-    whether an object of another class with more evidence is at its place.
+    """Return (R,) log P that the detections before a state and at it are of one object, 0 where there are none; and
+    (R,) whether an object of another class with more evidence is at its place.
 
     object_of (N,): the object of each detection, negative for none; length (n,) of the objects, m, NaN for unknown
     """
@@ -104,15 +107,29 @@ def _companions(
 
 
 def far_off(
-    covariance: FloatArray, yaw_variance: FloatArray, speed: FloatArray, length: FloatArray, score: FloatArray
+    covariance: FloatArray,
+    yaw_variance: FloatArray,
+    speed: FloatArray,
+    length: FloatArray,
+    score: FloatArray,
+    agreement: FloatArray,
 ) -> FloatArray:
     """(N,) probability that boxes are far off; covariance (N, 2, 2) of their positions, m^2, variance (N,) of their
-    headings, rad^2, speed (N,) in m/s, length (N,) in m, NaN where unknown, score (N,)."""
+    headings, rad^2, NaN without a heading, speed (N,) in m/s, length (N,) in m, NaN where unknown, score (N,),
+    agreement (N,): mean cosine between an object's heading and the detected ones.
+
+    What the features say is bounded by the tail of a normal error of twice the deviation, exp(-limit^2 / (8 variance)):
+    of the position, and of the heading together with the spread of the detected ones, -2 log agreement.
+    """
     size = np.log(np.maximum(np.nan_to_num(length, nan=1.0), 0.1))
-    deviation = np.log(np.maximum(np.trace(covariance, axis1=1, axis2=2) / 2, 1e-6)) / 2
-    turning = np.log(np.maximum(np.nan_to_num(yaw_variance, nan=1.0), 1e-6)) / 2
-    near = 1 - _probability(OFF, deviation, size, _logit(score))
-    return np.asarray(1 - near * (1 - _probability(AXIS, turning, size, np.minimum(np.nan_to_num(speed), 3.0))))
+    variance = np.maximum(np.trace(covariance, axis1=1, axis2=2) / 2, 1e-6)
+    turning = np.maximum(yaw_variance, 1e-6)
+    far = _probability(OFF, np.log(variance) / 2, size, _logit(score))
+    turned = _probability(AXIS, np.log(turning) / 2, size, np.minimum(np.nan_to_num(speed), 3.0))
+    spread = turning - 2 * np.log(np.clip(agreement, 1e-3, 1.0))
+    far = np.minimum(far, np.exp(-(FAR_OFF**2) / (8 * variance)))
+    turned = np.nan_to_num(np.minimum(turned, np.exp(-(TURNED_OFF**2) / (8 * spread))))
+    return np.asarray(1 - (1 - far) * (1 - turned))
 
 
 def object_probabilities(
@@ -124,8 +141,9 @@ def object_probabilities(
     votes: FloatArray,
     one: FloatArray,
 ) -> Probabilities:
-    """Of n objects, each (n,): score; number of detections, and sum of their probabilities; share of the boxes with a
-    rival; metres moved along the heading, and votes of detections for it; P(one object all along)."""
+    """Return what is probably right of n objects by their score, the number of detections, the sum `weight` of their
+    probabilities, the share of the boxes with a rival, the metres moved along the heading, the votes of detections for
+    it, and P(one object all along): each (n,)."""
     found = _logit(score), np.log(np.maximum(detections, 1.0))
     votes = np.abs(votes)
     moved = np.minimum(np.abs(path), 10.0), np.minimum(votes, 5.0), votes / np.maximum(weight, 1e-9)
@@ -139,7 +157,7 @@ class Review(Columns):
 
     id, label, boxes  name, class and number of boxes
     gain              expected number of errors that a look mends
-    why               the largest part of it: exists, class, identity, heading or box
+    why               the largest part of it, of `REASONS`
     time, position    where to look, s and m (n, 2)
     probability       that the object exists, ...; far_off: expected number of boxes that are far off
     """
@@ -156,9 +174,10 @@ class Review(Columns):
 
     def table_columns(self) -> dict[str, Any]:
         """The columns (n,) of a table, by name."""
-        shown = {"gain": self.gain, "why": self.why, "id": self.id, "label": self.label, "boxes": self.boxes}
-        place = {"timestamp": self.time, "x": self.position[:, 0], "y": self.position[:, 1]}
-        return {**shown, **place, **self.probability.table_columns(), "boxes_far_off": self.far_off}
+        gain, far_off, place = (np.round(values, 3) for values in (self.gain, self.far_off, self.position))
+        shown = {"gain": gain, "why": self.why, "id": self.id, "label": self.label, "boxes": self.boxes}
+        where = {"timestamp": self.time, "x": place[:, 0], "y": place[:, 1]}
+        return {**shown, **where, **self.probability.table_columns(), "boxes_far_off": far_off}
 
     def to_pandas(self) -> Any:
         """Return a `pandas.DataFrame` of `table_columns`. Needs the extra `pandas`."""
@@ -169,15 +188,16 @@ class Review(Columns):
         return text_table(f"{len(self)} objects", list(self.table_columns()), rows)
 
 
-REASONS = np.array(["exists", "class", "identity", "heading", "box"])
+REASONS = np.array(["false", "missing", "class", "identity", "heading", "box"])
 
 
-def gain_parts(probability: Probabilities, boxes: IntArray, off: FloatArray) -> FloatArray:
-    """(n, 5) errors that a look at an object mends, by `REASONS`; boxes (n,), of which `off` (n,) are far off."""
+def gain_parts(probability: Probabilities, boxes: IntArray, headed: IntArray, off: FloatArray) -> FloatArray:
+    """(n, 6) errors that a look at an object mends, by `REASONS`; boxes (n,), of which `headed` (n,) have a heading and
+    `off` (n,) are far off."""
     p = probability
-    parts = p.exists[:, None] * np.stack([p.exists, 1 - p.label, 1 - p.one, boxes * (1 - p.heading), off], axis=-1)
-    parts[:, 0] = 1 - p.exists
+    wrong = [1 - p.label, 1 - p.one, headed * (1 - p.heading), off]
+    parts = np.stack([1 - p.exists, 0 * p.exists, *(p.exists * part for part in wrong)], axis=-1)
     held_back = p.exists < HANDED_OUT
     parts[held_back] = 0.0
-    parts[held_back, 0] = (boxes * p.exists * p.label)[held_back]
+    parts[held_back, 1] = (boxes * p.exists * p.label)[held_back]
     return parts

@@ -12,7 +12,7 @@ import numpy as np
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.smoothing.boxes import is_reversed
-from saga_fg.smoothing.doubt import REASONS, Review, far_off, gain_parts, object_probabilities
+from saga_fg.smoothing.doubt import LEAST_GAIN, REASONS, Review, far_off, gain_parts, object_probabilities
 from saga_fg.smoothing.labelling import LabelColumns, LabelledStates, ObjectSummary, median_sizes, source_counts
 from saga_fg.smoothing.states import LabelCounts, Labels, Probabilities
 
@@ -34,8 +34,9 @@ class RecordingLabels:
     def __init__(self, parts: LabelParts) -> None:
         self._parts = parts
         self._id = np.empty(0, dtype=np.int64)  # of all objects, ascending; then their attributes
-        self._size, self._score, self._turned = np.empty((0, 3)), np.empty(0), np.empty(0, dtype=np.bool_)
-        self._gone, self._label = np.empty(0, dtype=np.bool_), np.empty(0, dtype="U64")
+        self._size, self._score, self._agreement = np.empty((0, 3)), np.empty(0), np.empty(0)
+        self._turned, self._gone = np.empty((2, 0), dtype=np.bool_)
+        self._label = np.empty(0, dtype="U64")
         self._boxes, self._weakest = np.empty(0, dtype=np.int64), np.empty((0, 2))
         self._probability = Probabilities(*(np.empty(0),) * 4)
 
@@ -78,6 +79,7 @@ class RecordingLabels:
         weight, detections, votes = column("probability"), column("detections"), column("votes")
         self._score = weight / (np.maximum(column("opportunities"), detections) + prior)
         self._turned = is_reversed(column("path"), votes)
+        self._agreement = np.abs(votes) / np.maximum(weight, 1e-9)
         self._boxes, rivals = column("boxes").astype(np.int64), column("rivals") / np.maximum(column("boxes"), 1)
         self._weakest = np.array([each.weakest for each in found]).reshape(len(found), 2)
         one, path = np.exp(column("log_one")), column("path")
@@ -106,17 +108,20 @@ class RecordingLabels:
                 columns.select(mine).labels(time, size[mine], score[mine], doubt.select(mine)) for time, mine in moments
             )
 
-    def review(self) -> Review:
-        """All objects, those first that are most worth a look."""
+    def review(self, least_gain: float = LEAST_GAIN) -> Review:
+        """The objects with a gain of `least_gain` at least, those first that are most worth a look."""
         n = len(self._id)
         off, worst, clearest = np.zeros(n), np.full((n, 4), -np.inf), np.full((n, 4), -np.inf)
+        headed = np.zeros(n, dtype=np.int64)
         label = np.full(n, "", dtype="U64")
         place = np.full((n, 3), np.nan)  # time, x, y at the weakest step
         for times, rows, at, columns in self._chunks():
             time = np.repeat(times, [mine.stop - mine.start for mine in rows])
             P, speed = columns.position_covariance, np.hypot(*columns.velocity.T)
-            doubt = far_off(P, columns.yaw_variance, speed, self._size[at, 0], self._score[at])
+            known = self._size[at, 0], self._score[at], self._agreement[at]
+            doubt = far_off(P, columns.yaw_variance, speed, *known)
             np.add.at(off, at, doubt)
+            np.add.at(headed, at, np.isfinite(columns.yaw))
             label[at] = columns.label
             where = np.column_stack([time, columns.position[:, :2]])
             _keep_largest(worst, at, doubt, where)
@@ -125,17 +130,17 @@ class RecordingLabels:
             first = later & ~(place[at, 0] <= time)
             place[at[first][::-1]] = where[first][::-1]
         p = self._probability
-        parts = gain_parts(p, self._boxes, off)
-        why = np.argmax(parts, axis=1)
+        parts = gain_parts(p, self._boxes, headed, off)
+        why = REASONS[np.argmax(parts, axis=1)]
         place = np.where(np.isnan(place), clearest[:, 1:], place)
-        shown = np.select([why[:, None] == 4, why[:, None] == 2], [worst[:, 1:], place], clearest[:, 1:])
+        shown = np.select([why[:, None] == "box", why[:, None] == "identity"], [worst[:, 1:], place], clearest[:, 1:])
         gain = parts.sum(axis=1)
-        found = Review(self._id, label, self._boxes, gain, REASONS[why], shown[:, 0], shown[:, 1:], p, off)
+        found = Review(self._id, label, self._boxes, gain, why, shown[:, 0], shown[:, 1:], p, off)
         order = np.lexsort((self._id, -gain))
-        return found.select(order[(self._boxes[order] > 0) & ~self._gone[order]])
+        return found.select(order[((self._boxes > 0) & ~self._gone & (gain >= least_gain))[order]])
 
     def _chunks(self) -> Iterator[tuple[FloatArray, list[slice], IntArray, LabelColumns]]:
-        """Of each chunk: the times of its moments, s, their rows, the objects of all rows, and their columns."""
+        """Yield the times of a chunk's moments, s, their rows, the objects of all rows, and their columns."""
         for part in self._parts:
             stored = dict(part)
             times, bounds, backward = (stored.pop(name) for name in ("time", "bounds", "reversed"))

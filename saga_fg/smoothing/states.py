@@ -165,7 +165,8 @@ class Probabilities(Columns):
 
     def table_columns(self) -> dict[str, FloatArray]:
         """The columns (N,) of a table, by name."""
-        return dict(zip(PROBABILITIES, (self.exists, self.label, self.one, self.heading), strict=True))
+        columns = (self.exists, self.label, self.one, self.heading)
+        return {name: np.round(p, 4) for name, p in zip(PROBABILITIES, columns, strict=True)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,8 +38,8 @@ class TableLabels:
         return self._table([(name, moment.table_columns()) for name, moment in found], Labels.empty().table_columns())
 
     def review(self) -> Table:
-        """A row for each object, with the columns of `review.csv`: in each scene those first that are most worth a
-        look."""
+        """A row for each object worth a look, with the columns of `review.csv`: in each scene those first that are most
+        worth it."""
         found = [(name, one.review().table_columns()) for name, one in self.scenes.items()]
         return self._table(found, RecordingLabels([]).review().table_columns())
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from saga_fg import Boxes, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.smoothing import LabelBuilder, LabelModel, RecordingLabels
-from saga_fg.smoothing.doubt import HANDED_OUT, gain_parts, object_probabilities
+from saga_fg.smoothing.doubt import HANDED_OUT, LEAST_GAIN, REASONS, far_off, gain_parts, object_probabilities
 from saga_fg.smoothing.states import Probabilities
 
 
@@ -42,7 +42,7 @@ def labelled(frames: list[Frame]) -> RecordingLabels:
 
 def test_every_label_has_probabilities_and_the_list_is_in_order():
     labels = labelled(drive())
-    review = labels.review()
+    review = labels.review(0.0)
     assert (np.diff(review.gain) <= 0).all()
     assert (review.gain >= 0).all()
     boxes = dict(zip(review.id.tolist(), review.boxes.tolist(), strict=True))
@@ -58,7 +58,7 @@ def test_every_label_has_probabilities_and_the_list_is_in_order():
 
 
 def test_what_little_speaks_for_is_in_doubt():
-    review = labelled(drive()).review()
+    review = labelled(drive()).review(0.0)
     exists = dict(zip(review.boxes.tolist(), review.probability.exists.tolist(), strict=False))
     weak = review.probability.exists[review.boxes <= 3]
     assert len(weak) == 1
@@ -66,7 +66,7 @@ def test_what_little_speaks_for_is_in_doubt():
 
 
 def test_objects_that_meet_may_be_exchanged():
-    far, near = labelled(drive()).review(), labelled(drive(swap=True)).review()
+    far, near = labelled(drive()).review(0.0), labelled(drive(swap=True)).review(0.0)
     alone = far.probability.one[far.label == "pedestrian"]
     meeting = near.probability.one[near.label == "pedestrian"]
     assert meeting.max() < alone.min()
@@ -80,13 +80,18 @@ unit = st.floats(0, 1)
 @given(st.lists(st.tuples(unit, unit, unit, unit, st.integers(1, 50), unit), min_size=1, max_size=8))
 def test_gains_fall_with_certainty(rows):
     exists, label, one, heading, n, share = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
-    parts = gain_parts(Probabilities(exists, label, one, heading), n.astype(int), share * n)
+    boxes, sure = n.astype(int), np.ones(len(n))
+    parts = gain_parts(Probabilities(exists, label, one, heading), boxes, boxes, share * n)
     assert (parts >= 0).all()
-    sure = np.ones(len(n))
-    assert not gain_parts(Probabilities(sure, sure, sure, sure), n.astype(int), 0 * n).any()
+    assert not gain_parts(Probabilities(sure, sure, sure, sure), boxes, boxes, 0 * n).any()
     kept = exists >= HANDED_OUT
-    better = gain_parts(Probabilities(exists, sure, sure, sure), n.astype(int), 0 * n)
+    better = gain_parts(Probabilities(exists, sure, sure, sure), boxes, boxes, 0 * n)
     assert (better.sum(axis=1) <= parts.sum(axis=1) + 1e-12)[kept].all()
+    missing, false = parts[:, REASONS == "missing"], parts[:, REASONS == "false"]
+    assert not missing[kept].any()  # what is handed out may be false, what is held back may be missing
+    assert not false[~kept].any()
+    headless = gain_parts(Probabilities(exists, label, one, heading), boxes, 0 * boxes, share * n)
+    assert not headless[:, REASONS == "heading"].any()
 
 
 @pytest.mark.parametrize("name", ["score", "path", "votes"])
@@ -97,3 +102,46 @@ def test_more_evidence_is_more_certain(name):
     found = object_probabilities(**columns)
     certain = found.exists if name == "score" else found.heading
     assert (np.diff(certain) > 0).all()
+
+
+def boxes_far_off(count: int = 5, **columns: object) -> np.ndarray:
+    usual = {"yaw_variance": 0.01, "speed": 0.0, "length": 0.5, "score": 0.5, "agreement": 0.9}
+    P = np.asarray(columns.pop("variance", 0.01)) * np.ones(count)
+    given_ = {name: np.asarray(columns.get(name, value)) * np.ones(count) for name, value in usual.items()}
+    return far_off(P[:, None, None] * np.eye(2), **given_)
+
+
+def test_what_is_well_determined_is_not_far_off():
+    surer = 10.0 ** -np.arange(5)
+    for length in (0.5, 12.0):
+        settled = boxes_far_off(length=length, variance=surer, yaw_variance=surer, agreement=1 - 0.2 * surer)
+        assert (np.diff(settled) < 0).all()
+        assert settled[-1] < 1e-6
+    assert (np.diff(boxes_far_off(agreement=1 - 0.2 * surer)) <= 0).all()
+    assert boxes_far_off(agreement=0.8)[0] > 0.1  # headings that do not agree leave a small variance in doubt
+    headless = boxes_far_off(yaw_variance=np.nan, agreement=0.0, variance=1e-3)
+    assert (headless < 1e-6).all()
+
+
+def test_standing_objects_that_detections_settle_are_not_listed_as_far_off():
+    frames, rng = [], np.random.default_rng(0)
+    for k in range(40):
+        boxes = np.array([[10.0 * i, 5.0, 0.5] for i in range(4)])
+        boxes[:, :2] += rng.normal(0, 0.03, (4, 2))
+        yaw, size = 0.3 + rng.normal(0, 0.02, 4), np.tile([0.5, 2.5, 1.0], (4, 1))
+        shown = Boxes.of(["barrier"] * 4, boxes, size, yaw, np.full((4, 2), np.nan))
+        frames.append(Frame(0.5 * k, "lidar", Detections(shown, np.full(4, 0.9))))
+    review = labelled(frames).review(0.0)
+    assert len(review) == 4
+    assert (review.far_off < 0.2).all()  # of 40 boxes
+
+
+def test_what_gains_nothing_is_left_out_and_the_rest_stays():
+    labels = labelled(drive())
+    whole, listed = labels.review(0.0), labels.review()
+    worth = whole.gain >= LEAST_GAIN
+    assert listed.id.tolist() == whole.id[worth].tolist()
+    assert worth.sum() > 0
+    columns = listed.table_columns()
+    np.testing.assert_allclose(columns["gain"], listed.gain, atol=5e-4)
+    assert all(len(repr(value)) < 12 for name in ("gain", "boxes_far_off", "x") for value in columns[name].tolist())
