@@ -7,7 +7,7 @@ CLASSES = "Names of classes: REGULAR_VEHICLE=car,PERSON=pedestrian. `SIGN=` leav
 UNITS = (
     "Units: time=ns (s, ms, us, ns, iso8601, 10Hz), length=ft (m, cm, mm, km, ft), speed=km/h (m/s, km/h, mph, "
     "ft/s), angle=deg (rad, deg; clockwise, clockwise_deg; compass, compass_rad: clockwise from north), score=percent "
-    "(share, percent)."
+    "(share, percent). Of one column: yaw=deg."
 )
 COORDINATES = (
     "Coordinates of rows that say none; all but world need the pose of the vehicle. camera: at its origin, x to the "
@@ -15,4 +15,4 @@ COORDINATES = (
 )
 SORT = "Sort the rows by time, in memory."
 AS_GIVEN = "Read the table as it is said to be, even where its contents contradict it."
-IMPORT = "YAML file with the same: columns, classes, units, coordinates, sort."
+IMPORT = "YAML file with the same: columns, classes, units, coordinates, sort, as_given."

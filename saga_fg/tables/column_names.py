@@ -1,6 +1,4 @@
-"""Options for reading foreign tables: names of columns and classes, units, coordinates, order of length.
-
-Columns by the names that files of others give them: aliases, units at the end of a name, and misspelt names.
+"""Columns by the names that tables of others give them, their units, and the options that say both.
 
 A name is compared without case, and with `_` for spaces, dots and dashes. Its end may be a unit of what it holds:
 `pos_x_m`, `timestamp_ns`, `yaw_deg`, `speed_x_kmh`. Where two columns could have one meaning, neither is taken.

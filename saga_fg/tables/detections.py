@@ -37,7 +37,7 @@ class _Rows:
 
 
 class DetectionTable:
-    """The scenes of one table of detections. See the package for its columns.
+    """The scenes of one table of detections; `saga_fg.track` has the columns.
 
     A scene's moments are all times at which some sensor spoke; without pose columns its poses are the identity.
     """

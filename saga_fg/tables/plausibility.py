@@ -1,8 +1,6 @@
-"""Suspicions about data and settings: units, coordinates, classes, times, and what mends them.
+"""Checks of detections and settings by their values: sizes, scores, times, names of classes.
 
-Checks of detections, one function for each suspicion, over the arrays of a sample.
-
-Each returns a `Finding` or None. Shares and numbers are such that recordings which come with tests raise none.
+Each function returns a `Finding` or None. Thresholds are such that the recordings of the tests raise none.
 """
 
 from __future__ import annotations
