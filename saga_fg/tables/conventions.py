@@ -220,7 +220,9 @@ def fitting_convention(yaw: FloatArray, velocity: FloatArray, walks: BoolArray) 
     now, usual = fits["rad"]
     said = f"{now:.0%} of those of moving objects differ from their motion, half of them by {usual:.2g} rad and more"
     astray, off = fits[best]
+    turned = share(np.abs(wrap_angle(2 * (given - direction))) > 2 * _ASTRAY)  # by something else than half a turn
     better = (now >= 0.15 and astray <= now / 3) or (usual > _OFF and off < usual / 3)
+    better &= now > 0.5 or turned > 0.1  # some that are turned round are no convention
     if better and astray < 0.2 and off < _OFF:
         return best, said
     constant = np.ptp(given) < 1e-6
@@ -259,7 +261,7 @@ def speeds_against_motion(velocity: FloatArray, motion: FloatArray) -> Finding |
     """Measured velocities (n, 2) which are those between frames (n, 2) in another unit than m/s, or are none."""
     known = np.isfinite(motion).all(axis=1) & np.isfinite(velocity).all(axis=1)
     moves = known & (np.hypot(*motion.T) > _MOVES)
-    if moves.sum() >= 2 * FEWEST and np.median(np.hypot(*velocity[moves].T)) < 0.1 * _MOVES:
+    if moves.sum() >= 2 * FEWEST and share(np.abs(velocity[moves]).max(axis=1) < 1e-9) > 0.9:
         what, mend = "measured velocities are zero of objects that move", Mend(columns={"vx": "", "vy": ""})
         return Finding("speeds", what, "expected those over ground, or none", mend)
     moves = known & (np.hypot(*velocity.T) > 2 * _WALKS)

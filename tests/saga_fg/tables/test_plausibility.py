@@ -67,6 +67,7 @@ def test_headings_against_motion(subtests):
     for name, yaw, v, found in [
         ("right", moving, velocity, "rad"),
         ("some turned round", turned, velocity, "rad"),
+        ("some turned round on a road along x", np.where(RNG.random(100) < 0.3, along_x + np.pi, along_x), on_x, "rad"),
         ("mirrored", -moving, velocity, "clockwise"),
         ("degrees", np.degrees(moving), velocity, "deg"),
         ("mirrored degrees", -np.degrees(moving), velocity, "clockwise_deg"),
