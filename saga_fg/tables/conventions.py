@@ -204,7 +204,8 @@ _CONVENTIONS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
 def fitting_convention(yaw: FloatArray, velocity: FloatArray, walks: BoolArray) -> tuple[str, str] | None:
     """The unit of headings (n,), read as rad, of objects that move with `velocity` (n, 2), and how far they are off.
 
-    The unit is "rad" where they fit as they are read, and "" where no convention fits; None where too few move.
+    The unit is "rad" where they fit as they are read, and "" where no convention fits; None where
+    nothing is told, as where too few move.
     """
     moves = (np.hypot(*velocity.T) > np.where(walks, _WALKS, _MOVES)) & np.isfinite(yaw)
     if moves.sum() < 2 * FEWEST:
@@ -226,7 +227,9 @@ def fitting_convention(yaw: FloatArray, velocity: FloatArray, walks: BoolArray) 
     if better and astray < 0.2 and off < _OFF:
         return best, said
     constant = np.ptp(given) < 1e-6
-    return ("" if now > 0.5 and (constant or not walks[moves].any()) else "rad"), said
+    if now > 0.5 and (constant or not walks[moves].any()):
+        return "", said
+    return ("rad", said) if now < 0.15 and usual < _OFF else None
 
 
 def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | None:

@@ -91,7 +91,6 @@ def test_dates_without_a_time_are_no_times_in_text(tmp_path):
 
 
 @pytest.mark.parametrize("rows", [["2024-05-01 00:00:00"] * 2, ["2024-05-01T00:00:00Z", "2024-05-02T00:00:00Z"]])
-def test_dates_at_midnight_alone_are_doubtful(tmp_path, rows, caplog):
-    path = write(tmp_path / "a.parquet", [("time", rows), ("x", X), ("y", X)])
-    read_detections(path)
-    assert "dates have no time of day: all rows of a day are one frame" in caplog.text
+def test_dates_at_midnight_alone_are_doubtful(tmp_path, rows):
+    scene = read_detections(write(tmp_path / "a.parquet", [("time", rows), ("x", X), ("y", X)])).scene("a")
+    assert "dates have no time of day: all rows of a day are one frame" in str(scene.findings)
