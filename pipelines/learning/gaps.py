@@ -99,6 +99,7 @@ class Contender:
         tracker = replace(
             own,
             report_coasting=inf,
+            report_out_of_view=True,
             max_coasting=LIFE,
             classes={label: replace(each, max_deviation=inf) for label, each in own.classes.items()},
             existence=replace(own.existence, delete_below=0.0, report_above=0.0),

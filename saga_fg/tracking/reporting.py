@@ -81,7 +81,7 @@ def reported_rows(state: TrackerState) -> IntArray:
     chosen = table.confirmed | (table.seen_existence >= settings.existence.report_above)
     if settings.tentative_score_factor == 0:
         chosen &= ~table.tentative
-    in_view = table.sensors.seen_by_any() > 0
+    in_view = (table.sensors.seen_by_any() > 0) | settings.report_out_of_view
     chosen &= (coasting == 0) | ((coasting <= settings.report_coasting) & in_view & known_places(state))
     return chosen.nonzero()[0]
 

@@ -260,6 +260,9 @@ class TrackerSettings(Settings):
         "report no track for longer than this after its last detection, s; .inf: for as long as `max_deviation` lets "
         "it; higher: fewer gaps, more false positives",
     )
+    report_out_of_view: bool = setting(
+        False, "true: report tracks outside every field of view as well, as long as the other limits let them"
+    )
 
     def nonlinear(self, rules: Sequence[EdgeRule]) -> bool:
         """Return True if a class moves nonlinearly or an edge rule is nonlinear."""

@@ -12,6 +12,7 @@ from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
 from saga_fg.kernels.components import existences
 from saga_fg.model.sensor import FieldOfView, NoiseModel
 from saga_fg.numerics.arrays import Columns
+from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, unresolved
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import PRIOR_LOGIT, SensorEvidence, TrackTable
@@ -160,6 +161,18 @@ def test_a_car_behind_outlives_an_outage_of_the_lidar_while_the_camera_looks_ahe
         tracker.step(frame(k / 10, [(-20.0, 0.0)], **pose))
     outage = run(tracker, [frame(0.5 + k / 10, [], "camera", **pose) for k in range(20)])
     assert [len(tracks) for tracks in outage] == [1] * 20
+
+
+def test_a_car_that_is_overtaken_is_reported_out_of_view_if_that_is_wanted():
+    ahead = Sensor(field_of_view=FieldOfView(min_azimuth=-0.5, max_azimuth=0.5))
+    for wanted in (False, True):
+        settings = TrackerSettings({"default": ClassSettings(max_deviation=50.0)}, report_out_of_view=wanted)
+        tracker = Tracker(settings, {"camera": ahead})
+        for k in range(5):
+            tracker.step(frame(k / 10, [(20.0, 0.0)], "camera", world_T_ego=np.eye(4)))
+        passed = yaw_transform(40.0, 3.0, 0.0, 0.0)
+        behind = run(tracker, [frame(0.5 + k / 10, [], "camera", world_T_ego=passed) for k in range(10)])
+        assert [len(tracks) for tracks in behind] == [wanted] * 10
 
 
 # Existence by Bayes' rule, and what it makes of a track's score
