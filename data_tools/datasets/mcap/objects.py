@@ -26,7 +26,7 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, StrArray, upper_triangle
-from saga_fg.numerics.geometry import quaternion_norms, quaternion_rotation, yaw_of, yaw_quaternion
+from saga_fg.numerics.geometry import checked_quaternions, quaternion_norms, quaternion_rotation, yaw_of, yaw_quaternion
 from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED, Boxes
 from saga_fg.types.frame import Detections
 from saga_fg.types.track import Tracks
@@ -162,6 +162,14 @@ def _covariances(rows: ObjectRows, name: str) -> FloatArray:
             f"{rows.fields[name].format(row)}: expected a positive definite covariance of x and y, got {got}"
         )
     return P
+
+
+def transform_matrix(transform: Any) -> FloatArray:
+    """The matrix (4, 4) of a geometry_msgs/Transform. Raises `InputError` for an invalid rotation."""
+    T = np.eye(4)
+    T[:3, :3] = quaternion_rotation(checked_quaternions("rotation", [wxyz(transform.rotation)]))[0]
+    T[:3, 3] = xyz(transform.translation)
+    return T
 
 
 def nanoseconds(stamp: Any) -> int:
