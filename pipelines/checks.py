@@ -1,6 +1,6 @@
-"""What is probably wrong in data and settings, each once, by the checks of `saga_fg.tables`.
+"""Warnings of what is probably wrong in data and settings, each once, by the checks of `saga_fg.tables`.
 
-Most of it is a warning. A table whose contents contradict how it is read is refused.
+A table whose contents contradict how it is read is refused.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ class DetectionFileSource(DatasetSource):
             return read_table_results(result, dataset, every_scene=truth, how=self.how, own_times=not truth)
 
     def option_for(self, mend: Mend) -> str:
-        return TableImport(**self.how.changes(mend, {})).options().strip()
+        return self.how.option_for(mend, {})
 
     def kept(self) -> Mapping[str, Any]:
         return self.how.values()

@@ -31,7 +31,7 @@ GATE = 2.0  # m, between a label and its track
 LIFE = LONGEST + 1.0  # s: for so long tracks live without a detection
 
 Errors = Mapping[float, float]
-"""Of one gap: the error at the end of each length that it reaches, m."""
+"""Position errors, m, by time since the last detection, s, of one gap."""
 A = TypeVar("A")
 B = TypeVar("B")
 

@@ -21,7 +21,7 @@ from pipelines.smoothing.configuration import SmoothConfig
 from pipelines.tracking import Progress, one_thread, scene_with_frames
 from saga_fg.graph import FactorProvider
 from saga_fg.smoothing import ChunkSettings, LabelBuilder, LabelCounts, LabelModel, Labels, RecordingLabels, Review
-from saga_fg.smoothing.corrections import Correction
+from saga_fg.smoothing.corrections import Correction, corrections_in
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.track import Tracks
 
@@ -73,7 +73,7 @@ def smooth_scene(
     providers: of factors of your own, in place of those that the configuration names; corrections: those of other
     scenes are left out
     """
-    model = label_model(config, method, of_scene(corrections, scene.name), providers)
+    model = label_model(config, method, corrections_in(scene.name, corrections), providers)
     builder = LabelBuilder(config.tracking.new_tracker(method), model)
     run = _labelled(scene.name, [scene], builder, progress)
     return replace(run, parts=((scene, run.labels),))
@@ -107,7 +107,8 @@ def smooth_stream(
     `InputError` for what the parts are refused for.
     """
     for number, (name, scene) in enumerate(groupby(parts, key=lambda part: part.name)):
-        model, waiting = label_model(config, method, of_scene(corrections, name)), StoredParts(folder / f"{number:06d}")
+        model = label_model(config, method, corrections_in(name, corrections))
+        waiting = StoredParts(folder / f"{number:06d}")
         builder = LabelBuilder(config.tracking.new_tracker(method), model, chunks or ChunkSettings(), waiting)
         yield _labelled(name, scene, builder, progress)
 
@@ -139,11 +140,6 @@ def label_model(
     """What the labels of a recording follow from."""
     tracker = config.tracking.of_method(method).tracker
     return LabelModel(tracker, config.sensors, config.smoothing, providers, corrections)
-
-
-def of_scene(corrections: Sequence[Correction], name: str) -> tuple[Correction, ...]:
-    """Those that name a scene, or none."""
-    return tuple(one for one in corrections if one.scene in ("", name))
 
 
 def _labelled(name: str, parts: Iterable[Scene], builder: LabelBuilder, progress: Progress | None) -> SmoothedScene:

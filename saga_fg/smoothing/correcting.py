@@ -122,7 +122,7 @@ class _Edits:
         return f"{names} {REACH:g} m"
 
     def _say(self, about: tuple[object, ...], number: int, one: Correction) -> None:
-        """Of two about the same that contradict each other the later one counts."""
+        """Note what a correction says; an earlier one that contradicts it is superseded."""
         said = {"exists": one.whole.exists, "class": one.label, "same": one.value}.get(str(about[0]), one.box)
         before, self._said[about] = self._said.get(about), (number, said)
         if before is not None and before[1] != said:

@@ -31,7 +31,7 @@ from saga_fg.types.frame import LATEST
 What = Literal["exists", "class", "same", "box", "standing", "size"]
 SIZE = ("length", "width", "height")
 DEVIATIONS = {"position": 0.1, "height": 0.1, "yaw": 0.05, "size": 0.05}
-"""Of a person's box, unless it says so: m, m, rad, and m."""
+"""Standard deviations of a person's box where it gives none: m, m, rad, m."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Place:
 
 @dataclass(frozen=True)
 class WholeObject:
-    """What was said of a whole object; None, "" and NaN where nothing was."""
+    """Corrections of an object as a whole: existence, class, size (3,), m; None, "" and NaN where there are none."""
 
     exists: bool | None = None
     label: str = ""
@@ -96,7 +96,7 @@ class Correction:
 
     @property
     def whole(self) -> WholeObject:
-        """What it says of the whole object."""
+        """The part of the correction that holds for the object at all times."""
         exists = self.value if self.what == "exists" else True if self.what == "box" else None
         size = self.size if self.what == "size" else np.full(3, np.nan)
         return WholeObject(exists, self.label, size)
@@ -156,6 +156,11 @@ def correction_from(record: Any, origin: str = "correction") -> Correction:
         given = _numbers(record, "deviation", origin, tuple(DEVIATIONS), tuple(DEVIATIONS))
         found = replace(found, box=box, deviation={**DEVIATIONS, **given})
     return found
+
+
+def corrections_in(scene: str, corrections: Iterable[Correction]) -> tuple[Correction, ...]:
+    """The corrections of a recording: those that name it, and those that name none."""
+    return tuple(one for one in corrections if one.scene in ("", scene))
 
 
 def checked_corrections(corrections: Iterable[Correction | Mapping[str, Any]]) -> tuple[Correction, ...]:

@@ -155,8 +155,8 @@ MEDIUM_DEVIATION = 0.8  # likewise of a box of medium quality, m
 
 @dataclass(frozen=True, eq=False)
 class Probabilities(Columns):
-    """Of N labels, or of objects, each (N,): that the object exists, that the class is right, that it is one object all
-    along, and that its heading is not turned round."""
+    """Probabilities (N,) of labels or objects: that the object exists, that its class is right, that it is one object
+    all along, and that its heading is not turned round."""
 
     exists: FloatArray
     label: FloatArray

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from saga_fg.model.sensor import Sensor
-from saga_fg.smoothing.corrections import Correction, checked_corrections, unfit
+from saga_fg.smoothing.corrections import Correction, checked_corrections, corrections_in, unfit
 from saga_fg.smoothing.recording import LabelBuilder, LabelModel
 from saga_fg.smoothing.recording_labels import RecordingLabels
 from saga_fg.smoothing.settings import SmoothingSettings
@@ -77,7 +77,7 @@ def smooth(
     check_scenes(raw, scenes, settings, known)
     labels, outcomes = {}, []
     for scene in scenes:
-        mine = tuple(one for one in given if one.scene in ("", scene.name))
+        mine = corrections_in(scene.name, given)
         model = LabelModel(settings, known, smoothing or SmoothingSettings(), (), mine)
         builder = LabelBuilder(Tracker(settings, sensors), model)
         builder.add(scene.frames, scene.timestamps)

@@ -397,6 +397,10 @@ class TableImport(Settings):
         mended = self.mended(mend, names)
         return {field.name: getattr(mended, field.name) for field in fields(Mend) if getattr(mend, field.name)}
 
+    def option_for(self, mend: Mend, names: Mapping[str, str]) -> str:
+        """The options of the command that mend a suspicion, in place of those of the same name."""
+        return TableImport(**self.changes(mend, names)).options().strip()
+
     def _mends(self, mend: Mend) -> bool:
         """False where a suspicion stays although these options say all that mends it."""
         return any(getattr(self.mended(mend, {}), field.name) != getattr(self, field.name) for field in fields(Mend))
@@ -407,7 +411,7 @@ class TableImport(Settings):
         judged = [replace(one, stops=not self.as_given and one.contradicts) for one in judged]
         together = reduce(or_, (one.mend for one in judged if one.stops and one.mend is not None), Mend())
         mends = [together if one.stops else one.mend for one in judged]
-        options = ["" if m is None else TableImport(**self.changes(m, names)).options().strip() for m in mends]
+        options = ["" if mend is None else self.option_for(mend, names) for mend in mends]
         return tuple(
             replace(one, mend=mend, option=option) for one, mend, option in zip(judged, mends, options, strict=True)
         )

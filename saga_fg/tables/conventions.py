@@ -233,7 +233,10 @@ def fitting_convention(yaw: FloatArray, velocity: FloatArray, walks: BoolArray) 
 
 
 def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | None:
-    """Headings of objects that move otherwise, `motion` (N, 2), as in another convention or none."""
+    """Headings of objects that move otherwise, `motion` (N, 2), as in another convention or none.
+
+    Where motion tells nothing, headings beyond a full turn, as in degrees.
+    """
     of_objects = fitting_convention(sample.yaw, motion, sample.walks)
     none = np.zeros(len(sample.time), dtype=np.bool_)
     of_ego = fitting_convention(sample.ego_yaw, sample.ego_motion, none)
@@ -254,7 +257,7 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
     if units.get("yaw") == "":
         what, mend = f"headings fit no convention: {said}", Mend(columns={"yaw": ""})
         return Finding("headings", what, "expected the direction of travel, or no headings", mend)
-    return None
+    return headings_in_degrees(sample.yaw) if of_objects is None else None
 
 
 _SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237}
@@ -402,11 +405,8 @@ def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: F
         known = np.isfinite(boxes.velocity).any(axis=1) & (np.hypot(*boxes.velocity.T) > _WALKS)
         motion = np.where(known[:, None], boxes.velocity, sample.own_motion)
         motion[sample.stands] = np.nan
-        headings = headings_against_motion(sample, motion)
-        if headings is None and fitting_convention(sample.yaw, motion, sample.walks) is None:
-            headings = headings_in_degrees(sample.yaw)
         speeds = speeds_against_motion(boxes.velocity, sample.own_motion) or far_too_fast(label, boxes.velocity)
-        found += [headings, speeds]
+        found += [headings_against_motion(sample, motion), speeds]
     else:
         found += [frame, headings_in_degrees(sample.yaw), far_too_fast(label, boxes.velocity)]
     return [finding for finding in found if finding is not None]

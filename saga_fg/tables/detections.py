@@ -71,7 +71,7 @@ class DetectionTable:
             return Scene(name, times, world_T_ego, ("",) * len(times), frames, findings=findings)
 
     def _findings(self, frames: list[Frame], rows: IntArray, firsts: IntArray) -> tuple[Finding, ...]:
-        """What is doubtful about the table and a scene, whose frames hold these rows, and begin at `firsts`."""
+        """Findings about the table and a scene; rows (N,): of its detections, firsts (F,): first row of each frame."""
         raw = self._rows.raw
         ego_yaw = raw.numbers("ego_yaw")[firsts]
         found = [*raw.findings(), *findings_of(Sample.from_frames(frames, raw.numbers("yaw")[rows], ego_yaw))]
@@ -102,7 +102,7 @@ class DetectionTable:
         self, rows: IntArray, moment: IntArray, poses: FloatArray | None
     ) -> tuple[list[Frame], IntArray, IntArray]:
         """The frames of a scene, the rows (N,) of their detections in this order, and the first row (F,) of each."""
-        table, kept = self._rows, []
+        table, kept, firsts = self._rows, [], []
         sensors, sensor = np.unique(table.sensor[rows], return_inverse=True)
         key = moment * len(sensors) + sensor
         order = np.argsort(key, kind="stable")
@@ -116,6 +116,7 @@ class DetectionTable:
                 row = int(members[np.argmax(kind != kind[0])])
                 raise table.raw.fault(row, "coordinates: expected the same in all rows of a frame")
             kept.append(members[~table.empty[members]])
+            firsts.append(members[0])
             frames.append(
                 Frame(
                     timestamp=float(table.timestamp[members[0]]),
@@ -126,7 +127,7 @@ class DetectionTable:
                     ego=None if table.ego is None else table.ego.measured(members),
                 )
             )
-        return frames, np.concatenate(kept), rows[[group[0] for group in np.split(order, starts[1:])]]
+        return frames, np.concatenate(kept), np.array(firsts)
 
 
 def _checked(raw: RawTable) -> _Rows:

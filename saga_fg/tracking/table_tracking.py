@@ -65,13 +65,11 @@ def track(
     return table_like(detections, found or [Tracks.empty(0.0).table_columns()])
 
 
-def check_scenes(
-    raw: RawTable, scenes: list[Scene], settings: TrackerSettings, sensors: Mapping[str, Sensor], depth: int = 4
-) -> None:
+def check_scenes(raw: RawTable, scenes: list[Scene], settings: TrackerSettings, sensors: Mapping[str, Sensor]) -> None:
     """Warn of what is doubtful in the scenes of a table, at the caller's caller; raise as `tell`."""
     frames = [frame for scene in scenes for frame in scene.frames]
     labels = {name for frame in frames for name in frame.detections.boxes.label.tolist()}
     logits = any(sensor_model(sensors, name).score == "logit" for name in {frame.sensor for frame in frames})
     found = [one for scene in scenes for one in scene.findings or () if one.kind != "scores" or not logits]
     rules = idle_rules(acting_classes(settings.edges), labels - {UNNAMED})
-    tell([*found, *([] if rules is None else [rules])], raw, depth)
+    tell([*found, *([] if rules is None else [rules])], raw, depth=4)
