@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from functools import partial
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from data_tools.plots import paths_from_above, png
 from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
 from pipelines.demo import run_demo
+from pipelines.review import CORRECTIONS, ReviewServer, ReviewSession, read_label_run
 from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.lidar_slam import lidar_slam, path_tracker
 from pipelines.slam.results import confirmed_paths, write_laser_slam, write_lidar_slam
@@ -33,14 +35,35 @@ from saga_fg.slam.joint import JointSettings, estimate_jointly
 HERE = Path(__file__).parent
 
 
-def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
-    """A picture of a page's upper left corner, taken in a browser without a window."""
+def screenshot(address: str, picture: Path, width: int, height: int) -> None:
+    """A picture of the upper left corner of a page, taken in a browser without a window."""
     chromium = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     assert chromium is not None, "no Chromium on the path, nor in the variable CHROMIUM"
     with tempfile.TemporaryDirectory() as profile:
         options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=5000"]
         options += [f"--user-data-dir={profile}", f"--window-size={width},{height}", f"--screenshot={picture}"]
-        subprocess.run([chromium, *options, page.resolve().as_uri()], check=True, capture_output=True)
+        subprocess.run([chromium, *options, address], check=True, capture_output=True)
+
+
+def write_review_picture(picture: Path, folder: Path) -> None:
+    """The page of a review of simulated traffic, with a box that was put right."""
+    smooth = "from pipelines.cli.main import main; main()"
+    options = ["smooth", "simulated", "--scenes", "1", "--seed", "3", "--output", str(folder)]
+    subprocess.run([sys.executable, "-c", smooth, *options], check=True)
+    run = read_label_run(folder)
+    session = ReviewSession(folder, run, folder / CORRECTIONS)
+    with run.open() as dataset:
+        start = float(dataset.scene("scene-0001").timestamps[0])
+    state = session.state("scene-0001")
+    row = next(row for row in state["rows"] if row["why"] == "box")
+    place = {"time": row["timestamp"], "x": row["x"], "y": row["y"]}
+    box = {"x": row["x"] + 0.8, "y": row["y"] + 0.5}
+    session.correct(state["version"], {"what": "box", "at": place, "box": box, "scene": "scene-0001", "who": "anna"})
+    with ReviewServer(session) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        time = row["timestamp"] - start
+        screenshot(f"{server.url}#t={time}&id={row['id']}", picture, 1300, 780)
+        server.shutdown()
 
 
 def main() -> None:
@@ -59,7 +82,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         write_birds_eye_picture(HERE / "birds_eye.png", result.comparison, load_config("simulated"))
-        screenshot(result.page, HERE / "report.png", 1300, 920)
+        screenshot(result.page.resolve().as_uri(), HERE / "report.png", 1300, 920)
+        write_review_picture(HERE / "review.png", Path(folder) / "labels")
         frames, truth, odometry = degraded_drive(simulate_scene(street(), 0), JointSettings(), "lidar", 0)
         start, config = truth.world_T_ego[0], load_config("simulated")
         joint = estimate_jointly(frames, odometry, partial(path_tracker, config), JointSettings(), start)

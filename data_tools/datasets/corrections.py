@@ -17,7 +17,7 @@ y alone are required; its time is that of the place unless it has one. Every lin
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from data_tools.datasets.detection_files import write_rows
@@ -30,13 +30,19 @@ COLUMNS = ("scene", "correction", "what", "timestamp", "x", "y", "who", "when", 
 
 def read_corrections(path: Path) -> tuple[Correction, ...]:
     """Read a file. Raises `InputError` naming line and field of one that can't be used."""
+    found = corrections_of_lines(read_lines(path), path)
+    if not found:
+        raise InputError(f"{path}: expected corrections, a line each, there are none")
+    return found
+
+
+def corrections_of_lines(lines: Iterable[str], path: Path) -> tuple[Correction, ...]:
+    """The corrections of a file's lines; raises as `read_corrections` does, but not where there are none."""
     found = []
-    for number, line in enumerate(read_lines(path), 1):
+    for number, line in enumerate(lines, 1):
         if line.strip():
             origin = f"{path}: line {number}"
             found.append(correction_from(parsed_json(line, origin), origin))
-    if not found:
-        raise InputError(f"{path}: expected corrections, a line each, there are none")
     return tuple(found)
 
 

@@ -20,6 +20,7 @@ COMMANDS = {
     "smooth": ("track:smooth_app", "Make labels of recorded detections, from past and future."),
     "evaluate": ("evaluate:evaluate_app", "Compare results with the ground truth."),
     "learn": ("learn:learn_app", "Learn settings from recordings."),
+    "review": ("review:review", "Correct labels on a page, those most worth a look first."),
     "report": ("report:report_app", "Make a page of a result: a player, figures, charts."),
     "view": ("report:view_app", "See a result in space, in rerun or Foxglove."),
     "benchmark": ("evaluate:benchmark_app", "Get the figures of a whole dataset, and the submission."),

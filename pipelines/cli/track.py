@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, Literal
 
 import typer
@@ -21,6 +22,7 @@ from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import write_settings
 from pipelines.explaining import journal_of, trackers
 from pipelines.report.page import RunRecord, write_run_record
+from pipelines.review import LabelRun
 from pipelines.scale_out import RunSummary, SceneTask, SmoothTask, TrackTask, file_name, new_pool, run_scenes
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg import InputError
@@ -257,12 +259,14 @@ def _smooth(
     corrections = read_corrections(labels.corrections) if labels.corrections else ()
     given = read_given_tracks(source, labels.tracks or ())
     settings = smoothing.for_given_tracks(settings, given)
+    record = LabelRun.of_command(source, method, settings, labels.tracks, labels.corrections).record
     usual = smoothing.load_smooth_config(source.family).tracking
     checks = Checks(settings.tracking.of_method(method), usual, source.option_for)
     if scale.wanted:
         checks.see_first(source)
         task = SmoothTask(settings, method, source, f".{labels.table}", corrections)
         report = run_at_scale(source, task, output, scale, labels=True, given=given)
+        write_run_record(output, record)
         _show_unfit(corrections, read_outcomes(output / "corrections"))
         exit_on_failures(report)
         return
@@ -275,6 +279,7 @@ def _smooth(
                     checks.over(parts), settings, folder, method, progress=progress, corrections=corrections
                 ),
                 table,
+                record=record,
             )
     else:
         with source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
@@ -287,6 +292,7 @@ def _smooth(
                 ),
                 table,
                 lambda folder, found: source.written.write_labels(folder, dataset, found),
+                record,
             )
     _show_unfit(corrections, [(one.origin, why) for run in done for _, one, why in run.outcomes])
     _show(output, done)
@@ -323,4 +329,5 @@ def _show(output: Path, runs: Sequence[smoothing.SmoothedScene]) -> None:
         f"{counted(total.joined, 'tracklet')} joined to others"
     )
     worth = sum(len(run.review) for run in runs)
-    typer.echo(f"{output / 'review.csv'}: {counted(worth, 'object')} worth a look, the most worth first")
+    listed = f"{output / 'review.csv'}: {counted(worth, 'object')} worth a look, the most worth first"
+    typer.echo(f"{listed}: saga-fg review {quote(str(output))}")

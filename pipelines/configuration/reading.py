@@ -57,6 +57,7 @@ class Choice:
 class Listing:
     items: tuple[Schema, ...]  # one schema for any length, or one for each entry
     any_length: bool
+    kind: type[list[Any]] | type[tuple[Any, ...]] = tuple
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,8 @@ def schema_of(hint: Any) -> Schema:
         return Choice(arguments)
     if origin in (Union, types.UnionType):
         return _union(arguments)
+    if origin is list:
+        return Listing((schema_of(arguments[0]),), any_length=True, kind=list)
     if origin is tuple and arguments:
         if arguments[-1] is Ellipsis:
             return Listing((schema_of(arguments[0]),), any_length=True)
@@ -194,7 +197,7 @@ def read_settings(
         for section, command in (other_files or {}).items():
             if isinstance(data, dict) and section in data:
                 raise InputError(f"{section}: unknown section, this is a file for `{command}`")
-        return cast(T, _read(Section((cls,)), {} if data is None else data, cls() if base is None else base, ""))
+        return cast(T, _read(Section((cls,)), {} if data is None else data, base, ""))
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
     except (yaml.YAMLError, ValueError) as error:  # ValueError: PyYAML on a date such as 2020-02-31
@@ -236,11 +239,11 @@ def _read_scalar(kind: type, data: Any, where: str) -> Any:
     return data
 
 
-def _read_listing(schema: Listing, data: Any, where: str) -> tuple[Any, ...]:
+def _read_listing(schema: Listing, data: Any, where: str) -> list[Any] | tuple[Any, ...]:
     if not isinstance(data, list):
         raise _mismatch(where, "a list", data)
     if schema.any_length:
-        return tuple(_read(schema.items[0], entry, None, f"{where}[{k}]") for k, entry in enumerate(data))
+        return schema.kind(_read(schema.items[0], entry, None, f"{where}[{k}]") for k, entry in enumerate(data))
     if len(data) != len(schema.items):
         raise InputError(f"{where}: expected a list of {len(schema.items)}, got {len(data)} entries")
     return tuple(_read(s, d, None, f"{where}[{k}]") for k, (s, d) in enumerate(zip(schema.items, data, strict=True)))

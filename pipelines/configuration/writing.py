@@ -39,8 +39,7 @@ def write_settings(settings: Any, comments: bool = True, selection: Sequence[str
 
     Of a `selection` of dotted keys, only these are written, values before sections, to be read over the same settings.
     """
-    cls = type(settings)
-    lines = _section_lines(Section((cls,)), settings, cls(), comments, selection)
+    lines = _section_lines(Section((type(settings),)), settings, None, comments, selection)
     starts = [k for k, line in enumerate(lines) if line.endswith(":") and not line.startswith((" ", "#"))]
     for start in reversed(starts):  # air between the sections of the top level
         while start > 0 and lines[start - 1].startswith("#"):

@@ -39,7 +39,7 @@ from pipelines.report.scenes import ReportScene, scene_data, start_thresholds, t
 from saga_fg.errors import InputError
 from saga_fg.tracking import SensorTime
 
-SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.js", "player.js")
+SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.js", "review.js", "player.js")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +49,7 @@ class Report:
     start   moment of the first scene that the player shows first; None: the one with the most tracks
     ghosts  whether it shows tracks that nobody sees now from the start
     beside  the method that it shows beside the last one from the start, "" for none
+    review  of labels, what `review.js` needs to take corrections; None for a page that takes none
     """
 
     title: str
@@ -61,6 +62,7 @@ class Report:
     start: int | None = None
     ghosts: bool = False
     beside: str = ""
+    review: Mapping[str, Any] | None = None
 
 
 def report_page(report: Report) -> str:
@@ -73,6 +75,7 @@ def report_page(report: Report) -> str:
         "beside": report.beside,
         "unseen": round(1000 * UNSEEN),
         "thresholds": start_thresholds(report.scenes),
+        "review": report.review,
     }
     configuration = f"<pre>{html.escape(report.configuration)}</pre>" if report.configuration else ""
     page = _part("page.html")
@@ -84,7 +87,8 @@ def report_page(report: Report) -> str:
         ("CONFIGURATION", configuration),
         ("STYLE", _part("page.css")),
         ("DATA", _packed(data)),
-        ("SCRIPT", "".join(map(_part, SCRIPTS))),
+        ("CONNECT", "; connect-src 'self'" if report.review and report.review["server"] else ""),
+        ("SCRIPT", "".join(_part(name) for name in SCRIPTS if report.review or name != "review.js")),
     ):
         page = page.replace(f"<!--{mark}-->", text)
     return page
@@ -181,7 +185,7 @@ def result_report(source: DatasetSource, result: Path, beside: Path | None = Non
     scenes = _scenes(source, results[0])
     for other in results[1:]:
         scenes = [_joined(scene, other, added) for scene, added in _pairs(scenes, _scenes(source, other))]
-    scenes = _on_the_ground(source, scenes, images)
+    scenes = with_surroundings(source, scenes, images)
     tables: list[FigureTable] = []
     charts: list[Chart] = []
     for each in results:
@@ -274,8 +278,8 @@ def _joined(scene: ReportScene, result: _Result, other: ReportScene | None) -> R
     )
 
 
-def _on_the_ground(source: DatasetSource, scenes: Sequence[ReportScene], width: int) -> list[ReportScene]:
-    """Add the maps of the places and the images of the cameras."""
+def with_surroundings(source: DatasetSource, scenes: Sequence[ReportScene], width: int) -> list[ReportScene]:
+    """Add the maps of the places and the images of the cameras, `width` pixels wide."""
     by_name = {each.scene.name: each.scene for each in scenes}
     around = source.surroundings(by_name)
     maps, images = around.maps(), around.images() if width else {}

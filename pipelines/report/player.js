@@ -1,5 +1,5 @@
 const $ = id => document.getElementById(id);
-const NEAREST = 1, FARTHEST = 80, START = 9;  // zoom, pixels per m
+const NEAREST = 1, FARTHEST = 80, START = 9, CLOSE = 20;  // zoom, pixels per m
 
 async function unpack(text) {
   const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
@@ -7,12 +7,12 @@ async function unpack(text) {
   return JSON.parse(await new Response(stream).text());
 }
 
-function player({scenes, start, thresholds, ghosts, beside}) {
+function player({scenes, start, thresholds, ghosts, beside, review}) {
   const canvas = $("view"), g = canvas.getContext("2d");
   const shown = Object.fromEntries(LAYERS.map(layer => [layer.name, layer.on]));
   const filters = makeFilters(scenes, thresholds, ghosts, () => draw());
-  let scene = scenes[0], k = 0, picked = null, timer = null, zoom = START, offset = [0, 0], home = null, views = [];
-  // picked: {method, id} of the track that is followed; views: of the last drawing, from left to right
+  let scene = scenes[0], k = 0, picked = null, timer = null, zoom = START, offset = [0, 0], home = null, views = [], lost = null, pointer = {x: 0, y: 0};
+  // picked: {method, id} of the track that is followed; views: of the last drawing, from left to right; lost: name of one that was followed, and deleted; pointer: where it is, m
 
   const last = () => scene.times.length - 1;
   const names = () => $("beside").value ? [$("beside").value, $("method").value] : [$("method").value];
@@ -36,6 +36,7 @@ function player({scenes, start, thresholds, ghosts, beside}) {
     k = 0;
     chooseMethods();
     show(fullest());
+    editor?.enter();
   }
 
   function fullest() {  // the first of the moments with the most tracks that are shown
@@ -129,21 +130,29 @@ function player({scenes, start, thresholds, ghosts, beside}) {
     if (!picked) { $("panel").replaceChildren(); return; }
     const result = scene.methods[picked.method], row = result.moments.flat().find(each => each[ID] === picked.id);
     describeTrack($("panel"), scene, result, k, picked.id, filters.colour(scene, row));
+    editor?.describe($("panel"), result.ids[picked.id]);
   }
 
   function follow(track) {
     picked = track;
+    lost = null;
     offset = [0, 0];
     draw();
     remember();
   }
 
-  function pick(event) {
+  function under(event) {  // the view and the point in the world under the pointer
     const ratio = window.devicePixelRatio || 1, pane = Math.min(views.length - 1, Math.floor(event.offsetX / canvas.clientWidth * views.length));
-    const view = views[Math.max(0, pane)], p = view.inverse.transformPoint(new DOMPoint(event.offsetX * ratio, event.offsetY * ratio));
+    const view = views[Math.max(0, pane)];
+    return [view, view.inverse.transformPoint(new DOMPoint(event.offsetX * ratio, event.offsetY * ratio))];
+  }
+
+  function pick(event) {
+    const [view, p] = under(event);
     const reach = row => Math.max(row[LENGTH] / 200, 12 / zoom);
     const near = view.tracks.map(row => [Math.hypot(row[X] / 100 - p.x, row[Y] / 100 - p.y) - reach(row), row[ID]]).filter(d => d[0] < 0);
-    follow(near.length ? {method: view.name, id: near.sort((a, b) => a[0] - b[0])[0][1]} : null);
+    const track = near.length ? {method: view.name, id: near.sort((a, b) => a[0] - b[0])[0][1]} : null;
+    if (!editor?.click(rowOf(track))) follow(track);
   }
 
   function next(step) {  // the tracks in view one after the other, the nearest to the vehicle first
@@ -182,7 +191,7 @@ function player({scenes, start, thresholds, ghosts, beside}) {
       if (asked.has(select) && scene.methods[asked.get(select)]) $(select).value = asked.get(select);
     chooseMethods();
     const t = parseFloat(asked.get("t"));
-    if (Number.isFinite(t)) show(scene.times.reduce((best, time, i) => Math.abs(time - t) < Math.abs(scene.times[best] - t) ? i : best, 0));
+    if (Number.isFinite(t)) show(nearest(t));
     const named = id => id === asked.get("id") || shortName(id) === asked.get("id");
     const owner = [...names()].reverse().find(name => scene.methods[name].ids.some(named));
     if (!owner) return;
@@ -191,6 +200,33 @@ function player({scenes, start, thresholds, ghosts, beside}) {
     offset = [0, 0];
     draw();
   }
+
+  function nearest(t) {  // moment
+    return scene.times.reduce((best, time, i) => Math.abs(time - t) < Math.abs(scene.times[best] - t) ? i : best, 0);
+  }
+
+  const stage = {  // for corrections
+    scene: () => scene, k: () => k, focus: () => rowOf(picked), pointer: () => pointer, draw,
+    look(name, time, id) {
+      const at = scenes.findIndex(each => each.name === name);
+      if (scenes[at] !== scene) chooseScene(at);
+      show(nearest(time - scene.start));
+      zoom = Math.max(zoom, CLOSE);
+      const number = scene.methods.labels.ids.indexOf(id);
+      follow(number < 0 ? null : {method: "labels", id: number});
+    },
+    refresh(of, data) {
+      const followed = picked && of === scene ? of.methods[picked.method].ids[picked.id] : lost;
+      Object.assign(of, data);
+      if (of !== scene) return;
+      const id = scene.methods.labels.ids.indexOf(followed);
+      picked = id < 0 ? null : {method: "labels", id};
+      lost = id < 0 ? followed : null;
+      filters.showClasses(scene);
+      draw();
+    },
+  };
+  const editor = review && makeReview(review, stage);
 
   function resize(factor) { zoom = Math.max(NEAREST, Math.min(FARTHEST, zoom * factor)); draw(); }
 
@@ -203,7 +239,7 @@ function player({scenes, start, thresholds, ghosts, beside}) {
     ArrowLeft: ["←", "moment before; with shift: ten", e => step(e.shiftKey ? -10 : -1)],
     n: ["n", "follow the next track, the nearest to the vehicle first", () => next(1)],
     p: ["p", "follow the one before", () => next(-1)],
-    Escape: ["Esc", "follow none", () => follow(null)],
+    Escape: ["Esc", "follow none", () => { editor?.cancel(); follow(null); }],
     "+": ["+", "closer; the wheel, too", () => resize(1.25)],
     "-": ["-", "farther", () => resize(.8)],
     0: ["0", "back to the vehicle", () => { goHome(); follow(null); }],
@@ -213,19 +249,25 @@ function player({scenes, start, thresholds, ghosts, beside}) {
     d: ["d", "detections", () => toggle("detections")],
     e: ["e", "edges of the graph", () => toggle("edges")],
     i: ["i", "ids", () => toggle("ids")],
+    ...editor?.keys,
     "?": ["?", "this help", () => $("help").showModal()],
   };
 
-  let held = null, moved = 0;
-  canvas.onpointerdown = e => { held = [e.clientX, e.clientY]; moved = 0; canvas.setPointerCapture(e.pointerId); };
+  let held = null, moved = 0, edited = false;
+  canvas.onpointerdown = e => {
+    held = [e.clientX, e.clientY]; moved = 0; edited = Boolean(editor?.grab(under(e)[1], 1 / zoom));
+    canvas.setPointerCapture(e.pointerId);
+  };
   canvas.onpointermove = e => {
+    pointer = under(e)[1];
     if (!held) return;
+    if (edited) { editor.drag(under(e)[1]); return; }
     const dx = e.clientX - held[0], dy = e.clientY - held[1];
     moved += Math.abs(dx) + Math.abs(dy);
     offset = [offset[0] + dx, offset[1] + dy]; held = [e.clientX, e.clientY];
     draw();
   };
-  canvas.onpointerup = e => { held = null; if (moved < 5) pick(e); };
+  canvas.onpointerup = e => { held = null; if (edited) editor.drop(); else if (moved < 5) pick(e); };
   canvas.onwheel = e => { e.preventDefault(); resize(Math.exp(-e.deltaY / 500)); };
   document.onkeydown = e => {
     if (takesKey(e.target, e.key) || $("help").open || e.ctrlKey || e.metaKey || e.altKey) return;

@@ -2,7 +2,8 @@
 
 Scenes as data of the page's player: rows of whole numbers, centimetres and milliradians, about the scene's start.
 
-    scene   {"name", "times": [s], "ego": [[x, y, yaw]], "labels": [class], "methods": {name: {"ids": [name],
+    scene   {"name", "start": s, "origin": [x, y] in m, "times": [s], "ego": [[x, y, yaw]], "labels": [class],
+             "methods": {name: {"ids": [name],
              "moments": [[track, ...]], "edges": [[[target id, source id, rate], ...]],
              "horizons": [ms], "predictions": [[prediction, ...]], [] without}},
              "truth": [[object, ...]], "detections": [[detection, ...]], "road": see below,
@@ -204,7 +205,9 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
     ego = np.column_stack([scene.world_T_ego[:, :2, 3] - origin, yaw_of(scene.world_T_ego[:, :3, :3])])
     return {
         "name": scene.name,
-        "times": (scene.timestamps - scene.timestamps[:1]).round(3).tolist(),
+        "start": float(scene.timestamps[0]) if len(scene) else 0.0,
+        "origin": origin.tolist(),
+        "times": (scene.timestamps - scene.timestamps[:1]).round(6).tolist(),
         "ego": _whole(ego * [100, 100, 1000]),
         "labels": labels.tolist(),
         "methods": {

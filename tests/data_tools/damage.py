@@ -38,6 +38,7 @@ from pipelines.configuration import load_settings
 from pipelines.explaining import read_events
 from pipelines.report.page import read_run_record
 from pipelines.report.scenes import thumbnails
+from pipelines.review import read_label_run
 from pipelines.serving import StateKeeper, StreamTracker
 from pipelines.slam.configuration import SlamConfig, load_slam_config
 from pipelines.slam.submaps import SlamMap, read_map, write_map
@@ -82,6 +83,8 @@ POSES = "1 0 0 0 0 1 0 0 0 0 1 0\n0 -1 0 1 1 0 0 2 0 0 1 3\n"
 TUM = "# timestamp tx ty tz qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n"
 CONFIG = "tracker:\n  max_delay: 0.5\n  classes:\n    car: {max_distance: 3.0}\nsensors:\n  default: {score: logit}\n"
 RECORD = json.dumps({"method": "kf", "version": "1", "configuration": "a", "milliseconds": {"s": [1.0, 2.0]}})
+LABEL_RUN = 'dataset: file\noptions: "detections: [a.csv]"\nmethod: kf\ntracks: []\ncorrections: ""\ndirectory: .\n'
+LABEL_RECORD = json.dumps({**json.loads(RECORD), "configuration": LABEL_RUN})
 MESSAGES = (
     '{"seq": 1, "timestamp": 0.5, "sensor": "a", "coordinates": "ego", "ego": {"x": 1, "y": 2, "yaw": 0.1}, '
     '"detections": [{"x": 1, "y": 2, "label": "car", "length": 4, "width": 2, "height": 1, "score": 0.5}]}\n'
@@ -192,6 +195,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "state": _state(folder / "state.saga", config),
         "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),
         "run record": Target((table("r.run.json", RECORD),), lambda: read_run_record(folder / "r.json")),
+        "record of labels": Target((table("run.json", LABEL_RECORD),), lambda: read_label_run(folder)),
         "stream": one("messages.ndjson", MESSAGES, lambda path: _stream(path, lambda: config.new_tracker("saga"))),
     }
 

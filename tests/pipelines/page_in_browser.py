@@ -23,32 +23,39 @@ const wait = setInterval(() => {
   if (document.body.dataset.ready !== "yes") return;
   clearInterval(wait);
   const found = {faults: window.faults};
-  SCRIPT
-  const output = document.createElement("pre");
-  output.id = "found"; output.textContent = JSON.stringify(found);
-  document.body.append(output);
+  (async () => { SCRIPT })().catch(error => window.faults.push(String(error))).then(() => {
+    const output = document.createElement("pre");
+    output.id = "found"; output.textContent = JSON.stringify(found);
+    document.body.append(output);
+  });
 }, 50);
 </script>"""
 
 
-def tried_in_browser(page: str, script: str, folder: Path, hash_: str = "") -> Any:
-    """Return the object `found` that `script` fills once the page is ready; `faults` are its errors.
+def with_script(page: str, script: str) -> str:
+    """A page that fills the object `found` by `script`, which may await, once it is ready; `faults` are its errors."""
+    return page.replace("<head>", "<head>" + CATCH).replace("</body>", TRY.replace("SCRIPT", script) + "</body>")
 
-    The address of the page ends in `hash_`. The test is skipped where there is no Chromium.
-    """
+
+def found_at(url: str, folder: Path, size: str = "1300,900") -> Any:
+    """Return the object `found` of a page at an address. The test is skipped where there is no Chromium."""
     chromium = os.environ.get("CHROMIUM") or next(
         filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
     )
     if chromium is None:
         pytest.skip("no Chromium on the path, nor in the variable CHROMIUM")
-    page = page.replace("<head>", "<head>" + CATCH).replace("</body>", TRY.replace("SCRIPT", script) + "</body>")
-    path = folder / "page.html"
-    path.write_text(page, encoding="utf-8")
     done = subprocess.run(
         [chromium, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}",
-         "--window-size=1300,900", "--virtual-time-budget=10000", "--dump-dom", path.as_uri() + hash_],
+         f"--window-size={size}", "--virtual-time-budget=60000", "--dump-dom", url],
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
     match = re.search(r'<pre id="found">(.*?)</pre>', done.stdout)
     assert match is not None, done.stdout[-2000:]
     return json.loads(html.unescape(match[1]))
+
+
+def tried_in_browser(page: str, script: str, folder: Path, hash_: str = "") -> Any:
+    """Return the object `found` of `with_script` for a page from disk, whose address ends in `hash_`."""
+    path = folder / "page.html"
+    path.write_text(with_script(page, script), encoding="utf-8")
+    return found_at(path.as_uri() + hash_, folder)

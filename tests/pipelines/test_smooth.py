@@ -40,7 +40,7 @@ def test_nuscenes_labels_are_complete(tmp_path):
     run = done(*arguments, "--detections", f"lidar={detections}", "-o", tmp_path / "labels")
     assert "observed" in run.output
     written = {path.name for path in (tmp_path / "labels").iterdir()}
-    assert written == {"labels.csv", "review.csv", "summary.json", "tracking.json", "v1.0-mini", "maps"}
+    assert written == {"labels.csv", "review.csv", "run.json", "summary.json", "tracking.json", "v1.0-mini", "maps"}
     rows = read_tracks(tmp_path / "labels" / "labels.csv", labels=True)
     summary = json.loads((tmp_path / "labels" / "summary.json").read_text())["total"]
     assert len(rows.source) == summary["observed"] + summary["filled"] + summary["extended"] > 0

@@ -87,7 +87,12 @@ def test_the_command_streams_several_recordings(tmp_path):
     rows = [f"{name},{row}" for name in ("a", "b") for row in drive(6.0)]
     path = write(tmp_path / "two.csv", rows, f"scene,{HEADER}")
     done("smooth", "file", path, "--output", tmp_path / "out")
-    assert {file.name for file in (tmp_path / "out").iterdir()} == {"labels.csv", "review.csv", "summary.json"}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "labels.csv",
+        "review.csv",
+        "run.json",
+        "summary.json",
+    }
     labels = read_tracks(tmp_path / "out" / "labels.csv")
     first, second = (labels.boxes.position[labels.scene == name] for name in ("a", "b"))
     np.testing.assert_array_equal(first, second)

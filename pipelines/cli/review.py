@@ -1,0 +1,74 @@
+"""`saga-fg review`: labels corrected on a page."""
+
+from __future__ import annotations
+
+import os
+from contextlib import chdir, suppress
+from pathlib import Path
+from shlex import quote
+from typing import Annotated
+
+import typer
+
+from data_tools.files.atomic_files import check_writable, write_text
+from pipelines.cli.console import working
+from pipelines.cli.options import Verbose
+from pipelines.review import CORRECTIONS, ReviewServer, ReviewSession, read_label_run
+from saga_fg.errors import InputError
+
+
+def review(
+    folder: Annotated[Path, typer.Argument(help="Folder that saga-fg smooth wrote.")],
+    corrections: Annotated[
+        Path | None,
+        typer.Option(
+            "--corrections",
+            help="File of corrections to go on with.  [default: that of the labels, else corrections.jsonl in FOLDER]",
+            metavar="FILE",
+        ),
+    ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            "--page",
+            help="Write the page to a file instead, to be opened without a server: it keeps corrections until they are "
+            "saved, and solves nothing again.",
+            metavar="FILE",
+        ),
+    ] = None,
+    who: Annotated[str | None, typer.Option("--who", help="Your name in corrections.  [default: as logged in]")] = None,
+    images: Annotated[
+        int, typer.Option("--images", min=0, help="Width of the camera images in the page, pixels; 0 leaves them out.")
+    ] = 240,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port on 127.0.0.1; 0: any that is free.")] = 0,
+    verbose: Verbose = False,
+) -> None:
+    """Correct labels on a page: objects by what a look is worth, boxes moved and turned from above, keys for the rest.
+
+    The page is served on 127.0.0.1, to whom knows the token in its address; nothing leaves the machine. Every
+    correction is in the file before the page shows it. Its scene is solved again, and what changed is marked.
+    Ctrl-C ends the server. `saga-fg smooth ... --corrections FILE` makes labels with the corrections.
+
+    \b
+    Examples:
+      saga-fg review labels
+      saga-fg review labels --corrections mine.jsonl --who anna
+      saga-fg review labels --page review.html   # for somebody without saga-fg
+    """
+    if page is not None and page.suffix not in (".html", ".htm"):
+        raise InputError(f"{page}: expected a file name that ends in .html")
+    run, folder, page = read_label_run(folder), folder.absolute(), page and page.absolute()
+    given = Path(run.directory, run.corrections) if run.corrections else folder / CORRECTIONS
+    file = given if corrections is None else corrections.absolute()
+    check_writable(page or file)
+    with chdir(run.directory):
+        with working("reading the recordings"):
+            session = ReviewSession(folder, run, file, os.environ.get("USER", "") if who is None else who, images)
+        if page is not None:
+            write_text(page, session.page(server=False))
+            typer.echo(f"{page}: open it in a browser; what it saves goes to saga-fg smooth ... --corrections FILE")
+            return
+        with ReviewServer(session, port) as server, suppress(KeyboardInterrupt):
+            typer.echo(f"{server.url}\nCorrections go to {file}; Ctrl-C ends.")
+            server.serve_forever()
+        typer.echo(f"labels with the corrections: saga-fg smooth ... --corrections {quote(str(file))}", err=True)

@@ -1,0 +1,10 @@
+"""Review of labels: a page on this machine that takes corrections, and the labels solved again with them.
+
+folder of labels + record of its run -> `ReviewSession` <-> `ReviewServer` <-> the page
+"""
+
+from pipelines.review.record import LabelRun, read_label_run
+from pipelines.review.server import ReviewServer
+from pipelines.review.session import CORRECTIONS, ReviewSession
+
+__all__ = ["CORRECTIONS", "LabelRun", "ReviewServer", "ReviewSession", "read_label_run"]

@@ -1,0 +1,236 @@
+"""A review: recordings with their labels, and the file of corrections, which is its only state.
+
+An action is checked, the scene is solved again, the file is written whole, and then it is answered. Every action names
+the version of the file that its page has seen: one that another page has changed since is refused.
+
+    answer  {"version": of the file, "corrections": [{"number": of the line, "record", "problem": why it does not hold
+             or ""}] of the scene, "rows": [row of review.csv] of the scene, "scene": parts of the page's data}
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import threading
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_tools.datasets.corrections import corrections_of_lines
+from data_tools.datasets.detection_files import read_tracks
+from data_tools.datasets.results import SceneResult, scene_result
+from data_tools.files.atomic_files import write_text
+from data_tools.files.input_files import open_text, read_text
+from data_tools.files.readers import parsed_json
+from data_tools.metrics import SceneBoxes
+from pipelines.report import Report, ReportScene, report_page
+from pipelines.report.page import with_surroundings
+from pipelines.report.scenes import scene_data
+from pipelines.review.record import LabelRun
+from pipelines.smoothing import label_model
+from pipelines.tracking import one_thread, scene_with_frames
+from saga_fg.errors import InputError, error_context, unknown_name
+from saga_fg.smoothing import LabelBuilder, Review
+from saga_fg.smoothing.corrections import Correction, correction_from, corrections_in
+from saga_fg.types.by_class import DEFAULT
+from saga_fg.types.dataset import Scene
+
+CORRECTIONS = "corrections.jsonl"  # in the folder of labels
+CHANGED = ("labels", "methods", "detections")  # parts of a scene's data that follow from its classes and labels
+LABELS = "labels"  # the name of labels as a method
+BESIDE = 12.0  # m around a box, in which the points of a scan are shown
+SPACING = 0.05  # m, to which they are thinned
+SCAN_TIME = 0.06  # s between a moment and its scan
+
+
+class ChangedElsewhereError(InputError):
+    """Another page has changed the corrections; status: as HTTP has it."""
+
+    status = HTTPStatus.CONFLICT
+
+
+class ReviewSession:
+    """The review of a folder of labels. Safe to call from several threads.
+
+    file   of corrections, which may not be there yet
+    who    their author
+
+    Raises `InputError` where the recordings, the labels or the file of corrections can't be read.
+    """
+
+    def __init__(self, folder: Path, run: LabelRun, file: Path, who: str = "", images: int = 0) -> None:
+        self.folder, self.file, self._run, self._who = folder, file, run, who
+        self._lock = threading.Lock()
+        self._builders: dict[str, LabelBuilder] = {}
+        self._answers: dict[str, tuple[Sequence[Correction], dict[str, Any]]] = {}  # the latest, by scene
+        with error_context(f"{folder}: its recordings ({run.dataset}) are needed"), run.open() as (source, dataset):
+            scenes = {name: scene_with_frames(dataset, name) for name in dataset.scenes}
+        shown = [_shown(found.scene, found.found, found.coasting, run) for found in _labels(folder, scenes)]
+        self._shown = {each.scene.name: each for each in with_surroundings(source, shown, images)}
+        self._scans = source.surroundings({name: each.scene for name, each in self._shown.items()}).scans()
+        self._title = f"Review of {folder.name}: {source}"
+        corrections_of_lines(self._lines(), file)
+
+    def page(self, server: bool) -> str:
+        """The page, which sends its corrections to the server it came from, or keeps them to be saved as a file."""
+        classes = Counter(dict.fromkeys(self._run.config.tracking.tracker.classes, 0))
+        classes.update(label for each in self._shown.values() for label in each.tracks[LABELS].boxes.label.tolist())
+        review = {
+            "server": server,
+            "who": self._who,
+            "file": self.file.name,
+            "folder": str(self.folder),
+            "classes": [label for label, _ in classes.most_common() if label != DEFAULT],
+            "scanned": list(self._scans) if server else [],
+            "rows": [row for row in _listed(self.folder) if row.get("scene") in self._shown],
+        }
+        facts = [*list(self._shown)[:3], f"{sum(len(each.scene) for each in self._shown.values())} moments"]
+        return report_page(Report(self._title, facts, list(self._shown.values()), ghosts=True, review=review))
+
+    def state(self, scene: str) -> dict[str, Any]:
+        """The answer for a scene as corrected so far. Raises `InputError` for an unknown one."""
+        with self._lock:
+            return self._answer(scene, self._lines())
+
+    def correct(self, version: str, record: Any) -> dict[str, Any]:
+        """Add a correction, which has to name its scene, to the file.
+
+        Raises `ChangedElsewhereError`, and `InputError` for one that is broken or does not hold; the file is unchanged.
+        """
+        with self._lock:
+            lines, one = self._lines(version), correction_from(record, "correction")
+            lines.append(json.dumps(record, allow_nan=False))
+            answer = self._answer(one.scene, lines)
+            if problem := answer["corrections"][-1]["problem"]:
+                raise InputError(f"{one}: {problem}")
+            self._write(lines)
+            return answer
+
+    def undo(self, version: str, scene: str) -> dict[str, Any]:
+        """Take back the last correction of a scene, and answer. Raises `InputError` where there is none."""
+        with self._lock:
+            lines = self._lines(version)
+            mine = corrections_in(scene, corrections_of_lines(lines, self.file))
+            if not mine:
+                raise InputError(f"undo: there is no correction of scene {scene} to take back")
+            del lines[_line(mine[-1])]
+            answer = self._answer(scene, lines)
+            self._write(lines)
+            return answer
+
+    def points(self, scene: str, moment: int, x: float, y: float) -> list[list[int]]:
+        """Points of the LiDAR's scan of a moment near a place (m), in cm about the scene's start; none without a scan.
+
+        Raises `InputError` for a moment that the scene has not.
+        """
+        known = self._known(scene).scene
+        if not 0 <= moment < len(known):
+            raise InputError(f"moment: expected 0 to {len(known) - 1}, got {moment}")
+        scans = self._scans.get(scene)
+        late = np.abs(scans.timestamps - known.timestamps[moment]) if scans is not None else np.empty(0)
+        if scans is None or not len(late) or late.min() > SCAN_TIME:
+            return []
+        with self._lock:
+            points = scans[int(np.argmin(late))].points
+        pose = known.world_T_ego[moment] @ scans.ego_T_lidar
+        places = (points @ pose[:3, :3].T + pose[:3, 3])[:, :2]
+        near = places[np.hypot(*(places - [x, y]).T) < BESIDE] - known.world_T_ego[0, :2, 3]
+        cells = np.unique(np.rint(near / SPACING), axis=0)
+        thinned: list[list[int]] = np.rint(100 * SPACING * cells).astype(np.int64).tolist()
+        return thinned
+
+    def _lines(self, version: str | None = None) -> list[str]:
+        """The lines of the file. Raises `ChangedElsewhereError` where they are not of this version."""
+        lines = read_text(self.file).splitlines() if self.file.exists() else []
+        if version not in (None, _version(lines)):
+            raise ChangedElsewhereError("the corrections were changed in another window: look again, and repeat")
+        return lines
+
+    def _write(self, lines: Sequence[str]) -> None:
+        """Write the file whole; one without corrections goes, as readers take none."""
+        if any(line.strip() for line in lines):
+            write_text(self.file, "".join(f"{line}\n" for line in lines))
+        else:
+            self.file.unlink(missing_ok=True)
+
+    def _known(self, scene: str) -> ReportScene:
+        if scene not in self._shown:
+            raise InputError(unknown_name("scene", scene, tuple(self._shown)))
+        return self._shown[scene]
+
+    def _answer(self, name: str, lines: Sequence[str]) -> dict[str, Any]:
+        """The answer for a scene; it is solved again if its corrections are others than before."""
+        scene, corrections = self._known(name).scene, corrections_in(name, corrections_of_lines(lines, self.file))
+        if name not in self._answers or self._answers[name][0] != corrections:
+            if name not in self._builders:
+                self._builders[name] = _solved(scene, self._run)
+            builder = self._builders[name]
+            with one_thread():
+                labels, _ = builder.corrected(corrections)
+            tracks = [moment.tracks for part in labels for moment in part]
+            coasting = np.concatenate([np.empty(0), *(each.coasting for each in tracks)])
+            data = scene_data(_shown(scene, SceneBoxes.of_tracks(tracks), coasting, self._run))
+            told = [
+                {"number": _line(one) + 1, "record": parsed_json(lines[_line(one)], one.origin), "problem": why}
+                for one, why in builder.outcomes
+            ]
+            changed = {part: data[part] for part in CHANGED}
+            answer = {"corrections": told, "rows": _rows(name, labels.review()), "scene": changed}
+            self._answers[name] = corrections, answer
+        return {"version": _version(lines), **self._answers[name][1]}
+
+
+def _solved(scene: Scene, run: LabelRun) -> LabelBuilder:
+    """A scene solved whole, without corrections."""
+    builder = LabelBuilder(run.config.tracking.new_tracker(run.method), label_model(run.config, run.method))
+    with one_thread():
+        builder.add(scene.frames, scene.timestamps)
+        builder.finish()
+    return builder
+
+
+def _line(one: Correction) -> int:
+    """Index of a correction's line in its file."""
+    return int(one.origin.rpartition(" ")[2]) - 1
+
+
+def _version(lines: Sequence[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+
+
+def _shown(scene: Scene, found: SceneBoxes, coasting: Any, run: LabelRun) -> ReportScene:
+    """A scene with labels; without edges, which take long to find."""
+    bare = replace(scene, ground_truth=None)
+    return ReportScene(bare, {LABELS: found}, {LABELS: coasting}, (), run.config.tracking.sensors)
+
+
+def _labels(folder: Path, scenes: Mapping[str, Scene]) -> Iterator[SceneResult]:
+    """The labels of the scenes, from the table of the folder or those of its parts, in the order of the recordings."""
+    tables = [*folder.glob("labels.*"), *sorted((folder / "labels").glob("*.*"))]
+    if not tables:
+        raise InputError(f"{folder}: expected the table labels.csv, or tables of scenes in labels/, there are none")
+    parts = [(table, read_tracks(table, labels=True)) for table in tables]
+    return (
+        scene_result(scene, rows, path) for name, scene in scenes.items() for path, rows in parts if name in rows.scene
+    )
+
+
+def _listed(folder: Path) -> list[dict[str, str]]:
+    """The rows of review.csv, or of the tables of a parallel run, as texts."""
+    rows: list[dict[str, str]] = []
+    for table in [*folder.glob("review.csv"), *sorted((folder / "review").glob("*.csv"))]:
+        with open_text(table, newline="") as file:
+            rows += csv.DictReader(file)
+    return rows
+
+
+def _rows(scene: str, review: Review) -> list[dict[str, Any]]:
+    """The rows of a scene."""
+    columns = {name: np.asarray(column).tolist() for name, column in review.table_columns().items()}
+    return [{"scene": scene, **dict(zip(columns, row, strict=True))} for row in zip(*columns.values(), strict=True)]
