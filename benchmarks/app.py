@@ -8,6 +8,7 @@ from benchmarks.runner import application
 
 NAMES = (
     *(
+        "calibration",
         "conventions",
         "endurance",
         "estimators",

@@ -82,6 +82,7 @@ class TrackedScene:
     milliseconds  that the tracker took for each frame
     predictions   made at its timestamps, where horizons were given
     clocks        of its sensors, at the end, where there are several
+    noise         that was found of sensors, in units of what their models say
     """
 
     scene: Scene
@@ -89,6 +90,7 @@ class TrackedScene:
     milliseconds: tuple[float, ...]
     predictions: tuple[PredictedTracks, ...] = ()
     clocks: Mapping[str, SensorTime] = field(default_factory=dict)
+    noise: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
@@ -124,7 +126,8 @@ def track_scene(
             wanted.append(latest if latest is not None and latest.timestamp == moment else tracker.tracks(moment))
             if horizons is not None and latest is not None:
                 predicted += _predicted(tracker, moment, horizons, latest.timestamp)
-    return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted), compared_clocks(tracker))
+    clocks, noise = compared_clocks(tracker), tracker.noise_scales
+    return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted), clocks, noise)
 
 
 def compared_clocks(tracker: OnlineTracker) -> dict[str, SensorTime]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 
 from data_tools.datasets.corrections import read_corrections, read_outcomes
@@ -86,6 +87,7 @@ class Summary:
     milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
     classes: set[str] = field(default_factory=set)
     clocks: dict[str, Mapping[str, SensorTime]] = field(default_factory=dict)  # of the sensors, by scene
+    noise: dict[str, list[float]] = field(default_factory=dict)  # of the sensors, in each scene
 
     def counting(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
         """Pass runs on and count them."""
@@ -96,6 +98,8 @@ class Summary:
             self.milliseconds[run.scene.name] = run.milliseconds
             if run.clocks:
                 self.clocks[run.scene.name] = run.clocks
+            for name, scale in run.noise.items():
+                self.noise.setdefault(name, []).append(scale)
             self.boxes += sum(len(tracks) for tracks in run.tracks)
             for tracks in run.tracks:
                 self.classes.update(tracks.boxes.label.tolist())
@@ -119,6 +123,11 @@ class Summary:
         tracks = f"{counted(len(self.best_score), 'track')} ({sure} with a score above 0.5)"
         counts = (counted(self.scenes, "scene"), counted(self.frames, "frame"), tracks, counted(self.boxes, "box"))
         typer.echo(f"{self.output}: {', '.join(counts)}{rate}")
+        for name, scales in self.noise.items():
+            typer.echo(
+                f"noise of {name}: {np.median(scales):.2g} of what its model says, by its successive detections; "
+                "ellipses are scaled"
+            )
 
 
 def exit_on_failures(report: RunSummary) -> None:

@@ -216,7 +216,15 @@ def _joined(parts: list[SensorTime]) -> tuple[float, float]:
     return mean, math.sqrt(max(1.0, chi2 / max(len(parts) - 1, 1)) / total)
 
 
-LEARNED = ("noise", "calibration", "detection_probability", "class_detection_probability", "field_of_view", "confusion")
+LEARNED = (
+    "noise",
+    "calibration",
+    "detection_probability",
+    "class_detection_probability",
+    "field_of_view",
+    "confusion",
+    "calibrate_noise",
+)
 KINDS: dict[type, str] = {ConstantVelocity: "constant_velocity", Curvilinear: "curvilinear"}
 
 

@@ -142,7 +142,7 @@ def fit_sensor(sample: DetectionSample, base: Sensor, gate: float) -> Sensor:
         part = seen.select(seen.label == label)
         calibration[label] = fit_score_calibration(part.logit, part.true, overall_calibration)
     view = fit_field_of_view(seen, base.field_of_view)
-    model = replace(base, calibration=calibration, field_of_view=view)
+    model = replace(base, calibration=calibration, field_of_view=view, calibrate_noise=False)
     in_view = sample.objects.select(view.holds(sample.objects.range, sample.objects.azimuth))
     overall, by_class = detection_probabilities(in_view, base.detection_probability)
     noise = fit_noise(seen, model, gate)

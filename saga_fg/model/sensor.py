@@ -149,6 +149,9 @@ class Sensor(Settings):
     noise: Mapping[str, NoiseModel] = settings_group(
         lambda: {DEFAULT: NoiseModel()}, "measurement noise by class; the entry named default serves all others"
     )
+    calibrate_noise: bool = setting(
+        False, "true: scale the noise of positions by what successive detections say of it, from 1/3 to 10/3"
+    )
     use_velocity: bool = setting(True, "use velocities and range rates, where they are measured")
     detection_probability: Fraction = setting(
         0.9, "probability that a visible object in the field of view is detected; higher: misses count more"

@@ -46,6 +46,7 @@ from saga_fg.smoothing.recording_labels import LabelParts, RecordingLabels
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import LabelCounts
 from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings
+from saga_fg.tracking.noise_scale import scaled_sensors
 from saga_fg.types.frame import Frame
 
 MIN_LENGTH = 5.0  # s, of a chunk that ends early: below the margins at its ends, which are smoothed again, take over
@@ -271,10 +272,11 @@ class LabelBuilder:
     def _smooth(self, until: float) -> None:
         """All chunks that are complete, with their margins, before a time; infinite: all that is left."""
         model = self._model
+        sensors = scaled_sensors(model.sensors, self._tracker.noise_scales)
         for begin, end in self._backlog.chunks(until):
             tracked, wanted = self._backlog.around(begin, end)
             frames = [each.frame for each in tracked]
-            evidence = gather_evidence(frames, wanted, model.sensors, model.tracker.classes)
+            evidence = gather_evidence(frames, wanted, sensors, model.tracker.classes)
             if len(evidence.times):
                 track_of = np.concatenate([np.empty(0, dtype=np.int64), *(each.track_of for each in tracked)])
                 objects = smooth_objects(evidence, track_of, model.smoothing, model.tracker, model.providers)

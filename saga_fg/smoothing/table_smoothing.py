@@ -18,7 +18,7 @@ from saga_fg.smoothing.states import Labels
 from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like
 from saga_fg.tracking import Tracker, TrackerSettings
-from saga_fg.tracking.table_tracking import check_scenes
+from saga_fg.tracking.table_tracking import UNKNOWN_SENSORS, check_scenes
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +71,14 @@ def smooth(
     """
     how = how or TableImport()
     settings = TrackerSettings(min_hits=2) if settings is None else settings
-    given, known = checked_corrections(corrections), sensors or {}
+    given, sensors = checked_corrections(corrections), UNKNOWN_SENSORS if sensors is None else sensors
     raw = raw_table(detections, how)
     scenes = scenes_of(raw)
-    check_scenes(raw, scenes, settings, known)
+    check_scenes(raw, scenes, settings, sensors)
     labels, outcomes = {}, []
     for scene in scenes:
         mine = corrections_in(scene.name, given)
-        model = LabelModel(settings, known, smoothing or SmoothingSettings(), (), mine)
+        model = LabelModel(settings, sensors, smoothing or SmoothingSettings(), (), mine)
         builder = LabelBuilder(Tracker(settings, sensors), model)
         builder.add(scene.frames, scene.timestamps)
         labels[scene.name], _ = builder.finish()

@@ -169,6 +169,11 @@ class GreedyTracker:
         """Snapshots are plain values."""
         return True
 
+    @property
+    def noise_scales(self) -> dict[str, float]:
+        """None are found."""
+        return {}
+
     def snapshot(self) -> GreedySnapshot:
         """Everything that the tracker knows, as a value."""
         return GreedySnapshot(self._memory, self._next_id, self._clock, self.time_verdict)

@@ -58,6 +58,7 @@ class FrameMeasurements:
     boxes                        in the world
     probability                  (m,)
     R                            (m, 4, 4) covariance of position and velocity
+    by_model                     (m,) whether that of the position is the sensor model's, not the detection's own
     with_velocity                (m,) whether the velocity was measured
     z_noise, yaw_noise           (m,) standard deviations of height, m, and heading, rad
     range_rate                   (m,) m/s, NaN where not to be used
@@ -78,6 +79,7 @@ class FrameMeasurements:
     boxes: Boxes
     probability: FloatArray
     R: FloatArray
+    by_model: BoolArray
     with_velocity: BoolArray
     z_noise: FloatArray
     yaw_noise: FloatArray
@@ -132,6 +134,7 @@ def frame_measurements(
         boxes=boxes,
         probability=probability,
         R=R,
+        by_model=np.asarray(~np.isfinite(detections.position_covariance).all(axis=(1, 2))),
         with_velocity=np.hypot(*boxes.velocity.T) <= limit,
         z_noise=z_noise,
         yaw_noise=np.where(np.isfinite(boxes.yaw), yaw_noise, UNKNOWN_YAW_NOISE),

@@ -15,8 +15,12 @@ from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like, 
 from saga_fg.tables.plausibility import idle_rules
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker
+from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.dataset import Scene
 from saga_fg.types.track import Tracks
+
+UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True)}
+"""Models of sensors of which nothing is known: their detections tell how noisy they are."""
 
 UNNAMED = "object"
 """Class of detections without a column of classes; any name will do."""
@@ -38,7 +42,7 @@ def track(
                  width, height, yaw (rad), vx, vy, range_rate, cov_xx, cov_xy, cov_yy (m^2), scene, and ego_x,
                  ego_y, ego_yaw, the vehicle's pose; a row without x and y is a moment at which nothing was detected
     settings     of the tracker; by default tracks are reported from their second detection on
-    sensors      models by name of the sensor
+    sensors      models by name of the sensor; by default the noise of each is told by its detections
     columns      names of columns in the table, by ours, where they are not found: {"x": "pos_e"}
     classes      our name of a class by that in the table, an empty one to leave its objects out
     units        {"angle": "deg", "time": "ns", "speed": "km/h", ...}, as of `saga-fg track file --units`
@@ -52,9 +56,10 @@ def track(
     """
     how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
     settings = TrackerSettings(min_hits=2) if settings is None else settings
+    sensors = UNKNOWN_SENSORS if sensors is None else sensors
     raw = raw_table(detections, how)
     scenes = scenes_of(raw)
-    check_scenes(raw, scenes, settings, sensors or {})
+    check_scenes(raw, scenes, settings, sensors)
     found = []
     for scene in scenes:
         tracker = Tracker(settings, sensors)

@@ -36,6 +36,7 @@ from saga_fg.tracking.initiation import initiate_tracks
 from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
+from saga_fg.tracking.noise_scale import SensorNoise, for_gates, observed, with_scale
 from saga_fg.tracking.prediction import judge_edges, look_ahead, predict
 from saga_fg.tracking.relinking import hand_over
 from saga_fg.tracking.reporting import delete_tracks, report_tracks
@@ -176,6 +177,9 @@ class Tracker:
         self._notify("predict", state, frame.sensor)
 
         measurements = frame_measurements(frame, sensor, self.settings.classes, state.confused)
+        by_model, noise = measurements, state.noise.get(frame.sensor, SensorNoise())
+        if sensor.calibrate_noise:
+            measurements = with_scale(measurements, noise)
         measurements = measurements.with_context(delay, state.ego.relative_positions(measurements, frame))
         stamp = frame.timestamp + sensor.time_offset
         state.clock, state.shared = compared(state.clock, state.shared, stamp, measurements)
@@ -183,9 +187,13 @@ class Tracker:
         look(state, measurements)
         self._notify("measure", state, frame.sensor, measurements)
 
-        matching, rivals = associate(state, measurements)
+        gated = for_gates(measurements, noise) if sensor.calibrate_noise else measurements
+        matching, rivals = associate(state, gated)
         self._notify("associate", state, frame.sensor, measurements, matching)
 
+        if sensor.calibrate_noise and delay == 0:
+            noise = observed(noise, by_model, matching, state.table.id[matching.track], state.time)
+            state.noise = {**state.noise, frame.sensor: noise}
         if delay == 0:
             follow_encounters(state, measurements, matching, rivals, state.time - before)
         update_tracks(state, measurements, matching)
@@ -291,6 +299,11 @@ class Tracker:
     def sensor_times(self) -> dict[str, SensorTime]:
         """The clock of each sensor against the consensus of all: offset, its standard deviation, drift and jitter."""
         return sensor_times(self._state.clock, self._state.shared)
+
+    @property
+    def noise_scales(self) -> dict[str, float]:
+        """Of the sensors with `calibrate_noise`, what the deviations of their models are to be multiplied by."""
+        return {name: noise.scale for name, noise in self._state.noise.items()}
 
     @property
     def late_frames(self) -> int:

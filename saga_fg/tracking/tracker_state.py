@@ -38,6 +38,7 @@ from saga_fg.tracking.halting_places import HaltingPlaces
 from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past_position
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.measurements import EgoNode
+from saga_fg.tracking.noise_scale import SensorNoise
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.tracking.track_table import TrackTable
@@ -74,6 +75,7 @@ class TrackerSnapshot:
     late_frames   number of frames left out because they came late
     assignment    of the latest frame
     identities    that the sensors give
+    noise         of sensors with `calibrate_noise`, by name
     joint         the estimator's state
     """
 
@@ -95,6 +97,7 @@ class TrackerSnapshot:
     late_frames: int
     assignment: Assignment
     identities: GivenIdentities
+    noise: Mapping[str, SensorNoise]
     joint: Any
 
 
@@ -120,6 +123,7 @@ class TrackerState:
         self.time_verdict: TimeVerdict = "accepted"
         self.late_frames = 0
         self.assignment = Assignment.empty()
+        self.noise: Mapping[str, SensorNoise] = {}
         self.clear()
 
     def clear(self) -> None:

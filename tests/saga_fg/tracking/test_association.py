@@ -30,6 +30,7 @@ def measured(found, probability, noise=0.3):
         row=np.arange(n),
         probability=np.broadcast_to(probability, n),
         R=R,
+        by_model=np.ones(n, dtype=bool),
         with_velocity=flat.astype(bool),
         z_noise=flat,
         yaw_noise=flat,

@@ -1,0 +1,94 @@
+"""Noise told by successive detections: it is found whatever the motion, and scales gates, ellipses and labels."""
+
+import numpy as np
+import pytest
+
+from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
+from saga_fg.tracking.noise_scale import LEAST, MOST, SensorNoise, scaled_sensors
+
+MODEL = 0.3  # m
+TABLE = {"default": Sensor(calibrate_noise=True)}
+
+
+def seen(sigma, motion, rng, frames=60, objects=8, jitter=0.0):
+    """What is known after frames of objects that move by `motion(t)` (2,), with white errors."""
+    noise, time = SensorNoise(), 0.0
+    start = rng.uniform(-50, 50, (objects, 2))
+    for _ in range(frames):
+        time += 0.1 + rng.uniform(-jitter, jitter)
+        position = start + motion(time) + rng.normal(0, sigma, (objects, 2))
+        noise = noise.observed(time, np.arange(objects), position, np.tile(MODEL**2 * np.eye(2), (objects, 1, 1)))
+    return noise
+
+
+@pytest.mark.parametrize("sigma", [0.15, 0.3, 0.9])
+@pytest.mark.parametrize("jitter", [0.0, 0.04])
+def test_noise_is_found_whatever_the_motion_and_the_steps(sigma, jitter):
+    rng = np.random.default_rng(0)
+    standing = seen(sigma, lambda t: np.zeros(2), rng, jitter=jitter)
+    braking = seen(sigma, lambda t: np.array([20 * t - 2 * t**2, 0.5 * t]), rng, jitter=jitter)
+    assert standing.scale == pytest.approx(sigma / MODEL, rel=0.15)
+    assert braking.scale == pytest.approx(sigma / MODEL, rel=0.15)
+
+
+def test_the_scale_stays_within_bounds_and_waits_for_evidence():
+    rng = np.random.default_rng(1)
+    assert SensorNoise().scale == 1.0
+    assert seen(0.095, lambda t: np.zeros(2), rng).scale == pytest.approx(LEAST, rel=0.1)
+    assert seen(0.03, lambda t: np.zeros(2), rng).scale == 1.0
+    assert seen(5.0, lambda t: np.zeros(2), rng).scale == pytest.approx(MOST)
+    assert seen(0.3, lambda t: np.zeros(2), rng, frames=2, objects=5).scale == 1.0
+
+
+def frames(sigma, count=80, seed=0, **columns):
+    rng = np.random.default_rng(seed)
+    start = np.stack([15.0 * np.arange(6), 4.0 * np.arange(6)], axis=1)
+    for k in range(count):
+        truth = start + np.array([8.0, 0.5]) * 0.1 * k
+        position = np.column_stack([truth + rng.normal(0, sigma, truth.shape), np.zeros(6)])
+        boxes = Boxes.of(np.full(6, "car"), position, np.tile((4.0, 2.0, 1.5), (6, 1)), np.zeros(6))
+        yield Frame(0.1 * k, "table", Detections(boxes, np.full(6, 0.9), **columns)), truth
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.3, 1.0])
+def test_ellipses_of_a_table_hold_what_they_say(sigma):
+    held, tracker = [], Tracker(TrackerSettings(min_hits=2), TABLE)
+    for seed in range(3):
+        tracker = Tracker(TrackerSettings(min_hits=2), TABLE)
+        for frame, truth in frames(sigma, seed=seed):
+            tracks = tracker.step(frame)
+            if frame.timestamp < 1.0:  # until then little is known
+                continue
+            apart = tracks.boxes.position[:, None, :2] - truth
+            error = apart[np.arange(len(tracks)), np.linalg.norm(apart, axis=2).argmin(axis=1)]
+            d2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(tracks.position_covariance), error)
+            held += (d2 < 4.605).tolist()
+    assert 0.82 < np.mean(held) < 0.97
+    assert tracker.noise_scales["table"] == pytest.approx(sigma / MODEL, rel=0.25)
+
+
+def test_noise_that_comes_with_the_detections_stays_as_it_is():
+    given = np.tile(0.3**2 * np.eye(2), (6, 1, 1))
+    with_scale, without = Tracker(TrackerSettings(), TABLE), Tracker(TrackerSettings())
+    for frame, _ in frames(1.0, position_covariance=given):
+        a, b = with_scale.step(frame), without.step(frame)
+        np.testing.assert_array_equal(a.position_covariance, b.position_covariance)
+
+
+def test_a_restored_tracker_goes_on_with_what_it_knows():
+    recording = [frame for frame, _ in frames(0.8, 40)]
+    tracker = Tracker(TrackerSettings(), TABLE)
+    for frame in recording[:20]:
+        tracker.step(frame)
+    other = Tracker(TrackerSettings(), TABLE)
+    other.restore(tracker.snapshot())
+    for frame in recording[20:]:
+        a, b = tracker.step(frame), other.step(frame)
+        np.testing.assert_array_equal(a.position_covariance, b.position_covariance)
+    assert other.noise_scales == tracker.noise_scales
+
+
+def test_models_are_scaled_in_positions_alone():
+    scaled = scaled_sensors({}, {"table": 2.0})["table"].noise["default"]
+    usual = Sensor().noise["default"]
+    assert (scaled.position, scaled.velocity, scaled.yaw) == (2 * usual.position, usual.velocity, usual.yaw)
