@@ -7,7 +7,7 @@ a polynomial of degree k - 1 in time. What is left is noise, of a known share of
     s^2 = least over k = 1, 2, 3 of the 90 % quantile of ( D_k^T R^-1 D_k / sum of c_j^2 ) / chi^2_2(90 %)
 
 with R the noise by the sensor's model. Orders that motion is still part of are larger, and the quantile is that up to
-which ellipses are meant to hold. Until there are enough differences, gates are those of `UNKNOWN` times the model's noise:
+which ellipses are meant to hold. Until there are enough differences, gates are those of `UNKNOWN` times its noise:
 with too small ones a tracker would only see the small errors.
 
 More noise than the model says widens gates and slows the filter (factor max(s, 1) on the deviations R). Less noise
@@ -36,7 +36,7 @@ from saga_fg.tracking.measurements import FrameMeasurements
 ORDERS = (1, 2, 3)
 QUANTILE = 0.9
 LEAST, MOST = 1 / 3, 10 / 3  # bounds of s
-SHARED = (0.2, 0.3)  # s, from which differences are no longer believed, and are believed
+SHARED = (0.18, 0.28)  # s, from which differences are no longer believed, and are believed
 UNKNOWN = 2.0  # s of gates, before it is known
 FEWEST, PRIOR, LATEST = 15, 3, 300  # differences of an order: for an estimate, that s = 1 counts for, that are kept
 ROUGHLY, ENOUGH = 300, 900  # differences, from which gates follow s, and from which s stays

@@ -34,7 +34,7 @@ def test_noise_is_found_whatever_the_motion_and_the_steps(sigma, jitter):
 def test_the_scale_stays_within_bounds_and_waits_for_evidence():
     rng = np.random.default_rng(1)
     assert SensorNoise().scale == 1.0
-    assert seen(0.095, lambda t: np.zeros(2), rng).scale == pytest.approx(LEAST, rel=0.1)
+    assert seen(0.1, lambda t: np.zeros(2), rng).scale == pytest.approx(LEAST, rel=0.15)
     assert seen(0.03, lambda t: np.zeros(2), rng).scale == 1.0
     assert seen(5.0, lambda t: np.zeros(2), rng).scale == pytest.approx(MOST)
     assert seen(0.3, lambda t: np.zeros(2), rng, frames=2, objects=5).scale == 1.0
