@@ -33,6 +33,9 @@ SIZE = ("length", "width", "height")
 DEVIATIONS = {"position": 0.1, "height": 0.1, "yaw": 0.05, "size": 0.05}
 """Standard deviations of a person's box where it gives none: m, m, rad, m."""
 
+UNKNOWN_SIZE = np.full(3, np.nan)
+UNKNOWN_SIZE.flags.writeable = False
+
 
 @dataclass(frozen=True)
 class Place:
@@ -53,7 +56,7 @@ class WholeObject:
 
     exists: bool | None = None
     label: str = ""
-    size: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    size: FloatArray = field(default_factory=lambda: UNKNOWN_SIZE)
 
     def updated(self, later: WholeObject) -> WholeObject:
         """With what was said later."""
@@ -98,7 +101,7 @@ class Correction:
     def whole(self) -> WholeObject:
         """The part of the correction that holds for the object at all times."""
         exists = self.value if self.what == "exists" else True if self.what == "box" else None
-        size = self.size if self.what == "size" else np.full(3, np.nan)
+        size = self.size if self.what == "size" else UNKNOWN_SIZE
         return WholeObject(exists, self.label, size)
 
     @property

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import get_args
 
 import numpy as np
@@ -216,7 +217,7 @@ class ObjectSummary:
         self.detections += len(size)
         known = np.isfinite(size).all(axis=1)
         for axis, values in enumerate(self.sizes):
-            more = np.concatenate([values, np.stack([size[known, axis], weight[known]])], axis=1)
+            more = np.concatenate([values, np.array([size[known, axis], weight[known]])], axis=1)
             if more.shape[1] > MAX_VALUES:
                 steps, index = np.unique(np.rint(more[0] / RESOLUTION), return_inverse=True)
                 more = np.stack([steps * RESOLUTION, np.bincount(index, more[1])])
@@ -272,11 +273,13 @@ class Identities:
         tracklets, begins = np.unique(track_of[rows], return_index=True)
         first = dict(zip(tracklets.tolist(), times[rows[begins]].tolist(), strict=True))
         names: dict[int, int] = {}
-        for id_ in ids.tolist():
-            tracks = self._in_order(pairs[pairs[:, 0] == id_, 1].tolist(), first, begin)
+        others, taken = ids.tolist(), set[int]()
+        own = [np.searchsorted(pairs[:, 0], ids, side).tolist() for side in ("left", "right")]
+        for id_, low, high in zip(others, *own, strict=True):
+            tracks = self._in_order(pairs[low:high, 1].tolist(), first, begin)
             known = [self._owner[track][0] for track in tracks if track in self._owner]
-            taken = set(names.values())
-            names[id_] = next(name for name in (*known, id_, *ids.tolist()) if name not in taken)
+            names[id_] = next(name for name in chain(known, [id_], others) if name not in taken)
+            taken.add(names[id_])
             for k, track in enumerate(tracks):
                 if k == 0 or first[track] < end:
                     self.joined += track != names[id_] and track not in self._owner
