@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from contextlib import chdir, suppress
 from pathlib import Path
 from shlex import quote
@@ -45,7 +46,7 @@ def review(
 ) -> None:
     """Correct labels on a page: objects by what a look is worth, boxes moved and turned from above, keys for the rest.
 
-    The page is served on 127.0.0.1, to whom knows the token in its address; nothing leaves the machine. Every
+    The page is served on 127.0.0.1, behind a token in its address; nothing leaves the machine. Every
     correction is in the file before the page shows it. Its scene is solved again, and what changed is marked.
     Ctrl-C ends the server. `saga-fg smooth ... --corrections FILE` makes labels with the corrections.
 
@@ -68,6 +69,7 @@ def review(
             write_text(page, session.page(server=False))
             typer.echo(f"{page}: open it in a browser; what it saves goes to saga-fg smooth ... --corrections FILE")
             return
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it for what runs in the background
         with ReviewServer(session, port) as server, suppress(KeyboardInterrupt):
             typer.echo(f"{server.url}\nCorrections go to {file}; Ctrl-C ends.")
             server.serve_forever()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from data_tools.datasets.results import SceneResult
 from data_tools.figures import Chart, FigureTable, Series, cell, distribution
 from data_tools.metrics import SceneBoxes
-from saga_fg.numerics.arrays import FloatArray, StrArray
+from saga_fg.numerics.arrays import Columns, FloatArray, StrArray
 from saga_fg.types.boxes import Boxes
 
 
@@ -36,7 +37,7 @@ TITLE = (
 
 
 @dataclass(frozen=True, eq=False)
-class _TrackSpans:
+class _TrackSpans(Columns):
     """T tracks as wholes: their class, s from first to last box, boxes, and gaps, (T,)."""
 
     label: StrArray
@@ -44,13 +45,9 @@ class _TrackSpans:
     boxes: FloatArray
     gaps: FloatArray
 
-    def of_class(self, label: str) -> _TrackSpans:
-        rows = np.flatnonzero((self.label == label) | (label == "all"))
-        return _TrackSpans(self.label[rows], self.seconds[rows], self.boxes[rows], self.gaps[rows])
-
 
 @dataclass(frozen=True, eq=False)
-class _Boxes:
+class _Boxes(Columns):
     """N boxes: their class, speed (m/s), deviation of the position (m), score, and whether they are unseen, (N,)."""
 
     label: StrArray
@@ -59,9 +56,12 @@ class _Boxes:
     score: FloatArray
     unseen: FloatArray
 
-    def of_class(self, label: str) -> _Boxes:
-        rows = np.flatnonzero((self.label == label) | (label == "all"))
-        return _Boxes(*(column[rows] for column in vars(self).values()))
+
+Table = TypeVar("Table", _TrackSpans, _Boxes)
+
+
+def _of_class(table: Table, label: str) -> Table:
+    return table.select((table.label == label) | (label == "all"))
 
 
 def track_figures(results: Sequence[SceneResult]) -> FigureTable:
@@ -69,7 +69,7 @@ def track_figures(results: Sequence[SceneResult]) -> FigureTable:
     lives, boxes = _track_spans(results), _boxes(results)
     classes = np.unique(lives.label).tolist()
     rows = [
-        _row(name, lives.of_class(name), boxes.of_class(name))
+        _row(name, _of_class(lives, name), _of_class(boxes, name))
         for name in (["all"] if len(classes) > 1 else []) + classes
     ]
     return FigureTable(TITLE, COLUMNS, tuple(rows))
@@ -80,9 +80,13 @@ def track_charts(results: Sequence[SceneResult]) -> list[Chart]:
     lives, boxes = _track_spans(results), _boxes(results)
     classes = np.unique(lives.label).tolist()
     charts = [
-        distribution("Life of tracks", "s", "share of tracks below", [(c, lives.of_class(c).seconds) for c in classes]),
-        distribution("Speed", "m/s", "share of boxes below", [(c, _known(boxes.of_class(c).speed)) for c in classes]),
-        distribution("Score", "score", "share of boxes below", [(c, _known(boxes.of_class(c).score)) for c in classes]),
+        distribution(
+            "Life of tracks", "s", "share of tracks below", [(c, _of_class(lives, c).seconds) for c in classes]
+        ),
+        distribution("Speed", "m/s", "share of boxes below", [(c, _known(_of_class(boxes, c).speed)) for c in classes]),
+        distribution(
+            "Score", "score", "share of boxes below", [(c, _known(_of_class(boxes, c).score)) for c in classes]
+        ),
     ]
     return [_counts(results), *(chart for chart in charts if chart.series)]
 
@@ -127,32 +131,32 @@ def _unseen(result: SceneResult) -> FloatArray:
 
 
 def _boxes(results: Sequence[SceneResult]) -> _Boxes:
-    tables = [each.found for each in results]
-    variance = [np.trace(table.position_covariance, axis1=1, axis2=2) / 2 for table in tables]
-    columns = (
-        [np.linalg.norm(table.boxes.velocity, axis=1) for table in tables],
-        [np.sqrt(each) for each in variance],
-        [table.score for table in tables],
-        [_unseen(each) for each in results],
-    )
-    label = np.concatenate([np.empty(0, dtype="<U1"), *(table.boxes.label for table in tables)])
-    return _Boxes(label, *(np.concatenate([np.empty(0), *parts]) for parts in columns))
+    none = _Boxes(np.empty(0, dtype="<U1"), *(np.empty(0),) * 4)
+    return _Boxes.concatenate([none, *map(_scene_boxes, results)])
+
+
+def _scene_boxes(result: SceneResult) -> _Boxes:
+    found = result.found
+    deviation = np.sqrt(np.trace(found.position_covariance, axis1=1, axis2=2) / 2)
+    speed = np.linalg.norm(found.boxes.velocity, axis=1)
+    return _Boxes(found.boxes.label, speed, deviation, found.score, _unseen(result))
 
 
 def _track_spans(results: Sequence[SceneResult]) -> _TrackSpans:
-    parts: list[tuple[StrArray, FloatArray, FloatArray, FloatArray]] = []
-    for each in results:
-        table, unseen = each.found, np.nan_to_num(_unseen(each))
-        ids, first, number, count = np.unique(table.id, return_index=True, return_inverse=True, return_counts=True)
-        time = each.scene.timestamps[table.frame]
-        order = np.lexsort((table.frame, number))
-        ends = np.cumsum(count)
-        seconds = time[order][ends - 1] - time[order][ends - count]
-        again = (unseen[order][:-1] == 1) & (unseen[order][1:] == 0) & (number[order][:-1] == number[order][1:])
-        gaps = np.bincount(number[order][1:][again], minlength=len(ids))
-        parts.append((table.boxes.label[first], seconds, count.astype(np.float64), gaps.astype(np.float64)))
-    label = np.concatenate([np.empty(0, dtype="<U1"), *(part[0] for part in parts)])
-    return _TrackSpans(label, *(np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in (1, 2, 3)))
+    none = _TrackSpans(np.empty(0, dtype="<U1"), *(np.empty(0),) * 3)
+    return _TrackSpans.concatenate([none, *map(_scene_spans, results)])
+
+
+def _scene_spans(result: SceneResult) -> _TrackSpans:
+    table, unseen = result.found, np.nan_to_num(_unseen(result))
+    ids, first, number, count = np.unique(table.id, return_index=True, return_inverse=True, return_counts=True)
+    time = result.scene.timestamps[table.frame]
+    order = np.lexsort((table.frame, number))
+    ends = np.cumsum(count)
+    seconds = time[order][ends - 1] - time[order][ends - count]
+    again = (unseen[order][:-1] == 1) & (unseen[order][1:] == 0) & (number[order][:-1] == number[order][1:])
+    gaps = np.bincount(number[order][1:][again], minlength=len(ids))
+    return _TrackSpans(table.boxes.label[first], seconds, count.astype(np.float64), gaps.astype(np.float64))
 
 
 REACH = 2.0  # m between the centres of a track and a detection of its class

@@ -90,7 +90,8 @@ class ReviewSession:
             "scanned": list(self._scans) if server else [],
             "rows": [row for row in _listed(self.folder) if row.get("scene") in self._shown],
         }
-        facts = [*list(self._shown)[:3], f"{sum(len(each.scene) for each in self._shown.values())} moments"]
+        names = ", ".join([*self._shown][:3]) + ", ..." * (len(self._shown) > 3)
+        facts = [names, f"{sum(len(each.scene) for each in self._shown.values())} moments"]
         return report_page(Report(self._title, facts, list(self._shown.values()), ghosts=True, review=review))
 
     def state(self, scene: str) -> dict[str, Any]:

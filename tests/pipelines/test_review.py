@@ -271,7 +271,7 @@ def test_what_is_no_http_is_answered_or_closed_and_the_others_are_served(server)
         connection.close()
 
 
-def test_the_page_is_served_to_whom_knows_the_token_and_loads_nothing(server):
+def test_the_page_is_served_behind_the_token_and_loads_nothing(server):
     status, page = Client(server).ask("GET", f"/{server.token}/")
     assert status == 200
     assert "connect-src 'self'" in page
@@ -422,9 +422,8 @@ def test_points_of_the_lidar_beside_a_box(server):
 
 
 def test_the_command_serves_until_it_is_interrupted(labels):
-    command = subprocess.Popen(
-        [*COMMAND, "review", str(labels), "--who", "anna"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    options = [*COMMAND, "review", str(labels), "--who", "anna"]
+    command = subprocess.Popen(options, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert command.stdout is not None
     url = urlsplit(command.stdout.readline().strip())
     assert url.hostname == "127.0.0.1"
@@ -437,7 +436,10 @@ def test_the_command_serves_until_it_is_interrupted(labels):
     with urlopen(Request(f"{url.geturl()}correct", body, {"Content-Type": "application/json"}), timeout=60) as answer:
         assert answer.status == 200
     command.send_signal(signal.SIGINT)
-    _, told = command.communicate(timeout=60)
+    try:
+        _, told = command.communicate(timeout=60)
+    finally:
+        command.kill()
     assert command.returncode == 0, told
     assert f"--corrections {labels / CORRECTIONS}" in told
     assert len(read_corrections(labels / CORRECTIONS)) == 1
