@@ -24,7 +24,8 @@ from benchmarks.runner import Row, Rows, clocked, each
 from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors
-from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam
+from pipelines.slam.driver import SlamResult
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import inverse_transform
@@ -148,7 +149,7 @@ class _Drifting:
         return replace(self.course[row], time=None)  # without skew
 
 
-def drive_course(seed: int, drift: float = 0.0) -> tuple[SimulatedCourse, LidarSlamResult]:
+def drive_course(seed: int, drift: float = 0.0) -> tuple[SimulatedCourse, SlamResult]:
     """Drive the course of a seed."""
     course = SimulatedCourse(seed, period=PERIOD, skewed=False)
     return course, lidar_slam(_Drifting(course, odometry_of(course, seed, drift)), "recorded", settings=SETTINGS)

@@ -117,7 +117,7 @@ def _lines(points: FloatArray, map_points: FloatArray) -> tuple[FloatArray, Floa
 
     The ratio is infinite where fewer than four points are near.
     """
-    k = min(_NEIGHBOURS, len(map_points))
+    k = max(1, min(_NEIGHBOURS, len(map_points)))
     distance, rows = cKDTree(map_points).query(points, k=k, distance_upper_bound=_REACH)
     known = np.isfinite(distance).reshape(len(points), k)
     near = map_points[np.where(known, rows.reshape(len(points), k), 0)]

@@ -19,9 +19,8 @@ from pipelines.cli.console import counted, progress_bar, working
 from pipelines.cli.options import Config, Verbose
 from pipelines.slam.configuration import load_slam_config, sensor_log
 from pipelines.slam.lidar_slam import lidar_slam, path_tracker, with_objects
-from pipelines.slam.localisation import LocaliserSettings
-from pipelines.slam.localised_drive import localise, write_localised
-from pipelines.slam.results import write_lidar_slam
+from pipelines.slam.localisation import LocaliserSettings, localise
+from pipelines.slam.results import write_lidar_slam, write_localised
 from pipelines.slam.submaps import Origin, SlamMap, read_map
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform

@@ -16,7 +16,7 @@ from data_tools.recordings import ScanRecording
 from data_tools.sensor_logs import SensorLog, plausible_inertial, read_sensor_log
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings
-from pipelines.slam.laser_slam import LaserSettings
+from pipelines.slam.laser_odometry import LaserSettings
 from pipelines.slam.lidar_slam import LidarSlamSettings
 from pipelines.slam.localisation import LocaliserSettings
 from pipelines.slam.submaps import Origin

@@ -1,13 +1,15 @@
-"""Odometry, keyframes and loops of a robot with a planar laser.
+"""The front end of a planar laser with wheels: odometry, and loops.
 
-Odometry of a robot with a planar laser, without implausible steps, and the scale of the wheels.
+Each scan that has moved is registered with a map of the last keyframes, point to line; the wheels are its prior.
+
+Poses by the wheels, without implausible steps, and the scale of the wheels.
 
 Along a bare corridor odometry alone tells the way, and wheels of another size than the robot believes err by some per
 cent. The scale k is estimated from the steps s that registration determines, as x ahead:
 
     s_registered = k s_wheels + noise of variance v,        k ~ N(1, 0.05^2)
 
-Loops of a planar laser: keyframes are searched for in older submaps, by branch and bound.
+Loops: keyframes of a closed submap are searched for in older submaps, by branch and bound.
 
 The window is what the graph leaves open: it grows with the way along measurements between the two, so that what has
 been closed before is searched closely and what has drifted widely. A place that has a rival is no loop; one found in a
@@ -18,17 +20,33 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from data_tools.laser import LaserLog
 from data_tools.laser.mapping import SMEAR, Fit, LineMap, ScoreGrid, thinned
-from pipelines.slam.loop_closures import Agreement
+from data_tools.lidar import Scan, Submap
+from pipelines.slam.loop_closures import Agreement, LoopSearch
+from pipelines.slam.odometry import OdometryStep, motion
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import moved, transform, transforms, vector, vectors
-from saga_fg.slam.pose_graph.consensus import Measured, RunningPoseGraph
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.geometry import (
+    carried_covariance,
+    heading,
+    in_plane,
+    in_space,
+    inverse_transform,
+    moved,
+    transform,
+    transforms,
+    vector,
+    vectors,
+)
+from saga_fg.settings import Positive, Range, Settings, setting
+from saga_fg.slam.submaps import LoopClosure
+from saga_fg.slam.submaps.loops import Motion
 
 _SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
 _SCALE = 0.05  # standard deviation of the scale of wheels
@@ -129,14 +147,17 @@ _FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any
 _DETERMINED = 0.05  # ratio of information along and across below which a place is a bare corridor
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A scan (n, 2) of the graph, its pose by scan matching alone, the row of the scan, and the way until there, m."""
+    """Points (n, 2) of a scan, its pose (3, 3) by scan matching alone, and the way until there, m.
+
+    covariance: (3, 3) of the motion since the keyframe before, in its own frame
+    """
 
     points: FloatArray
     matched: FloatArray
-    row: int
     way: float
+    covariance: FloatArray
 
 
 def joined(frames: Sequence[Keyframe], centre: Keyframe) -> FloatArray:
@@ -145,10 +166,10 @@ def joined(frames: Sequence[Keyframe], centre: Keyframe) -> FloatArray:
     return np.concatenate([moved(frame.points, back @ frame.matched) for frame in frames])
 
 
-def measured_by(first: int, second: int, fit: Fit) -> Measured:
-    """The measurement between two keyframes by a registration."""
+def measured_by(fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """The pose (3, 3) that a registration measured, and its covariance (3, 3)."""
     measured = transform(fit.pose)
-    return Measured(first, second, measured, covariance_of(_firm(fit.information) / SMEAR, measured))
+    return measured, covariance_of(_firm(fit.information) / SMEAR, measured)
 
 
 def determined(information: FloatArray) -> bool:
@@ -176,97 +197,204 @@ def covariance_of(information: FloatArray, pose: FloatArray) -> FloatArray:
     return np.asarray((own + own.T) / 2 + np.diag(_FLOOR))
 
 
-_KNOWN_SHARE = 0.8  # m, half width of a window up to which a corridor may be recognised: it then says nothing along it
-_UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
-_ACROSS = 5.0  # m from the centre of a submap that it is searched from, besides the window
-_UNIQUE = 0.92  # share of the best score that a rival may have
-_LONGEST = 60.0  # m of way from which the search of headings does not grow
+TANGENT = np.array([3, 4, 2])  # x, y and heading in the tangent of a pose in space
+_LEVEL = 1e-6  # rad^2 and m^2: variance out of the plane
 
 
-@dataclass(frozen=True, eq=False)
-class _Submap:
-    """Keyframes from `first` to before `end`, in the frame of `centre`."""
-
-    first: int
-    end: int
-    centre: int
-    grid: ScoreGrid
-    lines: LineMap
+def covariance_in_space(covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a level pose in space, by that of x, y and heading (3, 3)."""
+    whole = _LEVEL * np.eye(6)
+    whole[TANGENT[:, None], TANGENT] = covariance
+    return whole
 
 
-def _agreement() -> Agreement[Measured]:
-    return Agreement(np.array([0.3, 0.06]), np.array([0.03, 0.003]), patience=15.0)
+def level_scan(points: FloatArray) -> Scan:
+    """Points (n, 2) as a scan at z = 0."""
+    return Scan.of(np.column_stack([points, np.zeros(len(points))]))
 
 
-@dataclass(eq=False)
-class LoopSearch:
-    """Submaps of a growing list of keyframes, and the search in them.
+@dataclass(frozen=True)
+class LaserSettings(Settings):
+    """Settings of SLAM with a planar laser."""
 
-    length  m of way in a submap; drift: half width of the window, share of the way; score: least mean score of a loop
+    largest_range: Positive = setting(30.0, "m: readings beyond are left out; raise for halls and yards")
+    largest_speed: Positive = setting(
+        3.0, "m/s: steps of the wheels that are faster, and 1 m longer, count as standing still; raise for vehicles"
+    )
+    loop_score: Annotated[float, Range(0, 1)] = setting(0.6, "least mean score of a loop; raised: fewer, surer loops")
+    loop_drift: Positive = setting(0.04, "half width of the search, share of the way since; raised: slower, finds more")
+
+
+_SCAN_STEP = 0.1  # m: scans that moved less, and turned less than 3 degrees, are not registered
+LEAST_POINTS = 20  # of a scan that is registered
+_WIDEST = 3.0  # m, half width of the search where wheels slipped: its time and memory grow with the square
+_POOR = 0.8  # share of a scan that lies on the local map, below which the pose is searched
+_DOUBT = 0.2  # share of a difference between wheels and registration that counts as standard deviation: one errs
+_TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
+KEYFRAME_STEP = 0.5  # distance between keyframes, m
+KEYFRAME_TURN = 0.5  # turn between keyframes, rad
+LOCAL_MAP = 10.0  # m of way whose keyframes scans are registered with
+ODOMETRY_DRIFT = 0.15  # error of the wheels, share of the way: standard deviation
+ODOMETRY_TURN = 0.1  # error of the wheels' heading, rad for each rad turned and for each 2 m driven: standard deviation
+_RADIAN = 1.0  # m of way that a radian of turning counts as
+
+
+class LaserOdometry:
+    """Places level scans, points in the robot's frame, by the wheels and the last keyframes.
+
+    wheels: their pose (3, 3) at the next scan, set before `step`; keyframes: so far; scale: of the wheels
     """
 
-    keyframes: Sequence[Keyframe]
-    graph: RunningPoseGraph
-    length: float
-    drift: float
-    score: float
-    _submaps: list[_Submap] = field(default_factory=list)
-    _agreement: Agreement[Measured] = field(default_factory=_agreement)
+    registers = True
 
-    def extend(self) -> None:
-        """Close a submap if the keyframes since the last one go far enough."""
-        frames = self.keyframes
-        first = self._submaps[-1].end if self._submaps else 0
-        if frames[-1].way - frames[first].way > self.length:
-            centre = (first + len(frames)) // 2
-            points = joined(frames[first:], frames[centre])
-            self._submaps.append(_Submap(first, len(frames), centre, ScoreGrid.of(points), LineMap.of(points)))
+    def __init__(self, scale: WheelScale | None = None) -> None:
+        self.scale, self.keyframes = scale or WheelScale(), list[Keyframe]()
+        self.wheels: FloatArray = np.eye(3)
+        self._at, self._last, self._at_keyframe = (
+            np.eye(3),
+            np.eye(3),
+            np.eye(3),
+        )  # the scan registered last, its wheels
+        self._map: LineMap | None = None
+        self._grid: ScoreGrid | None = None
+        self._since = 0  # scans since the last keyframe
 
-    def loops(self, row: int) -> list[Measured]:
-        """Loops of a keyframe to the nearest older submaps whose windows reach it, and those that they confirm."""
-        frames = self.keyframes
-        over = [each for each in self._submaps if frames[each.end - 1].way < frames[row].way - self.length]
-        if not over:
-            return []
-        centres = np.array([each.centre for each in over])
-        way = self.graph.distances(row)[centres]
-        poses = self.graph.poses
-        window = 0.5 + self.drift * way
-        apart = np.linalg.norm(poses[centres, :2, 2] - poses[row, :2, 2], axis=1)
+    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
+        """Place the next scan."""
+        points, first = scan.points[:, :2], not self.keyframes
+        if first:
+            self._last = self._at_keyframe = self.wheels
+        rolled = self.scale.corrected(np.linalg.inv(self._last) @ self.wheels)
+        at, way, turn = self._at @ rolled, float(np.hypot(rolled[0, 2], rolled[1, 2])), abs(heading(rolled))
+        sigma = np.array([0.02 + ODOMETRY_DRIFT * way] * 2 + [0.01 + ODOMETRY_TURN * (turn + way / 2)])
+        covariance, keyframe, lost = np.diag(sigma**2), first, 0
+        still = way < _SCAN_STEP and turn < np.deg2rad(3)
+        if len(points) >= LEAST_POINTS and (self._map is None or not still):
+            if self._map is not None:
+                fit = self._registered(self._map, points, at, np.diag(sigma**-2.0), way, turn)
+                before, at = self._at, transform(fit.pose)
+                self.scale.update(rolled, np.linalg.inv(before) @ at, covariance_of(fit.information / SMEAR, at))
+                covariance = self._doubted(covariance_of(fit.information / SMEAR + np.diag(sigma**-2.0), at), at)
+                lost = self._since
+            since = np.linalg.inv(self.keyframes[-1].matched) @ at if self.keyframes else np.eye(3)
+            keyframe = (
+                self._map is None or np.hypot(*since[:2, 2]) > KEYFRAME_STEP or abs(heading(since)) > KEYFRAME_TURN
+            )
+            self._at, self._last = at, self.wheels
+        if keyframe:
+            self._add_keyframe(points, at, covariance)
+        self._since = 0 if keyframe else self._since + 1
+        P = np.zeros((6, 6)) if first else covariance_in_space(covariance)
+        return OdometryStep(timestamp, in_space(at), P, scan, keyframe, None, lost=lost)
+
+    def _registered(
+        self, local: LineMap, points: FloatArray, predicted: FloatArray, prior: FloatArray, way: float, turn: float
+    ) -> Fit:
+        """The pose in the local map, where the wheels, of information `prior`, and the scan agree on it."""
+        scan = thinned(points, 0.05)
+        fit = local.fit(scan, vector(predicted), prior, reach=min(1.0, 0.3 + way))
+        if fit.share >= _POOR:
+            return fit
+        few = scan if len(scan) <= 200 else scan[:: len(scan) // 200 + 1]
+        self._grid = self._grid or ScoreGrid.of(local.points)  # a fast turn, wheels that slipped, or much is new
+        found = self._grid.search(few, vector(predicted), min(0.2 + way / 2, _WIDEST), 0.1 + turn / 2, 0.4)
+        if found is None:
+            return fit
+        return max(fit, local.fit(scan, found.pose, 0.01 * prior, reach=0.3), key=lambda each: each.share)
+
+    def _doubted(self, covariance: FloatArray, at: FloatArray) -> FloatArray:
+        """The covariance of the motion since the last keyframe, larger where the wheels say otherwise."""
+        since = np.linalg.inv(self.keyframes[-1].matched) @ at
+        rolled = self.scale.corrected(np.linalg.inv(self._at_keyframe) @ self.wheels)
+        off = vector(np.linalg.inv(since) @ rolled)
+        doubt = _DOUBT * np.array([np.hypot(off[0], off[1])] * 2 + [abs(off[2])])
+        doubt[2] += _TURNING * abs(heading(since))
+        return np.asarray(covariance + np.diag(doubt**2))
+
+    def _add_keyframe(self, points: FloatArray, at: FloatArray, covariance: FloatArray) -> None:
+        frames, way = self.keyframes, 0.0
+        if frames:
+            since = np.linalg.inv(frames[-1].matched) @ at
+            way = frames[-1].way + float(np.hypot(*since[:2, 2])) + _RADIAN * abs(heading(since))
+        frames.append(Keyframe(thinned(points, 0.03), at, way, covariance))
+        self._at_keyframe = self.wheels
+        recent = np.concatenate([moved(one.points, one.matched) for one in frames if one.way > way - LOCAL_MAP])
+        self._map, self._grid = LineMap.of(recent) if len(recent) >= LEAST_POINTS else None, None
+
+
+_KNOWN_SHARE = 0.8  # m, half width of a window up to which a corridor may be recognised: it then says nothing along it
+_UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
+_ACROSS = 5.0  # m from the middle of a submap that it is searched from, besides the window
+_UNIQUE = 0.92  # share of the best score that a rival may have
+_LONGEST = 60.0  # m of way from which the search of headings does not grow
+_BENT = np.diag([0.0, 0.0, 0.003, 0.03, 0.03, 0.0]) ** 2  # rad^2 and m^2, of the submap that is searched
+_EVERY = 2  # keyframes of which one is searched for
+SUBMAP = 10.0  # m of way in a submap in which loops are searched
+
+
+class LaserLoops(LoopSearch):
+    """Loops of a planar laser; keyframes: the growing list of those that submaps are made of."""
+
+    def __init__(self, keyframes: Sequence[Keyframe], settings: LaserSettings) -> None:
+        super().__init__(SUBMAP, Agreement(np.array([0.3, 0.06]), np.array([0.03, 0.003]), patience=15.0))
+        self._keyframes, self._settings = keyframes, settings
+        self._maps = dict[int, tuple[ScoreGrid, LineMap, FloatArray]]()  # of submaps, with their middles
+
+    def found(
+        self, submap: Submap, older: IntArray, way: FloatArray, frames: FloatArray
+    ) -> list[tuple[LoopClosure, bool]]:
+        first, end = submap.keyframes
+        at, found = in_plane(frames), list[tuple[LoopClosure, bool]]()
+        frames_of = self._keyframes[first:end]
+        path = in_space(np.array([one.matched for one in frames_of]))
+        noise = np.array([covariance_in_space(one.covariance) for one in frames_of])
+        known = [number for number in older.tolist() if number in self._maps]
+        for k in range(0, end - first, _EVERY):
+            inner = motion(path[: k + 1], noise[1 : k + 1])
+            found += self._loops(first + k, inner, at, np.array(known, dtype=np.int64), way)
+        points = submap.points[:, :2].astype(np.float64)
+        middle = (inverse_transform(path[0]) @ path[len(path) // 2])[[0, 1, 3], 3]
+        if len(points) >= LEAST_POINTS:
+            self._maps[len(frames) - 1] = ScoreGrid.of(points), LineMap.of(points), middle
+        return found
+
+    def driven(self, submap: Submap) -> float:
+        return self._keyframes[submap.keyframes[1] - 1].way
+
+    def _loops(
+        self, row: int, inner: Motion, at: FloatArray, older: IntArray, way: FloatArray
+    ) -> list[tuple[LoopClosure, bool]]:
+        """Loops of a keyframe to the nearest older submaps whose windows reach it; inner: since the submap began."""
+        recent = self._keyframes[max(0, row - 4) : row + 1]
+        source, found = thinned(joined(recent, recent[-1]), 0.2), list[tuple[LoopClosure, bool]]()
+        if not len(older) or len(source) < LEAST_POINTS:
+            return found
+        window, world = 0.5 + self._settings.loop_drift * way[older], at[-1] @ in_plane(inner[0])
+        middles = np.array([(at[number] @ self._maps[number][2])[:2] for number in older.tolist()])
+        apart = np.linalg.norm(middles - world[:2, 2], axis=1)
         near = np.flatnonzero(apart < _ACROSS + window)
         near = near[np.argsort(apart[near])]
-        source = self._source(row)
-        found: list[Measured] = []
-        for at in near[: 3 + int(window[near].min(initial=0.0))].tolist():
-            guess = np.linalg.inv(poses[centres[at]]) @ poses[row]
-            turn = np.deg2rad(5) + 0.01 * min(way[at], _LONGEST)
-            loop = self._loop(over[at], row, source, guess, float(window[at]), float(turn))
-            if loop is not None:
-                found += [loop] if window[at] < _UNSURE else self._confirmed(loop)
+        for k in near[: 3 + int(window[near].min(initial=0.0))].tolist():
+            number = int(older[k])
+            turn = np.deg2rad(5) + 0.01 * min(way[number], _LONGEST)
+            measured = self._matched(number, row, source, np.linalg.inv(at[number]) @ world, window[k], float(turn))
+            if measured is not None:
+                T, P = in_space(measured[0]) @ inverse_transform(inner[0]), covariance_in_space(measured[1]) + inner[1]
+                loop = LoopClosure(number, len(at) - 1, T, carried_covariance(inner[0], P + _BENT))
+                found.append((loop, bool(window[k] >= _UNSURE)))
                 if len(found) >= 2:
                     break
         return found
 
-    def _confirmed(self, loop: Measured) -> Sequence[Measured]:
-        frames = self.keyframes
-        return self._agreement.confirmed(
-            loop,
-            lambda one, other: np.asarray(np.linalg.inv(frames[one].matched) @ frames[other].matched),
-            lambda row: frames[row].way,
-        )
-
-    def _loop(
-        self, submap: _Submap, row: int, source: FloatArray, guess: FloatArray, window: float, turn: float
-    ) -> Measured | None:
-        found = submap.grid.search(source, vector(guess), window, turn, self.score)
+    def _matched(
+        self, number: int, row: int, source: FloatArray, guess: FloatArray, window: float, turn: float
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Pose of a keyframe in a submap, and its covariance; None where it does not fit, or elsewhere as well."""
+        s, (grid, lines, _) = self._settings, self._maps[number]
+        found = grid.search(source, vector(guess), window, turn, s.loop_score)
         if found is None or found.rival > _UNIQUE * found.score:
             return None
-        fit = submap.lines.fit(self.keyframes[row].points, found.pose, np.diag([1.0, 1.0, 10.0]), reach=0.4)
-        if fit.share < self.score or (window > _KNOWN_SHARE and not determined(fit.information)):
+        fit = lines.fit(self._keyframes[row].points, found.pose, np.diag([1.0, 1.0, 10.0]), reach=0.4)
+        if fit.share < s.loop_score or (window > _KNOWN_SHARE and not determined(fit.information)):
             return None
-        return measured_by(submap.centre, row, fit)
-
-    def _source(self, row: int) -> FloatArray:
-        """Points of a keyframe and of the four before it, in its frame."""
-        frames = self.keyframes[max(0, row - 4) : row + 1]
-        return thinned(joined(frames, frames[-1]), 0.2)
+        return measured_by(fit)

@@ -19,6 +19,7 @@ them, those at the start backwards from the first.
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,11 +34,16 @@ from data_tools.lidar import (
     voxel_downsample,
 )
 from data_tools.lidar.places import PlaceImage, PlaceIndex, Structure
+from data_tools.lidar.recording import scan_context
+from data_tools.lidar.scan import ScanSequence
+from data_tools.sensor_logs import SensorLog
+from data_tools.trajectories import Trajectory
 from factors import Robust, pose_prior_factor
 from pipelines.slam.loop_closures import COMPARED, FEWEST, SURFEL, agreeing, fits_otherwise, registered
 from pipelines.slam.odometry import LOST_TRANSLATION, Drive, LidarOdometry, OdometrySettings, moved_pose
 from pipelines.slam.submaps import SlamMap, placed_clouds
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
+from pipelines.tracking import Progress
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, Additions, FactorProvider
@@ -217,7 +223,7 @@ class Localiser:
         """
         if self._finished:
             raise InputError("step: expected no scan after finish; a new Localiser takes the next drive")
-        self._path.check(scan, time, True)
+        self._path.check(scan, time)
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
         placed = self._odometry.step(scan, time, self._sensors.velocity(self._sensors.corrected(wheels)))
@@ -405,3 +411,62 @@ class Localiser:
             self._clouds = [one for one in self._clouds if self.way - self._path.ways[one[0]] <= _WINDOW]
             self._compare()
         return found is not None
+
+
+@dataclass(frozen=True, eq=False)
+class LocalisedDrive:
+    """Poses (K) of the vehicle in the map, and whether each scan (K,) was registered with it.
+
+    covariances (K, 6, 6) of the sensor's poses, (rotation, translation) in its frame, rad^2, m^2
+    misfits   what does not fit of the vehicle's sensors, in words, by their names
+    unjudged  sensors that have measured too little to tell, likewise
+    """
+
+    trajectory: Trajectory
+    covariances: FloatArray
+    registered: BoolArray
+    misfits: Mapping[str, str]
+    unjudged: Mapping[str, str]
+
+
+def localise(
+    scans: ScanSequence,
+    slam_map: SlamMap,
+    guess: FloatArray | None = None,
+    settings: LocaliserSettings | None = None,
+    progress: Progress | None = None,
+    log: SensorLog | None = None,
+) -> LocalisedDrive:
+    """Localise a recording in a map.
+
+    guess: map_T_ego (4, 4) of the vehicle at the first scan, good to a metre or two and 0.1 rad. None: it is looked
+    for, as it is where the scans do not fit the map at the guess. log: of the vehicle's sensors, fixes in the map's
+    frame. Of the recording's poses none is used.
+    Raises `InputError` where no place of the map was found, or several, and where no scan fits the map.
+    """
+    log = log or SensorLog({})
+    start = None if guess is None else guess @ scans.ego_T_lidar
+    localiser = Localiser(slam_map, start, settings, Vehicle(scans.ego_T_lidar, tuple(log.tables), log.settings))
+    for k, (time, ego) in enumerate(log.until(scans.timestamps)):
+        with scan_context(scans, k):
+            localiser.step(scans[k], time, ego.imu, ego.gps, ego.wheels)
+        if progress is not None:
+            progress("localising", k + 1, len(scans))
+    localiser.finish()
+    path, covariances, registered = localiser.path(), localiser.covariances(), localiser.registered
+    if path is None or covariances is None or not registered.any():
+        if localiser.ambiguous:
+            raise InputError(
+                "map: expected one that shows the place of this drive once, it is ambiguous: several places of the map "
+                "look like it; a longer drive or a guess may help"
+            )
+        where = (
+            "none was found" if guess is None else "the scans do not fit it at the guess, and elsewhere none was found"
+        )
+        raise InputError(
+            f"map: expected one that shows a place of this drive, {where} in {localiser.way:.0f} m of way; a longer "
+            "drive, or a guess good to a metre or two and 0.1 rad, may help"
+        )
+    trajectory = Trajectory(scans.timestamps, path @ inverse_transform(scans.ego_T_lidar))
+    fit = localiser.consistency
+    return LocalisedDrive(trajectory, covariances, registered, fit.misfits, fit.unjudged)

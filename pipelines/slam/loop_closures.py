@@ -32,9 +32,10 @@ the way, that agrees with it: both loops and the odometry between their ends com
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 
@@ -53,10 +54,8 @@ from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import carried_covariance, inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
-from saga_fg.slam.pose_graph.consensus import Measured, shortest_paths
+from saga_fg.slam.pose_graph.consensus import shortest_paths
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
-
-Loop = TypeVar("Loop", bound=LoopClosure | Measured)  # in space, or in the plane
 
 
 def deviation(T: FloatArray) -> FloatArray:
@@ -67,7 +66,7 @@ def deviation(T: FloatArray) -> FloatArray:
 
 
 @dataclass(eq=False)
-class Agreement(Generic[Loop]):
+class Agreement:
     """Loops that wait for another one that agrees with them.
 
     within    largest difference of two loops that agree (2,), m and rad; `drift` (2,) more for each m between them
@@ -79,17 +78,17 @@ class Agreement(Generic[Loop]):
     drift: FloatArray
     patience: float
     apart: float = 0.0
-    _waiting: list[Loop] = field(default_factory=list)
+    _waiting: list[LoopClosure] = field(default_factory=list)
 
     def confirmed(
-        self, loop: Loop, between: Callable[[int, int], FloatArray], way: Callable[[int], float]
-    ) -> Sequence[Loop]:
+        self, loop: LoopClosure, between: Callable[[int, int], FloatArray], way: Callable[[int], float]
+    ) -> Sequence[LoopClosure]:
         """The loop with those of before that agree with it; it waits if there are none.
 
         between: pose of the second in the frame of the first, by odometry; way: driven until a pose, m
         """
         now = way(loop.second)
-        agreed = list[Loop]()
+        agreed = list[LoopClosure]()
         self._waiting = [k for k in self._waiting if way(k.second) > now - self.patience]
         for other in self._waiting:
             far = abs(way(loop.first) - way(other.first)) + abs(now - way(other.second))
@@ -178,17 +177,30 @@ class _Proved:
     way: float
 
 
-@dataclass(eq=False)
-class PlaceLoops:
-    """Submaps in, loops out: `SubmapLoops`."""
+class LoopSearch(ABC):
+    """Submaps in, loops out: `SubmapLoops`, where `found` says which older submaps show the place of a new one.
 
-    settings: LoopSettings = field(default_factory=LoopSettings)
-    _index: PlaceIndex = field(default_factory=PlaceIndex)
-    _submaps: list[Submap] = field(default_factory=list)
-    _edges: list[tuple[int, int, float]] = field(default_factory=list)
-    _waiting: Agreement[LoopClosure] = field(
-        default_factory=lambda: Agreement(np.array([2.0, 0.05]), np.array([0.05, 1e-3]), patience=150.0, apart=15.0)
-    )
+    min_path: m of way between two submaps that are compared; waiting: loops that need another one
+    """
+
+    def __init__(self, min_path: float, waiting: Agreement) -> None:
+        self._min_path, self._waiting = min_path, waiting
+        self._submaps = list[Submap]()
+        self._edges = list[tuple[int, int, float]]()
+
+    @abstractmethod
+    def found(
+        self, submap: Submap, older: IntArray, way: FloatArray, frames: FloatArray
+    ) -> list[tuple[LoopClosure, bool]]:
+        """Loops of a submap, and whether each waits for another one that agrees with it. Keep what the next need.
+
+        older: numbers of the submaps to compare with; way: from each submap so far along measurements, m; frames: of
+        all, as `add` has them
+        """
+
+    def driven(self, submap: Submap) -> float:
+        """Way until the end of a submap, m, with which drift grows."""
+        return submap.way[1]
 
     def add(self, submap: Submap, world_T_submap: FloatArray) -> Sequence[LoopClosure]:
         """Take the next submap and return loops, `first` and `second` numbers of submaps.
@@ -198,22 +210,62 @@ class PlaceLoops:
         """
         number = len(self._submaps)
         if number:
-            self._edges.append((number - 1, number, submap.way[1] - self._submaps[-1].way[1]))
+            self._edges.append((number - 1, number, self.driven(submap) - self.driven(self._submaps[-1])))
+        older = [k for k, one in enumerate(self._submaps) if one.way[1] <= submap.way[0] - self._min_path]
         self._submaps.append(submap)
-        if len(submap.points) < FEWEST:
-            return []
-        image = PlaceImage.of(submap.points.astype(np.float64))
-        proved = self._proved(number, image, world_T_submap)
-        self._index.add(number, image)
         taken: list[LoopClosure] = []
-        for one in proved[:_TAKEN]:
-            taken += self._believed(one, world_T_submap)
+        for loop, waits in self.found(submap, np.array(older, dtype=np.int64), self._ways(number), world_T_submap):
+            taken += self._confirmed(loop, world_T_submap) if waits else [loop]
         self._edges += [(loop.first, loop.second, float(deviation(loop.first_T_second)[0])) for loop in taken]
         return taken
 
-    def _proved(self, number: int, image: PlaceImage, frames: FloatArray) -> list[_Proved]:
+    def _confirmed(self, loop: LoopClosure, frames: FloatArray) -> Sequence[LoopClosure]:
+        agreed = self._waiting.confirmed(
+            loop,
+            lambda a, b: np.asarray(inverse_transform(frames[a]) @ frames[b]),
+            lambda number: self._submaps[number].way[1],
+        )
+        return [replace(loop, confirmed=True) for loop in agreed]
+
+    def _ways(self, number: int) -> FloatArray:
+        """Way from each submap so far to this one, along measurements, m."""
+        if not self._edges:
+            return np.zeros(len(self._submaps))
+        first, second, length = (np.array(column) for column in zip(*self._edges, strict=True))
+        return shortest_paths(first, second, length, len(self._submaps), number)
+
+
+class PlaceLoops(LoopSearch):
+    """Loops of a LiDAR, by place."""
+
+    def __init__(self, settings: LoopSettings | None = None) -> None:
+        self.settings = settings or LoopSettings()
+        waiting = Agreement(np.array([2.0, 0.05]), np.array([0.05, 1e-3]), patience=150.0, apart=15.0)
+        super().__init__(self.settings.min_path, waiting)
+        self._index = PlaceIndex()
+
+    def found(
+        self, submap: Submap, older: IntArray, way: FloatArray, frames: FloatArray
+    ) -> list[tuple[LoopClosure, bool]]:
+        if len(submap.points) < FEWEST:
+            return []
+        number, image = len(frames) - 1, PlaceImage.of(submap.points.astype(np.float64))
+        proved = self._proved(number, image, older, way, frames)
+        self._index.add(number, image)
+        believed = list[tuple[LoopClosure, bool]]()
+        for one in proved[:_TAKEN]:
+            if self._trusted(one):
+                believed.append((one.loop, False))
+            elif one.overlap >= _ALONE and self._trusted(one, 2.0):
+                believed.append((replace(one.loop, confirmed=True), False))
+            elif one.overlap >= _SURELY:
+                believed.append((one.loop, True))
+        return believed
+
+    def _proved(
+        self, number: int, image: PlaceImage, older: IntArray, way: FloatArray, frames: FloatArray
+    ) -> list[_Proved]:
         """Loops of the submap, without rivals, the best first."""
-        way, older = self._ways(number), self._older(number)
         apart = np.linalg.norm(frames[older, :3, 3] - frames[number, :3, 3], axis=1)
         length = self._submaps[number].way[1] - self._submaps[number].way[0]
         older = older[apart < self._farthest(way[older]) + 2 * length + 20.0]
@@ -253,38 +305,9 @@ class PlaceLoops:
         overlap = np.array([one.overlap for one in found])
         return [found[k] for k in agreeing(places, overlap, SAME + self.settings.drift * ways)]
 
-    def _believed(self, one: _Proved, frames: FloatArray) -> Sequence[LoopClosure]:
-        if self._trusted(one):
-            return [one.loop]
-        if one.overlap >= _ALONE and self._trusted(one, 2.0):
-            return [replace(one.loop, confirmed=True)]
-        if one.overlap < _SURELY:
-            return []
-        agreed = self._waiting.confirmed(
-            one.loop,
-            lambda a, b: np.asarray(inverse_transform(frames[a]) @ frames[b]),
-            lambda number: self._submaps[number].way[1],
-        )
-        return [replace(loop, confirmed=True) for loop in agreed]
-
     def _trusted(self, one: _Proved, times: float = 1.0) -> bool:
         """True if the loop deviates from odometry by no more than its drift, or so many times of it."""
         return one.off < 1.0 + times * self.settings.drift * one.way
-
-    def _older(self, number: int) -> IntArray:
-        """Submaps that ended `min_path` before this one began."""
-        begins = self._submaps[number].way[0]
-        return np.array(
-            [k for k, one in enumerate(self._submaps[:number]) if one.way[1] <= begins - self.settings.min_path],
-            dtype=np.int64,
-        )
-
-    def _ways(self, number: int) -> FloatArray:
-        """Way from each submap so far to this one, along measurements, m."""
-        if not self._edges:
-            return np.zeros(len(self._submaps))
-        first, second, length = (np.array(column) for column in zip(*self._edges, strict=True))
-        return shortest_paths(first, second, length, len(self._submaps), number)
 
     @staticmethod
     def _farthest(way: FloatArray) -> FloatArray:

@@ -98,6 +98,8 @@ class OdometryStep:
 class LidarOdometry:
     """Takes scans in order of time and returns the pose of each."""
 
+    registers = True
+
     def __init__(self, settings: OdometrySettings | None = None) -> None:
         self.settings = settings or OdometrySettings()
         self._map = SurfelMap(self.settings.surfel_size, self.settings.max_range)
@@ -158,6 +160,8 @@ class LidarOdometry:
 
     def _within_range(self, scan: Scan, timestamp: float) -> Scan:
         s = self.settings
+        if self._last is None and not len(scan):
+            raise InputError(f"scan at {timestamp:.3f} s: expected points to begin with, got none")
         near = scan.within(s.min_range, s.max_range)
         out_of_range = self._out_of_range + 1 if len(scan) and not len(near) else 0
         if out_of_range and (self._last is None or out_of_range >= _OUT_OF_RANGE):
@@ -314,8 +318,8 @@ class Drive:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def check(self, scan: Scan | None, time: float, points_first: bool) -> None:
-        """Raise `InputError` for what cannot be the next scan; points_first: whether the first one must have some."""
+    def check(self, scan: Scan | None, time: float) -> None:
+        """Raise `InputError` for what cannot be the next scan."""
         if scan is None:
             raise InputError(
                 "scan: expected one in every step: what sensors measure between scans comes with the next scan, as "
@@ -326,8 +330,6 @@ class Drive:
             raise InputError(f"time: expected a finite number of seconds, got {time!r}")
         if self.times and not time > self.times[-1]:
             raise InputError(f"time: expected one after {self.times[-1]:.6f} s, got {time:.6f} s")
-        if points_first and not self.times and not len(scan):
-            raise InputError(f"scan at {time:.3f} s: expected points to begin with, got none")
 
     def add(self, time: float, pose: FloatArray, step: OdometryStep) -> None:
         """Add the scan at `time` with its pose (4, 4), which stands for the poses of the scans lost before, too."""
@@ -410,7 +412,10 @@ def checked_step(step: object) -> OdometryStep:
 
 
 class Odometry(Protocol):
-    """Places scans one by one, in the frame of the first; `LidarOdometry` is one."""
+    """Places scans one by one, in the frame of the first; `LidarOdometry` is one.
+
+    One with an attribute `registers` that is True registers scans with each other, so that they show things straight.
+    """
 
     def step(self, scan: Scan, timestamp: float) -> OdometryStep:
         """Place the next scan."""

@@ -35,6 +35,11 @@ metrics.json                errors of the trajectories against the recording's o
                             that left motions open, and sensors that do not fit or measured too little to tell
 
 Files of points and landmarks are left out where there are none.
+
+Results of localisation: the path in the map's frame (trajectory.tum, trajectory.txt with times.txt), reference.tum,
+covariances.csv of the sensor's pose at each scan, and whether that was registered with the map, above.png, and in
+metrics.json errors against the recording's poses, as they are and with the path aligned, and counts.
+
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
 
@@ -43,7 +48,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -57,15 +61,17 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import occupancy_picture, paths_from_above, png, scan_map_from_above
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
+from pipelines.slam.driver import SlamResult
 from pipelines.slam.laser_slam import LaserPath
-from pipelines.slam.lidar_slam import START, LidarSlamResult, LidarSlamSettings
+from pipelines.slam.lidar_slam import LidarSlamSettings
+from pipelines.slam.localisation import LocalisedDrive
 from pipelines.slam.odometry import KeyframeClouds, OdometrySettings
 from pipelines.slam.scan_content import LINE, WALL
 from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import inverse_transform, transform_points, transforms
+from saga_fg.numerics.geometry import in_space, inverse_transform, transform_points, transforms
 from saga_fg.slam.joint import JointEstimate
-from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph, PosePriors
+from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
 from saga_fg.types.landmark import Landmark
 
 _CONFIRMED = 5  # detections
@@ -130,10 +136,7 @@ def write_objects(path: Path, estimate: JointEstimate) -> None:
 
 def planar_trajectory(time: FloatArray, world_T_pose: FloatArray) -> Trajectory:
     """Return a trajectory in the plane, (N, 3, 3), as one in space at z = 0."""
-    poses = np.tile(np.eye(4), (len(world_T_pose), 1, 1))
-    poses[:, :2, :2] = world_T_pose[:, :2, :2]
-    poses[:, :2, 3] = world_T_pose[:, :2, 2]
-    return Trajectory(time, poses)
+    return Trajectory(time, in_space(world_T_pose))
 
 
 def write_pose_graph(
@@ -220,7 +223,7 @@ _log = logging.getLogger(__name__)
 _LINED = (WALL.name, LINE.name)
 
 
-def metrics(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySettings | None = None) -> dict[str, Any]:
+def metrics(result: SlamResult, scans: ScanSequence, odometry: OdometrySettings | None = None) -> dict[str, Any]:
     """Errors (start aligned) of the three trajectories against the recording's poses, if it has any; residuals, counts.
 
     odometry: settings of the run
@@ -283,7 +286,7 @@ def degenerate_spans(times: FloatArray, degenerate: Sequence[tuple[str, ...]]) -
     return spans
 
 
-def _residual(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySettings) -> float:
+def _residual(result: SlamResult, scans: ScanSequence, odometry: OdometrySettings) -> float:
     """Mean scan-to-map residual, m, of some forty keyframes at most, whose scans are read again; NaN without points."""
     if not any(len(submap.points) for submap in result.submaps):
         return float("nan")
@@ -293,7 +296,7 @@ def _residual(result: LidarSlamResult, scans: ScanSequence, odometry: OdometrySe
 
 def write_lidar_slam(
     output: Path,
-    result: LidarSlamResult,
+    result: SlamResult,
     scans: ScanSequence,
     settings: LidarSlamSettings | None = None,
     origin: Origin | None = None,
@@ -340,7 +343,7 @@ def write_paths(folder: Path, trajectory: Trajectory, **others: Trajectory | Non
             write_tum_poses(folder / f"{name}.tum", path)
 
 
-def _lines(result: LidarSlamResult) -> dict[int, FloatArray]:
+def _lines(result: SlamResult) -> dict[int, FloatArray]:
     """Ends (n, 2, 2), from above, of the pieces of each wall and road line that were observed."""
     return {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind.name in _LINED}
 
@@ -358,7 +361,7 @@ def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
     return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
 
 
-def _seen_pieces(result: LidarSlamResult, mark: Landmark) -> FloatArray:
+def _seen_pieces(result: SlamResult, mark: Landmark) -> FloatArray:
     """Ends (n, 2, 2) of the pieces of a wall or road line that were observed."""
     place = mark.kind.coordinates(mark.state)
     normal = np.array([place["nx"], place["ny"]]) / np.hypot(place["nx"], place["ny"])
@@ -385,25 +388,6 @@ def covered_spans(spans: Sequence[tuple[float, float]]) -> list[tuple[float, flo
     return covered
 
 
-def pose_graph_of(result: LidarSlamResult) -> PoseGraph:
-    """Keyframes 0 .. M - 1 with the odometry between them and the loops; M > 1."""
-    odometry = result.motions(result.drive.keyframes)
-    pairs = [*pairwise(range(len(result.keyframes))), *((loop.first, loop.second) for loop in result.loops)]
-    measured = [*(T for T, _ in odometry), *(loop.first_T_second for loop in result.loops)]
-    covariances = np.array([*(P for _, P in odometry), *(loop.covariance for loop in result.loops)])
-    information = np.linalg.inv(covariances)
-    first, second = np.array(pairs, dtype=np.int64).T
-    return PoseGraph(
-        np.arange(len(result.keyframes), dtype=np.int64),
-        result.world_T_lidar,
-        first,
-        second,
-        np.array(measured),
-        (information + information.swapaxes(1, 2)) / 2,
-        priors=PosePriors(np.zeros(1, dtype=np.int64), result.drive.poses[0][None], np.linalg.inv(START)[None]),
-    )
-
-
 def write_landmark_table(path: Path, landmarks: Iterable[Landmark], pieces: Mapping[int, FloatArray]) -> None:
     """Write number, kind, observations, standard deviations of the state, and the geometry as WKT, in x and y, m.
 
@@ -425,11 +409,11 @@ def write_landmark_table(path: Path, landmarks: Iterable[Landmark], pieces: Mapp
 _OBSERVED = ("keyframe", "landmark", "kind", "value", "covariance")
 
 
-def write_graph(folder: Path, result: LidarSlamResult) -> None:
+def write_graph(folder: Path, result: SlamResult) -> None:
     """Write graph.g2o and observations.csv to a folder that exists; a graph of one keyframe is none."""
     if len(result.keyframes) < 2:
         return
-    write_g2o(folder / "graph.g2o", pose_graph_of(result))
+    write_g2o(folder / "graph.g2o", result.pose_graph())
     marks = {mark.number for mark in result.landmarks}
     rows = [",".join(_OBSERVED)]
     for one in result.observations:
@@ -439,3 +423,28 @@ def write_graph(folder: Path, result: LidarSlamResult) -> None:
             value, covariance = (" ".join(f"{x:.17g}" for x in field) for field in fields)
             rows.append(f"{one.pose},{one.landmark},{one.observation.kind.name},{value},{covariance}")
     write_text(folder / "observations.csv", "\n".join(rows) + "\n")
+
+
+def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, slam_map: SlamMap) -> dict[str, Any]:
+    """Write all files, or none; returns the metrics."""
+    truth, path = reference(scans), found.trajectory
+    figures: dict[str, Any] = {
+        "scans": len(scans),
+        "registered": int(found.registered.sum()),
+        "first_registered": int(np.argmax(found.registered)) if found.registered.any() else None,
+        "misfits": dict(found.misfits),
+        "unjudged": dict(found.unjudged),
+    }
+    if truth is not None:
+        figures["trajectory"] = asdict(trajectory_errors(path, truth, "none"))
+        figures["aligned"] = asdict(trajectory_errors(path, truth, "rigid"))
+    points = placed_clouds(slam_map.points, slam_map.map_T_submap, 0.3)
+    with atomic_directory(output, known=LIDAR_FILES) as folder:
+        write_paths(folder, trajectory=path, reference=truth)
+        registered, times = found.registered.astype(int).tolist(), path.timestamps.tolist()
+        write_covariances(folder / "covariances.csv", "timestamp", times, found.covariances, registered=registered)
+        drawn = {} if truth is None else {"reference": truth.positions}
+        drawn["trajectory"] = path.positions
+        write_bytes(folder / "above.png", png(scan_map_from_above(points, drawn, np.empty((0, 2)), {})))
+        write_figures(folder / "metrics.json", figures)
+    return figures

@@ -163,6 +163,20 @@ def moved(points: FloatArray, T: FloatArray) -> FloatArray:
     return np.asarray(points @ T[:2, :2].T + T[:2, 2])
 
 
+def in_space(T: FloatArray) -> FloatArray:
+    """Poses in the plane (..., 3, 3) as poses in space (..., 4, 4) at z = 0."""
+    poses = np.zeros((*T.shape[:-2], 4, 4))
+    poses[..., :2, :2], poses[..., :2, 3] = T[..., :2, :2], T[..., :2, 2]
+    poses[..., 2, 2] = poses[..., 3, 3] = 1.0
+    return poses
+
+
+def in_plane(T: FloatArray) -> FloatArray:
+    """Upright poses in space (..., 4, 4) from above (..., 3, 3)."""
+    rows = np.array([0, 1, 3])
+    return T[..., rows[:, None], rows]
+
+
 class Feet(NamedTuple):
     """Nearest points (m, 2) of a polyline to m places, s (m,) and e (m,), m, and its direction (m, 2) at s."""
 

@@ -13,7 +13,8 @@ from benchmarks.scans import CURB, SimulatedScans, drive
 from data_tools.lidar import Scan, Submap, read_scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
-from pipelines.slam.lidar_slam import LidarSlam, LidarSlamResult, LidarSlamSettings, lidar_slam
+from pipelines.slam.driver import SlamResult
+from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.odometry import OdometrySettings, RecordedOdometry
 from pipelines.slam.results import covered_spans, metrics, write_graph, write_lidar_slam
@@ -31,11 +32,11 @@ def scans() -> SimulatedScans:
 
 
 @pytest.fixture(scope="module")
-def result(scans: SimulatedScans) -> LidarSlamResult:
+def result(scans: SimulatedScans) -> SlamResult:
     return lidar_slam(scans)
 
 
-def test_the_drive_is_found_and_the_covariance_grows(scans: SimulatedScans, result: LidarSlamResult) -> None:
+def test_the_drive_is_found_and_the_covariance_grows(scans: SimulatedScans, result: SlamResult) -> None:
     truth = Trajectory(scans.timestamps, scans.world_T_ego)
     assert trajectory_errors(result.trajectory, truth, "start").relative_translation < 0.05
     assert trajectory_errors(result.online, truth, "start").relative_translation < 0.1
@@ -44,7 +45,7 @@ def test_the_drive_is_found_and_the_covariance_grows(scans: SimulatedScans, resu
     assert np.linalg.eigvalsh(result.covariances).min() > 0
 
 
-def test_landmarks_stand_where_they_do(scans: SimulatedScans, result: LidarSlamResult) -> None:
+def test_landmarks_stand_where_they_do(scans: SimulatedScans, result: SlamResult) -> None:
     poles = [mark for mark in result.landmarks if mark.kind == POLE]
     walls = [mark for mark in result.landmarks if mark.kind.name == "wall"]
     assert len(poles) >= 2
@@ -140,7 +141,7 @@ def test_loops_and_inflation_go_through_the_files(tmp_path: Path) -> None:
     assert np.linalg.det(saved.information[0]) < 0.1 * np.linalg.det(stated[0])  # odometry as the loops have it
 
 
-def test_step_by_step_is_what_the_recording_gives(scans: SimulatedScans, result: LidarSlamResult) -> None:
+def test_step_by_step_is_what_the_recording_gives(scans: SimulatedScans, result: SlamResult) -> None:
     slam = LidarSlam(scans.world_T_ego[0])
     steps = [slam.step(scans[k], time) for k, time in enumerate(scans.timestamps.tolist())]
     np.testing.assert_allclose([step.world_T_lidar for step in steps], result.online.world_T_ego)
@@ -173,7 +174,7 @@ def test_what_cannot_be_placed_is_said() -> None:
     assert len(slam.finish().trajectory.timestamps) == 4
 
 
-def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: LidarSlamResult, tmp_path: Path) -> None:
+def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: SlamResult, tmp_path: Path) -> None:
     figures = write_lidar_slam(tmp_path / "run", result, scans, LidarSlamSettings(map_spacing=0.6))
     folder = tmp_path / "run"
     for trajectory in (
@@ -196,7 +197,7 @@ def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: Lida
     assert sorted(tmp_path.iterdir()) == [folder]
 
 
-def test_the_residual_is_of_the_run_s_ranges(scans: SimulatedScans, result: LidarSlamResult) -> None:
+def test_the_residual_is_of_the_run_s_ranges(scans: SimulatedScans, result: SlamResult) -> None:
     near, default = OdometrySettings(max_range=12.0), OdometrySettings()
     found = [metrics(result, scans, one)["scan_to_map_residual"] for one in (near, default, None)]
     assert found[0] != found[1] == found[2]

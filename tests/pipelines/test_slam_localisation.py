@@ -13,9 +13,8 @@ from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.sensor_logs import SensorLog
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
-from pipelines.slam.localisation import Localiser, LocaliserSettings
-from pipelines.slam.localised_drive import localise, write_localised
-from pipelines.slam.results import write_lidar_slam
+from pipelines.slam.localisation import Localiser, LocaliserSettings, localise
+from pipelines.slam.results import write_lidar_slam, write_localised
 from pipelines.slam.submaps import SlamMap, read_map, write_map
 from pipelines.slam.vehicle_sensors import Vehicle
 from saga_fg.errors import InputError

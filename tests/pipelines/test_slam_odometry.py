@@ -11,7 +11,8 @@ from benchmarks.scans import SMALL, ScannerSettings, SimulatedScans, StaticWorld
 from data_tools.lidar import Scan, Submap, constant_velocity, voxel_downsample
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import load_config
-from pipelines.slam.lidar_slam import LidarSlamResult, LidarSlamSettings, lidar_slam, path_tracker
+from pipelines.slam.driver import SlamResult
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam, path_tracker
 from pipelines.slam.loop_closures import Agreement, PlaceLoops, deviation
 from pipelines.slam.odometry import (
     LOST_ROTATION,
@@ -147,7 +148,7 @@ def drive_behind_a_car(count: int = 24) -> tuple[SimulatedScans, list[Frame], np
     return scans, frames, places
 
 
-def points_on(result: LidarSlamResult, places: np.ndarray, size: np.ndarray = SIZE) -> int:
+def points_on(result: SlamResult, places: np.ndarray, size: np.ndarray = SIZE) -> int:
     """Number of points of the map in boxes along x, above the ground."""
     cloud = np.concatenate(
         [

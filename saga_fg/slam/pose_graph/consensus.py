@@ -1,11 +1,8 @@
 """Selection of the true loop closures of a pose graph.
 
 Odometry (between successive poses), priors, known places and landmarks are trusted. First, graduated non-convexity
-with truncated least squares from dead reckoning: in each step of mu one weighted Gauss-Newton step,
-
-    w = 1                     s^2 <= mu/(mu+1) c^2                s: distance of the loop's residual
-        0                     s^2 >= (mu+1)/mu c^2                c^2: 99 % quantile of chi^2
-        c/s sqrt(mu(mu+1)) - mu   in between
+with truncated least squares from dead reckoning (`saga_fg.estimators.graduated`), c^2 the 99 % quantile of chi^2: in
+each step of mu one weighted Gauss-Newton step.
 
 Then data snooping: each loop is judged by the solution without it,
 
@@ -22,13 +19,6 @@ at the solution without them come back, until there are none: whatever k, they a
 
 Sources: Yang, Antonante, Tzoumas, Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020; Baarda, A
 testing procedure for use in geodetic networks, 1968.
-
-A pose graph that grows pose by pose, with loops that must agree with the way between their ends.
-
-A pose graph in the plane that grows pose by pose, its estimate by iSAM2; loops are under a robust loss.
-
-The loss bounds what a false loop can do while the graph runs. `settled` decides which loops are false, by consensus of
-all of them.
 """
 
 from __future__ import annotations
@@ -41,13 +31,13 @@ from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.stats import chi2
 
-from factors import ResidualFactors, Robust, between_factor, linearised, pose_prior_factor, solve
+from factors import ResidualFactors, linearised, solve
 from saga_fg.errors import InputError
+from saga_fg.estimators.graduated import MAX_STAGES, GraduatedNonConvexity
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.slam.pose_graph.chordal import factorised
 from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
 from saga_fg.slam.pose_graph.optimisation import (
-    HELD,
     SOLVER,
     factor_graph,
     graph_values,
@@ -60,9 +50,7 @@ PROBABILITY = 0.99  # of a true loop within c
 _CERTAIN = 0.999  # of a true loop within the gate: few of many loops may be lost
 _TAILS = 8.0  # m: loops of recordings have tails far longer than Gaussian ones
 _FEWEST = 8  # loops that tell a variance of unit weight
-_STEP = 1.4  # of mu, as in the paper
-_NONE = 1e-3  # weight that counts as 0
-_MOST_STAGES, _MOST_ROUNDS = 200, 50
+_MOST_ROUNDS = 50
 _BLOCK = 200  # loops whose covariances are solved for at once
 
 
@@ -155,8 +143,8 @@ class _Problem:
         return float(chi2.ppf(PROBABILITY, self.k))
 
     def distances(self, values: gtsam.Values) -> FloatArray:
-        """Squares of the distances (M,), in variances."""
-        return np.array([2 * self.factors.at(self.held + edge).error(values) for edge in range(self.edges)])
+        """Distances (M,) of the residuals, standard deviations."""
+        return np.sqrt([2 * self.factors.at(self.held + edge).error(values) for edge in range(self.edges)])
 
     def step(self, values: gtsam.Values, weights: FloatArray) -> gtsam.Values:
         """A step of Gauss and Newton with weights (M,)."""
@@ -203,18 +191,15 @@ class _Problem:
 
 def _graduated(problem: _Problem, values: gtsam.Values, loop: BoolArray) -> tuple[gtsam.Values, FloatArray]:
     """Poses and weights (M,) by truncated least squares."""
-    squares = problem.distances(values) / problem.gate
-    mu = 1 / max(2 * float(squares[loop].max()) - 1, 1e-9)
+    loss = GraduatedNonConvexity(np.sqrt(problem.gate))
+    mu: float | None = loss.first(problem.distances(values)[loop])
     weights = np.ones(len(loop))
-    for _ in range(_MOST_STAGES):
-        between = np.sqrt(mu * (mu + 1) / np.maximum(squares, 1e-100)) - mu
-        weights = np.where(squares <= mu / (mu + 1), 1.0, np.where(squares >= (mu + 1) / mu, 0.0, between))
-        weights[~loop] = 1.0
-        values = problem.step(values, weights)
-        squares = problem.distances(values) / problem.gate
-        if mu >= 1 and (np.minimum(weights, 1 - weights) < _NONE).all():
+    for _ in range(MAX_STAGES):
+        if mu is None:
             break
-        mu *= _STEP
+        weights[loop] = loss.weights(mu, problem.distances(values)[loop])
+        values = problem.step(values, weights)
+        mu = loss.next(mu, weights)
     return values, weights
 
 
@@ -255,7 +240,7 @@ def _snooped(
 
 def _readmitted(problem: _Problem, values: gtsam.Values, kept: BoolArray) -> tuple[gtsam.Values, BoolArray]:
     """Take in what was left out and agrees with the solution, until nothing does."""
-    while (agreeing := ~kept & (problem.distances(values) <= problem.gate)).any():
+    while (agreeing := ~kept & (problem.distances(values) <= np.sqrt(problem.gate))).any():
         kept = kept | agreeing
         values = problem.solved(values, kept)
     return values, kept
@@ -299,97 +284,3 @@ def shortest_paths(first: IntArray, second: IntArray, length: FloatArray, poses:
     kept = order[once]
     joined = csr_array((np.maximum(length[kept], _SHORTEST), (low[kept], high[kept])), shape=(poses, poses))
     return np.asarray(dijkstra(joined, directed=False, indices=row))
-
-
-_LOSS = Robust("cauchy", 3.0)
-_RADIAN = 1.0  # m of way that a radian of turning counts as
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """first_T_second (3, 3) between two poses, with the covariance (3, 3) of its tangent."""
-
-    first: int
-    second: int
-    first_T_second: FloatArray
-    covariance: FloatArray
-
-
-def path_lengths(steps: FloatArray) -> FloatArray:
-    """Length (n,) of steps (n, 3, 3), m: the distance, and a metre for each radian turned."""
-    turn = np.abs(np.arctan2(steps[:, 1, 0], steps[:, 0, 0]))
-    return np.asarray(np.hypot(steps[:, 0, 2], steps[:, 1, 2]) + _RADIAN * turn)
-
-
-class RunningPoseGraph:
-    """Poses from 0 on, each measured from the one before it, and loops."""
-
-    def __init__(self, world_T_first: FloatArray) -> None:
-        params = gtsam.ISAM2Params()
-        params.setRelinearizeThreshold(0.02)
-        params.relinearizeSkip = 1
-        self._solver = gtsam.ISAM2(params)
-        self._edges: list[Measured] = []
-        self._poses = [world_T_first]
-        self._new, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._new.add(pose_prior_factor(0, world_T_first, HELD * np.eye(3)))
-        self._start.insert(0, _pose2(world_T_first))
-
-    def append(self, last_T_new: FloatArray, covariance: FloatArray) -> int:
-        """Add a pose by odometry from the last one; returns its number."""
-        row = len(self._poses)
-        self._poses.append(self._poses[-1] @ last_T_new)
-        self._edges.append(Measured(row - 1, row, last_T_new, covariance))
-        self._new.add(between_factor(row - 1, row, last_T_new, covariance))
-        self._start.insert(row, _pose2(self._poses[-1]))
-        return row
-
-    def close(self, loops: list[Measured]) -> None:
-        """Add loops, and solve."""
-        for loop in loops:
-            self._edges.append(loop)
-            self._new.add(between_factor(loop.first, loop.second, loop.first_T_second, loop.covariance, _LOSS))
-        self._solver.update(self._new, self._start)
-        self._new, self._start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._solver.update()
-        values = self._solver.calculateEstimate()
-        self._poses = [values.atPose2(row).matrix() for row in range(len(self._poses))]
-
-    def pose(self, row: int) -> FloatArray:
-        """The present estimate (3, 3) of a pose."""
-        return self._poses[row]
-
-    @property
-    def poses(self) -> FloatArray:
-        """The present estimates (N, 3, 3)."""
-        return np.stack(self._poses)
-
-    def distances(self, row: int) -> FloatArray:
-        """Length (N,) of the shortest way from a pose to each along measurements, m: what relative errors grow with."""
-        first, second = (
-            np.array([getattr(edge, end) for edge in self._edges], dtype=np.int64) for end in ("first", "second")
-        )
-        length = path_lengths(np.array([edge.first_T_second for edge in self._edges]).reshape(-1, 3, 3))
-        return shortest_paths(first, second, length, len(self._poses), row)
-
-    def graph(self, loops: list[Measured] | None = None) -> PoseGraph:
-        """The whole graph; loops: in place of those that came."""
-        edges = self._edges
-        if loops is not None:
-            edges = [edge for edge in edges if edge.second == edge.first + 1] + loops
-        first, second = (
-            np.array([getattr(edge, end) for edge in edges], dtype=np.int64) for end in ("first", "second")
-        )
-        between = np.array([edge.first_T_second for edge in edges]).reshape(-1, 3, 3)
-        information = np.linalg.inv(np.array([edge.covariance for edge in edges]).reshape(-1, 3, 3))
-        information = (information + information.swapaxes(1, 2)) / 2
-        ids: IntArray = np.arange(len(self._poses), dtype=np.int64)
-        return PoseGraph(ids, self.poses, first, second, between, information)
-
-    def settled(self, loops: list[Measured] | None = None) -> Consensus:
-        """The graph without false loops, optimised."""
-        return consensus(self.graph(loops))
-
-
-def _pose2(T: FloatArray) -> gtsam.Pose2:
-    return gtsam.Pose2(T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0]))
