@@ -103,7 +103,7 @@ class TrafficOptions(RecordingOptions):
         typer.Option(
             "--longest",
             min=1.0,
-            help="Of recordings of ngsim, openacc and crossings, s, from the middle of longer ones.",
+            help="Of recordings of ngsim, openacc, dut and crossings, s, from the middle of longer ones.",
         ),
     ] = None
 

@@ -16,6 +16,7 @@ import typer
 from benchmarks.class_figures import class_rows, frames_with_two_classes
 from benchmarks.recordings.crossings import simulated_crossings
 from benchmarks.recordings.crowds import RATE, recorded_crowds, simulated_crowds
+from benchmarks.recordings.dut import dut_clips
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
 from benchmarks.recordings.sensed import ABOVE, MAST, VEHICLE, default_sensors, sensed_scene
@@ -58,7 +59,7 @@ class RecordingOptions:
         typer.Option(
             "--sets",
             help="Of megvii, centerpoint, camera, kitti, simulated; confused (classes); with made detections ngsim, "
-            "openacc, crossings (simulated, without signals), eth_ucy and crowds (simulated).  "
+            "openacc, dut, crossings (simulated, without signals), eth_ucy and crowds (simulated).  "
             "[default: the first five]",
         ),
     ] = None
@@ -67,7 +68,7 @@ class RecordingOptions:
         str | None,
         typer.Option(
             "--viewpoint",
-            help="Of the sensors in the sets ngsim, openacc and crossings: mast, above, where nothing is hidden, "
+            help="Of the sensors in the sets ngsim, openacc, dut and crossings: mast, above, where nothing is hidden, "
             "vehicle, the id of one, or X,Y,Z in m.  [default: above in gaps, else mast, vehicle, above]",
         ),
     ] = None
@@ -285,5 +286,6 @@ SETS: dict[str, Callable[[Path], RecordingSet]] = {
 TRAFFIC_SETS: dict[str, tuple[Callable[[Path], Recordings], str]] = {
     "ngsim": (ngsim_windows, MAST),
     "openacc": (openacc_platoons, VEHICLE),
+    "dut": (dut_clips, MAST),
 }
 """Recorded traffic, whose detections are made, and the usual viewpoint; taken only where it is asked for."""

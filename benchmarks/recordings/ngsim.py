@@ -16,6 +16,7 @@ from __future__ import annotations
 import gzip
 import json
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -79,7 +80,7 @@ def ngsim_windows(root: Path, road: Road = "signals") -> Recordings:
 
 
 def _maps(root: Path) -> tuple[Path, dict[str, Any]]:
-    path, text = _text(root, MAPS, "; --road none goes without")
+    path, text = text_of(root, MAPS, "; --road none goes without")
     try:
         maps = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -91,10 +92,18 @@ def _maps(root: Path) -> tuple[Path, dict[str, Any]]:
 
 def _windows(root: Path) -> TextTable:
     """The columns of `COLUMNS`, in their order, of all rows."""
-    path, text = _text(root, WINDOWS)
+    table = named_columns(*text_of(root, WINDOWS), COLUMNS)
+    unnamed = (table.values[:, :3] == "").any(axis=1)
+    if unnamed.any():
+        raise table.fault(int(np.argmax(unnamed)), "scenario, id, type: expected a value")
+    return table
+
+
+def named_columns(path: Path, text: str, columns: Sequence[str]) -> TextTable:
+    """Some columns, in their order, of the rows of a table with a header; raises `InputError` for one without them."""
     rows = [[value.strip() for value in line.split(",")] for line in text.splitlines()] or [[""]]
     there = rows[0]
-    missing = next((name for name in COLUMNS if name not in there), None)
+    missing = next((name for name in columns if name not in there), None)
     if missing is not None:
         raise InputError(f"{path}: {missing}: expected this column, the file has {', '.join(there)[:200] or 'none'}")
     found = {number: row for number, row in enumerate(rows[1:], start=2) if any(row)}
@@ -103,15 +112,11 @@ def _windows(root: Path) -> TextTable:
             raise InputError(f"{path}: line {number}: expected {len(there)} columns, got {len(row)}")
     if not found:
         raise InputError(f"{path}: expected rows, there are none")
-    at = [there.index(name) for name in COLUMNS]
-    table = TextTable.from_rows(path, [[row[k] for k in at] for row in found.values()], list(found))
-    unnamed = (table.values[:, :3] == "").any(axis=1)
-    if unnamed.any():
-        raise table.fault(int(np.argmax(unnamed)), "scenario, id, type: expected a value")
-    return table
+    at = [there.index(name) for name in columns]
+    return TextTable.from_rows(path, [[row[k] for k in at] for row in found.values()], list(found))
 
 
-def _text(root: Path, names: tuple[str, ...], otherwise: str = "") -> tuple[Path, str]:
+def text_of(root: Path, names: tuple[str, ...], otherwise: str = "") -> tuple[Path, str]:
     """The first of the files that is there, and what it says."""
     path = next((root / name for name in names if (root / name).is_file()), None)
     if path is None:

@@ -146,8 +146,11 @@ def test_the_command_refuses(refused, subtests):
         ("--contenders nobody", "--contenders: unknown name"),
         ("--contender own", "expected a new NAME=FILE"),
         ("--against turn --contenders saga,kf", "--against: unknown name"),
-        ("--viewpoint mast", "--viewpoint: expected ngsim or openacc or eth_ucy or crowds or crossings among --sets"),
-        ("--longest 20", "--longest: expected ngsim or openacc or eth_ucy or crowds or crossings among --sets"),
+        (
+            "--viewpoint mast",
+            "--viewpoint: expected ngsim or openacc or dut or eth_ucy or crowds or crossings among --sets",
+        ),
+        ("--longest 20", "--longest: expected ngsim or openacc or dut or eth_ucy or crowds or crossings among --sets"),
         ("--picture gap.jpg", "gap.jpg: expected a name that ends in .png"),
         ("--test scene-0099", "--test: unknown name"),
         ("--fit edge", "--fit: unknown name 'edge'"),
