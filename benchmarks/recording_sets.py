@@ -129,9 +129,9 @@ def _nuscenes(name: str, split: str, sensor: str, file: str, data: Path) -> Reco
             f = nuscenes_tracking_metrics([scenes[row] for row in rows]).overall
             return {"AMOTA": f.amota, "AMOTP": f.amotp, "MOTA": f.mota, "IDS": f.ids, "FRAG": f.frag}
 
-        pairs = zip(scored, scenes, strict=True)
-        errors = tuple(nuscenes_label_errors(s, placed_detections(runs[n].scene)) for n, s in pairs)
-        return Score(figures_of, errors, partial(class_rows, scenes))
+        placed = [placed_detections(runs[name].scene) for name in scored]
+        errors = tuple(nuscenes_label_errors(*pair) for pair in zip(scenes, placed, strict=True))
+        return Score(figures_of, errors, partial(class_rows, scenes, placed))
 
     return RecordingSet(name, "nuscenes", dataset, score)
 

@@ -159,7 +159,7 @@ def evaluate_nuscenes(
 
 def nuscenes_hota(scenes: Sequence[NuScenesTrackingScene], tracking: NuScenesTrackingMetrics) -> list[HotaRow]:
     """HOTA, at the scores of the best MOTA. Raises `MissingExtraError` without trackeval."""
-    return hota([_in_range(scene) for scene in scenes], best_thresholds(tracking))
+    return hota([in_range(scene) for scene in scenes], best_thresholds(tracking))
 
 
 def nuscenes_label_errors(scene: NuScenesTrackingScene, detections: PlacedBoxes | None = None) -> LabelErrors:
@@ -168,7 +168,7 @@ def nuscenes_label_errors(scene: NuScenesTrackingScene, detections: PlacedBoxes 
     return label_errors(scene.truth, scene.found, velocity, detections)
 
 
-def _in_range(scene: NuScenesTrackingScene) -> tuple[SceneBoxes, SceneBoxes]:
+def in_range(scene: NuScenesTrackingScene) -> tuple[SceneBoxes, SceneBoxes]:
     """Truth and tracks within the distance from the vehicle up to which their class is scored."""
     limits = NuScenesTrackingSettings().class_range
 
