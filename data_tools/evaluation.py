@@ -17,9 +17,9 @@ covariances are right. What lies outside the gate is never matched, which lowers
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -48,11 +48,14 @@ from data_tools.metrics import (
 from data_tools.metrics.hota import Similarity
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.parts import new_part, of_own_code, part_kind
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
+from saga_fg.types.shown import html_table, text_table
 
 __all__ = [
     "Evaluation",
+    "Metric",
     "evaluate_tracks",
 ]
 
@@ -309,6 +312,28 @@ def _sweep_cells(f: NuScenesClassMetrics) -> tuple[str, ...]:
     return (*shares, *counts, *(cell(value, 2) for value in (f.faf, f.tid, f.lgd)))
 
 
+@part_kind("metric", "saga_fg.metrics")
+class Metric(Protocol):
+    """A metric of a user's own."""
+
+    def __call__(self, scenes: Sequence[tuple[SceneBoxes, SceneBoxes]]) -> Mapping[str, float]:
+        """Figures by name, of (true boxes, tracks) of all scenes, world coordinates."""
+
+
+def own_figures(
+    results: Sequence[tuple[Scene, SceneBoxes]], metrics: Iterable[str | Metric]
+) -> dict[str, dict[str, float]]:
+    """The figures of a user's metrics, by the name of each. Raises `InputError` for what is none, naming it."""
+    found: dict[str, dict[str, float]] = {}
+    pairs = [(SceneBoxes.of_annotations(scene.ground_truth or ()), boxes) for scene, boxes in results]
+    for given in metrics:
+        metric: Metric = new_part("metric", given, Metric)
+        name = given if isinstance(given, str) else getattr(metric, "__name__", type(metric).__name__)
+        with of_own_code(f"metric: {name}"):
+            found[name] = {str(key): float(value) for key, value in metric(pairs).items()}
+    return found
+
+
 LEGEND = (
     "AMOTA: mean over all scores. score: that of the best MOTA; from it on HOTA,\n"
     "MOTA, recall, identity switches (IDS), false boxes (FP). m, m/s: RMSE of places\n"
@@ -364,6 +389,7 @@ class Evaluation:
     innovations  squared distances in sigmas by class; empty where they are not known
     curves       of the tracking metrics over recall, by class; empty where there are none
     sweep        over scores; None where it was not asked for
+    own          figures of a user's metrics by their names
     """
 
     tracking: FigureTable
@@ -373,6 +399,18 @@ class Evaluation:
     innovations: Mapping[str, FloatArray] = field(default_factory=dict)
     curves: Mapping[str, RecallCurves] = field(default_factory=dict)
     sweep: NuScenesTrackingMetrics | None = None
+    own: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """The summary, or the figures of tracking, as a table for a terminal."""
+        shown = self.summary() or self.tracking
+        return text_table(shown.title, shown.columns, shown.rows)
+
+    def _repr_html_(self) -> str:
+        """The tables for a notebook."""
+        shown = self.summary()
+        tables = [*([] if shown is None else [shown]), *self.tables()]
+        return "".join(html_table(table.title, table.columns, table.rows) for table in tables)
 
     def summary(self) -> FigureTable | None:
         """One narrow table of what matters most, None without the sweep over scores."""
@@ -387,6 +425,7 @@ class Evaluation:
             *error_tables(self.errors),
             *innovations,
             *([hota_table(self.hota)] if self.hota else []),
+            *(FigureTable(name, ("figure", "value"), _cells_of(figures)) for name, figures in self.own.items()),
         ]
 
     def figures(self) -> dict[str, Any]:
@@ -398,6 +437,7 @@ class Evaluation:
             **error_json(self.errors),
             "innovations": innovation_json(self.innovations),
             "hota": hota_json(self.hota),
+            **({"own": self.own} if self.own else {}),
         }
 
     def charts(self) -> dict[str, list[Chart]]:
@@ -446,6 +486,10 @@ def evaluate_tracks(
         curves={} if swept is None else swept.curves,
         sweep=swept,
     )
+
+
+def _cells_of(figures: Mapping[str, float]) -> tuple[tuple[str, str], ...]:
+    return tuple((name, cell(value)) for name, value in figures.items())
 
 
 def _moment_cells(m: SceneMetrics) -> tuple[str, ...]:

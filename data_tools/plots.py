@@ -1,4 +1,4 @@
-"""Pictures of tracks, paths, maps, graphs and charts; matplotlib is imported when one is drawn."""
+"""Pictures of paths, maps, graphs and charts; matplotlib is imported when one is drawn."""
 
 from __future__ import annotations
 
@@ -10,19 +10,13 @@ from typing import Any
 import numpy as np
 
 from data_tools.figures import Chart
-from saga_fg import Boxes, Detections, Tracks
-from saga_fg.errors import error_context
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.tables.columns import TRACK_COLUMNS
-from saga_fg.tables.data_frames import raw_table
-from saga_fg.tables.detections import box_columns
+from saga_fg.numerics.arrays import BoolArray, FloatArray
 
 __all__ = [
     "chart_picture",
     "new_figure",
     "occupancy_picture",
     "paths_from_above",
-    "plot",
     "png",
     "running_graph_picture",
     "scan_map_from_above",
@@ -61,59 +55,6 @@ def ellipse(covariance: FloatArray, probability: float = 0.95) -> FloatArray:
     angle = np.linspace(0.0, 2 * np.pi, 64)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * np.sqrt(squared * np.maximum(values, 0.0))
     return np.asarray(circle @ vectors.T)
-
-
-UNMEASURED = (1.0, 1.0, 1.0)
-"""Size of an object of unknown size, m."""
-
-
-def plot(tracks: Tracks | Sequence[Tracks] | Any, detections: Detections | None = None, ids: bool = True) -> Any:
-    """Return a matplotlib `Figure` of tracks from above: a colour for each, a path, and a box at its end.
-
-    tracks      of one moment, of several, or the `pandas.DataFrame` of `saga_fg.track`
-    detections  crosses, in world coordinates
-    ids         whether the boxes have their numbers
-
-    Raises `InputError` for anything else.
-    """
-    names, boxes = _rows(tracks)
-    figure = new_figure(10.0, 6.0)
-    ax = _above(figure)
-    ax.set_aspect("equal", adjustable="datalim")
-    if detections is not None:
-        ax.plot(*detections.boxes.position[:, :2].T, "x", color="#27313b", markersize=4, markeredgewidth=0.8)
-    for k, name in enumerate(dict.fromkeys(names.tolist())):
-        rows = np.flatnonzero(names == name)
-        colour, last = COLOURS[k % len(COLOURS)], boxes.select(rows[-1:])
-        ax.plot(*boxes.position[rows, :2].T, color=colour, linewidth=1.2, alpha=0.7)
-        ax.fill(*_footprint(last).T, facecolor=colour + "33", edgecolor=colour, linewidth=1.6)
-        if ids:
-            x, y, _ = last.position[0].tolist()
-            ax.annotate(name, (x, y), xytext=(5, 5), textcoords="offset points", color=colour, fontsize=9)
-    return figure
-
-
-def _rows(tracks: Any) -> tuple[StrArray, Boxes]:
-    """Return the ids (N,) and boxes of all rows in order of time."""
-    if isinstance(tracks, Tracks):
-        tracks = [tracks]
-    if isinstance(tracks, Sequence) and all(isinstance(each, Tracks) for each in tracks):
-        names = np.concatenate([np.empty(0, dtype=np.int64), *(each.id for each in tracks)]).astype(np.str_)
-        return names, Boxes.concatenate([each.boxes for each in tracks])
-    with error_context("tracks: expected Tracks, a list of them, or a table of tracks"):
-        table = raw_table(tracks, columns=TRACK_COLUMNS, required=("id", "x", "y"))
-    return table.identities("id"), box_columns(table, np.zeros(table.length, dtype=np.bool_)).boxes
-
-
-def _footprint(box: Boxes) -> FloatArray:
-    known = Boxes(
-        box.label,
-        box.position,
-        np.where(np.isnan(box.size), UNMEASURED, box.size),
-        np.nan_to_num(box.yaw),
-        box.velocity,
-    )
-    return np.asarray(known.corners()[0])
 
 
 MAX_POINTS = 60_000  # of a map that are drawn, evenly chosen

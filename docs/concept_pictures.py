@@ -40,8 +40,7 @@ def queue_at(time: float) -> FloatArray:
 def follow(rules: tuple[EdgeRule, ...]) -> Follow:
     """Track the queue; the noise of the detections has a fixed seed."""
     rng = np.random.default_rng(0)
-    settings = TrackerSettings({DEFAULT: ClassSettings(max_deviation=np.inf)})
-    tracker = Tracker(settings, rules=rules)
+    tracker = Tracker(TrackerSettings({DEFAULT: ClassSettings(max_deviation=np.inf)}, edges=rules))
     rows = []
     for time in np.arange(0, END, PERIOD):
         places = queue_at(time)

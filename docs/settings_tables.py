@@ -8,7 +8,6 @@ from typing import Any
 from pipelines.configuration.reading import (
     DEFAULT_ENTRY,
     Choice,
-    Imported,
     Listing,
     Nullable,
     Scalar,
@@ -113,10 +112,14 @@ def _type_text(schema: Schema, bounds: str) -> str:
             return f"list of {len(items)}: " + ", ".join(_type_text(item, bounds) for item in items)
         case Table(inner):
             return f"table of {_plural(_type_text(inner, bounds))}"
-        case Section(classes):
-            return "section" if len(classes) == 1 else "section of a `kind`"
-        case Imported():
-            return "name, or section of a `kind`"
+        case Section(classes, kept_name=named):
+            return (
+                "section"
+                if len(classes) == 1
+                else "section of a `kind`"
+                if not named
+                else "name, or section of a `kind`"
+            )
         case Nullable(inner):
             return f"{_type_text(inner, bounds)}, or `null`"
 

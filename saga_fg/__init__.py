@@ -4,16 +4,22 @@ from functools import cache
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import resolve_name
 
 import lazy_loader
 
 _attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __version__ = version("saga-fg")
 
+ABOVE = {"evaluate": "data_tools.datasets.data_frames:evaluate", "view": "pipelines.report.data_frames:view"}
+"""Functions of packages above this one, found by name when they are first asked for, as the command is."""
+
 
 def __getattr__(name):
     if not name.startswith("__"):
         _check_factors()
+    if name in ABOVE:
+        return resolve_name(ABOVE[name])
     return _attribute(name)
 
 

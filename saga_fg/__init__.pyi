@@ -1,3 +1,6 @@
+import data_tools.datasets.data_frames as _judged
+import pipelines.report.data_frames as _shown
+
 from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
 from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType, RandomWalk
 from .model.scene_graph import Edges, SceneGraph
@@ -11,6 +14,8 @@ from .types.frame import Detection, Detections, Frame
 from .types.track import PredictedTracks, Track, Tracks
 
 __version__: str
+evaluate = _judged.evaluate
+view = _shown.view
 
 __all__ = [
     "Annotations",
@@ -38,7 +43,9 @@ __all__ = [
     "TrackerSettings",
     "Tracks",
     "UnknownNodeError",
+    "evaluate",
     "frames_of",
     "smooth",
     "track",
+    "view",
 ]

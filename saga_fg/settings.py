@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from numbers import Real
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from saga_fg.errors import InputError, require_type
+from saga_fg.parts import PartKind, kind_among
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,10 @@ NonNegativeInt = Annotated[int, Range(0)]
 
 
 class Settings:
-    """Base of settings dataclasses: construction raises `InputError` for values of other types, ranges and choices."""
+    """Base of settings dataclasses: construction raises `InputError` for values of other types, ranges and choices.
+
+    A part of a user's own (`saga_fg.parts`) must be of its kind; a name in its place is looked up where it is used.
+    """
 
     def __post_init__(self) -> None:
         cls: Any = type(self)
@@ -74,6 +78,9 @@ class Settings:
                 entries = given.items() if isinstance(given, Mapping) else [("", given)]
                 for key, entry in entries:
                     require_type(f"{name}.{key}".rstrip("."), entry, allowed)
+                continue
+            if isinstance(allowed, PartKind):
+                _require_parts(name, given, allowed)
                 continue
             for where, value in _values(name, given):
                 if isinstance(allowed, Range) and not (isinstance(value, Real) and float(value) in allowed):
@@ -85,11 +92,27 @@ class Settings:
 
 
 @cache
-def _allowed(cls: type) -> list[tuple[str, Range | tuple[str, ...] | type]]:
-    """The range, the choices or the settings class of each field that has one."""
+def _allowed(cls: type) -> list[tuple[str, Range | tuple[str, ...] | type | PartKind]]:
+    """The range, the choices, the kind of part or the settings class of each field that has one."""
     hints = get_type_hints(cls, include_extras=True).items()
-    found = [(name, range_of(hint) or _settings_class(hint)) for name, hint in hints]
+    found = [(name, range_of(hint) or _part_kind(hint) or _settings_class(hint)) for name, hint in hints]
     return [(name, allowed) for name, allowed in found if allowed is not None]
+
+
+def _require_parts(name: str, given: Any, kind: PartKind) -> None:
+    """Raise `InputError` unless a setting is a part of the kind, or a tuple of such; names are not looked up."""
+    if kind.several:
+        require_type(name, given, tuple, list)
+    for k, entry in enumerate(given if kind.several else [given]):
+        if entry is not None and not isinstance(entry, str):
+            kind.require(f"{name}[{k}]" if kind.several else name, entry)
+
+
+def _part_kind(hint: Any) -> PartKind | None:
+    """The kind of part that a type hint, or that of the entries of a tuple, allows beside others; None for none."""
+    several, within = get_origin(hint) is tuple, get_args(hint)
+    kind = kind_among(get_args(within[0]) if several and within else within)
+    return None if kind is None else replace(kind, several=several)
 
 
 def _settings_class(hint: Any) -> type | None:

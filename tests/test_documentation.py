@@ -16,7 +16,8 @@ from pipelines.config import TrackConfig
 from pipelines.configuration.reading import Listing, Nullable, Schema, Section, Table, settings_of
 from pipelines.serving import StreamSettings
 from pipelines.slam.configuration import SlamSettings
-from saga_fg import Tracker
+from saga_fg import Tracker, conformance  # noqa: F401 (all kinds of parts)
+from saga_fg.parts import KINDS
 from saga_fg.smoothing import SmoothingSettings
 
 ROOT = Path(__file__).parents[1]
@@ -26,7 +27,7 @@ ADDRESSES = (
     URLS["Repository"].replace("github.com", "raw.githubusercontent.com") + "/main",
 )
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
-GROUPS = ("saga_fg.datasets", "saga_fg.scans")
+GROUPS = {"saga_fg.scans", *(kind.group for kind in KINDS.values())}
 
 
 def page_name(page: Path) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from data_tools.datasets import import_options
-from data_tools.datasets.detection_files import TableImport, TruthFile
+from data_tools.datasets.detection_files import TableImport, TruthTable, read_truth
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
 from data_tools.datasets.results import Results, SceneResult, clear_figures, read_table_results
 from data_tools.datasets.source import (
@@ -191,7 +191,7 @@ class DetectionFileSource(DatasetSource):
         assert self.truth is not None
         how = self.how if self.truth_import is None else self.truth_import
         with local_copy(self.truth) as path:
-            truth = TruthFile(path, how)
+            truth = read_truth(path, how)
         dataset: Dataset = truth
         if self.detections is not None:
             with local_copy(self._table()) as path:
@@ -230,7 +230,7 @@ class DetectedTruth:
     Where one of them does not name its only scene, it is that of the other.
     """
 
-    def __init__(self, truth: TruthFile, detections: Dataset) -> None:
+    def __init__(self, truth: TruthTable, detections: Dataset) -> None:
         self._truth, self._detections = truth, detections
         same = len(truth.scenes) == 1 and len(detections.scenes) == 1
         self._true_name = {detections.scenes[0]: truth.scenes[0]} if same else {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from saga_fg.types.finding import Mend
 from saga_fg.types.track import known_velocities
 
 if TYPE_CHECKING:
-    from data_tools.evaluation import Evaluation
+    from data_tools.evaluation import Evaluation, Metric
 
 log = logging.getLogger(__name__)
 
@@ -67,9 +67,20 @@ class Results:
         """Some of the scenes."""
         return replace(self, scenes={name: each for name, each in self.scenes.items() if name in names})
 
-    def evaluate(self, hota: bool = False, innovations: Mapping[str, FloatArray] | None = None) -> Evaluation:
-        """Score the tracks. innovations: squared distances of the run, by class."""
-        return self.score(self.scenes, hota, innovations)
+    def evaluate(
+        self,
+        hota: bool = False,
+        innovations: Mapping[str, FloatArray] | None = None,
+        metrics: Sequence[str | Metric] = (),
+    ) -> Evaluation:
+        """Score the tracks. innovations: squared distances of the run, by class; metrics: a user's own."""
+        evaluation = self.score(self.scenes, hota, innovations)
+        if not metrics:
+            return evaluation
+        from data_tools.evaluation import own_figures
+
+        pairs = [(each.scene, each.found) for each in self.scenes.values()]
+        return replace(evaluation, own=own_figures(pairs, metrics))
 
 
 def read_table_results(
@@ -80,10 +91,25 @@ def read_table_results(
     judged: bool = False,
     own_times: bool = False,
 ) -> dict[str, SceneResult]:
+    """Read a table of tracks, see `table_results`; how: what it takes to understand it, if saga-fg did not write it."""
+    rows = read_tracks(path, how, lenient=True)
+    return table_results(rows, path, dataset, every_scene, how, judged, own_times)
+
+
+def table_results(
+    rows: TrackRows,
+    path: Path,
+    dataset: Dataset | None,
+    every_scene: bool = False,
+    how: TableImport | None = None,
+    judged: bool = False,
+    own_times: bool = False,
+) -> dict[str, SceneResult]:
     """A table of tracks in those scenes of a dataset that it has; rows of other scenes are left out.
 
+    path         of the table, for errors
     every_scene  include scenes without a row, in which nothing was found; an empty table always has all scenes
-    how          what it takes to understand the table, if saga-fg did not write it
+    how          what it took to understand the table
     judged       these are anybody's tracks beside the ground truth of the dataset: rows at other times are left out,
                  and the only scene of the one is that of the other
     own_times    the times of rows are moments too, whether or not they are some of the scene
@@ -93,7 +119,6 @@ def read_table_results(
     that has none of the scenes, for times that are no moments of their scene, and for judged tracks where hardly a
     moment has some near its time.
     """
-    rows = read_tracks(path, how, lenient=True)
     there = tuple(dict.fromkeys(rows.scene.tolist()))
     if dataset is None:
         return {name: scene_result(_scene(rows, name), rows, path) for name in there}

@@ -33,9 +33,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import MISSING, dataclass, field, fields, replace
-from functools import cache
-from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
@@ -44,6 +41,7 @@ import numpy as np
 from data_tools.files.input_files import open_bytes
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.parts import find, names_of, part_kind
 from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
@@ -56,6 +54,8 @@ if TYPE_CHECKING:
 Verb = Literal[
     "track", "smooth", "evaluate", "evaluate labels", "benchmark", "report", "view", "learn noise", "learn interactions"
 ]
+
+GROUP = "saga_fg.datasets"
 
 TRACKING: tuple[Verb, ...] = ("track", "evaluate labels", "benchmark", "learn noise")
 """Verbs that need detections; `smooth` takes tracks as well."""
@@ -285,6 +285,7 @@ class ResultFormat:
         return
 
 
+@part_kind("dataset", GROUP)
 @dataclass(frozen=True, kw_only=True)
 class DatasetSource(ABC):
     """Recordings and how to work with them; the fields are the options that name them. Picklable.
@@ -419,8 +420,7 @@ def clipped(ring: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     return ring
 
 
-GROUP = "saga_fg.datasets"
-BUILT_IN = {
+BUILT_IN: Mapping[str, str] = {
     "nuscenes": "data_tools.datasets.nuscenes.source:NuScenesSource",
     "kitti": "data_tools.datasets.kitti.source:KittiSource",
     "argoverse2": "data_tools.datasets.argoverse2.source:ArgoverseSource",
@@ -432,7 +432,7 @@ BUILT_IN = {
 
 def dataset_names() -> tuple[str, ...]:
     """The names of all datasets, those that come along first."""
-    return (*BUILT_IN, *(name for name in external_datasets() if name not in BUILT_IN))
+    return names_of(GROUP, BUILT_IN)
 
 
 def dataset_source(name: str) -> type[DatasetSource]:
@@ -441,35 +441,7 @@ def dataset_source(name: str) -> type[DatasetSource]:
     Raises `InputError` for an unknown name, a name that several packages give, and for what cannot be imported or is no
     dataset, naming the package.
     """
-    if ":" in name:
-        return _loaded(name, f"dataset {name}")
-    if name in BUILT_IN and name not in external_datasets():
-        return _loaded(BUILT_IN[name], f"dataset {name}")
-    found = external_datasets().get(name, ())
-    if not found:
-        raise InputError(unknown_name("dataset", name, dataset_names()))
-    packages = [entry.dist.name if entry.dist is not None else entry.value for entry in found]
-    packages += ["saga-fg"] * (name in BUILT_IN)
-    if len(packages) > 1:
-        raise InputError(f"dataset {name}: expected one package to offer it, {' and '.join(packages)} do")
-    return _loaded(found[0].value, f"dataset {name} of the package {packages[0]}")
-
-
-@cache
-def external_datasets() -> dict[str, tuple[EntryPoint, ...]]:
-    """The entry points of installed packages, by name."""
-    found: dict[str, tuple[EntryPoint, ...]] = {}
-    for entry in sorted(entry_points(group=GROUP), key=lambda entry: (entry.name, entry.value)):
-        found[entry.name] = (*found.get(entry.name, ()), entry)
-    return found
-
-
-def _loaded(location: str, what: str) -> type[DatasetSource]:
-    module, _, attribute = location.partition(":")
-    try:
-        found = getattr(import_module(module), attribute)
-    except Exception as error:  # the module is somebody else's code
-        raise InputError(f"{what}: {location} cannot be loaded: {type(error).__name__}: {error}") from error
+    found: type[DatasetSource] = find("dataset", name, GROUP, BUILT_IN)
     if not (isinstance(found, type) and issubclass(found, DatasetSource)):
-        raise InputError(f"{what}: {location}: expected a class derived from DatasetSource")
+        raise InputError(f"dataset: {name}: expected a class derived from DatasetSource, got {found!r:.60}")
     return found

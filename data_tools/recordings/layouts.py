@@ -13,7 +13,6 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +33,9 @@ from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, quaternion_rotation
+from saga_fg.parts import find
 from saga_fg.providers.odometry import mounting
 from saga_fg.tables.column_names import seconds_of_dates
-from saga_fg.tracking.by_name import named
 
 GROUP = "saga_fg.scans"
 """Group of entry points of packages that bring layouts."""
@@ -74,12 +73,7 @@ def open_recording(
 
 
 def _opener(layout: str) -> Opener:
-    if layout in LAYOUTS:
-        return LAYOUTS[layout][1]
-    points = {point.name: point for point in entry_points(group=GROUP)}
-    if ":" not in layout and layout not in points:
-        raise InputError(unknown_name("layout", layout, (*LAYOUTS, *points)))
-    opener: Opener = named(layout if ":" in layout else points[layout].value, "layout")
+    opener: Opener = find("layout", layout, GROUP, {name: opener for name, (_, opener) in LAYOUTS.items()})
     return opener
 
 

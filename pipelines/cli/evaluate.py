@@ -39,6 +39,10 @@ class EvaluationOptions:
         bool,
         typer.Option("--innovations", help="How well innovations fit (NIS), from the journal beside the result."),
     ] = False
+    metric: Annotated[
+        list[str] | None,
+        typer.Option("--metric", help="Metric of your own: MODULE:NAME, or an installed entry point.", metavar="NAME"),
+    ] = None
     full: Annotated[bool, typer.Option("--full", help="Print all tables, not the summary alone.")] = False
     json_file: JsonFile = None
     markdown: MarkdownFile = None
@@ -79,12 +83,13 @@ def _evaluate(
             found = source.read_results(result)
             nis = journal_innovations(journal_of(result)) if shown.innovations else {}
     with working("scoring"):
-        evaluation = found.evaluate(shown.hota, nis)
+        evaluation = found.evaluate(shown.hota, nis, shown.metric or ())
     summary = evaluation.summary()
     if summary is not None:
         show_summary(summary, LEGEND)
     tables = evaluation.tables()
-    report(tables if shown.full or summary is None else (), evaluation.figures(), shown.json_file)
+    named = [table for table in tables if table.title in evaluation.own]
+    report(tables if shown.full or summary is None else named, evaluation.figures(), shown.json_file)
     if shown.markdown is not None:
         write_text(shown.markdown, "\n".join(table.markdown() for table in (*([summary] if summary else ()), *tables)))
     if shown.plots is not None:

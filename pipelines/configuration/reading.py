@@ -10,7 +10,10 @@ Schema of settings dataclasses, shared by reading, writing and documenting them.
 | Mapping[str, X]                         | `Table`    | keys of one's own choice                                    |
 | a dataclass, or a union of dataclasses  | `Section`  | a section; of a union, its `kind:` says which dataclass     |
 | X | None                                | `Nullable` | null, or X                                                  |
-| str | FactorProvider                    | `Imported` | MODULE:NAME, or a section: `kind: MODULE:NAME`, and settings |
+
+Where a type or one of a union is that of a kind of part (`saga_fg.parts`), a part of a user's own stands there by its
+name: alone, or as the `kind` of a section with its settings, if it is a dataclass. Beside `str`, a name alone is kept,
+and looked up where it is used.
 
 The kind of a dataclass is its attribute `kind` if it has one, else its name in snake case without "Settings".
 
@@ -38,9 +41,8 @@ import yaml
 
 from data_tools.files.input_files import read_text
 from saga_fg.errors import InputError
-from saga_fg.graph import FactorProvider
+from saga_fg.parts import PartKind, as_part, find, kind_among, names_of
 from saga_fg.settings import Range, range_of
-from saga_fg.tracking.by_name import named
 
 
 @dataclass(frozen=True)
@@ -68,9 +70,12 @@ class Table:
 @dataclass(frozen=True)
 class Section:
     classes: tuple[type, ...]
+    part: PartKind | None = None  # parts of a user's own that may stand in its place
+    kept_name: bool = False  # a name alone is a value
 
-    def class_of_kind(self, kind: str) -> type | None:
-        return next((cls for cls in self.classes if kind_of(cls) == kind), None)
+    def kind_of(self, cls: type) -> str:
+        """The word or name that chooses a class."""
+        return kind_of(cls) if cls in self.classes else f"{cls.__module__}:{cls.__qualname__}"
 
 
 @dataclass(frozen=True)
@@ -78,12 +83,7 @@ class Nullable:
     value: Schema
 
 
-@dataclass(frozen=True)
-class Imported:
-    """Something by the name of what makes it; with settings, which are a dataclass, itself."""
-
-
-Schema = Scalar | Choice | Listing | Table | Section | Nullable | Imported
+Schema = Scalar | Choice | Listing | Table | Section | Nullable
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def schema_of(hint: Any) -> Schema:
     if hint in (bool, int, float, str):
         return Scalar(hint)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-        return Section((hint,))
+        return Section((hint,), kind_among([hint]))
     if origin is Literal:
         return Choice(arguments)
     if origin in (Union, types.UnionType):
@@ -158,13 +158,14 @@ def schema_of(hint: Any) -> Schema:
 
 
 def _union(arguments: tuple[Any, ...]) -> Schema:
-    if set(arguments) == {str, FactorProvider}:
-        return Imported()
     if type(None) in arguments:
         rest = tuple(a for a in arguments if a is not type(None))
         return Nullable(schema_of(rest[0]) if len(rest) == 1 else _union(rest))
-    if all(isinstance(a, type) and dataclasses.is_dataclass(a) for a in arguments):
-        return Section(arguments)
+    classes = tuple(a for a in arguments if isinstance(a, type) and dataclasses.is_dataclass(a))
+    part = kind_among(arguments)
+    roles = () if part is None else (str, *part.roles)
+    if all(a in classes or a in roles for a in arguments):
+        return Section(classes, part, str in arguments)
     raise TypeError(f"a union of {', '.join(str(a) for a in arguments)} has no YAML form")
 
 
@@ -221,9 +222,7 @@ def _read(schema: Schema, data: Any, base: Any, where: str) -> Any:
         case Table(value):
             return _read_table(value, data, base, where)
         case Section():
-            return _read_section(schema, data, base, where)
-        case Imported():
-            return data if isinstance(data, str) else _read_imported(data, where)
+            return _read_part(schema, data, base, where)
 
 
 def _read_scalar(kind: type, data: Any, where: str) -> Any:
@@ -260,24 +259,38 @@ def _read_table(value: Schema, data: Any, base: Any, where: str) -> dict[str, An
     return result
 
 
+def _read_part(schema: Section, data: Any, base: Any, where: str) -> Any:
+    """A section, or a part of a user's own by its name."""
+    if schema.part is None:
+        return _read_section(schema, data, base, where)
+    if isinstance(data, str) and schema.kept_name:
+        return data
+    part = _read_section(schema, {"kind": data} if isinstance(data, str) else data, base, where)
+    schema.part.require(where, part)
+    return part
+
+
 def _read_section(schema: Section, data: Any, base: Any, where: str) -> Any:
     keys = _text_keys(data, where)
-    cls = schema.classes[0] if base is None else type(base)
-    if len(schema.classes) > 1:
-        cls = _class_of_kind(schema, data, where) if "kind" in keys or base is None else cls
+    choice = len(schema.classes) != 1
+    cls = schema.classes[0] if base is None and schema.classes else type(base)
+    if ("kind" in keys and (choice or schema.part)) or (choice and (base is None or isinstance(base, str))):
+        cls = _class_of_kind(schema, data, where)
+    values = {key: data[key] for key in keys if key != "kind" or not (choice or schema.part)}
+    if schema.part and not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
+        if values:
+            raise InputError(f"{where}.kind: {data['kind']}: expected a dataclass, whose fields are its settings")
+        return as_part(where, cls, schema.part)
     settings = {setting.name: setting for setting in settings_of(cls)}
-    values: dict[str, Any] = {}
-    for key in keys:
-        if key in settings:
-            values[key] = data[key]
-        elif key != "kind" or len(schema.classes) == 1:
+    for key in values:
+        if key not in settings:
             raise InputError(f"{_join(where, key[:40])}: unknown key, {_suggestion(key, settings)}")
-    start = base if type(base) is cls else None
+    start = base if isinstance(base, cls) or issubclass(cls, type(base)) else None
     for name, setting in settings.items():
-        before = getattr(start, name) if start is not None else None if setting.required else setting.default()
+        before = getattr(start, name) if hasattr(start, name) else None if setting.required else setting.default()
         if name in values:
             values[name] = _read(setting.schema, values[name], before, _join(where, name))
-        elif start is None and setting.required:
+        elif setting.required and not hasattr(start, name):
             raise InputError(f"{_join(where, name)}: expected a value, the key is missing")
         else:
             values[name] = before
@@ -287,31 +300,21 @@ def _read_section(schema: Section, data: Any, base: Any, where: str) -> Any:
         raise InputError(f"{where}: {error}" if where else str(error)) from error
 
 
-def _read_imported(data: Any, where: str) -> Any:
-    values = {key: data[key] for key in _text_keys(data, where)}
-    kind = values.pop("kind", None)
-    if not isinstance(kind, str):
-        raise _mismatch(f"{where}.kind", "MODULE:NAME", kind)
-    try:
-        cls = named(kind)
-        settings_of(cls)
-    except InputError as error:
-        raise InputError(f"{where}.kind: {error}") from error
-    except TypeError as error:
-        raise InputError(f"{where}.kind: {kind}: expected a dataclass, whose fields are its settings") from error
-    return _read_section(Section((cls,)), values, None, where)
-
-
 def _class_of_kind(schema: Section, data: dict[str, Any], where: str) -> type:
-    kinds = [kind_of(cls) for cls in schema.classes]
+    """The class of the kind of a section; what a user's name stands for is a class, or a function that makes a part."""
+    own = {kind_of(cls): cls for cls in schema.classes}
+    kinds = [*own, *(names_of(schema.part.group) if schema.part else ()), *(["MODULE:NAME"] if schema.part else [])]
+    expected = f"one of {', '.join(kinds)}" if len(kinds) > 1 else kinds[0]
     if "kind" not in data:
-        raise InputError(f"{where}.kind: expected one of {', '.join(kinds)}, the key is missing")
+        raise InputError(f"{where}.kind: expected {expected}, the key is missing")
     if not isinstance(data["kind"], str):
-        raise _mismatch(f"{where}.kind", f"one of {', '.join(kinds)}", data["kind"])
-    cls = schema.class_of_kind(data["kind"])
-    if cls is None:
+        raise _mismatch(f"{where}.kind", expected, data["kind"])
+    if schema.part and data["kind"] not in own and (":" in data["kind"] or data["kind"] in kinds):
+        found: type = find(f"{where}.kind", data["kind"], schema.part.group)
+        return found
+    if data["kind"] not in own:
         raise InputError(f"{where}.kind: got {data['kind'][:40]!r}, {_suggestion(data['kind'], kinds)}")
-    return cls
+    return own[data["kind"]]
 
 
 def _text_keys(data: Any, where: str) -> list[str]:

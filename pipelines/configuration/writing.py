@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
 from typing import Any
 
 import yaml
@@ -18,14 +19,12 @@ import yaml
 from pipelines.configuration.reading import (
     DEFAULT_ENTRY,
     Choice,
-    Imported,
     Listing,
     Nullable,
     Schema,
     Section,
     Setting,
     Table,
-    kind_of,
     settings_of,
 )
 
@@ -70,11 +69,12 @@ def _section_lines(
     schema: Section, settings: Any, base: Any, comments: bool, selection: Sequence[str] = EVERYTHING
 ) -> list[str]:
     entries: list[tuple[list[str], str]] = []
-    if len(schema.classes) > 1:
-        comment = "one of " + ", ".join(kind_of(cls) for cls in schema.classes) if comments else ""
-        entries.append(([f"kind: {scalar_text(kind_of(type(settings)))}"], comment))
+    if len(schema.classes) != 1 or type(settings) not in schema.classes:
+        own = ", ".join(schema.kind_of(cls) for cls in schema.classes)
+        kind = scalar_text(schema.kind_of(type(settings)))
+        entries.append(([f"kind: {kind}"], f"one of {own}" if comments and own else ""))
     same = type(base) is type(settings)
-    for item in settings_of(type(settings)):
+    for item in settings_of(type(settings)) if is_dataclass(settings) else ():
         below = _below(selection, item.name)
         if not below or (len(schema.classes) > 1 and item.name == "kind"):
             continue
@@ -100,12 +100,10 @@ def _form(
     while isinstance(schema, Nullable) and value is not None:
         schema = schema.value
     match schema:
-        case Section():
+        case Section() if not isinstance(value, str):
+            if hasattr(value, "__qualname__"):  # a class or a function
+                return scalar_text(f"{value.__module__}:{value.__qualname__}")
             return _section_lines(schema, value, base, comments, selection) or "{}"
-        case Imported() if not isinstance(value, str):
-            cls = type(value)
-            kind = scalar_text(f"{cls.__module__}:{cls.__qualname__}")
-            return [f"kind: {kind}", *_section_lines(Section((cls,)), value, None, comments)]
         case Table(value=inner):
             return _table_lines(inner, value, base, comments, selection) or "{}"
         case Listing():

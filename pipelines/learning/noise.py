@@ -237,6 +237,7 @@ def learned_fragment(learned: LearnedNoise, origin: str) -> str:
     written: dict[str, dict[str, Any]] = {}
     for label, settings in learned.config.tracker.classes.items():
         if label in learned.classes:
+            assert isinstance(settings.motion, ConstantVelocity | Curvilinear)
             motion = {"kind": KINDS[type(settings.motion)], **_rounded(asdict(settings.motion))}
             written.setdefault(label, {})["motion"] = motion
         if settings.typical_size is not None:

@@ -191,7 +191,7 @@ def result_report(source: DatasetSource, result: Path, beside: Path | None = Non
     for each in results:
         found = each.found.only([scene.scene.name for scene in scenes])
         prefix = f"{each.method}: " if len(results) > 1 else ""
-        own_tables, own_charts = _figures(source, found)
+        own_tables, own_charts = result_figures(found, source.has_truth)
         if each.record is not None:
             times = [ms for of_scene in each.record.milliseconds.values() for ms in of_scene]
             own_charts += [latency_chart(np.array(times))] if times else []
@@ -289,8 +289,9 @@ def with_surroundings(source: DatasetSource, scenes: Sequence[ReportScene], widt
     ]
 
 
-def _figures(source: DatasetSource, found: Results) -> tuple[list[FigureTable], list[Chart]]:
-    if source.has_truth:
+def result_figures(found: Results, with_truth: bool) -> tuple[list[FigureTable], list[Chart]]:
+    """Tables and charts of a result: of its errors beside ground truth, else of the tracks alone."""
+    if with_truth:
         evaluation = found.evaluate()
         return list(evaluation.tables()), list(chain.from_iterable(accuracy_charts(evaluation.errors).values()))
     results = list(found.scenes.values())

@@ -24,10 +24,10 @@ from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.landmarks import LandmarkDetector
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.parts import new_part
 from saga_fg.providers.odometry import mounting
 from saga_fg.settings import setting, settings_group
 from saga_fg.slam.sensors import SensorName, SensorSettings
-from saga_fg.tracking.by_name import made_by_name, new_provider
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,9 @@ class SlamSettings:
     providers: tuple[str | FactorProvider, ...] = setting(
         (), "factor providers, MODULE:NAME or {kind: MODULE:NAME, ...settings}, asked at every pose"
     )
-    landmarks: tuple[str, ...] = setting((), "your own detectors of landmarks, MODULE:NAME, asked at every pose")
+    landmarks: tuple[str | LandmarkDetector, ...] = setting(
+        (), "your own detectors of landmarks, as providers are named, asked at every pose"
+    )
     sensors: SensorSettings = settings_group(SensorSettings, "scans: GPS, IMU and wheels of the vehicle, also in a map")
     lidar: LidarSlamSettings = settings_group(LidarSlamSettings, "scans: LiDAR SLAM, with objects")
     localisation: LocaliserSettings = settings_group(LocaliserSettings, "scans --map: localisation in a map")
@@ -45,12 +47,11 @@ class SlamSettings:
 
     def new_providers(self) -> list[FactorProvider]:
         """Fresh providers. Raises `InputError` for a name that cannot be resolved."""
-        return [new_provider(name) for name in self.providers]
+        return [new_part("providers", given, FactorProvider) for given in self.providers]
 
     def new_detectors(self) -> list[LandmarkDetector]:
         """Fresh detectors of landmarks. Raises `InputError` for a name that cannot be resolved."""
-        expected = "a detector of landmarks, which has a method observations"
-        return [made_by_name("landmarks", name, expected) for name in self.landmarks]
+        return [new_part("landmarks", name, LandmarkDetector) for name in self.landmarks]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Conformance of an estimator, a user's own too: one import, one call.
+"""Conformance of an estimator, a user's own too: one import, one call. Of other parts: `saga_fg.conformance.parts`.
 
     from saga_fg.conformance import check_estimator
 
@@ -22,6 +22,16 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from saga_fg.conformance.parts import (
+    check_association_cost,
+    check_class_model,
+    check_edge_rule,
+    check_interaction,
+    check_motion,
+    check_provider,
+    check_sensor,
+    require,
+)
 from saga_fg.conformance.programs import (
     CAR,
     TRAM,
@@ -52,7 +62,14 @@ __all__ = [
     "Update",
     "assert_equal",
     "assert_equal_in_every_step",
+    "check_association_cost",
+    "check_class_model",
+    "check_edge_rule",
     "check_estimator",
+    "check_interaction",
+    "check_motion",
+    "check_provider",
+    "check_sensor",
     "new_nodes",
     "random_graph",
     "random_program",
@@ -67,21 +84,21 @@ Make = Callable[[], Estimator]
 def assert_equal(estimator: Estimator, textbook: TextbookEstimator, tolerance: float = TOLERANCE) -> None:
     """Raise `AssertionError` unless all means and joint covariances agree within a tolerance."""
     nodes = textbook.nodes
-    _require(sorted(estimator.nodes.tolist()) == sorted(nodes.tolist()), f"nodes {estimator.nodes.tolist()}")
+    require(sorted(estimator.nodes.tolist()) == sorted(nodes.tolist()), f"nodes {estimator.nodes.tolist()}")
     if len(nodes) == 0:
         return
     P = textbook.joint_covariance(nodes)
     sigma = np.sqrt(np.diag(P))
     error = float(np.abs((estimator.joint_mean(nodes) - textbook.joint_mean(nodes)) / sigma).max())
-    _require(error <= tolerance, f"joint_mean is off by {error:.3g} standard deviations")
+    require(error <= tolerance, f"joint_mean is off by {error:.3g} standard deviations")
     error = float(np.linalg.norm(estimator.joint_covariance(nodes) - P) / np.linalg.norm(P))
-    _require(error <= tolerance, f"joint_covariance is off by {error:.3g}, relative")
+    require(error <= tolerance, f"joint_covariance is off by {error:.3g}, relative")
     for node in nodes.tolist():
         own, mean = textbook.covariance([node])[0], textbook.mean([node])[0]
         error = float(np.linalg.norm(estimator.covariance([node])[0] - own) / np.linalg.norm(own))
-        _require(error <= tolerance, f"covariance of node {node} is off by {error:.3g}, relative")
+        require(error <= tolerance, f"covariance of node {node} is off by {error:.3g}, relative")
         error = float((np.abs(estimator.mean([node])[0] - mean) / np.sqrt(np.diag(own)).max()).max())
-        _require(error <= tolerance, f"mean of node {node} is off by {error:.3g} standard deviations")
+        require(error <= tolerance, f"mean of node {node} is off by {error:.3g} standard deviations")
 
 
 def assert_equal_in_every_step(
@@ -94,7 +111,7 @@ def assert_equal_in_every_step(
         try:
             if expected is not None and result is not None and not np.isnan(result):
                 close = abs(result - expected) <= tolerance * max(abs(expected), 10.0)
-                _require(close, f"the log-likelihood is {result:.12g}, expected {expected:.12g}")
+                require(close, f"the log-likelihood is {result:.12g}, expected {expected:.12g}")
             assert_equal(estimator, textbook, tolerance)
         except AssertionError as error:
             raise AssertionError(f"operation {number}, {type(operation).__name__}: {error}") from error
@@ -104,7 +121,7 @@ def assert_equal_in_every_step(
 def check_methods(make: Make) -> None:
     """All methods of the protocol are there."""
     lacking = missing(make())
-    _require(not lacking, f"lacks {', '.join(lacking)}")
+    require(not lacking, f"lacks {', '.join(lacking)}")
 
 
 def check_programs(make: Make) -> None:
@@ -130,9 +147,9 @@ def check_without_nodes(make: Make) -> None:
     estimator = make()
     estimator.predict(discretise(SceneGraph.of([], CAR, []), 0.5))
     nothing = Measurements(np.empty(0, dtype=np.int64), np.empty((0, 2)), np.eye(2, 4), np.eye(2))
-    _require(estimator.update(nothing) == 0.0, "update by no measurements is expected to return 0")
+    require(estimator.update(nothing) == 0.0, "update by no measurements is expected to return 0")
     estimator.marginalise([])
-    _require(len(estimator.nodes) == 0 and estimator.joint_mean([]).shape == (0,), "expected no node")
+    require(len(estimator.nodes) == 0 and estimator.joint_mean([]).shape == (0,), "expected no node")
 
 
 def check_several_kinds(make: Make) -> None:
@@ -146,7 +163,7 @@ def check_several_kinds(make: Make) -> None:
     for kind in kinds:
         apart.update(kind)
     close = np.allclose(together.joint_mean(ids), apart.joint_mean(ids), rtol=1e-9, atol=1e-9)
-    _require(close, "an update by a sequence of measurements differs from one update after the other")
+    require(close, "an update by a sequence of measurements differs from one update after the other")
 
 
 def check_copies(make: Make) -> None:
@@ -159,10 +176,10 @@ def check_copies(make: Make) -> None:
     untouched.restore(estimator.snapshot())
     for twin in (copy.copy(estimator), restored):
         run(program[half:], twin)
-        _require(estimator.nodes.tolist() == untouched.nodes.tolist(), "a copy has changed its original")
+        require(estimator.nodes.tolist() == untouched.nodes.tolist(), "a copy has changed its original")
         nodes = untouched.nodes
         same = np.array_equal(estimator.joint_covariance(nodes), untouched.joint_covariance(nodes))
-        _require(same and estimator.time == untouched.time, "a copy has changed its original")
+        require(same and estimator.time == untouched.time, "a copy has changed its original")
         textbook, _ = run(program, TextbookEstimator())
         assert_equal(twin, textbook)
 
@@ -200,7 +217,7 @@ def check_bad_input(make: Make) -> None:
         else:
             raise AssertionError(f"{name}: expected an InputError")
         same = np.array_equal(estimator.joint_covariance(ids), untouched.joint_covariance(ids))
-        _require(same and estimator.nodes.tolist() == ids, f"{name}: has changed the estimator")
+        require(same and estimator.nodes.tolist() == ids, f"{name}: has changed the estimator")
 
 
 CHECKS: Sequence[Callable[[Make], None]] = (
@@ -223,8 +240,3 @@ def check_estimator(make: Make) -> None:
             check(make)
         except AssertionError as error:
             raise AssertionError(f"{check.__name__}: {error}") from error
-
-
-def _require(condition: bool, otherwise: str) -> None:
-    if not condition:
-        raise AssertionError(otherwise)

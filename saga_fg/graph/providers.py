@@ -27,6 +27,7 @@ from saga_fg.graph.factor_checks import Factor, each_factor, mentioned_keys, wit
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphError, GraphVariable, NewVariable, ProviderError, VariableKind, key_of
 from saga_fg.numerics.arrays import FloatArray
+from saga_fg.parts import part_kind
 from saga_fg.types.frame import Frame
 
 Factors = Sequence[Factor] | gtsam.NonlinearFactorGraph
@@ -46,6 +47,7 @@ class Additions:
     named: Mapping[Hashable, Factors] = field(default_factory=dict)
 
 
+@part_kind("factor provider", "saga_fg.providers")
 class FactorProvider(Protocol):
     """Anything that adds factors; `name` is for messages."""
 

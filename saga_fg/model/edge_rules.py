@@ -56,6 +56,7 @@ from saga_fg.model.nonlinear_interactions import (
 )
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.numerics.gating import near_pairs
+from saga_fg.parts import part_kind
 from saga_fg.settings import (
     NonNegative,
     NonNegativeInt,
@@ -160,6 +161,7 @@ class Pairs(NamedTuple):
 NO_PAIRS = Pairs(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
 
 
+@part_kind("edge rule", "saga_fg.edge_rules")
 class EdgeRule(Protocol):
     """Chooses edges from the estimates at the start of an interval.
 
@@ -182,7 +184,9 @@ class Neighbours(Settings):
     """Edges between moving objects that are close and head the same way; by default they share their velocity."""
 
     map_classes: ClassVar[tuple[str, ...]] = ()
-    interaction: SharedVelocity | CarFollowing = settings_group(SharedVelocity, "interaction function of the edges")
+    interaction: SharedVelocity | CarFollowing | Interaction | AccelerationLaw = settings_group(
+        SharedVelocity, "interaction function of the edges"
+    )
     rate: NonNegative = setting(
         0.3, "strength of an edge at distance and heading difference zero, 1/s; usual 0.2 to 0.6"
     )
@@ -239,8 +243,8 @@ class Following(Settings):
     """
 
     map_classes: ClassVar[tuple[str, ...]] = ()
-    interaction: SharedVelocity | CarFollowing | IntelligentDriver | SmoothDriver = settings_group(
-        CarFollowing, "interaction function of the edges"
+    interaction: SharedVelocity | CarFollowing | IntelligentDriver | SmoothDriver | Interaction | AccelerationLaw = (
+        settings_group(CarFollowing, "interaction function of the edges")
     )
     rate: NonNegative = setting(1.0, "strength of an edge right behind the leader, straight ahead, 1/s; usual 0.5 to 4")
     max_gap: NonNegative = setting(

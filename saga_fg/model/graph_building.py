@@ -107,15 +107,3 @@ def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
             bad = int(rows[np.argmax((rows < 0) | (rows >= len(nodes)))])
             raise InputError(f"{what}: {name}: row {bad} is outside {len(nodes)} nodes")
     return Pairs(target, source, checked(f"{what}: rate", pairs[2], (len(target),)))
-
-
-def require_rules(name: str, rules: object) -> None:
-    """Raise `InputError` unless `rules` are a tuple or list of edge rules, which edges of a graph are not."""
-    if not isinstance(rules, tuple | list):
-        raise InputError(f"{name}: expected a tuple of edge rules, got {type(rules).__name__}")
-    for k, rule in enumerate(rules):
-        if isinstance(rule, type) or not (hasattr(rule, "interaction") and hasattr(rule, "pairs")):
-            instead = "; their law can be the interaction of a rule" if isinstance(rule, NonlinearEdges) else ""
-            raise InputError(
-                f"{name}[{k}]: expected an edge rule, with interaction and pairs, got {type(rule).__name__}{instead}"
-            )

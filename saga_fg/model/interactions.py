@@ -32,6 +32,7 @@ import numpy as np
 from saga_fg.kernels.paths import path_cones, places_along
 from saga_fg.model.motion import NodeType
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, unchecked
+from saga_fg.parts import part_kind
 from saga_fg.settings import (
     NonNegative,
     PositiveOrInf,
@@ -192,6 +193,7 @@ class Triples(NamedTuple):
     b: FloatArray
 
 
+@part_kind("interaction", "saga_fg.interactions")
 class Interaction(Protocol):
     """An interaction function, evaluated for E edges between nodes of one type and nodes of one type."""
 

@@ -32,11 +32,13 @@ from factors import (
 )
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.parts import part_kind
 from saga_fg.settings import Positive, Settings, setting
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
 
 
+@part_kind("detector of landmarks", "saga_fg.landmarks")
 class LandmarkDetector(Protocol):
     """Finds landmarks in the data of a moment: a frame, or the points (N, 3), m, of a scan in the scanner's frame."""
 

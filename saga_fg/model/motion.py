@@ -21,12 +21,14 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
+from saga_fg.parts import part_kind
 from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting
 
 _LATERAL_FADING = 0.1  # s, with which an acceleration fades that is not along a vehicle's heading
 _LATERAL_DEVIATION = 0.1  # m/s^2, so that what is left of it stays uncertain
 
 
+@part_kind("motion model", "saga_fg.motions")
 class Motion(Protocol):
     """Own motion of a node: named components, generator A (d, d) in 1/s, diffusion Qc (d, d) per s."""
 

@@ -55,6 +55,7 @@ from scipy.special import expit, softmax
 from factors.measurement import soft_distance
 from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.parts import part_kind
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 
 MIN_GAP = 0.5  # m; smaller gaps are below their own noise
@@ -196,6 +197,7 @@ class Accelerations(NamedTuple):
     by_other: FloatArray
 
 
+@part_kind("interaction", "saga_fg.interactions")
 @runtime_checkable
 class AccelerationLaw(Protocol):
     """Acceleration of a node with position and velocity by another; an edge of rate 1/s acts with all of it."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from saga_fg.errors import InputError, require_type
 from saga_fg.kernels.components import measured_covariances
 from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, distinct
 from saga_fg.numerics.geometry import wrap_angle, yaw_transform
+from saga_fg.parts import part_kind
 from saga_fg.settings import (
     Finite,
     Fraction,
@@ -36,6 +37,7 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import DEFAULT, class_values
 from saga_fg.types.frame import LATEST, Detections, Frame
 
@@ -142,6 +144,19 @@ class ScoreCalibration(Settings):
     offset: Finite = setting(0.0, "logit of the probability at a score of one half; lower: detections are trusted less")
 
 
+@part_kind("class model", "saga_fg.class_models")
+class ClassModel(Protocol):
+    """What the boxes of a detector say about the classes of their objects."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The classes that it tells apart."""
+
+    def likelihood(self, boxes: Boxes) -> FloatArray:
+        """(n, C) chance of each box, of one of its classes, if the object is of each of its `classes` (C,)."""
+
+
+@part_kind("sensor model", "saga_fg.sensors")
 @dataclass(frozen=True)
 class Sensor(Settings):
     """Model of a sensor and its detector."""
@@ -167,6 +182,9 @@ class Sensor(Settings):
     confusion: Mapping[str, Mapping[str, NonNegative]] = settings_group(
         dict,
         "by true class, how many of its detections are reported as each class, counts or shares; {}: none is confused",
+    )
+    class_model: str | ClassModel | None = setting(
+        None, "your own class model, in place of confusion, MODULE:NAME or {kind: MODULE:NAME, ...settings}; null: none"
     )
     colour_accuracy: Fraction = setting(
         0.9, "probability that the reported colour of a traffic light is right; higher: beliefs change faster"

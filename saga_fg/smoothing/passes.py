@@ -22,6 +22,7 @@ import numpy as np
 from saga_fg.graph import FactorProvider
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.parts import new_part
 from saga_fg.smoothing.association import (
     Evidence,
     assign_detections,
@@ -43,7 +44,6 @@ from saga_fg.smoothing.boxes import constant_sizes, size_weights
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import MEDIUM_SCORE, Lifespans, SmoothedEdges, StateTable
 from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings
-from saga_fg.tracking.by_name import new_provider
 from saga_fg.tracking.settings import ClassSettings
 from saga_fg.types.by_class import class_values
 from saga_fg.types.frame import Frame
@@ -210,7 +210,8 @@ class Passes:
             edges = self._edges(lifespans, object_of, states.within(lifespans)) if self.tracker.edges else no_edges
             loss = self.settings.robust
             weight = None if loss is None else robust_weights(self.evidence, object_of, states, loss)
-            asked = self.providers or [new_provider(name) for name in self.settings.providers]
+            named = (new_part("providers", given, FactorProvider) for given in self.settings.providers)
+            asked = self.providers or list(named)
             motion = self.motion(lifespans, edges, stationary)
             states = smooth_states(self.evidence, object_of, lifespans, motion, weight, asked)
         return states

@@ -32,6 +32,12 @@ class TableLabels:
     detections: Table
     named: bool
 
+    def __repr__(self) -> str:
+        """The numbers of scenes and boxes, and the objects most worth a look."""
+        boxes = sum(len(moment.tracks) for one in self.scenes.values() for part in one for moment in part)
+        title = f"labels of {len(self.scenes)} scenes, {boxes} boxes (.boxes()); objects most worth a look (.review()):"
+        return f"{title}\n{self.review()}"
+
     def boxes(self) -> Table:
         """A row for each box, with the columns of `labels.csv`."""
         found = [(name, moment) for name, one in self.scenes.items() for part in one for moment in part]

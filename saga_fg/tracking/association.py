@@ -27,6 +27,8 @@ goes with these costs, and of a detection the share that is its track's, among t
 It is 1 almost everywhere, and is taken as 1 from `association.clear_above` on. Below that the update is weighted by it
 (`saga_fg.tracking.update`), and the two tracks may have exchanged their objects (`saga_fg.tracking.encounters`).
 
+Costs of a user's own (`AssociationCost`) are added to those of the pairs.
+
 Sources: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, section 6.2; Williams and Lau, IEEE
 Transactions on Aerospace and Electronic Systems 50(4), 2014: marginals by belief propagation.
 """
@@ -38,6 +40,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.kernels.identities import association_marginals
 from saga_fg.kernels.pairs import gated_pairs
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, common_numbers
@@ -55,7 +58,7 @@ from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.given_identities import identity_cost
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.relinking import relinked
-from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
+from saga_fg.tracking.settings import AssociationProblem, AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.unresolved import over_confirmed
 from saga_fg.types.boxes import Boxes
@@ -108,8 +111,26 @@ def associate(state: TrackerState, measurements: FrameMeasurements) -> tuple[Mat
     real = np.where(table.confirmed, seen, 0.0)
     belief = state.class_belief()
     tracks = ExpectedTracks(predicted, P, expected, real, cross, deferred, state.confused, belief, table.id)
+    if state.costs:
+        tracks = tracks._replace(own_cost=_own_cost(state, measurements, predicted))
     found, rivals = match(tracks, measurements, state.settings, area, last)
-    return relinked(state, measurements, found, position, P), rivals
+    return relinked(state, measurements, found, position, P, tracks.own_cost), rivals
+
+
+def _own_cost(state: TrackerState, measurements: FrameMeasurements, predicted: Boxes) -> FloatArray:
+    """(n, m) sum of the costs of a user's own. Raises `InputError` for one of another shape, NaN or -infinity."""
+    time = state.start + state.time - measurements.delay
+    problem = AssociationProblem(
+        measurements.name, time, state.table.id, predicted, measurements.row, measurements.boxes
+    )
+    total = np.zeros((len(predicted), len(measurements)))
+    for k, cost in enumerate(state.costs):
+        given = np.asarray(cost(problem), dtype=np.float64)
+        if given.shape != total.shape or not (given > -math.inf).all():
+            what = f"shape {given.shape}" if given.shape != total.shape else "NaN or -infinity"
+            raise InputError(f"association.costs[{k}]: expected numbers of shape {total.shape}, got {what}")
+        total += given
+    return total
 
 
 class ExpectedTracks(NamedTuple):
@@ -123,6 +144,7 @@ class ExpectedTracks(NamedTuple):
     deferred  (n,) tracks that are matched to what the others leave; None: none
     confused  classes that sensors confuse, and the log-beliefs (n, C) in them
     id        (n,) of the tracks; needed where detections have identities
+    own_cost  (n, m) of a user's own, added to that of the distance; None: none
     """
 
     boxes: Boxes
@@ -134,6 +156,7 @@ class ExpectedTracks(NamedTuple):
     confused: ConfusedClasses = NONE_CONFUSED
     class_belief: FloatArray | None = None
     id: IntArray | None = None
+    own_cost: FloatArray | None = None
 
 
 def match(
@@ -219,6 +242,9 @@ def _candidates(
         group_z=of_detection,
     )
     found = CandidatePairs(*pairs)
+    if tracks.own_cost is not None:
+        found = found._replace(gain=found.gain + tracks.own_cost[found.track, found.detection])
+        found = found.select(np.flatnonzero(found.gain < math.inf))
     if tracks.class_belief is not None and len(confused):
         reported = measurements.class_likelihood[found.detection]
         found = found._replace(gain=found.gain - 2 * confused.log_evidence(tracks.class_belief[found.track], reported))

@@ -19,19 +19,34 @@ nothing by their speed.
 Classes are of one group if a chain of confusions joins them. A detection may be of any track of its group, at the cost
 -2 log sum_c b(c) L(c). Without tables there are no groups, and every track has the class of its detections.
 
+A class model of a user's own (`saga_fg.model.sensor.ClassModel`) gives L for the boxes of its classes in place of A, by
+all that they show.
+
 Source: Pearl, Probabilistic Reasoning in Intelligent Systems, 1988, section 2.2.2: virtual evidence.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, common_numbers, distinct
+from saga_fg.errors import InputError
+from saga_fg.model.sensor import ClassModel, Sensor
+from saga_fg.numerics.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    StrArray,
+    checked,
+    common_numbers,
+    distinct,
+    of_classes,
+)
+from saga_fg.parts import new_part
 from saga_fg.tracking.settings import ClassSettings
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import DEFAULT, class_settings
 
 MIN_BELIEF = 1e-3  # of a class of the group
@@ -49,6 +64,7 @@ class ConfusedClasses:
     tables     by sensor, (C, C) chance of each report (row) by true class (column), 0 between groups
     shape      (C, 4) logs of the typical length, width and height, and their deviation, NaN where the group has none
     speed      (C,) standard deviation of the speeds, m/s
+    models     by sensor, class models of a user's own, None for none
     """
 
     classes: tuple[str, ...]
@@ -57,12 +73,20 @@ class ConfusedClasses:
     tables: Mapping[str, FloatArray]
     shape: FloatArray
     speed: FloatArray
+    models: Mapping[str, ClassModel | None] = field(default_factory=dict)
 
     @classmethod
     def of(cls, sensors: Mapping[str, Sensor], settings: Mapping[str, ClassSettings]) -> ConfusedClasses:
         """The classes that the tables of these sensors confuse."""
         tables = {DEFAULT: {}, **{name: sensor.confusion for name, sensor in sensors.items()}}
         entries = [(c, z) for rows in tables.values() for c, row in rows.items() for z, n in row.items() if n > 0]
+        models: dict[str, ClassModel | None] = {
+            name: None
+            if sensor.class_model is None
+            else new_part(f"sensors.{name}.class_model", sensor.class_model, ClassModel)
+            for name, sensor in sensors.items()
+        }
+        entries += [(model.classes[0], other) for model in models.values() if model for other in model.classes]
         classes = tuple(sorted({label for c, z in entries for label in (c, z) if c != z}))
         group, C = np.arange(len(classes)), len(classes)
         for i, j in ((classes.index(c), classes.index(z)) for c, z in entries if c in classes):
@@ -78,7 +102,7 @@ class ConfusedClasses:
             found[name] = A / A.sum(axis=0)
         totals = [[sum(rows[c].values()) for rows in tables.values() if c in rows] for c in classes]
         of_all = [n for own in totals for n in own]
-        prior = np.array([np.mean(own or of_all) for own in totals])
+        prior = np.array([np.mean(own or of_all or [1.0]) for own in totals])
         of_class = [class_settings(settings, ClassSettings, label) for label in classes]
         sizes = [each.typical_size for each in of_class]
         parts = [[np.nan] * 4 if s is None else [*np.log([s.length, s.width, s.height]), s.spread] for s in sizes]
@@ -86,7 +110,7 @@ class ConfusedClasses:
         shape[alike @ np.isnan(shape[:, 0])] = np.nan
         speed = np.array([each.initial_speed_deviation for each in of_class])
         head = {label: classes[k] for label, k in zip(classes, group.tolist(), strict=True)}
-        return cls(classes, head, np.log(prior / (alike @ prior)), found, shape, speed)
+        return cls(classes, head, np.log(prior / (alike @ prior)), found, shape, speed, models)
 
     def __len__(self) -> int:
         return len(self.classes)
@@ -112,6 +136,21 @@ class ConfusedClasses:
             return np.empty((len(label), 0))
         column = self.columns(label)
         return np.where(column[:, None] >= 0, self.tables.get(sensor, self.tables[DEFAULT])[column], 0.0)
+
+    def report_likelihood(self, sensor: str, boxes: Boxes) -> FloatArray:
+        """(n, C) chance of boxes by the true class, by the class model of the sensor where it has one, else its table.
+
+        Raises `InputError` for a model whose answer is not positive numbers of the right shape.
+        """
+        chance, model = self.likelihood(sensor, boxes.label), self.models.get(sensor, self.models.get(DEFAULT))
+        rows = of_classes(boxes.label, model.classes).nonzero()[0] if model else ()
+        if model and len(rows):
+            where = f"sensors.{sensor}.class_model: likelihood"
+            own = checked(where, model.likelihood(boxes.select(rows)), (len(rows), len(model.classes)))
+            if own.min() < 0 or not own.any(axis=1).all():
+                raise InputError(f"{where}: expected no negative chance, and one above 0 of each box")
+            chance[np.ix_(rows, self.columns(np.array(model.classes)))] = own / own.max(axis=1, keepdims=True)
+        return chance
 
     def initial(self, likelihood: FloatArray) -> FloatArray:
         """Log-beliefs (n, C) of new tracks by the likelihood (n, C) of their first detections; -inf between groups."""

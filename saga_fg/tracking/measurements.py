@@ -113,7 +113,7 @@ def frame_measurements(
     near, wide = class_values(classes, ClassSettings, detections.boxes.label, "nms_distance", "weak_nms_distance")
     label = detections.boxes.label
     into = suppress_duplicates(detections.boxes, probability, near, wide, confused.numbers(label)[0])
-    likelihood = confused.likelihood(frame.sensor, label)
+    likelihood = confused.report_likelihood(frame.sensor, detections.boxes)
     kept = (into == np.arange(len(into))).nonzero()[0]
     if len(kept) < len(keep):
         if len(confused):

@@ -63,11 +63,17 @@ _FARTHEST = 100.0  # squared distance of two positions from which not even the n
 
 
 def relinked(
-    state: TrackerState, measurements: FrameMeasurements, matching: Matching, position: FloatArray, P: FloatArray
+    state: TrackerState,
+    measurements: FrameMeasurements,
+    matching: Matching,
+    position: FloatArray,
+    P: FloatArray,
+    own_cost: FloatArray | None = None,
 ) -> Matching:
     """The matching, with the returns of tracks that it left unmatched.
 
     position  (n, 2) of the tracks at the time of the frame, local, m; P (n, 2, 2) their covariances
+    own_cost  (n, m) of a user's own, None: none
     """
     rows = initiating(state, measurements, matching)
     if len(rows) == 0:
@@ -81,7 +87,9 @@ def relinked(
     t, j, cost = _pairs(state, tracks, position, P, label, places, noise)
     if len(state.confused):
         cost -= _class_odds(state, t, measurements.class_likelihood[rows[j]])
-        t, j, cost = t[cost < 0], j[cost < 0], cost[cost < 0]
+    if own_cost is not None:
+        cost = cost + own_cost[t, rows[j]] / 2
+    t, j, cost = t[cost < 0], j[cost < 0], cost[cost < 0]
     if len(t) == 0:
         return matching
     chosen = least_total(t, j, cost)

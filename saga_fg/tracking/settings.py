@@ -5,20 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple, Protocol
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
-from saga_fg.model.graph_building import require_rules
 from saga_fg.model.lanes import ConeLine, InLane
 from saga_fg.model.modes import Mixture
-from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NonlinearMotion, RandomWalk
+from saga_fg.model.motion import (
+    ConstantAcceleration,
+    ConstantVelocity,
+    Curvilinear,
+    Motion,
+    NonlinearMotion,
+    RandomWalk,
+)
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.stability import require_stable
 from saga_fg.model.stop_lines import GreenLight, RedLight
 from saga_fg.model.turning import CoordinatedTurn
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.parts import part_kind
 from saga_fg.settings import (
     Fraction,
     FractionBelowOne,
@@ -32,13 +40,38 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
-from saga_fg.tracking.by_name import require_estimator_name
+from saga_fg.tracking.by_name import EstimatorMaker, require_estimator
 from saga_fg.tracking.clock import MAX_JUMP
 from saga_fg.tracking.traffic import TrafficSettings
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.road_map import RoadMap, SignalSettings
 
 AssociationName = Literal["hungarian", "greedy", "graph"]
+
+
+class AssociationProblem(NamedTuple):
+    """The tracks and detections of a frame, between which pairs are to be found.
+
+    sensor, time  its name; time of the frame, s
+    id, tracks    (n,) of the tracks, and their predicted boxes, world
+    row, detections  (m,) of the detections in the frame, and their boxes, world
+    """
+
+    sensor: str
+    time: float
+    id: IntArray
+    tracks: Boxes
+    row: IntArray
+    detections: Boxes
+
+
+@part_kind("association cost", "saga_fg.costs")
+class AssociationCost(Protocol):
+    """A cost of pairs of tracks and detections, added to that of their distance; it keeps nothing between frames."""
+
+    def __call__(self, problem: AssociationProblem) -> FloatArray:
+        """(n, m) -2 log of the likelihood ratio that they are one object; infinite where they cannot be."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +90,7 @@ class TypicalSize(Settings):
 class ClassSettings(Settings):
     """Motion, initiation, association and deletion of the tracks of one class."""
 
-    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn | Mixture = (
+    motion: ConstantVelocity | ConstantAcceleration | Curvilinear | RandomWalk | CoordinatedTurn | Mixture | Motion = (
         settings_group(
             lambda: ConstantVelocity(acceleration_noise=2.0),
             "motion model of the class; curvilinear for vehicles with measured headings; random_walk for objects that "
@@ -124,6 +157,9 @@ class AssociationSettings(Settings):
         "re-link a track that was not detected with a detection that would initiate another one, from this "
         "probability on; usual 0.8 to 0.99; higher: fewer wrong links, more lost identities, 1: never",
     )
+    costs: tuple[str | AssociationCost, ...] = setting(
+        (), "your own costs of pairs, MODULE:NAME or {kind: MODULE:NAME, ...settings}, added to that of the distance"
+    )
 
 
 @dataclass(frozen=True)
@@ -186,12 +222,9 @@ class TrackerSettings(Settings):
         0.0,
         "factor on the score of tentative tracks, which may be false or a second box of one object; 0: not reported",
     )
-    edges: tuple[Following | Neighbours | Repulsion | RedLight | GreenLight | InLane | ConeLine | Attached, ...] = (
-        settings_group(
-            traffic_rules,
-            "edge rules of the scene graph: who interacts with whom; []: no interactions",
-        )
-    )
+    edges: tuple[
+        Following | Neighbours | Repulsion | RedLight | GreenLight | InLane | ConeLine | Attached | EdgeRule, ...
+    ] = settings_group(traffic_rules, "edge rules of the scene graph: who interacts with whom; []: no interactions")
     edge_prior: Fraction = setting(
         1.0,
         "probability that an edge governs, before it is known how well such edges predicted objects in view; higher: "
@@ -210,7 +243,7 @@ class TrackerSettings(Settings):
     road_map: RoadMap | None = settings_group(
         lambda: None, "lights, stop lines, lanes and walls in world coordinates; null: those that frames bring along"
     )
-    estimator: str = setting(
+    estimator: str | EstimatorMaker = setting(
         "kalman",
         "kalman: fastest; isam2: the same filter as a factor graph of the last interval; fixed-lag: a factor graph "
         "of the last `lag` seconds, exact for late frames; MODULE:NAME or the name of an entry point: your own",
@@ -271,8 +304,7 @@ class TrackerSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_estimator_name(self.estimator)
+        require_estimator(self.estimator)
         if self.ego is not None and self.ego.estimated and self.association.method == "graph":
             raise InputError("ego.estimated: expected association without pairs, got association.method graph")
-        require_rules("edges", self.edges)
         require_stable(self.edges, self.max_step)

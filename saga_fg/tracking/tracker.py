@@ -22,14 +22,13 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, SagaError, require_type
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
-from saga_fg.model.edge_rules import EdgeRule
-from saga_fg.model.graph_building import require_rules
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Assignment
+from saga_fg.parts import KINDS, new_part
 from saga_fg.tracking.association import associate
-from saga_fg.tracking.by_name import new_provider
+from saga_fg.tracking.by_name import estimator_name
 from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, compared, sensor_times
 from saga_fg.tracking.initiation import initiate_tracks
@@ -62,7 +61,6 @@ class Tracker:
 
     settings  the tracker's settings
     sensors   models by sensor name; the entry named "default" serves all others
-    rules     edge rules, in place of `settings.edges`
     observer  is notified at the end of every step of a frame
     providers add factors of your own to the running graph of the tracks, once a frame (`saga_fg.graph`)
 
@@ -81,21 +79,18 @@ class Tracker:
         self,
         settings: TrackerSettings | None = None,
         sensors: Mapping[str, Sensor] | None = None,
-        rules: tuple[EdgeRule, ...] | None = None,
         observer: Observer | None = None,
         providers: Sequence[FactorProvider] = (),
     ) -> None:
         self.settings = TrackerSettings() if settings is None else settings
         require_type("settings", self.settings, TrackerSettings)
         self.sensors = checked_sensors(sensors)
-        self.rules: tuple[EdgeRule, ...] = self.settings.edges if rules is None else rules
-        require_rules("rules", self.rules)
         self.observer = observer
         for provider in providers:
-            if not callable(getattr(provider, "factors", None)):
-                raise InputError(f"providers: expected factor providers, with a method factors, got {provider!r:.40}")
-        self.providers = tuple(providers) or tuple(new_provider(name) for name in self.settings.providers)
-        self._state = TrackerState(self.settings, self.rules, self.providers, self.sensors)
+            KINDS[FactorProvider].require("providers", provider)
+        named = (new_part("providers", given, FactorProvider) for given in self.settings.providers)
+        self.providers = tuple(providers) or tuple(named)
+        self._state = TrackerState(self.settings, self.providers, self.sensors)
         self._last_step_failed = False
 
     def __repr__(self) -> str:
@@ -107,8 +102,8 @@ class Tracker:
         state = self._state
         at = f" at {state.clock.newest:.3f} s" if len(state.table) else ""
         return (
-            f"Tracker({len(state.table)} tracks{at}; estimator {self.settings.estimator}, "
-            f"{len(self.rules)} edge rules, sensors {sensors}; changed: {', '.join(changed) or 'nothing'})"
+            f"Tracker({len(state.table)} tracks{at}; estimator {estimator_name(self.settings.estimator)}, "
+            f"{len(self.settings.edges)} edge rules, sensors {sensors}; changed: {', '.join(changed) or 'nothing'})"
         )
 
     def step(self, frame: Frame) -> Tracks:
@@ -123,7 +118,7 @@ class Tracker:
         try:
             reported = self._step(state, frame)
         except BaseException as error:
-            if (named := self._of_own_estimator(error)) is not None:
+            if (named := self._of_own_part(error)) is not None:
                 raise named from error
             if self.providers and isinstance(error, ProviderError | UndeterminedError):  # tracks are not to blame
                 raise
@@ -137,14 +132,25 @@ class Tracker:
         self._state, self._last_step_failed = state, False
         return reported
 
-    def _of_own_estimator(self, error: BaseException) -> InputError | None:
-        """The error of an estimator that is not of this package, with its name; None for one of another origin."""
-        module = type(self._state.joint.estimator).__module__
-        if module.startswith("saga_fg.") or not isinstance(error, Exception) or isinstance(error, SagaError):
+    def _of_own_part(self, error: BaseException) -> InputError | None:
+        """The error of a part that is not of this package, with its name; None for one of another origin."""
+        if not isinstance(error, Exception) or isinstance(error, SagaError):
             return None
-        if all(frame.f_globals.get("__name__") != module for frame, _ in walk_tb(error.__traceback__)):
-            return None
-        return InputError(f"estimator: {self.settings.estimator}: {type(error).__name__}: {error}")
+        settings, edges = self.settings, self.settings.edges
+        parts: list[tuple[str, Any]] = [
+            *((f"classes.{label}.motion", one.motion) for label, one in settings.classes.items()),
+            *((f"sensors.{name}", sensor) for name, sensor in self.sensors.items()),
+            *((f"sensors.{name}.class_model", model) for name, model in self._state.confused.models.items()),
+            *((f"association.costs[{k}]", cost) for k, cost in enumerate(self._state.costs)),
+            *((f"edges[{k}].interaction", rule.interaction) for k, rule in enumerate(edges)),
+            *((f"edges[{k}]", rule) for k, rule in enumerate(edges)),
+            (f"estimator: {estimator_name(settings.estimator)}", self._state.joint.estimator),
+        ]
+        modules = [(getattr(part, "__module__", "saga_fg."), where) for where, part in parts]
+        where_of = {module: where for module, where in modules if not module.startswith("saga_fg.")}
+        calls = [frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__)]
+        blamed = [where_of[module] for module in calls if module in where_of]
+        return InputError(f"{blamed[-1]}: {type(error).__name__}: {error}") if blamed else None
 
     def _step(self, state: TrackerState, frame: Frame) -> Tracks:
         """Take a frame into a state."""
@@ -269,7 +275,7 @@ class Tracker:
         self._state.restore(snapshot)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.settings, self.sensors, self.rules, None, self.providers), self.snapshot()
+        return type(self), (self.settings, self.sensors, None, self.providers), self.snapshot()
 
     __setstate__ = restore
 
@@ -324,7 +330,7 @@ class Tracker:
     def plain_snapshots(self) -> bool:
         """Whether snapshots are plain values, which go into a file without pickling."""
         models = self._state.joint.estimator.snapshots_hold_models
-        return not (models and self.settings.nonlinear(self.rules))
+        return not (models and self.settings.nonlinear(self.settings.edges))
 
     @property
     def running_graph(self) -> SceneFactorGraph:

@@ -21,12 +21,12 @@ import numpy as np
 
 from saga_fg.graph import FactorProvider
 from saga_fg.kernels.components import velocities_along
-from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import POSITION
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.numerics.assignment import Assignment, CrossCovariances
+from saga_fg.parts import new_part
 from saga_fg.tracking.by_name import new_estimator
 from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.tracking.clock import Clock, TimeVerdict
@@ -39,7 +39,7 @@ from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.measurements import EgoNode
 from saga_fg.tracking.noise_scale import SensorNoise
-from saga_fg.tracking.settings import ClassSettings, TrackerSettings
+from saga_fg.tracking.settings import AssociationCost, ClassSettings, TrackerSettings
 from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.traffic import Traffic, speed_prior
@@ -110,12 +110,13 @@ class TrackerState:
     def __init__(
         self,
         settings: TrackerSettings,
-        rules: tuple[EdgeRule, ...],
         providers: tuple[FactorProvider, ...] = (),
         sensors: Mapping[str, Sensor] | None = None,
     ) -> None:
-        self.settings, self.rules, self.providers = settings, rules, providers
+        self.settings, self.rules, self.providers = settings, settings.edges, providers
         self.confused = ConfusedClasses.of(sensors or {}, settings.classes)
+        named = (new_part("association.costs", given, AssociationCost) for given in settings.association.costs)
+        self.costs: tuple[AssociationCost, ...] = tuple(named)
         self.graph: SceneGraph | None = None
         self.start, self.time, self.origin = 0.0, 0.0, np.zeros(2)
         self.next_id = 1

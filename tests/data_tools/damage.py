@@ -23,7 +23,7 @@ from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
 from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.corrections import read_corrections
-from data_tools.datasets.detection_files import TruthFile, read_detections, read_predictions, read_tracks
+from data_tools.datasets.detection_files import read_detections, read_predictions, read_tracks, read_truth
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.source import read_scored_sequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
@@ -165,7 +165,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "detections, NDJSON": one("table.ndjson", NDJSON, _read_table),
         "detections, NumPy": Target((npz,), lambda: _read_table(npz)),
         "tracks": one("tracks.csv", TRACKS, read_tracks),
-        "tracks of others": one("others.csv", OTHERS, lambda path: _scenes_of(TruthFile(path))),
+        "tracks of others": one("others.csv", OTHERS, lambda path: _scenes_of(read_truth(path))),
         **_arrow(folder),
         "labels": one("labels.csv", LABELS, lambda path: read_tracks(path, labels=True)),
         "pose graph, plane": one("plane.g2o", G2O_2D, read_g2o),

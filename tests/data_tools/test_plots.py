@@ -10,8 +10,7 @@ import pytest
 from data_tools.evaluation import recall_charts
 from data_tools.figures import Chart, FigureTable, Series, as_json, cell, count, write_figures
 from data_tools.metrics import RecallCurves
-from data_tools.plots import chart_picture, plot, png, running_graph_picture
-from saga_fg import Detection, Detections, Frame, InputError, Tracker, track
+from data_tools.plots import chart_picture, png, running_graph_picture
 
 
 def test_a_chart_is_drawn_as_it_is():
@@ -64,38 +63,6 @@ def test_a_running_graph_is_drawn_where_it_is():
     (around,) = running_graph_picture({"nodes": nodes, "factors": factors}, centre=[20, 0], radius=5.0).axes
     assert around.get_xlim() == (15.0, 25.0)
     running_graph_picture({"nodes": [], "factors": []})
-
-
-# `plot`: tracks from above
-
-
-def some_tracks():
-    tracker = Tracker()
-    cars = [Detections.of([Detection("car", (k * 1.0, 3.0 * n, 0.0)) for n in range(3)]) for k in range(6)]
-    return [tracker.step(Frame(k / 10, "lidar", found)) for k, found in enumerate(cars)], cars[-1]
-
-
-def test_each_track_has_a_path_and_a_box():
-    history, detections = some_tracks()
-    (ax,) = plot(history, detections).axes
-    assert len(ax.lines) == 4  # with the detections
-    assert len(ax.patches) == 3
-    assert sorted(text.get_text() for text in ax.texts) == ["1", "2", "3"]
-    assert ax.lines[1].get_xdata()[-1] == pytest.approx(5, abs=0.3)
-    assert png(plot(history[-1], ids=False)).startswith(b"\x89PNG")
-    assert not plot([]).axes[0].lines
-
-
-def test_the_table_of_the_one_line_tracker_is_drawn():
-    pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
-    rows = pd.DataFrame([{"timestamp": k / 10, "x": k * 1.0, "y": 3.0 * n} for k in range(6) for n in range(2)])
-    (ax,) = plot(track(rows)).axes
-    assert len(ax.patches) == 2
-
-
-def test_anything_else_is_refused():
-    with pytest.raises(InputError, match="got str"):
-        plot("tracks.csv")
 
 
 # Figures as tables and as JSON

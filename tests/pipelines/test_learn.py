@@ -295,8 +295,8 @@ def test_the_fragment_leads_to_the_learned_settings(noise_learned, tmp_path):
             assert config.sensors[name].field_of_view.max_range == pytest.approx(
                 sensor.field_of_view.max_range, rel=1e-3
             )
-    q = noise_learned.config.tracker.classes[DEFAULT].motion.acceleration_noise  # type: ignore[union-attr]
-    assert config.tracker.classes[DEFAULT].motion.acceleration_noise == pytest.approx(q, rel=1e-3)  # type: ignore[union-attr]
+    q = noise_learned.config.tracker.classes[DEFAULT].motion.acceleration_noise  # type: ignore[attr-defined]
+    assert config.tracker.classes[DEFAULT].motion.acceleration_noise == pytest.approx(q, rel=1e-3)  # type: ignore[attr-defined]
 
 
 def test_process_noise_is_alike_with_and_without_truth():

@@ -13,9 +13,10 @@ import pytest
 from data_tools.datasets import source
 from data_tools.datasets.source import DatasetSource
 from saga_fg.errors import InputError
+from saga_fg.parts import offered
 from tests.pipelines.command import COMMAND, done, refused, saga_fg
 
-PAGE = Path(__file__).parents[2] / "docs" / "guides" / "add-a-dataset.md"
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "parts.md"
 
 
 def install(folder: Path, package: str, **datasets: str) -> None:
@@ -33,9 +34,9 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = tmp_path / "packages"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
-    source.external_datasets.cache_clear()
+    offered.cache_clear()
     yield folder
-    source.external_datasets.cache_clear()
+    offered.cache_clear()
 
 
 @pytest.fixture
@@ -43,10 +44,10 @@ def square(packages: Path, tmp_path: Path) -> Iterator[Path]:
     """The dataset of the documentation, installed; recordings of it, made as there."""
     text = PAGE.read_text(encoding="utf-8")
     (source,) = re.findall(r"^cat > square.py <<'END'\n(.*?)^END$", text, flags=re.M | re.S)
-    assert len([line for line in source.splitlines() if line.strip()]) <= 60
+    assert len([line for line in source.splitlines() if line.strip()]) <= 35
     (packages / "square.py").write_text(source)
     install(packages, "city-square", square="square:Square")
-    (recordings,) = re.findall(r"^```python\n(.*?)^```$", text, flags=re.M | re.S)
+    (recordings,) = re.findall(r"^```python\n(import json\n.*?)^```$", text, flags=re.M | re.S)
     run = subprocess.run([sys.executable, "-c", recordings], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     yield tmp_path / "recordings"
@@ -102,7 +103,10 @@ def test_it_runs_in_parallel_and_again_only_what_has_changed(square, tmp_path):
 
 def test_by_module_and_class_it_need_not_be_installed(square, tmp_path):
     done("track", "square:Square", "--folder", square, "-o", tmp_path / "tracks.csv")
-    for name, message in (("square:Round", "has no attribute 'Round'"), ("none_such:A", "No module named 'none_such'")):
+    for name, message in (
+        ("square:Round", "the module square has no Round"),
+        ("none_such:A", "No module named 'none_such'"),
+    ):
         assert message in refused("track", name, "--folder", square)
 
 
@@ -121,11 +125,11 @@ def test_by_module_and_class_it_is_smoothed_on_ray(square, tmp_path):
 def test_a_broken_package_is_named_and_hinders_no_other(packages, square, tmp_path):
     install(packages, "bad-cameras", cameras="no_such_module:Cameras", odd="json:JSONDecoder")
     listed = saga_fg("track", "--help").stdout
-    assert re.search(r"^  cameras +Cannot be loaded: dataset cameras of the package", listed, re.M)
-    expected = {"cameras": "no_such_module:Cameras cannot be loaded: ModuleNotFoundError", "odd": "DatasetSource"}
+    assert re.search(r"^  cameras +Cannot be loaded: dataset: cameras of the package", listed, re.M)
+    expected = {"cameras": "no_such_module cannot be imported: ModuleNotFoundError", "odd": "DatasetSource"}
     for name, message in expected.items():
         said = refused("track", name, "--folder", "x", "-o", "y")
-        assert said.startswith(f"error: dataset {name} of the package bad-cameras: ")
+        assert said.startswith(f"error: dataset: {name}")
         assert message in said
     assert saga_fg("track", "square", "--folder", square, "-o", tmp_path / "tracks.csv").exit_code == 0
 
@@ -133,9 +137,9 @@ def test_a_broken_package_is_named_and_hinders_no_other(packages, square, tmp_pa
 def test_a_name_belongs_to_one_package(packages):
     install(packages, "one", lidar="a:A", kitti="a:A")
     install(packages, "two", lidar="b:B")
-    with pytest.raises(InputError, match="dataset lidar: expected one package to offer it, one and two do"):
+    with pytest.raises(InputError, match="dataset: lidar: expected one package to offer it, one and two do"):
         source.dataset_source("lidar")
-    with pytest.raises(InputError, match="dataset kitti: expected one package to offer it, one and saga-fg do"):
+    with pytest.raises(InputError, match="dataset: kitti: expected one package to offer it, one and saga-fg do"):
         source.dataset_source("kitti")
     with pytest.raises(InputError, match="unknown dataset 'kity'; did you mean 'kitti'"):
         source.dataset_source("kity")

@@ -77,7 +77,10 @@ def test_a_kind_of_landmark_of_ones_own_is_in_the_map(drive: Path) -> None:
 def test_what_cannot_be_is_refused(drive: Path, subtests: pytest.Subtests) -> None:
     for config, message in [
         ("slam: {providers: [wall]}", "providers: expected MODULE:NAME, got 'wall'"),
-        ("slam: {landmarks: ['collections:Counter']}", "expected a detector of landmarks, which has a method"),
+        (
+            "slam: {landmarks: ['collections:Counter']}",
+            "expected a detector of landmarks with observations; it lacks observations",
+        ),
         ("tracker: {estimator: isam2, providers: ['a:B']}", "tracker.providers: expected under slam"),
         ("slam: {lidar: {rounds: 0}}", "slam.lidar"),
     ]:

@@ -234,9 +234,10 @@ def test_settings_of_providers_that_make_no_sense():
         ('{kind: "saga_fg.providers:Gps", deviaton: 1}', r"providers\[0\].deviaton: unknown key, did you mean"),
         ('{kind: "saga_fg.providers:Gps", deviation: far}', r"providers\[0\].deviation: expected a number, got"),
         ('{kind: "saga_fg.providers:Odometry", start: {place: [0, 0]}}', r"start.place: expected a list of 3"),
-        ("{deviation: 1}", r"providers\[0\].kind: expected MODULE:NAME, got nothing"),
-        ('{kind: "math:sqrt"}', r"providers\[0\].kind: math:sqrt: expected a dataclass"),
-        ('{kind: "no_such_module:X"}', r"providers\[0\].kind: .*expected a module that can be imported"),
+        ("{deviation: 1}", r"providers\[0\].kind: expected MODULE:NAME, the key is missing"),
+        ('{kind: "math:sqrt"}', r"providers\[0\]: cannot be made without arguments: TypeError"),
+        ('{kind: "math:sqrt", x: 1}', r"providers\[0\].kind: math:sqrt: expected a dataclass"),
+        ('{kind: "no_such_module:X"}', r"providers\[0\].kind: .*no_such_module cannot be imported"),
         ("3", r"providers\[0\]: expected a section \(key: value\), got 3"),
     ]:
         with pytest.raises(InputError, match=message):

@@ -67,7 +67,7 @@ from saga_fg.tables.conventions import Sample, findings_of
 from saga_fg.tables.detections import box_columns
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.finding import refuse_contradictions
+from saga_fg.types.finding import Finding, refuse_contradictions
 from saga_fg.types.track import PredictedTracks, Tracks
 
 if TYPE_CHECKING:
@@ -262,11 +262,22 @@ def read_tracks(
     """
     columns = LABEL_COLUMNS if labels else TRACK_COLUMNS
     layout = Layout((*columns, SETTLED, *QUATERNION), REQUIRED, lenient)
-    return _track_rows(read_raw_table(Path(path), layout, how, own=OWN))
+    return track_rows(read_raw_table(Path(path), layout, how, own=OWN))
 
 
-def _track_rows(raw: RawTable) -> TrackRows:
-    """The tracks in a table that may have further columns; without those of classes that are to be left out."""
+def _log_findings(findings: Sequence[Finding], raw: RawTable) -> None:
+    """Log what is doubtful in a file; raises `InputError` for what contradicts how it is read."""
+    with error_context(str(raw.path)):
+        refuse_contradictions(findings)
+    for finding in findings:
+        log.warning("%s: %s", raw.path, finding)
+
+
+def track_rows(raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None] = _log_findings) -> TrackRows:
+    """The tracks in a table that may have further columns; without those of classes that are to be left out.
+
+    tell  says what is doubtful in it, and raises `InputError` for contradictions
+    """
     raw.check_numbers(NUMBERS)
     _, left_out = raw.labels()
     kept = np.flatnonzero(~left_out)
@@ -282,11 +293,7 @@ def _track_rows(raw: RawTable) -> TrackRows:
         in_world = (raw.texts("coordinates", raw.how.coordinates or "world") == "world")[mine]
         yaw = raw.numbers("yaw")[mine]
         sample = Sample.from_rows(timestamp[mine], found.boxes.select(mine), found.score[mine], yaw, in_world)
-        findings = raw.how.judged([*raw.findings(), *findings_of(sample)], raw.found.names)
-        with error_context(str(raw.path)):
-            refuse_contradictions(findings)
-        for finding in findings:
-            log.warning("%s: %s", raw.path, finding)
+        tell(raw.how.judged([*raw.findings(), *findings_of(sample)], raw.found.names), raw)
     return TrackRows(
         scene=scene,
         timestamp=timestamp[kept],
@@ -308,25 +315,20 @@ def _covariance(raw: RawTable, names: tuple[str, str, str]) -> FloatArray:
     return from_upper_triangle(np.stack([raw.numbers(name) for name in names], axis=-1))
 
 
-LAYOUT = Layout(
-    (*TRACK_COLUMNS, SETTLED, *QUATERNION, "coordinates", *POSE, *ROTATIONS["ego_yaw"], "visible"),
-    REQUIRED,
-    lenient=True,
-)
+TRUTH_COLUMNS = (*TRACK_COLUMNS, SETTLED, *QUATERNION, "coordinates", *POSE, *ROTATIONS["ego_yaw"], "visible")
 REACH = 0.25  # s to either side, for a velocity
 LONGEST_GAP = 2.5  # steps between rows of an object, for a velocity
 
 
-class TruthFile:
+class TruthTable:
     """The scenes of one table of true objects, with ground truth alone. `named`: whether the table names its scenes."""
 
-    def __init__(self, path: str | Path, how: TableImport | None = None) -> None:
-        """Read and check everything. Raises `InputError` naming file, row and column."""
-        raw = read_raw_table(Path(path), LAYOUT, how)
+    def __init__(self, raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None] = _log_findings) -> None:
+        """Check everything; tell as of `track_rows`. Raises `InputError` naming file, row and column."""
         self.path = raw.path
-        self.rows = _track_rows(raw)
+        self.rows = track_rows(raw, tell)
         if not len(self.rows.id):
-            raise InputError(f"{path}: expected at least one row, the table is empty")
+            raise InputError(f"{raw.path}: expected at least one row, the table is empty")
         kept = np.flatnonzero(~raw.labels()[1])
         self._visible = _visible(raw)[kept]
         self._pose = _poses(raw)[kept]
@@ -356,6 +358,11 @@ class TruthFile:
             with error_context(f"{self.path}: scene {name}: {times[k]} s"):
                 truth.append(Annotations(self.rows.id[rows][at], boxes.select(at), self._visible[rows][at]))
         return Scene(name, times, poses, ("",) * len(times), (), truth)
+
+
+def read_truth(path: str | Path, how: TableImport | None = None) -> TruthTable:
+    """Read a table of true objects. Raises `InputError` naming file, row and column."""
+    return TruthTable(read_raw_table(Path(path), Layout(TRUTH_COLUMNS, REQUIRED, lenient=True), how))
 
 
 def _scene_poses(rows: TrackRows, at: Sequence[int] | np.ndarray, moment: np.ndarray, pose: FloatArray) -> FloatArray:

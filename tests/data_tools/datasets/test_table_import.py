@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from data_tools.datasets.detection_files import (
     TableImport,
-    TruthFile,
     read_detections,
     read_scenes_in_parts,
     read_tracks,
+    read_truth,
 )
 from saga_fg.errors import InputError
 from saga_fg.tables.column_names import ALIASES, FACTORS, Clock, canonical, meaning, pairs
@@ -214,7 +214,7 @@ def test_true_objects(tmp_path):
         for k in range(3)
         for name, shown in (("a", 1), ("b", 0))
     ]
-    scene = TruthFile(table(tmp_path, rows)).scene("drive")
+    scene = read_truth(table(tmp_path, rows)).scene("drive")
     first = scene.ground_truth[0]
     assert first.id.tolist() == ["a", "b"]
     assert first.visible.tolist() == [True, False]

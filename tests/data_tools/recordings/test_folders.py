@@ -17,6 +17,7 @@ from data_tools.recordings import RecordingOptions, open_recording
 from data_tools.recordings.layouts import GROUP
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.parts import offered
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import write_tables
 from tests.data_tools.scans_example import BEGIN, FOLDERS, write_scan, write_scans
@@ -333,8 +334,10 @@ def test_a_layout_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, s
     with pytest.raises(InputError, match="unknown layout 'kitty'"):
         open_recording(tmp_path, layout="kitty")
     point = EntryPoint("ours", "own_scans:opened", GROUP)
-    monkeypatch.setattr("data_tools.recordings.layouts.entry_points", lambda group: [point] if group == GROUP else [])
+    monkeypatch.setattr("saga_fg.parts.entry_points", lambda group: [point] if group == GROUP else [])
+    offered.cache_clear()
     assert len(open_recording(tmp_path, layout="ours")) == 3
+    offered.cache_clear()
     sys.modules.pop("own_scans")
 
 

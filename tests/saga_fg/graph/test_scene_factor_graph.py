@@ -413,7 +413,7 @@ def test_an_interaction(new_file, estimator):
     module = new_file("own_towing", INTERACTION)
 
     def position(rules):
-        tracker = Tracker(TrackerSettings(estimator=estimator), rules=rules)
+        tracker = Tracker(TrackerSettings(estimator=estimator, edges=rules))
         x, speed = 0.0, 10.0
         for k in range(30):
             speed -= 0.4 if k >= 20 else 0.0

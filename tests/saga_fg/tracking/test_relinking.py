@@ -125,6 +125,8 @@ def test_a_relinked_track_is_updated_as_any_other():
 class Quiet:
     """A provider without factors: it makes the graph run."""
 
+    name = "quiet"
+
     def factors(self, view):
         return Additions()
 

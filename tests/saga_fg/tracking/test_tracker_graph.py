@@ -127,7 +127,7 @@ class Broken:
 
 def test_a_users_rule_takes_the_place_of_the_settings():
     rule = Chain(rate=0.3)
-    tracker = Tracker(rules=(rule,))
+    tracker = Tracker(TrackerSettings(edges=(rule,)))
     run(tracker, seen(np.random.default_rng(0), straight([(0, 0), (30, 40)], [(9, 0), (0, 0)]), np.arange(0, 2, 0.1)))
     assert rule.asked > 10
     assert [(g.interaction, g.target.tolist(), g.source.tolist()) for g in tracker.graph.edges] == [
@@ -139,8 +139,9 @@ def test_a_users_rule_takes_the_place_of_the_settings():
 
 def test_a_coasting_track_that_hardly_exists_has_no_edges():
     classes = {"default": ClassSettings(min_score=0.0, initiation_score=0.0)}
-    doubtful = TrackerSettings(classes, existence=ExistenceSettings(delete_below=0.0))
-    tracker, places = Tracker(doubtful, rules=(Chain(rate=0.3),)), [(0.0, 0.0), (30.0, 40.0), (60.0, 0.0)]
+    rules = (Chain(rate=0.3),)
+    doubtful = TrackerSettings(classes, edges=rules, existence=ExistenceSettings(delete_below=0.0))
+    tracker, places = Tracker(doubtful), [(0.0, 0.0), (30.0, 40.0), (60.0, 0.0)]
     tied = []
     for k, score in enumerate((0.09, None, 0.9, 0.9)):
         detected = places[1:] if score is None else places
@@ -150,7 +151,7 @@ def test_a_coasting_track_that_hardly_exists_has_no_edges():
 
 
 def test_a_rule_that_makes_no_sense_is_named_and_nothing_has_happened():
-    broken, untouched = Tracker(rules=(Broken(),)), Tracker(rules=())
+    broken, untouched = (Tracker(TrackerSettings(edges=rules)) for rules in ((Broken(),), ()))
     run(untouched, seen(np.random.default_rng(0), braking_platoon, np.arange(0, 1, 0.1)))
     broken.restore(untouched.snapshot())
     later = frame(1.0, braking_platoon(1.0))
@@ -158,7 +159,7 @@ def test_a_rule_that_makes_no_sense_is_named_and_nothing_has_happened():
         broken.step(later)
     with pytest.raises(InputError, match="edge rule Broken"):
         broken.tracks(1.5)
-    again = Tracker(rules=())
+    again = Tracker(TrackerSettings(edges=()))
     again.restore(broken.snapshot())
     assert columns(again.step(later)) == columns(untouched.step(later))
 
@@ -272,7 +273,9 @@ def test_late_frames_of_objects_born_since(estimator):
 
 
 def test_an_estimator_that_is_none_is_refused():
-    expected = "estimator: expected one of kalman, isam2, fixed-lag, or MODULE:NAME, got 'kallman'"
+    expected = (
+        "unknown estimator 'kallman'; did you mean 'kalman'. Expected one of: kalman, isam2, fixed-lag, or MODULE:NAME"
+    )
     with pytest.raises(InputError, match=expected):
         TrackerSettings(estimator="kallman")
 

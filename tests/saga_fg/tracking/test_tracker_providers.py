@@ -82,14 +82,19 @@ def test_a_users_factor_moves_what_the_tracker_reports():
 
 
 def test_what_leads_to_no_provider_is_refused(subtests):
-    with pytest.raises(InputError, match="providers: expected factor providers, with a method factors, got 1"):
+    with pytest.raises(
+        InputError, match="providers: expected a factor provider with name, factors; it lacks name, factors, got int"
+    ):
         Tracker(providers=[1])  # type: ignore[list-item]
     for name, message in [
         ("wall", "expected MODULE:NAME, got 'wall'"),
-        ("no_such_module:Wall", "no_such_module:Wall: expected a module that can be imported"),
-        ("math:Wall", "math:Wall: the module has no Wall"),
-        ("math:sqrt", "math:sqrt: expected a class to be made without arguments"),
-        ("collections:Counter", "collections:Counter: expected a factor provider, which has a method factors"),
+        ("no_such_module:Wall", "no_such_module:Wall: no_such_module cannot be imported"),
+        ("math:Wall", "math:Wall: the module math has no Wall"),
+        ("math:sqrt", "math:sqrt: cannot be made without arguments"),
+        (
+            "collections:Counter",
+            "collections:Counter: expected a factor provider with name, factors; it lacks name, factors",
+        ),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             Tracker(TrackerSettings(estimator="isam2", providers=(name,)))

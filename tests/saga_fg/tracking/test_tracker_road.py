@@ -179,7 +179,7 @@ def test_elements_of_the_map_that_no_rule_reads_are_no_nodes():
         ((InLane(),), {"lane"}),
         ((OwnRule(),), {"traffic_light", "stop_line", "lane"}),
     ):
-        tracker = Tracker(replace(SETTINGS, edges=()), SENSORS, rules=edges)
+        tracker = Tracker(replace(SETTINGS, edges=edges), SENSORS)
         for each in frames:
             tracker.step(each)
         assert set(tracker.map_nodes.label.tolist()) == labels

@@ -1,0 +1,90 @@
+"""`saga_fg.evaluate` and `saga_fg.view`: as the command says, for tables of pandas, Polars and Arrow."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+import saga_fg
+from saga_fg import InputError
+from saga_fg.tables.column_names import TableImport
+from tests.pipelines.command import done
+
+pd = pytest.importorskip("pandas")
+NOISE = np.random.default_rng(0)
+ROWS = [(k / 10, n, "car", 10 * k / 10 - 12 * n, 0.0) for k in range(30) for n in range(3)]
+TRUTH = pd.DataFrame(ROWS, columns=["timestamp", "id", "label", "x", "y"])
+DETECTIONS = TRUTH.drop(columns="id").assign(x=TRUTH.x + NOISE.normal(0, 0.1, len(TRUTH)))
+
+
+@pytest.fixture(scope="module")
+def tracks():
+    return saga_fg.track(DETECTIONS)
+
+
+def test_the_figures_are_those_of_the_command(tracks, tmp_path):
+    tracks.to_csv(tmp_path / "tracks.csv", index=False)
+    TRUTH.to_csv(tmp_path / "truth.csv", index=False)
+    figures = tmp_path / "figures.json"
+    done("evaluate", "file", tmp_path / "tracks.csv", "--truth", tmp_path / "truth.csv", "--json", figures)
+    expected = json.loads(figures.read_text())["tracking"]["overall"]
+    found = saga_fg.evaluate(tracks, TRUTH)
+    assert found.figures()["tracking"]["overall"]["mota"] == expected["mota"] > 0.9
+    assert "AMOTA" in repr(found)
+    assert found._repr_html_().count("<table>") > 2
+
+
+@pytest.mark.parametrize("kind", ["polars", "pyarrow"])
+def test_other_tables_are_judged_alike(kind, tracks):
+    module = pytest.importorskip(kind)
+    made = module.from_pandas if kind == "polars" else module.Table.from_pandas
+    one, other = saga_fg.evaluate(made(tracks), made(TRUTH)), saga_fg.evaluate(tracks, TRUTH)
+    assert one.tracking == other.tracking
+
+
+def test_tracks_of_others_are_understood_by_names_and_units(tracks):
+    theirs = tracks[["timestamp", "id", "label", "x", "y"]].rename(columns={"id": "number", "x": "what"})
+    with pytest.raises(InputError, match="expected a column 'id'"):
+        saga_fg.evaluate(theirs, TRUTH)
+    how = TableImport(columns={"id": "number", "x": "what"}, classes={"car": "vehicle"})
+    found = saga_fg.evaluate(theirs, TRUTH, how, TableImport(classes={"car": "vehicle"}), hota=False)
+    assert "vehicle" in found.figures()["tracking"]
+    assert found.figures()["tracking"]["overall"]["mota"] > 0.9
+
+
+def test_metrics_of_ones_own_stand_beside(tracks):
+    def boxes(scenes):
+        return {"found": sum(len(found) for _, found in scenes)}
+
+    found = saga_fg.evaluate(tracks, TRUTH, metrics=[boxes])
+    assert found.figures()["own"] == {"boxes": {"found": len(tracks)}}
+    assert found.tables()[-1].title == "boxes"
+    with pytest.raises(InputError, match="metric: <lambda>: ZeroDivisionError"):
+        saga_fg.evaluate(tracks, TRUTH, metrics=[lambda scenes: 1 / 0])
+
+
+def test_tables_that_do_not_fit_are_refused(tracks):
+    with pytest.raises(InputError, match="expected tracks at the times of the ground truth"):
+        saga_fg.evaluate(tracks, TRUTH.assign(timestamp=TRUTH.timestamp + 100))
+    with pytest.raises(InputError, match="expected a column 'id'"):
+        saga_fg.evaluate(tracks, DETECTIONS)
+    with pytest.raises(InputError, match="expected a table of pandas, Polars or Arrow, got int"):
+        saga_fg.evaluate(3, TRUTH)
+    with warnings.catch_warnings(), pytest.raises(InputError, match=r"expected a file name that ends in \.html"):
+        saga_fg.view(tracks).write("page.txt")
+
+
+def test_a_page_shows_tracks_beside_detections_and_truth(tracks, tmp_path):
+    page = saga_fg.view(tracks, DETECTIONS, TRUTH)
+    page.write(tmp_path / "page.html")
+    assert (tmp_path / "page.html").read_text() == page.text
+    assert "MOTA" in page.text
+    assert "MOTA" not in saga_fg.view(tracks).text
+    assert page._repr_html_().startswith("<iframe")
+    assert repr(page).startswith(f"1 scene, {len(tracks)} boxes: a page of")
+
+
+def test_labels_say_how_many_they_are():
+    labels = saga_fg.smooth(DETECTIONS)
+    assert repr(labels).startswith("labels of 1 scenes, 90 boxes")
