@@ -7,7 +7,7 @@ check_dataset(Square(folder="recordings"))
 
 from __future__ import annotations
 
-import pickle
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -24,11 +24,11 @@ from saga_fg.types.dataset import Annotations, Scene
 def check_dataset(source: DatasetSource, scenes: int = 2) -> None:
     """Open recordings twice, read the first `scenes` of them, and track their first frames.
 
-    A reading is the same each time, and there is ground truth where the dataset says that it has some. Workers get the
-    dataset by pickling. Raises `AssertionError`, or `InputError` for what the dataset itself refuses.
+    A reading is the same each time, and there is ground truth where the dataset says that it has some. Raises
+    `AssertionError`, or `InputError` for what the dataset itself refuses.
     """
     KINDS[DatasetSource].require("dataset", source)
-    require(pickle.loads(pickle.dumps(source)) == source, "expected a dataset that is equal after pickling")
+    require(copy.deepcopy(source) == source, "expected a dataset whose copy is equal")
     with source.open(truth=source.has_truth) as opened, source.open() as again:
         names = tuple(opened.scenes)
         require(bool(names) and names == tuple(again.scenes), f"scenes: expected the same names twice, got {names}")

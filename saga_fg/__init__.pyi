@@ -2,12 +2,13 @@ import data_tools.datasets.data_frames as _judged
 import pipelines.report.data_frames as _shown
 
 from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
+from .model.ground_camera import GroundCamera
 from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType, RandomWalk
 from .model.scene_graph import Edges, SceneGraph
 from .model.sensor import Sensor
 from .smoothing import smooth
 from .tables.data_frames import frames_of
-from .tracking import GreedyTracker, Tracker, TrackerSettings, track
+from .tracking import GreedyTracker, IdentityTracker, Tracker, TrackerSettings, track
 from .types.boxes import Boxes
 from .types.dataset import Annotations, Dataset, Scene
 from .types.frame import Detection, Detections, Frame
@@ -29,6 +30,8 @@ __all__ = [
     "Edges",
     "Frame",
     "GreedyTracker",
+    "GroundCamera",
+    "IdentityTracker",
     "InputError",
     "MissingExtraError",
     "NodeType",

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from data_tools import conformance  # noqa: F401 (with all kinds of parts)
 from data_tools.simulator import SimulatorSettings
 from pipelines.config import TrackConfig
 from pipelines.configuration.reading import Listing, Nullable, Schema, Section, Table, settings_of
 from pipelines.serving import StreamSettings
 from pipelines.slam.configuration import SlamSettings
-from saga_fg import Tracker, conformance  # noqa: F401 (all kinds of parts)
+from saga_fg import Tracker
 from saga_fg.parts import KINDS
 from saga_fg.smoothing import SmoothingSettings
 

@@ -32,7 +32,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
@@ -151,6 +151,24 @@ def scene_digests(scene: Scene) -> dict[str, str]:
                 frames.update(np.ascontiguousarray(array).tobytes())
         digests[sensor] = frames.hexdigest()
     return digests
+
+
+@dataclass(frozen=True)
+class SourcePart:
+    """A recording of a dataset, opened and read at the worker; the dataset says which `files` it is read from."""
+
+    source: DatasetSource
+    name: str
+
+    @contextmanager
+    def opened(self) -> Iterator[OpenedPart]:
+        """Open with the digests of its files, and the settings among the options."""
+        settings = {field.name: getattr(self.source, field.name) for field in fields(self.source)}
+        texts = {name: repr(value) for name, value in settings.items() if is_dataclass(value)}
+        with self.source.open() as dataset:
+            files: Iterable[Path] = dataset.files(self.name)  # type: ignore[attr-defined]
+            digests = {f"{path.parent.name}/{path.name}": file_digest(path) for path in files}
+            yield OpenedPart({**digests, **texts}, lambda: dataset)
 
 
 def file_digest(path: Path) -> str:
@@ -424,6 +442,7 @@ BUILT_IN: Mapping[str, str] = {
     "nuscenes": "data_tools.datasets.nuscenes.source:NuScenesSource",
     "kitti": "data_tools.datasets.kitti.source:KittiSource",
     "argoverse2": "data_tools.datasets.argoverse2.source:ArgoverseSource",
+    "motchallenge": "data_tools.datasets.motchallenge:MotChallengeSource",
     "mcap": "data_tools.datasets.mcap.source:McapSource",
     "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
     "simulated": "data_tools.simulator.source:SimulatedSource",

@@ -143,6 +143,14 @@ def _numbered(names: Sequence[IntArray | StrArray]) -> list[IntArray]:
     return np.split(numbers.astype(np.int64), np.cumsum([len(each) for each in names])[:-1])
 
 
+def image_overlaps(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n, m) intersection over union of image boxes (n, 4) and (m, 4): left, top, right, bottom."""
+    low, high = np.maximum(a[:, None, :2], b[:, :2]), np.minimum(a[:, None, 2:], b[:, 2:])
+    shared = np.maximum(high - low, 0.0).prod(axis=2)
+    both = (a[:, 2:] - a[:, :2]).prod(axis=1)[:, None] + (b[:, 2:] - b[:, :2]).prod(axis=1) - shared
+    return np.asarray(np.where(both > 0, shared / np.where(both > 0, both, 1.0), 0.0))
+
+
 def _similarities(
     truth: SceneBoxes, found: SceneBoxes, label: str, similarity: Similarity, reach: float
 ) -> SceneSimilarities:

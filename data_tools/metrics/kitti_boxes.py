@@ -33,7 +33,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
-from data_tools.metrics.hota import HotaMetrics, SceneSimilarities, box_similarities, similarity_metrics
+from data_tools.metrics.hota import HotaMetrics, SceneSimilarities, box_similarities, image_overlaps, similarity_metrics
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.types.boxes import Boxes
 
@@ -175,19 +175,6 @@ def kitti_hota_metrics(
     )
 
 
-def image_overlaps(a: KittiObjects, b: KittiObjects) -> FloatArray:
-    """(n, m) intersection over union of the boxes in the image."""
-    low = np.maximum(a.bbox[:, None, :2], b.bbox[None, :, :2])
-    high = np.minimum(a.bbox[:, None, 2:], b.bbox[None, :, 2:])
-    shared = np.maximum(high - low, 0.0).prod(axis=2)
-    both = _areas(a)[:, None] + _areas(b)[None, :] - shared
-    return np.asarray(np.where(both > 0, shared / np.where(both > 0, both, 1.0), 0.0))
-
-
-def _areas(objects: KittiObjects) -> FloatArray:
-    return np.asarray((objects.bbox[:, 2:] - objects.bbox[:, :2]).prod(axis=1))
-
-
 def _evaluated(sequence: KittiTrackingSequence, label: str) -> tuple[KittiObjects, KittiObjects]:
     """The true and the found objects that are evaluated."""
     truth = of_class(sequence.truth, label, persons=True)
@@ -203,7 +190,7 @@ def _matches(truth: KittiObjects, found: KittiObjects, exempt: BoolArray) -> tup
     matched, of_exempt = np.zeros(len(found), dtype=np.bool_), np.zeros(len(found), dtype=np.bool_)
     for frame in np.intersect1d(truth.frame, found.frame).tolist():
         i, j = np.flatnonzero(truth.frame == frame), np.flatnonzero(found.frame == frame)
-        overlap = image_overlaps(truth.select(i), found.select(j))
+        overlap = image_overlaps(truth.bbox[i], found.bbox[j])
         overlap[overlap < _MATCHED] = 0.0
         rows, columns = linear_sum_assignment(-overlap)
         pairs = overlap[rows, columns] > 0
@@ -225,7 +212,7 @@ def _scene_similarities(truth: KittiObjects, found: KittiObjects, similarity: Ki
 
 def _similarities(truth: KittiObjects, found: KittiObjects, similarity: KittiSimilarity) -> FloatArray:
     if similarity == "image":
-        return image_overlaps(truth, found)
+        return image_overlaps(truth.bbox, found.bbox)
     result = np.zeros((len(truth), len(found)))
     i, j = np.flatnonzero(has_box(truth)), np.flatnonzero(has_box(found))
     a, b = (

@@ -10,7 +10,7 @@ raises `AssertionError`, or `InputError`, that names the member and what was exp
 
 from __future__ import annotations
 
-import pickle
+import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,9 +89,9 @@ def check_edge_rule(rule: EdgeRule, classes: tuple[str, ...] = ("car", "truck", 
 
 
 def check_sensor(sensor: Sensor) -> None:
-    """Probabilities and covariances of detections, of none too; it can be sent to another process."""
+    """Probabilities and covariances of detections, of none too; its copies are equal."""
     KINDS[Sensor].require("sensor", sensor)
-    require(pickle.loads(pickle.dumps(sensor)) == sensor, "expected a sensor that is equal after pickling")
+    require(copy.deepcopy(sensor) == sensor, "expected a sensor whose copy is equal")
     for count in (0, 5):
         some = Detections(boxes(count), np.full(count, 0.7))
         p = sensor.probability(some.score, some.boxes.label)

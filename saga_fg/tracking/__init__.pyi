@@ -1,6 +1,7 @@
 from .clock import TimeVerdict
 from .clock_offsets import SensorTime
 from .greedy import GreedySettings, GreedyTracker
+from .identity_tracking import IdentityTracker
 from .journal import Journal, Observer, Stage, TrackerView
 from .settings import (
     AssociationName,
@@ -22,6 +23,7 @@ __all__ = [
     "ExistenceSettings",
     "GreedySettings",
     "GreedyTracker",
+    "IdentityTracker",
     "Journal",
     "Observer",
     "SensorTime",

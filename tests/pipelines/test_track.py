@@ -11,8 +11,9 @@ from typing import get_args
 import pytest
 
 from data_tools.datasets.kitti import local_kitti
-from data_tools.datasets.kitti.source import KittiPart, KittiSource
+from data_tools.datasets.kitti.source import KittiSource
 from data_tools.datasets.nuscenes import NuScenes, read_tracking_results
+from data_tools.datasets.source import SourcePart
 from data_tools.files.input_files import local_tree
 from data_tools.simulator import SimulatorSettings
 from pipelines.checks import Checks
@@ -384,10 +385,10 @@ def test_a_worker_fetches_its_sequence_alone(tmp_path, put):
     with local_kitti(url, f"{url}/found", ["0008"]) as dataset:
         assert dataset.scenes == ("0008",)
         assert [path.name for path in dataset.files("0008")[0].parent.iterdir()] == ["0008.txt"]
-    with KittiPart(KittiSource(dataroot=url, detections=f"{url}/found", sequences="0007"), "0007").opened() as there:
+    with SourcePart(KittiSource(dataroot=url, detections=f"{url}/found", sequences="0007"), "0007").opened() as there:
         digests = there.digests
     local = KittiSource(dataroot=str(root), detections=str(root / "found"), sequences="0007")
-    with KittiPart(local, "0007").opened() as here:
+    with SourcePart(local, "0007").opened() as here:
         assert digests == here.digests
 
 

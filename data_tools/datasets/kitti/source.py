@@ -54,12 +54,11 @@ from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
     LabelledScenes,
-    OpenedPart,
     Parts,
     ResultFormat,
+    SourcePart,
     Surroundings,
     TrackedScenes,
-    file_digest,
     names,
     option,
     tracks_of,
@@ -417,7 +416,7 @@ class KittiSource(DatasetSource):
     def parts(self) -> Iterator[Parts]:
         with self.open() as dataset:
             scenes = dataset.scenes
-        yield Parts(scenes, (KittiPart(self.restricted([name]), name) for name in scenes))
+        yield Parts(scenes, (SourcePart(self.restricted([name]), name) for name in scenes))
 
     def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
         if is_url(self.dataroot):
@@ -441,18 +440,3 @@ class KittiSource(DatasetSource):
 
     def _chosen(self) -> tuple[str, ...] | None:
         return None if self.sequences is None else names("--sequences", self.sequences)
-
-
-@dataclass(frozen=True)
-class KittiPart:
-    """A sequence, read at the worker."""
-
-    source: KittiSource
-    name: str
-
-    @contextmanager
-    def opened(self) -> Iterator[OpenedPart]:
-        """Open with the digests of its text files."""
-        with self.source.open() as dataset:
-            files = dataset.files(self.name)
-            yield OpenedPart({f"{path.parent.name}/{path.name}": file_digest(path) for path in files}, lambda: dataset)
