@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from birds_eye_picture import write_birds_eye_picture
 from concept_pictures import write_concept_pictures
+from crowd_picture import write_crowd_picture
 from heterogeneous_picture import write_heterogeneous_picture
 from running_graph_picture import write_running_graph_pictures
 from scaling_picture import write_scaling_picture
@@ -69,6 +70,7 @@ def write_review_picture(picture: Path, folder: Path) -> None:
 def main() -> None:
     """All pictures; those of recordings where the variable SAGA_FG_DATA names their folder."""
     write_concept_pictures(HERE)
+    write_crowd_picture(HERE / "crowd.png")
     write_scaling_picture(HERE / "scaling.png")
     write_heterogeneous_picture(HERE)
     write_running_graph_pictures(HERE)
